@@ -1,0 +1,90 @@
+"""Log → trace → formula → numbers → log: spatio-temporal robustness of recorded runs.
+
+Names are loaded when they are first used, so that importing the package loads no numerical library.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from spatial_replay.errors import (
+    GeometryError,
+    LogError,
+    MissingFileError,
+    OutputError,
+    SpatialReplayError,
+    SpecificationError,
+    TraceError,
+    UsageError,
+)
+
+if TYPE_CHECKING:
+    from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
+    from spatial_replay.logs.source import read_trace
+    from spatial_replay.monitor.evaluation import Evaluation, evaluate
+    from spatial_replay.monitor.monitor import Monitor
+    from spatial_replay.monitor.verdict import Verdict
+    from spatial_replay.recording.recorder import Recorder
+    from spatial_replay.spec.formula import Specification
+    from spatial_replay.spec.specification import load_specification, parse_specification
+    from spatial_replay.trace.sample import Sample
+    from spatial_replay.trace.trace import Trace
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "ConvexPart",
+    "Evaluation",
+    "Footprint",
+    "GeometryError",
+    "LogError",
+    "MissingFileError",
+    "Monitor",
+    "OutputError",
+    "Recorder",
+    "Sample",
+    "SpatialReplayError",
+    "Specification",
+    "SpecificationError",
+    "Trace",
+    "TraceError",
+    "TrackedObject",
+    "UsageError",
+    "Verdict",
+    "__version__",
+    "evaluate",
+    "load_specification",
+    "parse_specification",
+    "read_trace",
+]
+
+_HOMES = {
+    "ConvexPart": "spatial_replay.geometry.footprint",
+    "Evaluation": "spatial_replay.monitor.evaluation",
+    "Footprint": "spatial_replay.geometry.footprint",
+    "Monitor": "spatial_replay.monitor.monitor",
+    "Recorder": "spatial_replay.recording.recorder",
+    "Sample": "spatial_replay.trace.sample",
+    "Specification": "spatial_replay.spec.formula",
+    "Trace": "spatial_replay.trace.trace",
+    "TrackedObject": "spatial_replay.geometry.footprint",
+    "Verdict": "spatial_replay.monitor.verdict",
+    "evaluate": "spatial_replay.monitor.evaluation",
+    "load_specification": "spatial_replay.spec.specification",
+    "parse_specification": "spatial_replay.spec.specification",
+    "read_trace": "spatial_replay.logs.source",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(_HOMES[name]), name)
+    # kept, so that the next use does not come here
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
