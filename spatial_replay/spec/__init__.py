@@ -1,0 +1,53 @@
+"""The language: text to formulas and back.
+
+Names are loaded when they are first used: values of formulas need no parser.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from spatial_replay.spec.format import format_formula, format_specification
+    from spatial_replay.spec.objects import check_names, instantiate, object_names, signal_names
+    from spatial_replay.spec.specification import load_specification, parse_specification
+
+__all__ = [
+    "check_names",
+    "format_formula",
+    "format_specification",
+    "instantiate",
+    "load_specification",
+    "object_names",
+    "parse_specification",
+    "signal_names",
+]
+
+_HOMES: Mapping[str, str] = MappingProxyType(
+    {
+        "check_names": "spatial_replay.spec.objects",
+        "format_formula": "spatial_replay.spec.format",
+        "format_specification": "spatial_replay.spec.format",
+        "instantiate": "spatial_replay.spec.objects",
+        "load_specification": "spatial_replay.spec.specification",
+        "object_names": "spatial_replay.spec.objects",
+        "parse_specification": "spatial_replay.spec.specification",
+        "signal_names": "spatial_replay.spec.objects",
+    }
+)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(_HOMES[name]), name)
+    # kept, so that the next use does not come here
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

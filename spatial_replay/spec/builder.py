@@ -1,0 +1,291 @@
+"""Parsed rules to syntax nodes: one method for each rule of grammar.lark."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from decimal import Decimal
+from math import isfinite
+from types import MappingProxyType
+from typing import Any, TypeVar
+
+from lark import Token
+
+from spatial_replay.spec.formula import Span
+from spatial_replay.spec.syntax import (
+    BooleanSyntax,
+    BoundSyntax,
+    Call,
+    ComparisonSyntax,
+    ConstStatement,
+    DefStatement,
+    Delayed,
+    DistanceSyntax,
+    Duration,
+    Enlargement,
+    Exclusion,
+    FormulaSyntax,
+    GroupStatement,
+    Name,
+    NumberSyntax,
+    OpenGroup,
+    Point,
+    QuantifierSyntax,
+    RegionStatement,
+    RelationSyntax,
+    Shape,
+    SpecStatement,
+    TemporalSyntax,
+    TruthSyntax,
+    UseStatement,
+    depth_of,
+)
+from spatial_replay.spec.tokens import span_of
+
+MAX_DEPTH = 100
+"""Brackets and operators within one another."""
+
+MAX_EXCLUDED = 1000
+"""Objects that one term leaves out of a group."""
+
+MAX_DURATION_NS = 2**63 - 1
+
+_BOOLEAN = MappingProxyType({"AND": "and", "OR": "or", "XOR": "xor", "IMPLIES": "->", "IFF": "<->"})
+_MIRRORED = MappingProxyType({"<=": ">=", "<": ">", ">=": "<=", ">": "<", "==": "=="})
+_NS = MappingProxyType({"s": Decimal(10**9), "ms": Decimal(10**6)})
+
+
+class StatementError(Exception):
+    """A fault that is seen while rules are put together."""
+
+    def __init__(self, span: Span, message: str, hint: str = "") -> None:
+        super().__init__(message)
+        self.span, self.message, self.hint = span, message, hint
+
+
+def _span(piece: Any) -> Span:
+    return span_of(piece) if isinstance(piece, Token) else piece.span
+
+
+def _cover(children: list[Any]) -> Span:
+    present = [child for child in children if child is not None]
+    return Span(_span(present[0]).start, _span(present[-1]).end)
+
+
+def _deeper(operands: tuple[FormulaSyntax, ...], span: Span) -> int:
+    depth = 1 + max(depth_of(operand) for operand in operands)
+    if depth > MAX_DEPTH:
+        hint = "give parts of it names of their own, with spec"
+        raise StatementError(span, f"more than {MAX_DEPTH} operators within one another", hint)
+    return depth
+
+
+def _chain_hint(below: str, above: str) -> str:
+    if "==" in (below, above):
+        return "write a dist b == c, or c1 <= a dist b <= c2"
+    if below[0] == above[0]:
+        return "write the lesser limit first: c1 <= a dist b <= c2"
+    return "write it as c1 <= a dist b <= c2, or as two comparisons joined by and"
+
+
+_Kind = TypeVar("_Kind")
+
+
+def _all_of(kind: type[_Kind], children: list[Any]) -> tuple[_Kind, ...]:
+    return tuple(child for child in children if isinstance(child, kind))
+
+
+def read_number(text: str, span: Span) -> float | Duration:
+    """The value of a number or a duration as written.
+
+    Raises:
+        StatementError: for one too large, or a duration of less than whole nanoseconds.
+    """
+    unit = "ms" if text.endswith("ms") else "s" if text.endswith("s") else ""
+    digits = text.removesuffix(unit)
+    if not unit:
+        value = float(digits)
+        if not isfinite(value):
+            hint = "numbers reach up to about 1.7e308"
+            raise StatementError(span, f"{text} is too large for a number", hint)
+        return value
+    seconds = Decimal(digits)
+    if seconds and not -40 < seconds.adjusted() < 40:
+        raise StatementError(span, f"{text} is no usable duration", "durations go from 1e-9s to 9e9s")
+    ns = seconds * _NS[unit]
+    if ns != int(ns) or ns > MAX_DURATION_NS:
+        raise StatementError(span, f"{text} is no usable duration", "give whole nanoseconds, at most 9e9s")
+    return Duration(int(ns))
+
+
+class TreeBuilder:
+    """Called by the parser with the pieces of each rule, tokens included."""
+
+    # ------------------------------------------------------------------------------------ statements
+
+    def use(self, children: list[Any]) -> UseStatement:
+        return UseStatement(children[1])
+
+    def const(self, children: list[Any]) -> ConstStatement:
+        return ConstStatement(children[1], children[3])
+
+    def region(self, children: list[Any]) -> RegionStatement:
+        _, name, _, shape, *height = children
+        if height[0] is None:
+            return RegionStatement(name, shape, None, None)
+        return RegionStatement(name, shape, (height[2], height[4]), _cover(height))
+
+    def group(self, children: list[Any]) -> GroupStatement:
+        _, name, _, members = children
+        if isinstance(members, OpenGroup):
+            return GroupStatement(name, None, members)
+        return GroupStatement(name, members, None)
+
+    def definition(self, children: list[Any]) -> DefStatement:
+        return DefStatement(children[1], children[3] or (), children[6])
+
+    def spec(self, children: list[Any]) -> SpecStatement:
+        return SpecStatement(children[1], children[3] or (), children[6])
+
+    def names(self, children: list[Any]) -> tuple[Name, ...]:
+        return _all_of(Name, children)
+
+    def name(self, children: list[Token]) -> Name:
+        return Name(children[0].value, span_of(children[0]))
+
+    def polygon(self, children: list[Any]) -> Shape:
+        return Shape("polygon", children[2] or (), None, _cover(children))
+
+    def box(self, children: list[Any]) -> Shape:
+        corners = ((children[2], children[4]), (children[6], children[8]))
+        return Shape("box", corners, None, _cover(children))
+
+    def circle(self, children: list[Any]) -> Shape:
+        return Shape("circle", (children[2],), children[4], _cover(children))
+
+    def points(self, children: list[Any]) -> tuple[Point, ...]:
+        return tuple(child for child in children if not isinstance(child, Token))
+
+    def point(self, children: list[Any]) -> Point:
+        return (children[1], children[3])
+
+    def number(self, children: list[Token]) -> NumberSyntax:
+        span = _cover(children)
+        value = read_number(children[-1].value, span)
+        if len(children) == 2:
+            value = Duration(-value.ns) if isinstance(value, Duration) else 0.0 - value
+        return NumberSyntax(value, span)
+
+    # -------------------------------------------------------------------------------------- formulas
+
+    def chain(self, children: list[Any]) -> BooleanSyntax:
+        left, token, right = children
+        operator: Any = _BOOLEAN[token.type]
+        span = _cover(children)
+        depth = _deeper((left, right), span_of(token))
+        gathers = operator in ("and", "or") and isinstance(left, BooleanSyntax)
+        if gathers and left.operator == operator and not left.is_bracketed:
+            left.operands.append(right)
+            return BooleanSyntax(operator, left.operands, span, max(left.depth, 1 + depth_of(right)))
+        return BooleanSyntax(operator, [left, right], span, depth)
+
+    def negation(self, children: list[Any]) -> BooleanSyntax:
+        token, operand = children
+        return BooleanSyntax("not", [operand], _cover(children), _deeper((operand,), span_of(token)))
+
+    def infix(self, children: list[Any]) -> TemporalSyntax:
+        left, token, bound, right = children
+        depth = _deeper((left, right), span_of(token))
+        return TemporalSyntax(token.value, span_of(token), bound, (left, right), _cover(children), depth)
+
+    def prefix(self, children: list[Any]) -> TemporalSyntax:
+        token, bound, operand = children
+        depth = _deeper((operand,), span_of(token))
+        return TemporalSyntax(token.value, span_of(token), bound, (operand,), _cover(children), depth)
+
+    def bound(self, children: list[Any]) -> BoundSyntax:
+        return BoundSyntax(children[1], children[3], _cover(children))
+
+    def quantifier(self, children: list[Any]) -> QuantifierSyntax:
+        token, variables, _, group, _, body = children
+        depth = _deeper((body,), span_of(token))
+        return QuantifierSyntax(token.value, variables, group, body, _cover(children), depth)
+
+    def truth(self, children: list[Token]) -> TruthSyntax:
+        return TruthSyntax(children[0].value == "true", span_of(children[0]))
+
+    def call(self, children: list[Any]) -> Call:
+        return Call(children[0], children[2] or (), _cover(children))
+
+    def arguments(self, children: list[Any]) -> tuple[Any, ...]:
+        return tuple(child for child in children if not isinstance(child, Token))
+
+    def bracketed(self, children: list[Any]) -> Any:
+        inner = children[1]
+        if isinstance(inner, BooleanSyntax):
+            return replace(inner, span=_cover(children), is_bracketed=True)
+        return replace(inner, span=_cover(children))
+
+    def relation(self, children: list[Any]) -> RelationSyntax:
+        first, token, parameters, second = children
+        operator = span_of(token)
+        return RelationSyntax(token.value, operator, (first, second), parameters or (), _cover(children))
+
+    def closer(self, children: list[Any]) -> RelationSyntax:
+        first, token, second, _, third = children
+        return RelationSyntax("closer", span_of(token), (first, second, third), (), _cover(children))
+
+    def between(self, children: list[Any]) -> RelationSyntax:
+        first, token, parameters, _, second, _, third, _ = children
+        terms = (first, second, third)
+        return RelationSyntax("between", span_of(token), terms, parameters or (), _cover(children))
+
+    def parameters(self, children: list[Any]) -> tuple[Any, ...]:
+        return tuple(child for child in children if not isinstance(child, Token))
+
+    def distance(self, children: list[Any]) -> DistanceSyntax:
+        first, _, second, token, limit = children
+        return DistanceSyntax(first, second, ((token.value, limit),), _cover(children))
+
+    def distance_within(self, children: list[Any]) -> DistanceSyntax:
+        lower, below, first, _, second, above, upper = children
+        for token, side in ((below, "left"), (above, "right")):
+            if token.value not in ("<=", "<"):
+                message = f"{token.value!r} cannot stand on the {side} of a chained comparison, only <= or <"
+                raise StatementError(span_of(token), message, _chain_hint(below.value, above.value))
+        comparisons = ((_MIRRORED[below.value], lower), (above.value, upper))
+        return DistanceSyntax(first, second, comparisons, _cover(children))
+
+    def comparison(self, children: list[Any]) -> ComparisonSyntax:
+        signal, token, limit = children
+        return ComparisonSyntax(signal, token.value, limit, _cover(children))
+
+    # ----------------------------------------------------------------------------------------- terms
+
+    def open_group(self, children: list[Any]) -> OpenGroup:
+        if len(children) == 1:
+            return OpenGroup(None, _cover(children))
+        if children[1].text == "*":
+            hint = "the group of every object is `all`"
+            raise StatementError(children[1].span, "no class is named '*'", hint)
+        return OpenGroup(children[1].text, _cover(children))
+
+    def exclusion(self, children: list[Any]) -> Exclusion:
+        group, _, name = children
+        if isinstance(group, Exclusion):
+            if len(group.excluded) >= MAX_EXCLUDED:
+                hint = "name those that belong to the group instead"
+                raise StatementError(name.span, f"more than {MAX_EXCLUDED} objects left out", hint)
+            return Exclusion(group.group, (*group.excluded, name), _cover(children))
+        return Exclusion(group, (name,), _cover(children))
+
+    def enlarge(self, children: list[Any]) -> Enlargement:
+        return Enlargement(children[2], children[4], _cover(children))
+
+    def delayed(self, children: list[Any]) -> Delayed:
+        term, _, _, amount, _ = children
+        span = _cover(children)
+        if isinstance(term, Delayed):
+            raise StatementError(span, "a delay of a delayed object", "add the two up in one [-n]")
+        if isinstance(amount, Token):
+            amount = NumberSyntax(read_number(amount.value, span_of(amount)), span_of(amount))
+        return Delayed(term, amount, span)

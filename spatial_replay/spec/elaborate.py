@@ -1,0 +1,294 @@
+"""Statements to a `Specification`: names resolved, macros and named quantifiers expanded."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from spatial_replay.spec.atoms import AtomBuilder
+from spatial_replay.spec.builder import MAX_DEPTH
+from spatial_replay.spec.faults import Faults
+from spatial_replay.spec.formula import Boolean, Formula, NamedSpec, Span, Temporal, Truth, Variable
+from spatial_replay.spec.namespace import Namespace, kind_of
+from spatial_replay.spec.quantifiers import QuantifierBuilder, first_repeated
+from spatial_replay.spec.relations import Relation
+from spatial_replay.spec.resolve import MAX_SIZE, Anything, Resolver, Scope, Value
+from spatial_replay.spec.syntax import (
+    BooleanSyntax,
+    BrokenStatement,
+    Call,
+    ComparisonSyntax,
+    DefStatement,
+    DistanceSyntax,
+    FormulaSyntax,
+    Name,
+    NumberSyntax,
+    QuantifierSyntax,
+    RelationSyntax,
+    SpecStatement,
+    TemporalSyntax,
+    TermSyntax,
+    TruthSyntax,
+)
+from spatial_replay.spec.terms import other_names
+
+_UNBOUNDED = frozenset({"X", "WX", "Y"})
+
+
+class TooLargeError(Exception):
+    """An expansion went past its bound; the fault is already reported."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """A spec that is done: its size and depth count again wherever it is named."""
+
+    spec: NamedSpec
+    order: int
+    size: int
+    depth: int
+
+
+@dataclass(slots=True)
+class Elaborator:
+    """Elaborates the statements of one text.
+
+    Attributes:
+        words: every name that occurs in the text; variables that must be renamed avoid them.
+    """
+
+    names: Namespace
+    relations: Mapping[str, Relation]
+    words: Collection[str]
+    faults: Faults
+    resolver: Resolver = field(init=False)
+    atoms: AtomBuilder = field(init=False)
+    quantifiers: QuantifierBuilder = field(init=False)
+    known: dict[str, _Known] = field(default_factory=dict)
+    referred: set[str] = field(default_factory=set)
+    deepest: int = 0
+    shared: int = 0
+
+    def __post_init__(self) -> None:
+        self.resolver = Resolver(self.names, self.faults)
+        relation_names = frozenset(self.relations)
+        self.atoms = AtomBuilder(self.relations, relation_names, self.resolver, self.faults)
+        self.quantifiers = QuantifierBuilder(
+            self.names, self.relations, self.words, self.resolver, self.formula
+        )
+
+    # ----------------------------------------------------------------------------------------- specs
+
+    def specs(self, statements: Sequence[SpecStatement]) -> tuple[NamedSpec, ...]:
+        """Every spec, in the order of the text.
+
+        Raises:
+            TooLargeError: where the text expands to more than `MAX_SIZE` nodes.
+        """
+        for order, statement in enumerate(statements):
+            if self.names.definitions.get(statement.name.text) is statement:
+                self._spec(statement, order)
+        for definition in self.names.definitions.values():
+            if isinstance(definition, DefStatement):
+                self._check_macro(definition)
+        done = [known.spec for known in self.known.values()]
+        total = sum(known.size for name, known in self.known.items() if name not in self.referred)
+        if total > MAX_SIZE:
+            self._too_large(statements[-1].name.span)
+        return tuple(replace(spec, is_result=spec.name not in self.referred) for spec in done)
+
+    def _spec(self, statement: SpecStatement, order: int) -> None:
+        name = statement.name.text
+        parameter = self._template_parameter(statement)
+        scope = Scope(order=order)
+        if parameter is not None:
+            values: dict[str, Value] = {parameter: Variable(parameter)}
+            scope = Scope(values, bound=frozenset(values), order=order)
+        before, self.deepest, self.shared = self.resolver.size, 0, 0
+        formula = self.formula(statement.formula, scope)
+        if parameter is not None:
+            self._check_capture(statement, formula)
+        if formula.name is not None:
+            formula = Boolean("spec", (formula,), span=statement.formula.span)
+            self.deepest += 1
+        formula = replace(formula, name=name)
+        spec = NamedSpec(name, formula, parameter, span=statement.name.span)
+        size = self.resolver.size - before + self.shared
+        self.known[name] = _Known(spec, order, size, self.deepest)
+
+    def _template_parameter(self, statement: SpecStatement) -> str | None:
+        if not statement.parameters:
+            return None
+        parameter, *more = statement.parameters
+        if more:
+            message = f"the template {statement.name.text!r} has more than one parameter"
+            self.faults.add(more[0].span, message, "a template is evaluated per object; use def for macros")
+        defined = self.names.definitions.get(parameter.text)
+        if defined is not None:
+            message = f"{parameter.text!r} is already the name of {kind_of(defined)}"
+            self.faults.add(parameter.span, message, "give the parameter another name")
+        return parameter.text
+
+    def _check_capture(self, statement: SpecStatement, formula: Formula) -> None:
+        parameter = statement.parameters[0]
+        if parameter.text in other_names(formula):
+            message = f"{parameter.text!r} is the template's parameter, and an object in something it uses"
+            self.faults.add(parameter.span, message, "give the parameter another name")
+
+    def _check_macro(self, definition: DefStatement) -> None:
+        """Read the body of a macro that nothing uses, whatever its arguments may be."""
+        doubled = first_repeated(definition.parameters)
+        if doubled is not None:
+            self.faults.add(doubled.span, f"the parameter {doubled.text!r} is given twice")
+        if definition.name.text not in self.names.used:
+            values: dict[str, Value] = {parameter.text: Anything() for parameter in definition.parameters}
+            scope = Scope(values, macros=(definition.name.text,), order=len(self.known))
+            self.formula(definition.body, scope)
+
+    # -------------------------------------------------------------------------------------- formulas
+
+    def formula(self, written: FormulaSyntax, scope: Scope) -> Formula:
+        """What a formula means; `true` in the place of one with faults."""
+        span = scope.call or written.span
+        self._count(span, scope)
+        match written:
+            case TruthSyntax():
+                return Truth(written.value, span=span)
+            case Name():
+                return self._reference(written, scope)
+            case Call():
+                return self._call(written, scope)
+            case RelationSyntax():
+                return self.atoms.relation(written, scope) or Truth(True)
+            case DistanceSyntax():
+                return self.atoms.distance(written, scope)
+            case ComparisonSyntax():
+                return self.atoms.comparison(written, scope)
+            case BooleanSyntax():
+                inner = scope.deeper()
+                operands = tuple([self.formula(operand, inner) for operand in written.operands])
+                return Boolean(written.operator, operands, span=span)
+            case TemporalSyntax():
+                return self._temporal(written, scope, span)
+            case QuantifierSyntax():
+                return self.quantifiers.formula(written, scope, span)
+
+    def _count(self, span: Span, scope: Scope) -> None:
+        self.resolver.size += 1
+        if self.resolver.size + self.shared > MAX_SIZE:
+            self._too_large(span)
+        self._reach(scope.depth, span)
+
+    def _reach(self, depth: int, span: Span) -> None:
+        self.deepest = max(self.deepest, depth)
+        if depth > MAX_DEPTH:
+            message = f"more than {MAX_DEPTH} operators within one another, counting what names stand for"
+            self.faults.add(span, message, "nest specs and macros less deeply")
+            raise TooLargeError
+
+    def _too_large(self, span: Span) -> None:
+        message = f"with macros, quantifiers and names written out, this text has more than {MAX_SIZE} parts"
+        self.faults.add(span, message, "use smaller groups, or an open group (class or all)")
+        raise TooLargeError
+
+    def _temporal(self, written: TemporalSyntax, scope: Scope, span: Span) -> Formula:
+        if written.operator in _UNBOUNDED and written.bound is not None:
+            hint = f"F and G take windows; {written.operator} means one sample"
+            self.resolver.fault(written.bound.span, scope, f"{written.operator!r} takes no window", hint)
+        bound = self.resolver.bound(written.bound, scope)
+        inner = scope.deeper()
+        operands = tuple([self.formula(operand, inner) for operand in written.operands])
+        return Temporal(written.operator, operands, bound, span=span)  # type: ignore[arg-type]
+
+    # -------------------------------------------------------------------------------- names and calls
+
+    def _reference(self, name: Name, scope: Scope) -> Formula:
+        if name.text in scope.values:
+            message = f"{name.text!r} is an object or number; a formula is expected here"
+            self.resolver.fault(name.span, scope, message, f"write a relation, such as {name.text} ovlp b")
+            return Truth(True)
+        defined = self.names.definitions.get(name.text)
+        known = self.known.get(name.text)
+        if known is not None and known.order < scope.order and known.spec.parameter is None:
+            self.names.used.add(name.text)
+            self.referred.add(name.text)
+            self.shared += known.size
+            self._reach(scope.depth + known.depth, name.span)
+            return known.spec.formula
+        if not isinstance(defined, BrokenStatement):
+            self._report_reference(name, known, scope)
+        return Truth(True)
+
+    def _report_reference(self, name: Name, known: _Known | None, scope: Scope) -> None:
+        defined = self.names.definitions.get(name.text)
+        if known is not None and known.spec.parameter is not None:
+            hint = "a template is evaluated for each object by itself; share formulas by def"
+            self.resolver.fault(name.span, scope, f"{name.text!r} is a template, not a formula", hint)
+        elif isinstance(defined, SpecStatement):
+            hint = "a spec may name those above it; move it down"
+            self.resolver.fault(name.span, scope, f"{name.text!r} is not defined before this place", hint)
+        elif isinstance(defined, DefStatement):
+            arguments = ", ".join(parameter.text for parameter in defined.parameters)
+            hint = f"write {name.text}({arguments})"
+            self.resolver.fault(name.span, scope, f"{name.text!r} is a macro, and needs its arguments", hint)
+        elif defined is not None:
+            message = f"{name.text!r} is {kind_of(defined)}; a formula is expected here"
+            self.resolver.fault(name.span, scope, message, f"write a relation, such as a ovlp {name.text}")
+        else:
+            hint = self.faults.nearest(name.text, self._formula_names())
+            hint = hint or f"an object needs a relation, such as {name.text} ovlp b"
+            self.resolver.fault(name.span, scope, f"no spec is named {name.text!r}", hint)
+
+    def _formula_names(self) -> Iterator[str]:
+        kinds = (SpecStatement, DefStatement)
+        return (name for name, each in self.names.definitions.items() if isinstance(each, kinds))
+
+    def _call(self, written: Call, scope: Scope) -> Formula:
+        name = written.name.text
+        macro = self.names.definitions.get(name)
+        if isinstance(macro, BrokenStatement):
+            return Truth(True)
+        if not isinstance(macro, DefStatement):
+            self._report_call(written, scope)
+            return Truth(True)
+        self.names.used.add(name)
+        if name in scope.macros:
+            message = f"def {name!r} is defined by way of itself"
+            self.faults.add(written.span, message, "a macro is written out where it is used, so it must end")
+            return Truth(True)
+        if len(written.arguments) != len(macro.parameters):
+            wanted = ", ".join(parameter.text for parameter in macro.parameters)
+            count = f"{len(macro.parameters)} arguments ({wanted}), not {len(written.arguments)}"
+            self.resolver.fault(written.span, scope, f"{name!r} takes {count}")
+            return Truth(True)
+        values = {
+            parameter.text: self._argument(argument, scope)
+            for parameter, argument in zip(macro.parameters, written.arguments, strict=True)
+        }
+        call = scope.call or written.span
+        inner = replace(scope, values=values, call=call, macros=(*scope.macros, name), depth=scope.depth + 1)
+        return self.formula(macro.body, inner)
+
+    def _report_call(self, written: Call, scope: Scope) -> None:
+        name = written.name.text
+        defined = self.names.definitions.get(name)
+        if isinstance(defined, SpecStatement) and defined.parameters:
+            hint = "a template is evaluated for each object by itself; share formulas by def"
+            self.resolver.fault(written.name.span, scope, f"{name!r} is a template, not a macro", hint)
+            return
+        macros = (each for each, what in self.names.definitions.items() if isinstance(what, DefStatement))
+        hint = self.faults.nearest(name, macros) or "define it with def"
+        self.resolver.fault(written.name.span, scope, f"no macro is named {name!r}", hint)
+
+    def _argument(self, written: TermSyntax | NumberSyntax, scope: Scope) -> Value:
+        if isinstance(written, NumberSyntax):
+            return written.value
+        if isinstance(written, Name):
+            local = scope.values.get(written.text)
+            if local is not None:
+                return local
+            constant = self.names.constant(written.text)
+            if constant is not None:
+                self.names.used.add(written.text)
+                return constant
+        return self.resolver.term(written, scope)

@@ -1,0 +1,183 @@
+"""Formula to text: the canonical way of writing a specification.
+
+Constants, macros and quantifiers over named groups are written out; every operand that is not a
+name or `true` or `false` stands in brackets; numbers keep every digit. Reading the text back gives
+an equal specification.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from decimal import Decimal
+
+from spatial_replay.spec.formula import (
+    ANY_CLASS,
+    Atom,
+    Boolean,
+    Bound,
+    Earlier,
+    Enlarged,
+    Formula,
+    Group,
+    NamedSpec,
+    Outline,
+    Quantified,
+    Specification,
+    Temporal,
+    Term,
+    Truth,
+)
+from spatial_replay.spec.relations import RELATION_NAMES
+from spatial_replay.spec.tokens import quoted, written_name
+
+_LARGEST_PLAIN = 1e16
+
+
+def format_number(value: float) -> str:
+    """A number with all of its digits, without a fraction where it has none."""
+    if value.is_integer() and abs(value) < _LARGEST_PLAIN:
+        return str(int(value))
+    return repr(value)
+
+
+def format_duration(ns: int) -> str:
+    """Nanoseconds as seconds, exactly."""
+    return f"{Decimal(ns).scaleb(-9).normalize():f}s"
+
+
+def format_bound(bound: Bound | None) -> str:
+    """A window as written behind its operator; "" for none."""
+    if bound is None:
+        return ""
+    write = format_duration if bound.unit == "ns" else str
+    upper = "inf" if bound.upper is None else write(bound.upper)
+    return f"[{write(bound.lower)}, {upper}]"
+
+
+# ---------------------------------------------------------------------------------------------- terms
+
+
+def format_term(term: Term, relations: frozenset[str] = RELATION_NAMES) -> str:
+    """A term as written; `relations` are names that need quotes."""
+    match term:
+        case Enlarged():
+            return f"enlarge({format_term(term.term, relations)}, {format_number(term.radius)})"
+        case Earlier(samples=int(samples)):
+            return f"{format_term(term.term, relations)}[-{samples}]"
+        case Earlier():
+            return f"{format_term(term.term, relations)}[-{format_duration(term.duration_ns or 0)}]"
+        case Group():
+            return _format_group(term, relations)
+        case _:
+            return written_name(term.name, relations)
+
+
+def _format_group(group: Group, relations: frozenset[str]) -> str:
+    text = written_name(group.name, relations) if group.name else _format_open(group)
+    for excluded in group.excluded:
+        text += f" except {written_name(excluded.name, relations)}"
+    return f"({text})" if group.excluded else text
+
+
+def _format_open(group: Group) -> str:
+    return "all" if group.class_name == ANY_CLASS else f"class {quoted(group.class_name or '')}"
+
+
+def format_relation(
+    relation: str,
+    terms: Sequence[Term],
+    parameters: Sequence[float | str],
+    relations: frozenset[str] = RELATION_NAMES,
+) -> str:
+    """An atom as written, of its relation, terms and parameters (see `Atom`)."""
+    names = [format_term(term, relations) for term in terms]
+    values = [format_number(value) if isinstance(value, float) else value for value in parameters]
+    if not terms:
+        return f"{written_name(values[0], relations)} {values[1]} {values[2]}"
+    if relation == "dist":
+        distance = f"{names[0]} dist {names[1]}"
+        if len(values) == 2:
+            return f"{distance} {values[0]} {values[1]}"
+        return f"{values[0]} {values[1]} {distance} {values[2]} {values[3]}"
+    if relation == "closer":
+        return f"{names[0]} closer {names[1]} than {names[2]}"
+    bracket = f"[{', '.join(values)}]" if values else ""
+    right = f"({names[1]}, {names[2]})" if relation == "between" else names[1]
+    return f"{names[0]} {relation}{bracket} {right}"
+
+
+# ------------------------------------------------------------------------------------------- formulas
+
+
+def format_formula(
+    formula: Formula, *, references: bool = False, relations: frozenset[str] = RELATION_NAMES
+) -> str:
+    """The canonical text of a formula.
+
+    Args:
+        references: write the named specs below the root by their names, as in a file, instead of
+            what they stand for.
+        relations: names that need quotes.
+    """
+
+    def operand(inner: Formula) -> str:
+        if references and inner.name is not None:
+            return written_name(inner.name, relations)
+        text = format_formula(inner, references=references, relations=relations)
+        return text if isinstance(inner, Truth) else f"({text})"
+
+    match formula:
+        case Truth():
+            return "true" if formula.value else "false"
+        case Atom():
+            return formula.text
+        case Boolean(operator="spec"):
+            that = formula.operands[0]
+            if references and that.name is not None:
+                return written_name(that.name, relations)
+            return format_formula(that, references=references, relations=relations)
+        case Boolean(operator="not"):
+            return f"not {operand(formula.operands[0])}"
+        case Boolean():
+            return f" {formula.operator} ".join([operand(each) for each in formula.operands])
+        case Temporal():
+            operator = formula.operator + format_bound(formula.bound)
+            if len(formula.operands) == 1:
+                return f"{operator} {operand(formula.operands[0])}"
+            return f"{operand(formula.operands[0])} {operator} {operand(formula.operands[1])}"
+        case Quantified():
+            variables = ", ".join(written_name(variable, relations) for variable in formula.variables)
+            group = format_term(formula.group, relations)
+            return f"{formula.quantifier} {variables} in {group}: {operand(formula.body)}"
+
+
+def format_specification(specification: Specification) -> str:
+    """The canonical text of a specification, every `spec` on a line of its own."""
+    relations = RELATION_NAMES | specification.relations
+    lines = [f"use {specification.profile}"]
+    for name, outline in specification.regions.items():
+        lines.append(f"region {written_name(name, relations)} = {_format_outline(outline)}")
+    for name, group in specification.groups.items():
+        members = _format_open(group)
+        if group.members is not None:
+            members = ", ".join(written_name(member, relations) for member in group.members)
+        lines.append(f"group {written_name(name, relations)} = {members}")
+    lines.extend(_format_spec(spec, relations) for spec in specification.specs)
+    return "\n".join(lines) + "\n"
+
+
+def _format_spec(spec: NamedSpec, relations: frozenset[str]) -> str:
+    parameter = f"({written_name(spec.parameter, relations)})" if spec.parameter is not None else ""
+    formula = format_formula(spec.formula, references=True, relations=relations)
+    return f"spec {written_name(spec.name, relations)}{parameter} = {formula}"
+
+
+def _format_outline(outline: Outline) -> str:
+    points = [f"({format_number(x)}, {format_number(y)})" for x, y in outline.vertices]
+    height = ""
+    if outline.height is not None:
+        bottom, top = outline.height
+        height = f" height ({format_number(bottom)}, {format_number(top)})"
+    if outline.is_disc:
+        return f"circle({points[0]}, {format_number(outline.radius)}){height}"
+    return f"polygon({', '.join(points)}){height}"

@@ -1,0 +1,486 @@
+"""What a specification says: terms, expressions, formulas, as frozen values.
+
+Three layers, each built of the one before:
+
+- a *term* names footprints: a tracked object, a region, a group, one of these earlier in time or
+  enlarged;
+- an *expression* is a number computed from terms in one sample: signed distance, enclosure,
+  projections, and their sums, minima and maxima. Every spatial relation is such an expression
+  (see `relations`), positive where the relation holds;
+- a *formula* combines atoms (an expression, as it was written) by Boolean and temporal operators.
+
+Nothing here computes: walks over these values live with what they compute.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+Axis: TypeAlias = Literal["x", "y", "z"]
+Side: TypeAlias = Literal["min", "max"]
+
+# ---------------------------------------------------------------------------------------------- terms
+
+
+@dataclass(frozen=True, slots=True)
+class TrackedName:
+    """A tracked object of the log, by its name."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Variable:
+    """An object still to be bound: by an open quantifier, or the parameter of a template."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class RegionName:
+    """A region of the specification, by its name; `Specification.regions` holds its shape."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """A set of tracked objects; as a term, the union of its members' footprints.
+
+    Exactly one of `members` (a named group) and `class_name` (an open group) is given; for the open
+    group of every object, `class_name` is `ANY_CLASS`.
+
+    Attributes:
+        name: the name it was declared under; "" for one written in place.
+        members: names of the members, in the order written; None for an open group.
+        class_name: objects of this class in the sample (compared without regard to case).
+        excluded: members left out, by name or by variable.
+    """
+
+    name: str
+    members: tuple[str, ...] | None = None
+    class_name: str | None = None
+    excluded: tuple[TrackedName | Variable, ...] = ()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether members are those of the current sample rather than fixed by name."""
+        return self.members is None
+
+
+ANY_CLASS = "*"
+"""The `class_name` of the open group of every object (`group g = all`)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Earlier:
+    """A term as it was earlier: exactly one of `samples` and `duration_ns` is given (`a[-3]`, `a[-2.5s]`).
+
+    With a duration it is the last sample at or before that much earlier.
+    """
+
+    term: TrackedName | Variable | RegionName | Group
+    samples: int | None = None
+    duration_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Enlarged:
+    """The Minkowski sum of a term with a disc in the plane (`enlarge(a, r)`); heights stay."""
+
+    term: Term
+    radius: float
+
+
+Term: TypeAlias = TrackedName | Variable | RegionName | Group | Earlier | Enlarged
+
+# ---------------------------------------------------------------------------------------- expressions
+
+
+class _Arithmetic:
+    """Operators of expressions, so that a relation reads like its definition."""
+
+    __slots__ = ()
+
+    def __add__(self, other: Expression | float) -> Sum:
+        return Sum(as_expression(self), as_expression(other))
+
+    def __radd__(self, other: Expression | float) -> Sum:
+        return Sum(as_expression(other), as_expression(self))
+
+    def __sub__(self, other: Expression | float) -> Sum:
+        return Sum(as_expression(self), Negative(as_expression(other)))
+
+    def __rsub__(self, other: Expression | float) -> Sum:
+        return Sum(as_expression(other), Negative(as_expression(self)))
+
+    def __neg__(self) -> Negative:
+        return Negative(as_expression(self))
+
+
+@dataclass(frozen=True, slots=True)
+class Number(_Arithmetic):
+    """A constant, in the units of the footprints or of the signal it is compared with."""
+
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
+class SignedDistance(_Arithmetic):
+    """Distance of two footprints when apart, minus their penetration depth when not (Def. 2-4)."""
+
+    first: Term
+    second: Term
+
+
+@dataclass(frozen=True, slots=True)
+class Protrusion(_Arithmetic):
+    """How far `inner` sticks out: max over hull(inner) of the signed distance to outer (Prop. 2)."""
+
+    inner: Term
+    outer: Term
+
+
+@dataclass(frozen=True, slots=True)
+class Projection(_Arithmetic):
+    """Least or greatest coordinate of a footprint along an axis (Def. 8)."""
+
+    term: Term
+    axis: Axis
+    side: Side
+
+
+@dataclass(frozen=True, slots=True)
+class CentroidProjection(_Arithmetic):
+    """Least or greatest coordinate, along x or y, of the centroids of a footprint's parts."""
+
+    term: Term
+    axis: Axis
+    side: Side
+
+
+@dataclass(frozen=True, slots=True)
+class Misalignment(_Arithmetic):
+    """Half the squared distance of two unit orientation vectors, 1 - cos of their angle (Def. 10)."""
+
+    first: Term
+    second: Term
+
+
+@dataclass(frozen=True, slots=True)
+class Signal(_Arithmetic):
+    """A named numeric signal of the log."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Sum(_Arithmetic):
+    """`first` + `second`."""
+
+    first: Expression
+    second: Expression
+
+
+@dataclass(frozen=True, slots=True)
+class Negative(_Arithmetic):
+    """-`operand`: how far a relation is from holding becomes how far it is from failing."""
+
+    operand: Expression
+
+
+@dataclass(frozen=True, slots=True)
+class Minimum(_Arithmetic):
+    """The least of its operands, as in a conjunction."""
+
+    operands: tuple[Expression, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Maximum(_Arithmetic):
+    """The greatest of its operands, as in a disjunction."""
+
+    operands: tuple[Expression, ...]
+
+
+Measurement: TypeAlias = SignedDistance | Protrusion | Projection | CentroidProjection | Misalignment
+"""An expression that geometry answers."""
+
+Expression: TypeAlias = Number | Measurement | Signal | Sum | Negative | Minimum | Maximum
+
+
+def as_expression(value: object) -> Expression:
+    """The expression that a number or an expression stands for.
+
+    Raises:
+        TypeError: for anything else.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float, _Arithmetic)):
+        raise TypeError(f"{value!r} is neither a number nor an expression over terms")
+    if isinstance(value, (int, float)):
+        return Number(float(value))
+    return value  # type: ignore[return-value]
+
+
+def minimum(*operands: Expression | float) -> Minimum:
+    """The least of some expressions."""
+    return Minimum(tuple(as_expression(operand) for operand in operands))
+
+
+def maximum(*operands: Expression | float) -> Maximum:
+    """The greatest of some expressions."""
+    return Maximum(tuple(as_expression(operand) for operand in operands))
+
+
+# ------------------------------------------------------------------------------------------- formulas
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Where something stands in a source text: characters `start` up to, not including, `end`."""
+
+    start: int
+    end: int
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """The window of a temporal operator, both ends included; in samples or in nanoseconds.
+
+    Attributes:
+        lower: 0 <= lower.
+        upper: lower <= upper; None where there is no upper end.
+        unit: "samples" or "ns".
+    """
+
+    lower: int
+    upper: int | None
+    unit: Literal["samples", "ns"]
+
+
+def _unspanned() -> Span:
+    return Span(0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """`true` or `false`: +inf or -inf."""
+
+    value: bool
+    name: str | None = None
+    span: Span = field(default_factory=_unspanned, compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Atom:
+    """A relation or a comparison: one number in each sample, at least 0 where it holds.
+
+    Attributes:
+        text: its canonical text, in the profile of its specification.
+        relation: the relation's name ("closeto", "dist", ...; "signal" for a numeric comparison).
+        expression: its robustness.
+        terms: what the relation is about, in the order written; none for a signal.
+        parameters: what is written besides: numbers, an axis, a comparison's operators.
+    """
+
+    text: str
+    relation: str
+    expression: Expression
+    name: str | None = None
+    span: Span = field(default_factory=_unspanned, compare=False)
+    terms: tuple[Term, ...] = ()
+    parameters: tuple[float | str, ...] = ()
+
+
+BooleanOperator: TypeAlias = Literal["not", "and", "or", "xor", "->", "<->", "spec"]
+"""`spec` has one operand and is that operand: a spec that only repeats another under its own name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Boolean:
+    """A Boolean operator: `not` and `spec` have one operand; `and` and `or` two or more; the rest two."""
+
+    operator: BooleanOperator
+    operands: tuple[Formula, ...]
+    name: str | None = None
+    span: Span = field(default_factory=_unspanned, compare=False)
+
+
+TemporalOperator: TypeAlias = Literal["X", "WX", "F", "G", "U", "R", "W", "Y", "O", "H", "S"]
+FUTURE_OPERATORS: frozenset[str] = frozenset({"X", "WX", "F", "G", "U", "R", "W"})
+PAST_OPERATORS: frozenset[str] = frozenset({"Y", "O", "H", "S"})
+
+
+@dataclass(frozen=True, slots=True)
+class Temporal:
+    """A temporal operator: U, R, W and S have two operands, the others one; X, WX and Y have no bound."""
+
+    operator: TemporalOperator
+    operands: tuple[Formula, ...]
+    bound: Bound | None = None
+    name: str | None = None
+    span: Span = field(default_factory=_unspanned, compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Quantified:
+    """`forall` or `exists` over an open group: one node, its members bound in each sample.
+
+    Over several variables the members are ordered tuples of distinct ones. The body holds no temporal
+    operator.
+
+    Attributes:
+        group: an open `Group`, or one `Earlier` (its members are those of then).
+    """
+
+    quantifier: Literal["forall", "exists"]
+    variables: tuple[str, ...]
+    group: Group | Earlier
+    body: Formula
+    name: str | None = None
+    span: Span = field(default_factory=_unspanned, compare=False)
+
+
+Formula: TypeAlias = Truth | Atom | Boolean | Temporal | Quantified
+
+
+def operands_of(formula: Formula) -> tuple[Formula, ...]:
+    """The formulas directly below a node of the tree; a quantifier over an open group has none."""
+    if isinstance(formula, (Boolean, Temporal)):
+        return formula.operands
+    return ()
+
+
+def operator_of(formula: Formula) -> str:
+    """The operator shown for a node: "and", "F", "forall"; an atom's relation; "true" or "false"."""
+    match formula:
+        case Boolean() | Temporal():
+            return formula.operator
+        case Quantified():
+            return formula.quantifier
+        case Truth():
+            return "true" if formula.value else "false"
+        case Atom():
+            return formula.relation
+
+
+def iter_nodes(formula: Formula) -> Iterator[tuple[int, int | None, Formula]]:
+    """The tree's nodes as (id, parent's id, node), from the root, 0, in the order of the text."""
+    stack: list[tuple[int | None, Formula]] = [(None, formula)]
+    identifier = 0
+    while stack:
+        parent, node = stack.pop()
+        yield identifier, parent, node
+        stack.extend((identifier, operand) for operand in reversed(operands_of(node)))
+        identifier += 1
+
+
+# -------------------------------------------------------------------------------------- specifications
+
+
+@dataclass(frozen=True, slots=True)
+class Outline:
+    """A region's shape: a polygon, or with one vertex and a radius, a disc.
+
+    Attributes:
+        vertices: corners (x, y), in the order written; for a box counter-clockwise from (xmin, ymin).
+        radius: rounding radius, 0 for polygons and boxes.
+        height: (bottom, top), or None.
+    """
+
+    vertices: tuple[tuple[float, float], ...]
+    radius: float = 0.0
+    height: tuple[float, float] | None = None
+
+    @property
+    def is_disc(self) -> bool:
+        """Whether it is a disc about its only vertex."""
+        return self.radius > 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class NamedSpec:
+    """One `spec` statement.
+
+    Attributes:
+        parameter: the object parameter of a template, or None.
+        is_result: whether no other spec of the file uses it; these are the results listed.
+    """
+
+    name: str
+    formula: Formula
+    parameter: str | None = None
+    is_result: bool = True
+    span: Span = field(default_factory=_unspanned, compare=False)
+
+
+@dataclass(frozen=True)
+class Specification:
+    """All specs of one text, parsed: macros, constants and named quantifiers expanded.
+
+    Two specifications are equal when they mean the same: the source text, its file name and the
+    warnings do not count.
+
+    Attributes:
+        specs: every `spec`, in the order of the text.
+        profile: the relation profile, "paper" or "spatial_spec".
+        regions: shapes by name.
+        groups: declared groups by name.
+        relations: names of the relations that were given in Python.
+        source: the text it was parsed from, without a byte order mark; spans are offsets into it.
+        filename: base name of the file it came from, or "<text>".
+        warnings: what `check` remarks on.
+    """
+
+    specs: tuple[NamedSpec, ...]
+    profile: str
+    regions: dict[str, Outline] = field(default_factory=dict)
+    groups: dict[str, Group] = field(default_factory=dict)
+    relations: frozenset[str] = frozenset()
+    source: str = field(default="", compare=False)
+    filename: str = field(default="<text>", compare=False)
+    warnings: tuple[Diagnostic, ...] = field(default=(), compare=False)
+
+    @property
+    def results(self) -> tuple[NamedSpec, ...]:
+        """The specs that no other spec uses: what an evaluation reports on."""
+        return tuple(spec for spec in self.specs if spec.is_result)
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnostic:
+    """A fault or a remark about a specification, with the place it is about.
+
+    Attributes:
+        severity: "error" or "warning".
+        line, column: counted from 1; the column in characters.
+        source_line: the line itself.
+        width: how many characters the caret underlines, at least 1.
+        hint: what to write instead, or "".
+    """
+
+    severity: Literal["error", "warning"]
+    message: str
+    filename: str
+    line: int
+    column: int
+    source_line: str
+    width: int = 1
+    hint: str = ""
+
+    def __str__(self) -> str:
+        first = max(0, self.column - _SHOWN_BEFORE) if len(self.source_line) > _SHOWN else 0
+        piece = self.source_line[first : first + _SHOWN]
+        shown = "".join(character if character.isprintable() else " " for character in piece)
+        offset = self.column - 1 - first
+        caret = " " * offset + "^" * max(1, min(self.width, _SHOWN - offset))
+        head = f"{self.filename}:{self.line}:{self.column}: {self.severity}: {self.message}"
+        tail = f"\n  {self.hint}" if self.hint else ""
+        return f"{head}\n  {shown}\n  {caret}{tail}"
+
+
+_SHOWN = 200
+"""Characters of a line that a message shows; of a longer one, those around the fault."""
+_SHOWN_BEFORE = 100

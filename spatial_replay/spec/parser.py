@@ -1,0 +1,285 @@
+"""Text to statements: every statement by itself, so that one that is wrong does not hide the others."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from types import MappingProxyType
+from typing import Any
+
+from lark import Lark, Token
+from lark.exceptions import UnexpectedToken
+from lark.lexer import Lexer
+
+from spatial_replay.spec.builder import MAX_DEPTH, StatementError, TreeBuilder
+from spatial_replay.spec.faults import Faults, nearest_hint
+from spatial_replay.spec.formula import Span
+from spatial_replay.spec.syntax import BrokenStatement, FormulaSyntax, Name, SpecStatement, Statement
+from spatial_replay.spec.tokens import BINARY_TYPES, KEYWORDS, STATEMENT_TYPES, quoted, span_of
+
+FORMULA_NAME = "spec"
+"""The name of the specification in a text that is only a formula."""
+
+_OPENING = frozenset({"LPAR", "LSQB"})
+_STATEMENT_WORDS = tuple(word for word, kind in KEYWORDS.items() if kind in STATEMENT_TYPES)
+
+
+@dataclass(frozen=True, slots=True)
+class TokenGroup:
+    """The tokens of one statement, or of the formula that a text consists of."""
+
+    tokens: tuple[Token, ...]
+    is_bare_formula: bool = False
+    is_broken: bool = False
+
+
+def parse_statements(tokens: Sequence[Token], relations: Collection[str], faults: Faults) -> list[Statement]:
+    """The statements of a text that can be read; the rest is reported.
+
+    A bare formula comes back as a `spec` of the name `FORMULA_NAME`.
+    """
+    statements: list[Statement] = []
+    for group in split_statements(tokens, faults):
+        statement = _parse_group(group, relations, faults)
+        if statement is not None:
+            statements.append(statement)
+    return statements
+
+
+# ---------------------------------------------------------------------------------- where statements end
+
+
+def split_statements(tokens: Sequence[Token], faults: Faults) -> Iterator[TokenGroup]:
+    """Cut the tokens of a text into statements.
+
+    Statement words are reserved, so one of them always begins a statement: an unclosed bracket costs
+    no more than the statement that it stands in.
+    """
+    if not any(token.type in STATEMENT_TYPES - {"USE"} for token in tokens):
+        yield from _split_bare_formula(tokens, faults)
+        return
+    current: list[Token] = []
+    brackets: list[tuple[Token, bool]] = []
+    continues = True
+    for token in tokens:
+        if current and _begins_statement(token, current[-1], bool(brackets), continues, faults):
+            yield from _close(current, brackets, faults)
+            current, brackets = [], []
+        continues = _step(token, current, brackets)
+        current.append(token)
+    yield from _close(current, brackets, faults)
+
+
+def _split_bare_formula(tokens: Sequence[Token], faults: Faults) -> Iterator[TokenGroup]:
+    start = 0
+    while start < len(tokens) and tokens[start].type == "USE":
+        line = tokens[start].line
+        end = start + 1
+        while end < len(tokens) and tokens[end].line == line and end < start + 2:
+            end += 1
+        yield TokenGroup(tuple(tokens[start:end]))
+        if end < len(tokens) and tokens[end].line == line:
+            message = "a statement ends at the end of its line"
+            faults.add(span_of(tokens[end]), message, "begin a new line here")
+        start = end
+    brackets: list[tuple[Token, bool]] = []
+    formula = list(tokens[start:])
+    for index, token in enumerate(formula):
+        _step(token, formula[:1] if index == 0 else [formula[index - 1]], brackets)
+    yield from _close(formula, brackets, faults, is_bare_formula=True)
+
+
+def _begins_statement(token: Token, last: Token, in_bracket: bool, continues: bool, faults: Faults) -> bool:
+    if token.type in STATEMENT_TYPES:
+        if token.line == last.line:
+            message = f"{token.value!r} begins a statement within a line"
+            faults.add(span_of(token), message, "begin a new line")
+        return True
+    return token.line != last.line and not in_bracket and not continues and token.type not in BINARY_TYPES
+
+
+def _step(token: Token, before: Sequence[Token], brackets: list[tuple[Token, bool]]) -> bool:
+    """Follow the brackets over one token; tell whether a line that ends in it goes on in the next."""
+    if token.type in _OPENING:
+        brackets.append((token, bool(before) and before[-1].type in ("PREFIX", "INFIX")))
+        return True
+    if token.type in ("RPAR", "RSQB") and brackets:
+        opened, after_temporal = brackets.pop()
+        return after_temporal and opened.type == "LSQB"
+    return token.type in BINARY_TYPES or token.type in ("PREFIX", "NOT", "EQUAL", "COLON")
+
+
+def _close(
+    tokens: list[Token], brackets: list[tuple[Token, bool]], faults: Faults, is_bare_formula: bool = False
+) -> Iterator[TokenGroup]:
+    if not tokens:
+        return
+    if brackets:
+        opened = brackets[-1][0]
+        closing = ")" if opened.type == "LPAR" else "]"
+        faults.add(span_of(opened), f"{opened.value!r} is never closed", f"add a {closing!r}")
+    broken = bool(brackets) or any(token.type == "ERROR" for token in tokens)
+    yield TokenGroup(tuple(tokens), is_bare_formula, broken)
+
+
+# ------------------------------------------------------------------------------------------ one statement
+
+
+class _Tokens(Lexer):
+    """Stands in for lark's lexers: tokens are fed to the parser one by one."""
+
+    def __init__(self, lexer_conf: object) -> None:
+        super().__init__()
+
+    def lex(self, lexer_state: object, parser_state: object) -> Iterator[Token]:
+        return iter(())
+
+
+@cache
+def grammar() -> Lark:
+    """The compiled grammar; a conflict in it would be an error here."""
+    text = files("spatial_replay.spec").joinpath("grammar.lark").read_text(encoding="utf-8")
+    builder: Any = TreeBuilder()
+    return Lark(
+        text, parser="lalr", lexer=_Tokens, start=["statement", "formula"], strict=True,
+        maybe_placeholders=True, transformer=builder,
+    )  # fmt: skip
+
+
+def _parse_group(group: TokenGroup, relations: Collection[str], faults: Faults) -> Statement | None:
+    tokens = group.tokens
+    if group.is_broken:
+        return _broken(tokens)
+    known = faults.count
+    deepest = _too_deep(tokens)
+    if deepest is not None:
+        message = f"more than {MAX_DEPTH} brackets within one another"
+        faults.add(span_of(deepest), message, "give parts names of their own, with spec")
+        return _broken(tokens)
+    if not group.is_bare_formula and tokens[0].type not in STATEMENT_TYPES:
+        words = ", ".join(_STATEMENT_WORDS)
+        hint = nearest_hint(tokens[0].value, _STATEMENT_WORDS) or "a line that goes on ends in an operator"
+        faults.add(span_of(tokens[0]), f"expected a statement ({words}), found {tokens[0].value!r}", hint)
+        return _broken(tokens)
+    parsing: Any = grammar().parse_interactive(start="formula" if group.is_bare_formula else "statement")
+    result: Any = None
+    try:
+        for token in tokens:
+            parsing.feed_token(token)
+        result = parsing.feed_eof(tokens[-1])
+    except UnexpectedToken as unexpected:
+        if faults.is_full:
+            # the tokens that could stand here are found by trying each of them
+            faults.add(_place(unexpected.token, tokens), "")
+        else:
+            _report(unexpected.token, tokens, parsing.accepts(), relations, faults)
+    except StatementError as fault:
+        faults.add(fault.span, fault.message, fault.hint)
+    if faults.count > known or result is None:
+        return _broken(tokens)
+    if group.is_bare_formula:
+        formula: FormulaSyntax = result
+        return SpecStatement(Name(FORMULA_NAME, Span(0, 0)), (), formula)
+    statement: Statement = result
+    return statement
+
+
+def _too_deep(tokens: Sequence[Token]) -> Token | None:
+    """The bracket that goes past the bound on nesting, if one does."""
+    depth = 0
+    for token in tokens:
+        if token.type in _OPENING:
+            depth += 1
+            if depth > MAX_DEPTH:
+                return token
+        elif token.type in ("RPAR", "RSQB"):
+            depth -= 1
+    return None
+
+
+def _broken(tokens: Sequence[Token]) -> BrokenStatement | None:
+    if len(tokens) > 1 and tokens[1].type == "NAME" and tokens[0].type != "USE":
+        return BrokenStatement(Name(tokens[1].value, span_of(tokens[1])))
+    return None
+
+
+# ----------------------------------------------------------------------------------- what was expected
+
+_EXPECTATIONS: tuple[tuple[frozenset[str], str], ...] = (
+    (frozenset({"TRUTH", "NOT", "PREFIX"}), "a formula"),
+    (frozenset({"ENLARGE", "ALL"}), "an object, region or group"),
+    (frozenset({"NUMBER", "MINUS"}), "a number"),
+    (frozenset({"NAME"}), "a name"),
+    (frozenset({"RELATION"}), "a relation"),
+    (frozenset({"COMPARE"}), "a comparison (<=, <, >=, >, ==)"),
+    (frozenset({"AND", "OR"}), "an operator"),
+)
+_SIGN_OF: Mapping[str, str] = MappingProxyType({
+    "LPAR": "'('", "RPAR": "')'", "LSQB": "'['", "RSQB": "']'", "COMMA": "','", "COLON": "':'",
+    "EQUAL": "'='", "MINUS": "'-'", "IN": "'in'", "THAN": "'than'", "DIST": "'dist'",
+    "$END": "the end of the statement", "HEIGHT": "'height'",
+    "POLYGON": "'polygon'", "BOX": "'box'", "CIRCLE": "'circle'", "CLASS": "'class'",
+})  # fmt: skip
+_COVERED: Mapping[str, frozenset[str]] = MappingProxyType(
+    {
+        "a formula": frozenset({"NAME", "LPAR", "MINUS", "NUMBER", "ENLARGE", "ALL", "CLASS"}),
+        "an object, region or group": frozenset({"NAME", "LPAR", "CLASS", "NUMBER", "MINUS"}),
+        "a number": frozenset({"NAME"}),
+        "a relation": frozenset({"DIST", "CLOSER", "BETWEEN"}),
+    }
+)
+
+
+def _expected(accepted: set[str]) -> str:
+    rest = set(accepted)
+    parts: list[str] = []
+    for marks, words in _EXPECTATIONS:
+        if marks <= rest:
+            parts.append(words)
+            rest -= marks | _COVERED.get(words, frozenset())
+    parts += [sign for kind, sign in _SIGN_OF.items() if kind in rest]
+    return " or ".join(parts) if len(parts) < 3 else ", ".join(parts[:-1]) + " or " + parts[-1]
+
+
+def _place(token: Token, tokens: Sequence[Token]) -> Span:
+    if token.type == "$END":
+        last = span_of(tokens[-1])
+        return Span(last.end, last.end)
+    return span_of(token)
+
+
+def _report(
+    token: Token, tokens: Sequence[Token], accepted: set[str], relations: Collection[str], faults: Faults
+) -> None:
+    """Say what is wrong with a token that cannot stand where it does."""
+    position = next((index for index, other in enumerate(tokens) if other is token), len(tokens))
+    before = tokens[position - 1] if position else None
+    span = _place(token, tokens)
+    if token.type == "$END":
+        faults.add(span, f"the statement ends too early: expected {_expected(accepted)}")
+        return
+    found = f"expected {_expected(accepted)}, found {token.value!r}"
+    if token.type == "NAME" and "RELATION" in accepted:
+        known = (*relations, "dist", "closer", "between", "and", "or", "implies")
+        hint = faults.nearest(token.value, known) or f"relations are {', '.join(sorted(relations))}, dist"
+        faults.add(span, f"unknown relation {token.value!r}", hint)
+    elif before is not None and before.type in ("RELATION", "DIST", "CLOSER", "THAN") and token.type in (
+        "PREFIX", "NOT", "QUANTIFIER", "TRUTH",
+    ):  # fmt: skip
+        hint = f"put it before the relation; an object of that name is written {quoted(token.value)}"
+        faults.add(span, f"{token.value!r} cannot stand inside a relation", hint)
+    elif token.type in ("RELATION", "DIST", "CLOSER", "BETWEEN") and before is not None:
+        hint = "a relation stands between two objects, without operators inside"
+        if before.type in ("PREFIX", "INFIX", "TRUTH", "NOT"):
+            hint = f"if {before.value!r} is an object, write it in quotes: {quoted(before.value)}"
+        faults.add(span, f"{token.value!r} needs an object, region or group on its left", hint)
+    elif "NAME" in accepted and (token.value in KEYWORDS or token.type == "RELATION"):
+        hint = f"that word is reserved; an object of its name is written in quotes: {quoted(token.value)}"
+        faults.add(span, found, hint)
+    elif "NAME" in accepted and token.type == "NUMBER":
+        hint = f"a name that begins with a digit is written in quotes: {quoted(token.value)}"
+        faults.add(span, found, hint)
+    else:
+        faults.add(span, found)

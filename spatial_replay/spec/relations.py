@@ -1,0 +1,239 @@
+"""The spatial relations, as definitions: what number each of them means.
+
+A relation is a function from terms (and parameters) to an expression that is positive where the
+relation holds. To add one, write such a function and pass it to `parse_specification`:
+
+    def near_but_apart(a, b, most):
+        return minimum(SignedDistance(a, b), most - SignedDistance(a, b))
+
+    parse_specification("F (cup near_but_apart[0.2] plate)", relations={"near_but_apart": near_but_apart})
+
+Its first two parameters are the terms left and right of its name; the others are numbers, written in
+brackets after the name, or left out where they have a default. A parameter called `axis` takes x, y
+or z instead. `closer` and `between` have three terms, and a syntax of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Literal, TypeAlias
+
+from spatial_replay.spec.formula import (
+    Axis,
+    CentroidProjection,
+    Enlarged,
+    Expression,
+    Misalignment,
+    Projection,
+    Protrusion,
+    SignedDistance,
+    Term,
+    minimum,
+)
+
+Relation: TypeAlias = Callable[..., Expression]
+ComparisonOperator: TypeAlias = Literal["<=", "<", ">=", ">", "=="]
+
+THREE_TERM_RELATIONS: frozenset[str] = frozenset({"closer", "between"})
+
+
+def compare(quantity: Expression, operator: str, limit: float) -> Expression:
+    """How far a quantity is on the right side of a limit; strict comparisons are no different."""
+    match operator:
+        case "<=" | "<":
+            return limit - quantity
+        case ">=" | ">":
+            return quantity - limit
+        case _:
+            return minimum(limit - quantity, quantity - limit)
+
+
+# ------------------------------------------------------------------------------------------- distance
+
+
+def closeto(a: Term, b: Term, e: float) -> Expression:
+    """`a closeto[e] b`: e - sd(a, b), at most `e` apart (Prop. 1)."""
+    return e - SignedDistance(a, b)
+
+
+def farfrom(a: Term, b: Term, e: float) -> Expression:
+    """`a farfrom[e] b`: sd(a, b) - e, at least `e` apart (Def. 5)."""
+    return SignedDistance(a, b) - e
+
+
+def touch(a: Term, b: Term, e: float) -> Expression:
+    """`a touch[e] b`: min(e - sd, sd + e), at most `e` apart, and no deeper in one another (Def. 5)."""
+    return minimum(e - SignedDistance(a, b), SignedDistance(a, b) + e)
+
+
+def ovlp(a: Term, b: Term) -> Expression:
+    """`a ovlp b`: -sd(a, b), overlapping (Prop. 1)."""
+    return -SignedDistance(a, b)
+
+
+def closer(a: Term, b: Term, c: Term) -> Expression:
+    """`a closer b than c`: sd(a, c) - sd(a, b), nearer to b than to c (Def. 5)."""
+    return SignedDistance(a, c) - SignedDistance(a, b)
+
+
+# ------------------------------------------------------------------------------------------ enclosure
+
+
+def enclosedin(a: Term, b: Term) -> Expression:
+    """`a enclosedin b`: -max over p in hull(a) of sd(p, b), wholly inside b (Prop. 2)."""
+    return -Protrusion(a, b)
+
+
+def partovlp(a: Term, b: Term) -> Expression:
+    """`a partovlp b`: min(a ovlp b, -(a enclosedin b)), overlapping, yet not wholly inside (Def. 5)."""
+    return minimum(ovlp(a, b), -enclosedin(a, b))
+
+
+def moved(a: Term, b: Term, e: float) -> Expression:
+    """`a moved[e] b`: -(a enclosedin enlarge(b, e)), somewhere more than `e` outside of b (Eq. 5)."""
+    return -enclosedin(a, Enlarged(b, e))
+
+
+# ------------------------------------------------------------------------------------------ direction
+
+
+def prec(a: Term, b: Term, axis: Axis) -> Expression:
+    """`a prec[axis] b`: min of b minus max of a along the axis, wholly before b (Def. 8)."""
+    return Projection(b, axis, "min") - Projection(a, axis, "max")
+
+
+def partprec(a: Term, b: Term, axis: Axis) -> Expression:
+    """`a partprec[axis] b`: min of b minus min of a along the axis, beginning before b (Def. 8)."""
+    return Projection(b, axis, "min") - Projection(a, axis, "min")
+
+
+def leftof(a: Term, b: Term) -> Expression:
+    """`a leftof b`: a prec[x] b, before b along x (Def. 9)."""
+    return prec(a, b, "x")
+
+
+def below(a: Term, b: Term) -> Expression:
+    """`a below b`: a prec[y] b, before b along y (Def. 9)."""
+    return prec(a, b, "y")
+
+
+def rightof(a: Term, b: Term) -> Expression:
+    """`a rightof b`: -(a leftof b), not left of b (Def. 9)."""
+    return -leftof(a, b)
+
+
+def above(a: Term, b: Term) -> Expression:
+    """`a above b`: -(a below b), not below b (Def. 9)."""
+    return -below(a, b)
+
+
+def partleftof(a: Term, b: Term) -> Expression:
+    """`a partleftof b`: a partprec[x] b, beginning further left than b (after Def. 9)."""
+    return partprec(a, b, "x")
+
+
+def partbelow(a: Term, b: Term) -> Expression:
+    """`a partbelow b`: a partprec[y] b, beginning further down than b (after Def. 9)."""
+    return partprec(a, b, "y")
+
+
+def partrightof(a: Term, b: Term) -> Expression:
+    """`a partrightof b`: -(a partleftof b), beginning no further left than b (after Def. 9)."""
+    return -partleftof(a, b)
+
+
+def partabove(a: Term, b: Term) -> Expression:
+    """`a partabove b`: -(a partbelow b), beginning no further down than b (after Def. 9)."""
+    return -partbelow(a, b)
+
+
+def between(a: Term, b: Term, c: Term, axis: Axis) -> Expression:
+    """`a between[axis] (b, c)`: min(b prec a, a prec c), after b and before c along an axis (Def. 9)."""
+    return minimum(prec(b, a, axis), prec(a, c, axis))
+
+
+def oriented(a: Term, b: Term, k: float) -> Expression:
+    """`a oriented[k] b`: k - |u(a) - u(b)|^2 / 2 for the unit orientation vectors u (Def. 10, 11)."""
+    return k - Misalignment(a, b)
+
+
+# --------------------------------------------------------------- as in the published implementation
+
+
+def closeto_in_pixels(a: Term, b: Term, e: float = 70.0) -> Expression:
+    """`a closeto b`: e - sd(a, b), with 70 pixels where no `e` is written."""
+    return closeto(a, b, e)
+
+
+def farfrom_in_pixels(a: Term, b: Term, e: float = 150.0) -> Expression:
+    """`a farfrom b`: sd(a, b) - e, with 150 pixels where no `e` is written."""
+    return farfrom(a, b, e)
+
+
+def touch_in_pixels(a: Term, b: Term, e: float = 5.0) -> Expression:
+    """`a touch b`: e - sd(a, b), however deep; with 5 pixels where no `e` is written."""
+    return closeto(a, b, e)
+
+
+def moved_in_pixels(a: Term, b: Term, e: float = 25.0) -> Expression:
+    """`a moved b`: -(a enclosedin enlarge(b, e)), with 25 pixels where no `e` is written."""
+    return moved(a, b, e)
+
+
+def _centroid_before(a: Term, b: Term, axis: Axis) -> Expression:
+    return CentroidProjection(b, axis, "min") - CentroidProjection(a, axis, "max")
+
+
+def leftof_by_centroid(a: Term, b: Term) -> Expression:
+    """`a leftof b`: min of b minus max of a, over the x of the centroids of their parts."""
+    return _centroid_before(a, b, "x")
+
+
+def below_by_centroid(a: Term, b: Term) -> Expression:
+    """`a below b`: min of b minus max of a, over the y of the centroids of their parts."""
+    return _centroid_before(a, b, "y")
+
+
+def rightof_by_centroid(a: Term, b: Term) -> Expression:
+    """`a rightof b`: b leftof a, by centroids."""
+    return _centroid_before(b, a, "x")
+
+
+def above_by_centroid(a: Term, b: Term) -> Expression:
+    """`a above b`: b below a, by centroids."""
+    return _centroid_before(b, a, "y")
+
+
+# ------------------------------------------------------------------------------------------- profiles
+
+_PAPER: Mapping[str, Relation] = MappingProxyType({
+    relation.__name__: relation
+    for relation in (
+        closeto, farfrom, touch, ovlp, closer, enclosedin, partovlp, moved, prec, partprec, leftof, below,
+        rightof, above, partleftof, partbelow, partrightof, partabove, between, oriented,
+    )
+})  # fmt: skip
+
+_PUBLISHED: Mapping[str, Relation] = MappingProxyType(
+    {
+        **_PAPER,
+        "closeto": closeto_in_pixels,
+        "farfrom": farfrom_in_pixels,
+        "touch": touch_in_pixels,
+        "moved": moved_in_pixels,
+        "leftof": leftof_by_centroid,
+        "below": below_by_centroid,
+        "rightof": rightof_by_centroid,
+        "above": above_by_centroid,
+    }
+)
+
+DEFAULT_PROFILE = "paper"
+
+PROFILES: Mapping[str, Mapping[str, Relation]] = MappingProxyType(
+    {"paper": _PAPER, "spatial_spec": _PUBLISHED}
+)
+"""Relations by name, for each profile; both profiles have the same names."""
+
+RELATION_NAMES: frozenset[str] = frozenset(_PAPER)

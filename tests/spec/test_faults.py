@@ -1,0 +1,270 @@
+"""What a user reads when a specification is wrong, or odd."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import suppress
+from types import FrameType
+from typing import Any
+
+import pytest
+
+from spatial_replay.errors import SpecificationError, UsageError
+from spatial_replay.spec import check_names, load_specification, parse_specification
+from spatial_replay.spec.faults import MAX_FAULTS
+
+
+def faults_of(text: str) -> list[str]:
+    with pytest.raises(SpecificationError) as caught:
+        parse_specification(text, filename="x.spatial")
+    return [str(diagnosis) for diagnosis in caught.value.diagnoses]
+
+
+DEFINITIONS = """region goal = box(0, 0, 1, 1)
+group reds = red1, red2
+group everyone = all
+const near = 3
+const wait = 2s
+def f(a, e) = a closeto[e] goal
+spec earlier = a ovlp goal
+spec template(ego) = ego ovlp goal
+"""
+
+
+@pytest.mark.parametrize(
+    ("statement", "where", "message", "hint"),
+    [
+        ("spec s = a closto b", "closto", "unknown relation 'closto'", "did you mean 'closeto'?"),
+        ("spec s = a closeto b", "closeto", "takes 1 parameter, not 0", "write a closeto[e] b"),
+        ("spec s = a prec b", "prec", "takes 1 parameter, not 0", "write a prec[x] b"),
+        ("spec s = a ovlp[3] b", "ovlp", "takes no parameter", "write a ovlp b"),
+        ("spec s = a closeto[1, 2] b", "closeto", "not 2", "write a closeto[e] b"),
+        ("spec s = a prec[w] b", "w", "an axis is expected", "x, y or z"),
+        ("spec s = a closeto[nera] b", "nera", "unknown constant 'nera'", "did you mean 'near'?"),
+        ("spec s = a closeto[wait] b", "wait", "a duration", "unit"),
+        ("spec s = a closeto[goal] b", "goal", "'goal' is a region", ""),
+        ("spec s = a ovlp F b", "F", "cannot stand inside a relation", '"F"'),
+        ("spec s = G ovlp b", "ovlp", "needs an object", '"G"'),
+        ("spec s = a ovlp S", "S", "found 'S'", '"S"'),
+        ("spec s = a ovlp 12", "12", "found '12'", '"12"'),
+        ("spec s = F[5, 2] a ovlp b", "[5, 2]", "is empty", ""),
+        ("spec s = F[0, 2.5] a ovlp b", "2.5", "no number of samples", "whole"),
+        ("spec s = F[1, 2s] a ovlp b", "[1, 2s]", "from samples to time", "both"),
+        ("spec s = F[-1, 2] a ovlp b", "-1", "no number of samples", ""),
+        ("spec s = F[inf, inf] a ovlp b", "inf", "cannot begin at inf", ""),
+        ("spec s = F[0, 1e-10s] a ovlp b", "1e-10s", "no usable duration", "nanoseconds"),
+        ("spec s = F[0, 3h] a ovlp b", "3h", "neither a number", "s and ms"),
+        ("spec s = X[1, 2] a ovlp b", "[1, 2]", "takes no window", ""),
+        ("spec s = a[-1][-2] ovlp b", "a[-1][-2]", "a delay of a delayed object", "add"),
+        ("spec s = a[-1.5] ovlp b", "1.5", "no number of samples", ""),
+        ("spec s = enlarge(a, -1) ovlp b", "-1", "negative radius", ""),
+        ("spec s = a moved[-1] b", "moved", "negative radius", ""),
+        ("spec s = a oriented[1] goal", "oriented", "a region has none", ""),
+        ("spec s = reds oriented[1] a", "oriented", "a group has none", ""),
+        ("spec s = a ovlp near", "near", "'near' is a constant", ""),
+        ("spec s = earler", "earler", "no spec is named", "did you mean 'earlier'?"),
+        ("spec s = later\nspec later = a ovlp b", "later", "is not defined before", "move it down"),
+        ("spec s = s", "s", "is not defined before", ""),
+        ("spec s = template and earlier", "template", "is a template", "def"),
+        ("spec s = template(a)", "template", "is a template", "def"),
+        ("spec s = f", "f", "is a macro", "write f(a, e)"),
+        ("spec s = f(a)", "f(a)", "takes 2 arguments (a, e), not 1", ""),
+        ("spec s = ff(a, 1)", "ff", "no macro is named", "did you mean 'f'?"),
+        ("def g(a) = g(a)\nspec s = g(b)", "g(a)", "by way of itself", ""),
+        ("spec s = forall x in goal: x ovlp a", "goal", "runs over a group", ""),
+        ("spec s = forall x, x in reds: x ovlp a", "x", "given twice", ""),
+        ("spec s = forall x in everyone: F (x ovlp a)", "F (x ovlp a)", "open group", "template"),
+        ("spec s = forall x in everyone: x", "x", "a formula is expected", ""),
+        ("spec s = (goal except a) ovlp b", "goal", "only a group", ""),
+        ("spec s = goal >= 3", "goal", "'goal' is a region; a signal", ""),
+        (
+            "spec s = 3 >= a dist b >= 1",
+            ">=",
+            "'>=' cannot stand on the left",
+            "write the lesser limit first",
+        ),
+        ("spec s = 1 <= a dist b >= 3", ">=", "'>=' cannot stand on the right", "c1 <= a dist b <= c2"),
+        ("spec s = 3 > a dist b <= 1", ">", "'>' cannot stand on the left", "two comparisons"),
+        ("spec s = 1 < a dist b == 3", "==", "'==' cannot stand on the right", "a dist b == c"),
+        ("spec s = a ovlp b)", ")", "found ')'", ""),
+        ("spec s = (a ovlp b", "(", "never closed", "')'"),
+        ("spec s = a ovlp", "", "ends too early", ""),
+        ("spec s = a ovlp @b", "@", "not part of the language", "quotes"),
+        ('spec s = a ovlp "b', '"b', "does not end on its line", ""),
+        ('spec s = a ovlp "b\\n"', "\\n", "unknown escape", ""),
+        ('spec s = a ovlp ""', '""', "a name is empty", ""),
+        ("spec near = a ovlp b", "near", "already the name of a constant", ""),
+        ("region r = polygon()\nspec s = a ovlp r", "polygon()", "without corners", ""),
+        ("region r = box(2, 0, 1, 1)", "box(2, 0, 1, 1)", "xmin, 2, is above", ""),
+        ("region r = circle((0, 0), -1)", "circle((0, 0), -1)", "negative radius", ""),
+        ("region r = box(0, 0, 1, 1) height (2, 1)", "height (2, 1)", "above its top", ""),
+        ("region r = circle((0, 1e999), 1)", "1e999", "too large", ""),
+        ("region r = polygon((0, 0), (1, 1), (1, 0), (0, 1))", "polygon", "crosses itself", "order"),
+        ("group g = a, goal", "goal", "'goal' is a region", ""),
+        ("group g = a, a", "a", "listed twice", ""),
+        ("use papr\nspec s = a ovlp b", "papr", "unknown profile", "did you mean 'paper'?"),
+        ("const a1 = b1\nconst b1 = a1", "a1", "by way of itself", ""),
+        ("sepc s = a ovlp b", "sepc", "expected a statement", "did you mean 'spec'?"),
+        ("spec s(a, b) = a ovlp b", "b", "more than one parameter", ""),
+        ("spec s(goal) = goal ovlp b", "goal", "already the name of a region", ""),
+    ],
+)
+def test_a_fault_says_what_where_and_what_instead(
+    statement: str, where: str, message: str, hint: str
+) -> None:
+    found = faults_of(DEFINITIONS + statement + "\n")
+    assert len(found) == 1, found
+    head, line, caret, *tail = found[0].splitlines()
+    assert message in head
+    assert head.startswith("x.spatial:")
+    assert hint in "".join(tail)
+    marked = line[caret.index("^") : caret.rindex("^") + 1]
+    assert marked.startswith(where) if where else caret.index("^") == len(line)
+
+
+def test_all_faults_are_told_at_once_in_the_order_of_the_text() -> None:
+    lines = [f"spec s{number} = a closto b" for number in range(10)]
+    found = faults_of("\n".join(lines))
+    assert [int(fault.split(":")[1]) for fault in found] == list(range(1, 11))
+
+
+def test_a_broken_definition_is_one_fault_however_often_it_is_used() -> None:
+    text = (
+        "spec s = a ovlp\nregion r = box(\ngroup g = ,\nspec t = s and a ovlp r and forall x in g: x ovlp a"
+    )
+    assert len(faults_of(text)) == 3
+
+
+def test_faults_in_macros_say_who_uses_them() -> None:
+    (found,) = faults_of("def f(a) = a[-1] ovlp b\nspec s = f(c[-2])")
+    assert "a delay of a delayed object (in 'f', used in line 2)" in found
+
+
+def test_bodies_of_unused_macros_are_checked() -> None:
+    (found,) = faults_of("def f(a, e) = a closeto[e] goal and a leftof[3] b\nspec s = a ovlp b")
+    assert "'leftof' takes no parameter" in found
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "(" * 20_000,
+        "not " * 20_000 + "a ovlp b",
+        "F " * 20_000 + "a ovlp b",
+        "a ovlp b -> " * 5_000 + "a ovlp b",
+        "enlarge(" * 5_000 + "a",
+        "a" + "[-1]" * 5_000 + " ovlp b",
+        "x" * 300_000,
+        "spec s0 = a ovlp b\n" + "".join(f"spec s{n + 1} = s{n} and s{n}\n" for n in range(60)),
+        "spec s0 = a ovlp b\n" + "".join(f"spec s{n + 1} = not s{n}\n" for n in range(300)),
+        "def f0(a) = a ovlp b\n" + "".join(f"def f{n + 1}(a) = f{n}(a) and f{n}(a)\n" for n in range(60))
+        + "spec s = f60(x)",
+        f"group g = {', '.join(f'm{n}' for n in range(300))}\nspec s = forall a, b, c, d in g: a ovlp b",
+    ],
+    ids=lambda text: text[:12],
+)  # fmt: skip
+def test_what_is_too_large_is_refused(text: str) -> None:
+    assert (
+        "more than" in faults_of(text)[0]
+        or "never closed" in faults_of(text)[0]
+        or "delay" in faults_of(text)[0]
+    )
+
+
+def test_no_more_faults_are_told_than_can_be_read() -> None:
+    found = faults_of("\n".join(f"spec s{number} = foo{number}" for number in range(300)))
+    assert len(found) == 101
+    assert "200 further faults" in found[-1]
+
+
+def calls_to_parse(text: str) -> int:
+    """Python functions called to parse a text: its cost, the same on every machine."""
+    calls = 0
+
+    def count(frame: FrameType, event: str, argument: object) -> None:
+        nonlocal calls
+        calls += event == "call"
+
+    previous = sys.getprofile()
+    sys.setprofile(count)
+    try:
+        with suppress(SpecificationError):
+            parse_specification(text)
+    finally:
+        sys.setprofile(previous)
+    return calls
+
+
+@pytest.mark.parametrize("wrong", ["a closetoo{} b", "a ovlp", "a ovlp b c{}"])
+def test_a_text_full_of_faults_costs_no_more_than_one_without(wrong: str) -> None:
+    number = 1500
+    faulty = "\n".join(f"spec s{each} = " + wrong.format(each) for each in range(number))
+    right = "\n".join(f"spec s{each} = a closeto[1] b" for each in range(number))
+    parse_specification(right)
+    assert calls_to_parse(faulty) < 1.5 * calls_to_parse(right)
+    *_, last = faults_of(faulty)
+    assert f"{number - MAX_FAULTS} further faults" in last
+
+
+# ------------------------------------------------------------------------------------------ warnings
+
+
+@pytest.mark.parametrize(
+    ("text", "messages"),
+    [
+        ("F (a ovlp b)", []),
+        ("F a ovlp b and c ovlp d", ["'F' reaches over 'and'"]),
+        ("G F a ovlp b -> c ovlp d", ["'F' reaches over '->'"]),
+        ("(F a ovlp b) and c ovlp d", []),
+        ("G (O (a ovlp b))", []),
+        ("O (a ovlp b)", ["'O' looks back"]),
+        ("(G (a ovlp b)) and H (a ovlp b)", ["'H' looks back"]),
+        ("not (a ovlp b) and (b ovlp c)", []),
+        ("use spatial_spec\nnot (a ovlp b) and (b ovlp c)", ["'not' over 'and'"]),
+        ("use spatial_spec\n(not (a ovlp b)) and (b ovlp c)", []),
+        ("use spatial_spec\n(a ovlp b) and (b ovlp c) or (c ovlp d)", ["'and' and 'or' the other way"]),
+        ("use spatial_spec\n(a ovlp b) or (b ovlp c) and (c ovlp d)", []),
+        ("use spatial_spec\n((a ovlp b) and (b ovlp c) U (c ovlp d))", ["'and' and 'U' the other way"]),
+        ("use spatial_spec\n((a ovlp b) U (b ovlp c) and (c ovlp d))", ["'U' and 'and' the other way"]),
+        ("use spatial_spec\n(a ovlp b) and (b ovlp c) and (c ovlp d)", []),
+        ("const c = 1\nspec s = a ovlp b", ["'c' is a constant that nothing uses"]),
+        ("def f(a) = a ovlp b\nspec s = a ovlp b", ["'f' is a macro that nothing uses"]),
+        ("region r = box(0, 0, 1, 1)\ngroup g = a\nspec s = g ovlp r", []),
+    ],
+)
+def test_warnings(text: str, messages: list[str]) -> None:
+    warnings = parse_specification(text).warnings
+    assert len(warnings) == len(messages)
+    for warning, message in zip(warnings, messages, strict=True):
+        assert message in warning.message
+        assert warning.severity == "warning"
+
+
+def test_names_are_compared_with_those_of_a_log() -> None:
+    specification = parse_specification(
+        "region goal = box(0, 0, 1, 1)\ngroup g = cup, plat\nspec s = F (g ovlp goal) and G (batery >= 3)"
+    )
+    found = check_names(specification, ["cup", "plate", "goal"], ["battery"])
+    assert [(each.severity, each.line) for each in found] == [("warning", 1), ("error", 2), ("error", 3)]
+    assert [each.hint for each in found[1:]] == [
+        "did you mean 'plate'? its objects are cup, plate, goal",
+        "did you mean 'battery'? its signals are battery",
+    ]
+
+
+@pytest.mark.parametrize("given", [3, None, b"a ovlp b"])
+def test_something_else_than_a_text_is_a_fault_of_the_call(given: Any) -> None:
+    with pytest.raises(UsageError, match=r"text is .*; give the text as a str") as caught:
+        parse_specification(given)
+    assert repr(given) in str(caught.value)
+
+
+def test_something_else_than_a_path_is_a_fault_of_the_call() -> None:
+    path: Any = 3
+    with pytest.raises(UsageError, match=r"path is 3; give the path of a file"):
+        load_specification(path)
+
+
+def test_an_unknown_profile_in_a_call_is_a_fault_of_the_call() -> None:
+    with pytest.raises(UsageError, match="paper, spatial_spec"):
+        parse_specification("a ovlp b", profile="other")

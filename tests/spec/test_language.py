@@ -1,0 +1,242 @@
+"""What a text means: statements, names, groups, macros, quantifiers, templates, windows."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+import spatial_replay.spec
+from spatial_replay.errors import MissingFileError, SpecificationError, UsageError
+from spatial_replay.spec import format_formula, instantiate, load_specification, parse_specification
+from spatial_replay.spec.formula import (
+    ANY_CLASS,
+    Atom,
+    Boolean,
+    Bound,
+    Earlier,
+    Enlarged,
+    Expression,
+    Formula,
+    Group,
+    Quantified,
+    RegionName,
+    SignedDistance,
+    Temporal,
+    Term,
+    TrackedName,
+    Truth,
+    Variable,
+    minimum,
+)
+
+
+def formula_of(text: str, **options: str) -> Formula:
+    return parse_specification(text, **options).specs[-1].formula
+
+
+def atom_of(text: str, **options: str) -> Atom:
+    formula = formula_of(text, **options)
+    assert isinstance(formula, Atom)
+    return formula
+
+
+def test_the_example_of_the_reference_has_its_structure() -> None:
+    specification = parse_specification(
+        """# blocks
+use spatial_spec
+const near = 70
+region redGoal = polygon((50,120), (250,120), (250,350), (50,350))
+region shelf = box(0, 0, 1, 0.3) height (1.2, 1.6)
+group reds = red1, red2
+def passes_below(a, b) = a closeto[near] b -> a below b
+spec reach = F (forall r in reds: r enclosedin redGoal)
+spec passage = (G passes_below(red1, blue1)) and (G passes_below(red2, blue1))
+spec blocks = reach and passage
+"""
+    )
+    reach, passage, blocks = specification.specs
+    assert [spec.name for spec in specification.results] == ["blocks"]
+    assert isinstance(blocks.formula, Boolean)
+    assert blocks.formula.operands == (reach.formula, passage.formula)
+    assert format_formula(reach.formula) == "F ((red1 enclosedin redGoal) and (red2 enclosedin redGoal))"
+    assert "G ((red2 closeto[70] blue1) -> (red2 below blue1))" in format_formula(passage.formula)
+    assert specification.regions["shelf"].height == (1.2, 1.6)
+    assert specification.profile == "spatial_spec"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "F (a ovlp b)\nand\n\n(c ovlp d)",
+        "use paper\nF\n(a ovlp b) # reach\nand (c\novlp d)",
+        "spec s =\n  F[0,\n 5]\n a ovlp b and\n c ovlp d",
+        "spec s = F (a ovlp b)\n# a remark\n\n  and (c ovlp d)",
+        "\ufeffspec s = forall x in all:\r\n  x ovlp a\r\n",
+    ],
+)
+def test_a_statement_goes_on_where_its_line_cannot_end(text: str) -> None:
+    assert len(parse_specification(text).specs) == 1
+
+
+def test_a_statement_ends_with_its_line() -> None:
+    specification = parse_specification("spec s = a ovlp b\nspec t = c ovlp d")
+    assert [spec.name for spec in specification.specs] == ["s", "t"]
+    with pytest.raises(SpecificationError, match="expected a statement"):
+        parse_specification("spec s = a ovlp b\n(c ovlp d)")
+
+
+def test_chains_are_one_node_and_brackets_another() -> None:
+    flat = formula_of("(a ovlp b) and (b ovlp c) and (c ovlp d)")
+    nested = formula_of("((a ovlp b) and (b ovlp c)) and (c ovlp d)")
+    assert isinstance(flat, Boolean) and len(flat.operands) == 3
+    assert isinstance(nested, Boolean) and len(nested.operands) == 2
+
+
+def test_a_spec_that_repeats_another_is_a_node_above_it() -> None:
+    specification = parse_specification("spec s = a ovlp b\nspec t = (s)")
+    first, second = specification.specs
+    assert second.formula == Boolean("spec", (first.formula,), name="t")
+
+
+def test_quantifiers_over_named_groups_are_their_instances() -> None:
+    group = "group g = a, b\ngroup one = a\n"
+    assert formula_of(group + "spec s = forall x in g: x ovlp c") == formula_of(
+        "spec s = a ovlp c and b ovlp c"
+    )
+    assert formula_of(group + "spec s = exists x, y in g: x leftof y") == formula_of(
+        "spec s = a leftof b or b leftof a"
+    )
+    assert formula_of(group + "spec s = forall x in one: x ovlp c") == formula_of("spec s = a ovlp c")
+    assert formula_of(group + "spec s = forall x in (one except a): x ovlp c") == Truth(True, name="s")
+    assert formula_of(group + "spec s = exists x, y in one: x ovlp y") == Truth(False, name="s")
+
+
+def test_quantifiers_over_open_groups_bind_a_variable() -> None:
+    formula = formula_of('exists m in (class "Cup" except a)[-2]: m ovlp b')
+    assert isinstance(formula, Quantified) and isinstance(formula.body, Atom)
+    assert formula.group == Earlier(Group("", class_name="Cup", excluded=(TrackedName("a"),)), samples=2)
+    assert formula.body.terms == (Variable("m"), TrackedName("b"))
+
+
+def test_macros_do_not_capture_what_is_given_to_them() -> None:
+    formula = formula_of(
+        'def near(a) = exists m in all: a closeto[1] m\nspec s = forall m in all: near(m) and near("m")'
+    )
+    assert isinstance(formula, Quantified) and isinstance(formula.body, Boolean)
+    inner = formula.body.operands[0]
+    assert isinstance(inner, Quantified) and isinstance(inner.body, Atom)
+    outer, bound = inner.body.terms
+    assert outer == Variable(formula.variables[0]) and bound == Variable(inner.variables[0])
+    assert outer != bound
+
+
+def test_groups_stand_for_their_members() -> None:
+    text = 'group g = a, b\ngroup people = class "person"\ngroup everyone = all\nspec s = {} ovlp c'
+    for written, term in {
+        "g": Group("g", ("a", "b")),
+        "people[-3]": Earlier(Group("people", class_name="person"), samples=3),
+        "(everyone except c)": Group("everyone", class_name=ANY_CLASS, excluded=(TrackedName("c"),)),
+        "enlarge(g, 2)[-1s]": Enlarged(Earlier(Group("g", ("a", "b")), duration_ns=10**9), 2.0),
+    }.items():
+        assert atom_of(text.format(written)).terms[0] == term
+
+
+def test_a_template_is_put_in_place_with_its_object() -> None:
+    specification = parse_specification(
+        'group people = class "person"\nspec near(ego) = G (ego dist (people except ego) >= 1)'
+    )
+    spec = specification.specs[0]
+    assert spec.parameter == "ego"
+    assert format_formula(instantiate(spec, "robot 1")) == (
+        'G ("robot 1" dist (people except "robot 1") >= 1)'
+    )
+    with pytest.raises(UsageError, match="no template"):
+        instantiate(parse_specification("a ovlp b").specs[0], "a")
+
+
+@pytest.mark.parametrize(
+    ("window", "bound"),
+    [
+        ("[0, 5]", Bound(0, 5, "samples")),
+        ("[0.5s, 2s]", Bound(500_000_000, 2_000_000_000, "ns")),
+        ("[0, 500ms]", Bound(0, 500_000_000, "ns")),
+        ("[2s, inf]", Bound(2_000_000_000, None, "ns")),
+        ("[0, inf]", Bound(0, None, "samples")),
+        ("[3, 3.0]", Bound(3, 3, "samples")),
+        ("[1e-9s, 1e2ms]", Bound(1, 100_000_000, "ns")),
+    ],
+)
+def test_windows(window: str, bound: Bound) -> None:
+    for text in (f"F{window} a ovlp b", f"a ovlp b S{window} c ovlp d"):
+        formula = formula_of(text)
+        assert isinstance(formula, Temporal) and formula.bound == bound
+
+
+def test_constants_stand_for_numbers_and_durations_and_can_be_replaced() -> None:
+    text = "const e = far\nconst far = 2.5\nconst wait = 2s\nspec s = F[0, wait] a[-wait] closeto[e] b"
+    expected = "F[0s, 2s] (a[-2s] closeto[{}] b)"
+    assert format_formula(parse_specification(text).specs[0].formula) == expected.format("2.5")
+    replaced = parse_specification(text, constants={"far": 7}).specs[0].formula
+    assert format_formula(replaced) == expected.format("7")
+    with pytest.raises(UsageError, match="did you mean 'far'"):
+        parse_specification(text, constants={"fra": 7})
+
+
+def test_relations_can_be_added_in_python() -> None:
+    def near_but_apart(a: Term, b: Term, most: float, least: float = 0.5) -> Expression:
+        return minimum(SignedDistance(a, b) - least, most - SignedDistance(a, b))
+
+    relations = {"near_but_apart": near_but_apart}
+    specification = parse_specification("a near_but_apart[3] b", relations=relations)
+    atom = specification.specs[0].formula
+    assert isinstance(atom, Atom)
+    assert atom.text == "a near_but_apart[3, 0.5] b"
+    assert atom.expression == near_but_apart(TrackedName("a"), TrackedName("b"), 3.0)
+    for wrong in ({"ovlp": near_but_apart}, {"until": lambda a: a}, {"a b": near_but_apart}):
+        with pytest.raises(UsageError, match="relations: "):
+            parse_specification("a ovlp b", relations=wrong)
+
+
+def test_names_may_be_anything_in_quotes() -> None:
+    atom = atom_of('"/robot1/base \\"link\\" \\\\" ovlp "F"')
+    assert atom.terms == (TrackedName('/robot1/base "link" \\'), TrackedName("F"))
+    assert atom_of(atom.text).terms == atom.terms
+
+
+def test_regions_hide_objects_of_their_name() -> None:
+    assert atom_of("region g = box(0, 0, 1, 1)\nspec s = a ovlp g").terms[1] == RegionName("g")
+
+
+def test_nodes_know_where_they_come_from() -> None:
+    text = "def f(a) = a ovlp b\nspec s = F (f(c) and x ovlp y)"
+    specification = parse_specification(text)
+    formula = specification.specs[0].formula
+    assert isinstance(formula, Temporal)
+    both = formula.operands[0]
+    assert isinstance(both, Boolean)
+    places = [specification.source[each.span.start : each.span.end] for each in both.operands]
+    assert places == ["f(c)", "x ovlp y"]
+
+
+def test_files(tmp_path: Path) -> None:
+    path = tmp_path / "reach.spatial"
+    path.write_bytes("\ufeffspec s = a ovlp b\r\n".encode())
+    assert load_specification(path).filename == "reach.spatial"
+    with pytest.raises(MissingFileError, match="nothing"):
+        load_specification(tmp_path / "nothing.spatial")
+    path.write_bytes(b"spec s = a\n  ovlp \xff")
+    with pytest.raises(SpecificationError, match=re.escape("reach.spatial:2:8")):
+        load_specification(path)
+
+
+@pytest.mark.parametrize("name", spatial_replay.spec.__all__)
+def test_every_name_of_the_language_is_there(name: str) -> None:
+    assert callable(getattr(spatial_replay.spec, name))
+    assert name in dir(spatial_replay.spec)
+
+
+def test_other_names_of_the_language_are_not_there() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'parse_everything'"):
+        _ = spatial_replay.spec.parse_everything
