@@ -1,0 +1,237 @@
+"""Footprints: the shapes that objects and regions cover in the plane."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from spatial_replay.errors import GeometryError
+from spatial_replay.geometry.arrays import Floats, read_only_floats
+from spatial_replay.geometry.decompose import convex_hull, convex_pieces
+from spatial_replay.geometry.outline import NOT_CONVEX, SOUND, normalise_polygons
+
+Concave: TypeAlias = Literal["decompose", "hull"]
+"""What becomes of a non-convex polygon: convex parts that cover exactly it, or its convex hull."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ConvexPart:
+    """A convex polygon, rounded: the Minkowski sum of its hull with a disc.
+
+    Two parts are equal when their radii are and their vertices, whichever comes first.
+
+    Attributes:
+        vertices: (n, 2) float64, read-only, counter-clockwise, no repeated or collinear ones; one
+            vertex is a point (with a radius: a disc), two are a segment (a capsule).
+        radius: rounding radius in footprint units, at least 0.
+
+    Raises:
+        GeometryError: no vertex, coordinates that are not finite, vertices that are not convex, a
+            negative radius. Clockwise order, repeated and collinear vertices are accepted and put right.
+    """
+
+    vertices: Floats
+    radius: float = 0.0
+
+    def __post_init__(self) -> None:
+        vertices, is_convex = _tidy(self.vertices)
+        if not is_convex:
+            raise GeometryError(
+                f"the vertices {_shown(vertices)} are not those of a convex polygon in order; "
+                "Footprint.polygon takes any polygon"
+            )
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "radius", _finite(self.radius, "a part's radius"))
+        if self.radius < 0:
+            raise GeometryError(f"a part's radius is {self.radius}; give 0 or more")
+
+    def __repr__(self) -> str:
+        radius = f", radius={self.radius:.6g}" if self.radius else ""
+        return f"ConvexPart({_shown(self.vertices)}{radius})"
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, ConvexPart):
+            return NotImplemented
+        return self.radius == other.radius and _ring(self.vertices) == _ring(other.vertices)
+
+    def __hash__(self) -> int:
+        return hash((self.radius, _ring(self.vertices)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Footprint:
+    """A union of rounded convex parts; equal when the parts are, in whatever order.
+
+    Raises:
+        GeometryError: if there is no part.
+    """
+
+    parts: tuple[ConvexPart, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parts", tuple(self.parts))
+        if not self.parts:
+            raise GeometryError("a footprint without parts; leave an object that covers nothing out instead")
+
+    def __repr__(self) -> str:
+        return f"Footprint({', '.join(map(repr, self.parts))})"
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Footprint):
+            return NotImplemented
+        return frozenset(self.parts) == frozenset(other.parts)
+
+    def __hash__(self) -> int:
+        return hash(frozenset(self.parts))
+
+    @classmethod
+    def box(cls, xmin: float, ymin: float, xmax: float, ymax: float) -> Footprint:
+        """The axis-aligned box with two opposite corners.
+
+        Raises:
+            GeometryError: coordinates that are not finite, a least one above the greatest. Equal ones
+                are accepted: they make a segment or a point.
+        """
+        if xmin > xmax or ymin > ymax:
+            raise GeometryError(
+                f"box({xmin}, {ymin}, {xmax}, {ymax}) has its least corner above its greatest; "
+                "give xmin, ymin, xmax, ymax"
+            )
+        return cls.polygon([(xmin, ymin), (xmax, ymin), (xmax, ymax), (xmin, ymax)])
+
+    @classmethod
+    def disc(cls, x: float, y: float, radius: float) -> Footprint:
+        """The disc around (x, y); of radius 0, the point.
+
+        Raises:
+            GeometryError: a value that is not finite, a negative radius.
+        """
+        return cls((ConvexPart(np.array([(x, y)]), radius),))
+
+    @classmethod
+    def capsule(cls, start: ArrayLike, end: ArrayLike, radius: float) -> Footprint:
+        """All points within a distance of the segment from one point (x, y) to another.
+
+        Raises:
+            GeometryError: a value that is not finite, a negative radius.
+        """
+        return cls((ConvexPart(np.array([start, end]), radius),))
+
+    @classmethod
+    def polygon(cls, vertices: ArrayLike, *, concave: Concave = "decompose") -> Footprint:
+        """The polygon with the given corners (n, 2), in either order.
+
+        Raises:
+            GeometryError: no corner, coordinates that are not finite, a boundary that crosses itself
+                (unless `concave="hull"`).
+        """
+        if concave not in ("decompose", "hull"):
+            raise GeometryError(f"concave={concave!r}; choose 'decompose' or 'hull'")
+        corners, is_convex = _tidy(vertices)
+        if is_convex:
+            return cls((ConvexPart(corners),))
+        if concave == "hull":
+            return cls((ConvexPart(convex_hull(corners)),))
+        pieces = [ConvexPart(piece) for piece in convex_pieces(corners)]
+        # A piece thinner than coordinates resolve covers nothing that its neighbours do not.
+        return cls(tuple(piece for piece in pieces if len(piece.vertices) > 2))
+
+    @classmethod
+    def union(cls, footprints: Iterable[Footprint]) -> Footprint:
+        """All parts of some footprints.
+
+        Raises:
+            GeometryError: if there is no footprint.
+        """
+        return cls(tuple(part for footprint in footprints for part in footprint.parts))
+
+
+@dataclass(frozen=True, slots=True)
+class TrackedObject:
+    """A footprint with what else a log may know of an object.
+
+    Attributes:
+        footprint: where it is.
+        class_name: what it is, or None.
+        yaw: its orientation in radians, counter-clockwise from the x axis, or None.
+        height: (bottom, top) in footprint units, or None.
+        uncertainty: radius, in footprint units, within which its true outline may differ.
+
+    Raises:
+        GeometryError: a value that is not finite, bottom above top, a negative uncertainty.
+    """
+
+    footprint: Footprint
+    class_name: str | None = None
+    yaw: float | None = None
+    height: tuple[float, float] | None = None
+    uncertainty: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.footprint, Footprint):
+            raise GeometryError(f"footprint is {self.footprint!r}; give a Footprint")
+        if self.class_name is not None and not isinstance(self.class_name, str):
+            raise GeometryError(f"class_name is {self.class_name!r}; give a text or None")
+        if self.yaw is not None:
+            object.__setattr__(self, "yaw", _finite(self.yaw, "yaw"))
+        if self.height is not None:
+            object.__setattr__(self, "height", _interval(self.height))
+        object.__setattr__(self, "uncertainty", _finite(self.uncertainty, "uncertainty"))
+        if self.uncertainty < 0:
+            raise GeometryError(f"uncertainty is {self.uncertainty}; give 0 or more")
+
+
+def _tidy(vertices: ArrayLike) -> tuple[Floats, bool]:
+    """Normalised vertices, read-only, and whether they are convex.
+
+    Raises:
+        GeometryError: for anything but one or more finite points.
+    """
+    try:
+        corners = np.array(vertices, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise GeometryError(f"vertices are {vertices!r}; give pairs of numbers (x, y)") from error
+    if corners.ndim != 2 or corners.shape[1] != 2 or not len(corners):
+        raise GeometryError(f"vertices have the shape {corners.shape}; give one or more pairs (x, y)")
+    outlines = normalise_polygons(np.array([0, len(corners)]), corners)
+    if outlines.fault[0] not in (SOUND, NOT_CONVEX):
+        raise GeometryError(f"vertices {_shown(corners)} are not all finite numbers of at most 1e100")
+    return read_only_floats(outlines.vertices), bool(outlines.fault[0] == SOUND)
+
+
+def _finite(value: float, what: str) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise GeometryError(f"{what} is {value!r}; give a number") from error
+    if not math.isfinite(number):
+        raise GeometryError(f"{what} is {number}; give a finite number")
+    return number
+
+
+def _interval(height: tuple[float, float]) -> tuple[float, float]:
+    try:
+        bottom, top = height
+    except (TypeError, ValueError) as error:
+        raise GeometryError(f"height is {height!r}; give (bottom, top)") from error
+    bottom, top = _finite(bottom, "height's bottom"), _finite(top, "height's top")
+    if bottom > top:
+        raise GeometryError(f"height is ({bottom}, {top}), its bottom above its top; give (bottom, top)")
+    return bottom, top
+
+
+def _shown(vertices: Floats) -> str:
+    corners = [f"({x:.6g}, {y:.6g})" for x, y in vertices[:8].tolist()]
+    return ", ".join(corners + ["…"] * (len(vertices) > 8))
+
+
+def _ring(vertices: Floats) -> tuple[tuple[float, float], ...]:
+    """The vertices from the least on, so that it does not matter which came first."""
+    corners = [(x, y) for x, y in vertices.tolist()]
+    first = corners.index(min(corners))
+    return tuple(corners[first:] + corners[:first])

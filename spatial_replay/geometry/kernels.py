@@ -1,0 +1,382 @@
+"""Compiled geometry of rounded convex parts: signed distance, protrusion, projections.
+
+All kernels share one layout, that of `FootprintBatch`: part p has the vertices `vertex_start[p]` up to
+`vertex_start[p + 1]`, row r the parts `part_start[r]` up to `part_start[r + 1]`. They stay in one
+module because the compiler's cache notices changes of a kernel's own file only.
+
+What is measured for one pair of parts never depends on the rest of the call, and every loop over two
+parts treats them alike: equal footprints give equal bits, in either order and in any batch.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spatial_replay.compiled import inlined, kernel
+from spatial_replay.geometry.arrays import Floats, Integers
+
+SIGNED_DISTANCE, PROTRUSION = 0, 1
+MIN_X, MAX_X, MIN_Y, MAX_Y, MIN_Z, MAX_Z = 2, 3, 4, 5, 6, 7
+CENTROID_MIN_X, CENTROID_MAX_X, CENTROID_MIN_Y, CENTROID_MAX_Y = 8, 9, 10, 11
+
+
+@inlined
+def _fill_edges(vertices: Floats, edges: Floats, start: int, stop: int) -> None:
+    """Set the edges of the part that has the vertices `start` up to `stop`."""
+    if stop - start < 2:
+        return
+    for i in range(start, stop):
+        following = i + 1 if i + 1 < stop else start
+        dx = vertices[following, 0] - vertices[i, 0]
+        dy = vertices[following, 1] - vertices[i, 1]
+        length = math.sqrt(dx * dx + dy * dy)
+        edges[i, 0] = dy / length
+        edges[i, 1] = -dx / length
+        edges[i, 2] = length
+
+
+@inlined
+def _fill_rows(
+    part_start: Integers,
+    vertex_start: Integers,
+    vertices: Floats,
+    edges: Floats,
+    members: Integers,
+    is_filled: NDArray[np.bool_],
+) -> None:
+    """Set the edges of the rows among `members` that have none yet."""
+    for row in members:
+        if row >= 0 and not is_filled[row]:
+            is_filled[row] = True
+            for p in range(part_start[row], part_start[row + 1]):
+                _fill_edges(vertices, edges, vertex_start[p], vertex_start[p + 1])
+
+
+@inlined
+def _least_height(vertices: Floats, start: int, stop: int, x: float, y: float, nx: float, ny: float) -> float:
+    """The least height of a part's vertices above the line through (x, y) with the normal (nx, ny)."""
+    least = np.inf
+    for j in range(start, stop):
+        least = min(least, nx * (vertices[j, 0] - x) + ny * (vertices[j, 1] - y))
+    return least
+
+
+@inlined
+def _separate(
+    vertices: Floats, edges: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
+) -> tuple[float, float]:
+    """How far the edges of A keep B away.
+
+    Returns:
+        (separation, nearest): the greatest, over A's edges, of the least height of B above the edge's
+        line (-inf for a point); and the least height of a vertex of B above the edge that it projects
+        into (+inf where none does).
+    """
+    separation = -np.inf
+    nearest = np.inf
+    count = a_stop - a_start
+    if count < 2:
+        return separation, nearest
+    for i in range(a_start, a_stop):
+        x, y = vertices[i, 0], vertices[i, 1]
+        nx, ny = edges[i, 0], edges[i, 1]
+        least = _least_height(vertices, b_start, b_stop, x, y, nx, ny)
+        separation = max(separation, least)
+        if least >= 0.0:
+            for j in range(b_start, b_stop):
+                dx, dy = vertices[j, 0] - x, vertices[j, 1] - y
+                if 0.0 <= nx * dy - ny * dx <= edges[i, 2]:
+                    nearest = min(nearest, nx * dx + ny * dy)
+        if count == 2:
+            # Beyond the end of a segment the normals alone see no gap.
+            k = a_start + a_stop - 1 - i
+            x, y = vertices[k, 0], vertices[k, 1]
+            separation = max(separation, _least_height(vertices, b_start, b_stop, x, y, -ny, nx))
+    return separation, nearest
+
+
+@inlined
+def _convex_distance(
+    vertices: Floats, edges: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
+) -> float:
+    """Signed distance of two convex polygons, segments or points (without their radii).
+
+    Some edge normal attains the penetration depth. The distance of disjoint polygons is attained at a
+    vertex and a point inside an edge, whose normal then separates by just that much, or at two vertices.
+    """
+    a_separation, a_nearest = _separate(vertices, edges, a_start, a_stop, b_start, b_stop)
+    b_separation, b_nearest = _separate(vertices, edges, b_start, b_stop, a_start, a_stop)
+    separation = max(a_separation, b_separation)
+    if separation < 0.0 and separation > -np.inf:
+        return separation
+    nearest = min(a_nearest, b_nearest)
+    if nearest <= separation:
+        return nearest
+    squared = np.inf
+    for i in range(a_start, a_stop):
+        for j in range(b_start, b_stop):
+            dx, dy = vertices[i, 0] - vertices[j, 0], vertices[i, 1] - vertices[j, 1]
+            squared = min(squared, dx * dx + dy * dy)
+    return min(nearest, math.sqrt(squared))
+
+
+@inlined
+def _convex_protrusion(
+    vertices: Floats, edges: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
+) -> float:
+    """Greatest signed distance from a vertex of A to the polygon B (without their radii)."""
+    greatest = -np.inf
+    for i in range(a_start, a_stop):
+        greatest = max(greatest, _convex_distance(vertices, edges, i, i + 1, b_start, b_stop))
+    return greatest
+
+
+@inlined
+def _centroid(vertices: Floats, start: int, stop: int) -> tuple[float, float]:
+    """Area centroid of a polygon; the mean of its vertices where it has no area."""
+    x0, y0 = vertices[start, 0], vertices[start, 1]
+    area = sum_x = sum_y = 0.0
+    for i in range(start + 1, stop - 1):
+        ax, ay = vertices[i, 0] - x0, vertices[i, 1] - y0
+        bx, by = vertices[i + 1, 0] - x0, vertices[i + 1, 1] - y0
+        cross = ax * by - bx * ay
+        area += cross
+        sum_x += cross * (ax + bx)
+        sum_y += cross * (ay + by)
+    if area > 0.0:
+        return x0 + sum_x / (3.0 * area), y0 + sum_y / (3.0 * area)
+    for i in range(start + 1, stop):
+        sum_x += vertices[i, 0] - x0
+        sum_y += vertices[i, 1] - y0
+    return x0 + sum_x / (stop - start), y0 + sum_y / (stop - start)
+
+
+@inlined
+def _rows_distance(
+    part_start: Integers,
+    vertex_start: Integers,
+    vertices: Floats,
+    edges: Floats,
+    radius: Floats,
+    bottom: Floats,
+    top: Floats,
+    a: int,
+    b: int,
+    enlargement: float,
+) -> float:
+    """Signed distance of rows a and b, as upright prisms where both have heights."""
+    least = np.inf
+    for p in range(part_start[a], part_start[a + 1]):
+        for q in range(part_start[b], part_start[b + 1]):
+            distance = _convex_distance(
+                vertices, edges, vertex_start[p], vertex_start[p + 1], vertex_start[q], vertex_start[q + 1]
+            )
+            least = min(least, distance - ((radius[p] + radius[q]) + enlargement))
+    if math.isnan(bottom[a]) or math.isnan(bottom[b]):
+        return least
+    gap = max(bottom[a] - top[b], bottom[b] - top[a])
+    if least > 0.0 and gap > 0.0:
+        return math.sqrt(least * least + gap * gap)
+    return float(max(least, gap))
+
+
+@inlined
+def _part_protrusion(
+    part_start: Integers,
+    vertex_start: Integers,
+    vertices: Floats,
+    edges: Floats,
+    radius: Floats,
+    bottom: Floats,
+    top: Floats,
+    a: int,
+    p: int,
+    b: int,
+    enlargement: float,
+) -> float:
+    """How far part p of row a sticks out of row b: the least over b's parts."""
+    least = np.inf
+    for q in range(part_start[b], part_start[b + 1]):
+        planar = _convex_protrusion(
+            vertices, edges, vertex_start[p], vertex_start[p + 1], vertex_start[q], vertex_start[q + 1]
+        )
+        least = min(least, planar + (radius[p] - radius[q]) + enlargement)
+    if math.isnan(bottom[a]) or math.isnan(bottom[b]):
+        return least
+    return float(max(least, max(bottom[b] - bottom[a], top[a] - top[b])))
+
+
+@inlined
+def _row_extreme(
+    part_start: Integers,
+    vertex_start: Integers,
+    vertices: Floats,
+    radius: Floats,
+    bottom: Floats,
+    top: Floats,
+    quantity: int,
+    row: int,
+    enlargement: float,
+) -> float:
+    """A row's greatest coordinate for a MAX_ quantity; for a MIN_, the greatest of their negatives."""
+    if quantity == MIN_Z:
+        return float(-bottom[row])
+    if quantity == MAX_Z:
+        return float(top[row])
+    sign = -1.0 if quantity % 2 == 0 else 1.0
+    greatest = -np.inf
+    for p in range(part_start[row], part_start[row + 1]):
+        start, stop = vertex_start[p], vertex_start[p + 1]
+        if quantity >= CENTROID_MIN_X:
+            x, y = _centroid(vertices, start, stop)
+            greatest = max(greatest, sign * (x if quantity <= CENTROID_MAX_X else y))
+        else:
+            axis = 0 if quantity <= MAX_X else 1
+            for i in range(start, stop):
+                greatest = max(greatest, sign * vertices[i, axis] + (radius[p] + enlargement))
+    return greatest
+
+
+@inlined
+def _union_distance(
+    part_start: Integers,
+    vertex_start: Integers,
+    vertices: Floats,
+    edges: Floats,
+    radius: Floats,
+    bottom: Floats,
+    top: Floats,
+    members: Integers,
+    first: tuple[int, int],
+    second: tuple[int, int],
+    enlargement: float,
+) -> float:
+    """Signed distance of two unions of rows: the least over their pairs."""
+    least = np.inf
+    for i in range(first[0], first[1]):
+        for j in range(second[0], second[1]):
+            a, b = members[i], members[j]
+            if a >= 0 and b >= 0:
+                distance = _rows_distance(
+                    part_start, vertex_start, vertices, edges, radius, bottom, top, a, b, enlargement
+                )
+                least = min(least, distance)
+    return least
+
+
+@inlined
+def _union_protrusion(
+    part_start: Integers,
+    vertex_start: Integers,
+    vertices: Floats,
+    edges: Floats,
+    radius: Floats,
+    bottom: Floats,
+    top: Floats,
+    members: Integers,
+    first: tuple[int, int],
+    second: tuple[int, int],
+    enlargement: float,
+) -> float:
+    """How far a union of rows sticks out of another: greatest over parts of the least over parts."""
+    greatest = -np.inf
+    for i in range(first[0], first[1]):
+        a = members[i]
+        if a < 0:
+            continue
+        for p in range(part_start[a], part_start[a + 1]):
+            least = np.inf
+            for j in range(second[0], second[1]):
+                b = members[j]
+                if b >= 0:
+                    protrusion = _part_protrusion(
+                        part_start, vertex_start, vertices, edges, radius, bottom, top, a, p, b, enlargement
+                    )
+                    least = min(least, protrusion)
+            greatest = max(greatest, least)
+    return greatest
+
+
+@inlined
+def _union_extreme(
+    part_start: Integers,
+    vertex_start: Integers,
+    vertices: Floats,
+    radius: Floats,
+    bottom: Floats,
+    top: Floats,
+    members: Integers,
+    first: tuple[int, int],
+    quantity: int,
+    enlargement: float,
+) -> float:
+    """A projection of a union of rows; NaN along z if one of them has no height."""
+    greatest = -np.inf
+    for i in range(first[0], first[1]):
+        row = members[i]
+        if row < 0:
+            continue
+        extreme = _row_extreme(
+            part_start, vertex_start, vertices, radius, bottom, top, quantity, row, enlargement
+        )
+        if math.isnan(extreme):
+            return np.nan
+        greatest = max(greatest, extreme)
+    return -greatest if quantity % 2 == 0 else greatest
+
+
+@kernel
+def measure_rows(
+    part_start: Integers,
+    vertex_start: Integers,
+    vertices: Floats,
+    radius: Floats,
+    bottom: Floats,
+    top: Floats,
+    members: Integers,
+    member_start: Integers,
+    width: Integers,
+    enlargement: Floats,
+    quantity: Integers,
+    first: Integers,
+    second: Integers,
+    values: Floats,
+) -> None:
+    """Fill `values` (K, T) with K quantities in T samples; see `measure`.
+
+    Operand o has, in sample t, the rows from `members[member_start[o] + t * width[o]]` on, `width[o]`
+    of them; `member_start` (O + 1,) ends with the number of all.
+    """
+    edges = np.empty((len(vertices), 3))
+    is_filled = np.zeros(len(part_start), dtype=np.bool_)
+    for k in range(len(quantity)):
+        if quantity[k] < MIN_X:
+            for operand in (first[k], second[k]):
+                operand_members = members[member_start[operand] : member_start[operand + 1]]
+                _fill_rows(part_start, vertex_start, vertices, edges, operand_members, is_filled)
+    for t in range(values.shape[1]):
+        for k in range(values.shape[0]):
+            a, b = first[k], second[k]
+            start = member_start[a] + t * width[a]
+            a_members = (start, start + width[a])
+            if quantity[k] >= MIN_X:
+                values[k, t] = _union_extreme(
+                    part_start, vertex_start, vertices, radius, bottom, top,
+                    members, a_members, quantity[k], enlargement[a],
+                )  # fmt: skip
+                continue
+            start = member_start[b] + t * width[b]
+            b_members = (start, start + width[b])
+            if quantity[k] == SIGNED_DISTANCE:
+                values[k, t] = _union_distance(
+                    part_start, vertex_start, vertices, edges, radius, bottom, top,
+                    members, a_members, b_members, enlargement[a] + enlargement[b],
+                )  # fmt: skip
+            else:
+                values[k, t] = _union_protrusion(
+                    part_start, vertex_start, vertices, edges, radius, bottom, top,
+                    members, a_members, b_members, enlargement[a] - enlargement[b],
+                )  # fmt: skip

@@ -1,0 +1,118 @@
+"""Measurements between footprints over many samples, in one kernel call."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+
+from spatial_replay.errors import GeometryError
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.kernels import measure_rows
+
+Quantity: TypeAlias = Literal[
+    "signed_distance",
+    "protrusion",
+    "min_x",
+    "max_x",
+    "min_y",
+    "max_y",
+    "min_z",
+    "max_z",
+    "centroid_min_x",
+    "centroid_max_x",
+    "centroid_min_y",
+    "centroid_max_y",
+]
+
+# The kernels know a quantity by its place in the list above.
+_CODES: Mapping[str, int] = MappingProxyType({name: code for code, name in enumerate(get_args(Quantity))})
+_BETWEEN_TWO = frozenset({"signed_distance", "protrusion"})
+_NO_ROWS = np.empty(0, dtype=np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Operand:
+    """A footprint over T samples: the union, in each sample, of the rows given.
+
+    Attributes:
+        rows: (T, M) int64, row numbers into a `FootprintBatch`; any negative number leaves that
+            place empty. A single object has M = 1, a group of members M > 1.
+        enlargement: radius of the disc added (Minkowski sum), in footprint units.
+    """
+
+    rows: Integers
+    enlargement: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One quantity of one operand, or between two (indices into the operands)."""
+
+    quantity: Quantity
+    first: int
+    second: int = -1
+
+
+def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequence[Request]) -> Floats:
+    """Each requested quantity in each sample.
+
+    signed_distance(A, B) is the least over pairs of parts of the signed distance of two rounded convex
+    parts: their distance when apart, minus their penetration depth when not (Def. 2-4 of the paper),
+    minus both radii; with height intervals on both footprints, that of upright prisms. protrusion(A, B)
+    is the greatest over parts of A, of the least over parts of B, of how far the one sticks out of the
+    other: max over vertices p of sd(p, B's polygon) + r_A - r_B, and for prisms the greatest of that,
+    B.bottom - A.bottom and A.top - B.top. Projections run over all parts (radius and enlargement
+    included; the centroid's: area centroids of the unrounded polygons). Over an empty union the
+    least is +inf and the greatest -inf. Along z, a footprint without a height gives NaN.
+
+    Returns:
+        (K, T) float64 for K requests.
+
+    Raises:
+        GeometryError: operands over different numbers of samples, a row the batch does not have, a
+            request for an operand that is not there.
+    """
+    samples = {operand.rows.shape[0] for operand in operands}
+    if len(samples) > 1:
+        raise GeometryError(f"operands span {sorted(samples)} samples; give each the same number")
+    members = np.concatenate([np.ravel(operand.rows) for operand in operands] or [_NO_ROWS])
+    if members.size and members.max() >= len(batch):
+        raise GeometryError(f"an operand has row {members.max()}; the batch has {len(batch)} rows, from 0")
+    width = np.array([operand.rows.shape[1] for operand in operands], dtype=np.int64)
+    size = np.array([operand.rows.size for operand in operands], dtype=np.int64)
+    for request in requests:
+        _check_request(request, len(operands))
+    values = np.empty((len(requests), samples.pop() if samples else 0))
+    measure_rows(
+        batch.part_start,
+        batch.vertex_start,
+        batch.vertices,
+        batch.radius,
+        batch.bottom,
+        batch.top,
+        members,
+        np.concatenate([[0], np.cumsum(size)]),
+        width,
+        np.array([operand.enlargement for operand in operands], dtype=np.float64),
+        np.array([_CODES[request.quantity] for request in requests], dtype=np.int64),
+        np.array([request.first for request in requests], dtype=np.int64),
+        np.array([request.second for request in requests], dtype=np.int64),
+        values,
+    )
+    return values
+
+
+def _check_request(request: Request, operand_count: int) -> None:
+    if request.quantity not in _CODES:
+        raise GeometryError(f"no quantity {request.quantity!r}; there are {', '.join(_CODES)}")
+    needed = [request.first, request.second] if request.quantity in _BETWEEN_TWO else [request.first]
+    for index in needed:
+        if not 0 <= index < operand_count:
+            raise GeometryError(
+                f"{request.quantity} asks for operand {index}; there are {operand_count}, from 0"
+            )

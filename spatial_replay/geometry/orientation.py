@@ -1,0 +1,29 @@
+"""Orientation in the plane."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from spatial_replay.compiled import kernel
+from spatial_replay.geometry.arrays import Floats
+
+
+@kernel
+def _misalignment(first: Floats, second: Floats, result: Floats) -> None:
+    for k in range(len(first)):
+        x = math.cos(first[k]) - math.cos(second[k])
+        y = math.sin(first[k]) - math.sin(second[k])
+        result[k] = 0.5 * (x * x + y * y)
+
+
+def misalignment(first: Floats, second: Floats) -> Floats:
+    """Half the squared distance of the unit vectors at two angles (Def. 10, 11): 1 - cos of their difference.
+
+    Args:
+        first, second: (T,) radians; NaN where there is none, and then the result is NaN.
+    """
+    result = np.empty(len(first))
+    _misalignment(first, second, result)
+    return result

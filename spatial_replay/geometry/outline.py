@@ -1,0 +1,208 @@
+"""Raw outlines put into the form the kernels read: convex, counter-clockwise, nothing superfluous."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spatial_replay.compiled import inlined, kernel
+from spatial_replay.geometry.arrays import Floats, Integers
+
+SOUND, EMPTY, NOT_FINITE, NOT_CONVEX = 0, 1, 2, 3
+
+LARGEST_COORDINATE = 1e100
+"""Coordinates beyond this are refused: products of a few of them must stay finite."""
+
+_FLATNESS = 1e-9
+_ROUNDING = 4 * 2.0**-52
+_SMALLEST = 1e-100
+
+
+class Outlines(NamedTuple):
+    """P outlines as ragged rows, and what is wrong with each.
+
+    Attributes:
+        vertex_start: (P + 1,) int64.
+        vertices: (V, 2) float64.
+        fault: (P,) int8: `SOUND`; or, with its vertices left as they were, `EMPTY` (no vertex),
+            `NOT_FINITE` (or beyond `LARGEST_COORDINATE`), `NOT_CONVEX` (which includes a boundary
+            that crosses itself).
+    """
+
+    vertex_start: Integers
+    vertices: Floats
+    fault: NDArray[np.int8]
+
+
+def normalise_polygons(vertex_start: Integers, vertices: Floats) -> Outlines:
+    """Each outline counter-clockwise, without repeated or collinear vertices.
+
+    A vertex is superfluous when it is no farther from the segment between its neighbours than a
+    billionth of the outline's extent, or than its coordinates resolve; an outline no wider than that is
+    a segment or a point. What is convex and counter-clockwise already comes back bit for bit.
+
+    Args:
+        vertex_start: (P + 1,) int64; outline p has the vertices vertex_start[p] up to vertex_start[p + 1].
+        vertices: (V, 2) float64, in footprint units.
+    """
+    tidy = np.array(vertices, dtype=np.float64, order="C")
+    counts = np.empty(len(vertex_start) - 1, dtype=np.int64)
+    fault = np.empty(len(counts), dtype=np.int8)
+    raw_start = np.array(vertex_start, dtype=np.int64)
+    used = _normalise_all(raw_start, tidy, counts, fault)
+    start = np.zeros(len(counts) + 1, dtype=np.int64)
+    np.cumsum(counts, out=start[1:])
+    return Outlines(start, tidy[:used], fault)
+
+
+@kernel
+def _normalise_all(start: Integers, vertices: Floats, counts: Integers, fault: NDArray[np.int8]) -> int:
+    """Normalise every outline in place and close the gaps; returns how many vertices are left."""
+    used = 0
+    scratch = np.empty_like(vertices)
+    for p in range(len(counts)):
+        first, stop = start[p], start[p + 1]
+        counts[p] = stop - first
+        fault[p] = SOUND
+        tolerance = _tolerance(vertices, first, stop)
+        if tolerance < 0.0:
+            fault[p] = EMPTY if first == stop else NOT_FINITE
+        elif counts[p] > 1:
+            winding = _winding(vertices, first, stop, tolerance)
+            if winding == 0:
+                _copy(vertices, first, scratch, 0, counts[p])
+                left = _tidy(scratch, counts[p], tolerance)
+                winding = _winding(scratch, 0, left, 0.0) if left > 2 else 1
+                if winding == 0:
+                    fault[p] = NOT_CONVEX
+                else:
+                    _copy(scratch, 0, vertices, first, left)
+                    counts[p] = left
+            if winding == -1:
+                _reverse(vertices, first + 1, first + counts[p])
+        _copy(vertices, first, vertices, used, counts[p])
+        used += counts[p]
+    return used
+
+
+@inlined
+def _copy(source: Floats, source_start: int, target: Floats, target_start: int, count: int) -> None:
+    """Copy vertices, in ascending order: a target that overlaps may begin before its source."""
+    for i in range(count):
+        target[target_start + i, 0] = source[source_start + i, 0]
+        target[target_start + i, 1] = source[source_start + i, 1]
+
+
+@inlined
+def _reverse(vertices: Floats, start: int, stop: int) -> None:
+    while start < stop - 1:
+        stop -= 1
+        for axis in range(2):
+            vertices[start, axis], vertices[stop, axis] = vertices[stop, axis], vertices[start, axis]
+        start += 1
+
+
+@inlined
+def _tolerance(vertices: Floats, first: int, stop: int) -> float:
+    """How far a vertex may stray from a line and still count as on it; -1 for what cannot be used."""
+    least_x = least_y = np.inf
+    most_x = most_y = -np.inf
+    for i in range(first, stop):
+        x, y = vertices[i, 0], vertices[i, 1]
+        if not (abs(x) <= LARGEST_COORDINATE and abs(y) <= LARGEST_COORDINATE):
+            return -1.0
+        least_x, most_x = min(least_x, x), max(most_x, x)
+        least_y, most_y = min(least_y, y), max(most_y, y)
+    if first == stop:
+        return -1.0
+    extent = max(most_x - least_x, most_y - least_y)
+    magnitude = max(max(-least_x, most_x), max(-least_y, most_y))
+    return max(_FLATNESS * extent, max(_ROUNDING * magnitude, _SMALLEST))
+
+
+@inlined
+def _winding(vertices: Floats, first: int, stop: int, tolerance: float) -> int:
+    """1 if every turn is to the left and they make one round; -1 if all to the right; else 0.
+
+    A turn whose vertex strays no more than `tolerance` from its neighbours' line counts as none.
+    """
+    left = right = rounds = 0
+    count = stop - first
+    ax, ay = vertices[stop - 1, 0], vertices[stop - 1, 1]
+    bx, by = vertices[first, 0], vertices[first, 1]
+    was_upper = by > ay or (by == ay and bx > ax)
+    for i in range(count):
+        following = first if i + 1 == count else first + i + 1
+        cx, cy = vertices[following, 0], vertices[following, 1]
+        cross = (bx - ax) * (cy - by) - (by - ay) * (cx - bx)
+        chord = (cx - ax) * (cx - ax) + (cy - ay) * (cy - ay)
+        if cross * cross > tolerance * tolerance * chord:
+            left += cross > 0.0
+            right += cross < 0.0
+        is_upper = cy > by or (cy == by and cx > bx)
+        rounds += is_upper != was_upper
+        was_upper = is_upper
+        ax, ay, bx, by = bx, by, cx, cy
+    if rounds != 2:
+        return 0
+    return 1 if left == count else (-1 if right == count else 0)
+
+
+@inlined
+def _tidy(vertices: Floats, count: int, tolerance: float) -> int:
+    """Drop superfluous ones of the first `count` vertices in place; returns how many are left."""
+    head = _farthest(vertices, count, 0)
+    tail = _farthest(vertices, count, head)
+    is_flat = True
+    for i in range(count):
+        is_flat = is_flat and _strays(vertices, i, head, tail) <= tolerance
+    if is_flat:
+        first, second = min(head, tail), max(head, tail)
+        _copy(vertices, first, vertices, 0, 1)
+        _copy(vertices, second, vertices, 1, 1)
+        return 1 if _distance(vertices, 0, 1) <= tolerance else 2
+    changed = True
+    while changed and count > 2:
+        changed = False
+        i = 0
+        while i < count and count > 2:
+            if _strays(vertices, i, (i + count - 1) % count, (i + 1) % count) <= tolerance:
+                _copy(vertices, i + 1, vertices, i, count - i - 1)
+                count -= 1
+                changed = True
+            else:
+                i += 1
+    return count
+
+
+@inlined
+def _distance(vertices: Floats, i: int, j: int) -> float:
+    dx, dy = vertices[i, 0] - vertices[j, 0], vertices[i, 1] - vertices[j, 1]
+    return math.sqrt(dx * dx + dy * dy)
+
+
+@inlined
+def _farthest(vertices: Floats, count: int, origin: int) -> int:
+    """The vertex farthest from one of them."""
+    greatest, index = -1.0, origin
+    for i in range(count):
+        distance = _distance(vertices, i, origin)
+        if distance > greatest:
+            greatest, index = distance, i
+    return index
+
+
+@inlined
+def _strays(vertices: Floats, i: int, head: int, tail: int) -> float:
+    """Distance of vertex i from the segment between two others."""
+    length = _distance(vertices, head, tail)
+    if length == 0.0:
+        return _distance(vertices, i, head)
+    dx, dy = vertices[tail, 0] - vertices[head, 0], vertices[tail, 1] - vertices[head, 1]
+    px, py = vertices[i, 0] - vertices[head, 0], vertices[i, 1] - vertices[head, 1]
+    along = min(max((px * dx + py * dy) / length, 0.0), length) / length
+    ox, oy = px - along * dx, py - along * dy
+    return math.sqrt(ox * ox + oy * oy)

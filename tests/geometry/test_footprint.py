@@ -1,0 +1,145 @@
+"""What shapes people can write down, and what they are told when they cannot."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from spatial_replay.errors import GeometryError
+from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
+
+SQUARE = [(0, 0), (2, 0), (2, 2), (0, 2)]
+L_SHAPE = [(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]
+BOW_TIE = [(0, 0), (2, 2), (2, 0), (0, 2)]
+
+
+def vertices_of(footprint):
+    return [tuple(vertex) for part in footprint.parts for vertex in part.vertices.tolist()]
+
+
+@pytest.mark.parametrize(
+    "corners",
+    [
+        SQUARE,
+        SQUARE[::-1],
+        [*SQUARE, SQUARE[0]],
+        [(0, 0), (1, 0), (2, 0), (2, 0), (2, 2), (0, 2), (0, 1)],
+        [(2, 2), (0, 2), (0, 0), (2, 0)],
+        [(0, 0), (1, 1e-12), (2, 0), (2, 2), (0, 2)],
+    ],
+    ids=["plain", "clockwise", "closed", "superfluous", "other start", "dent of a rounding error"],
+)
+def test_spellings_of_one_square_are_equal(corners):
+    square = Footprint.polygon(corners)
+    assert square == Footprint.box(0, 0, 2, 2)
+    assert hash(square) == hash(Footprint.box(0, 0, 2, 2))
+
+
+def test_what_is_in_order_is_kept_to_the_bit():
+    corners = np.array([(0.1, 0.2), (1.7, 0.3), (0.9, 1.1)])
+    assert Footprint.polygon(corners).parts[0].vertices.tobytes() == corners.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("footprint", "vertices"),
+    [
+        (Footprint.box(1, 1, 1, 3), [(1, 1), (1, 3)]),
+        (Footprint.box(1, 1, 1, 1), [(1, 1)]),
+        (Footprint.polygon([(0, 0), (2, 0), (1, 0), (3, 0)]), [(0, 0), (3, 0)]),
+        (Footprint.polygon([(5, 5), (5, 5), (5, 5)]), [(5, 5)]),
+        (Footprint.polygon([(7, 1)]), [(7, 1)]),
+        (Footprint.capsule((0, 0), (4, 0), 1), [(0, 0), (4, 0)]),
+        (Footprint.disc(3, 4, 2), [(3, 4)]),
+    ],
+)
+def test_shapes_without_an_inside_are_segments_and_points(footprint, vertices):
+    assert vertices_of(footprint) == vertices
+
+
+def test_a_polygon_that_is_not_convex_becomes_few_convex_parts_or_its_hull():
+    parts = Footprint.polygon(L_SHAPE).parts
+    assert 2 <= len(parts) <= 3
+    assert vertices_of(Footprint.polygon(L_SHAPE, concave="hull")) == [
+        *[(0, 2), (0, 0), (2, 0), (2, 1), (1, 2)]
+    ]
+
+
+def test_a_boundary_that_crosses_itself_is_refused_by_place_and_remedy():
+    with pytest.raises(GeometryError, match=r"crosses or touches itself at \(1, 1\).*concave='hull'"):
+        Footprint.polygon(BOW_TIE)
+    assert Footprint.polygon(BOW_TIE, concave="hull") == Footprint.box(0, 0, 2, 2)
+
+
+def test_a_star_drawn_in_one_line_is_no_convex_polygon():
+    star = [(math.cos(4 * math.pi * i / 5), math.sin(4 * math.pi * i / 5)) for i in range(5)]
+    with pytest.raises(GeometryError, match="crosses"):
+        Footprint.polygon(star)
+    with pytest.raises(GeometryError, match="convex"):
+        ConvexPart(np.array(star))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Footprint.polygon([]), "one or more pairs"),
+        (lambda: Footprint.polygon([(0, 0, 0)]), r"\(1, 3\)"),
+        (lambda: Footprint.polygon([(0, "east")]), "pairs of numbers"),
+        (lambda: Footprint.polygon([(0, 0), (math.nan, 1), (1, 1)]), "nan.*finite"),
+        (lambda: Footprint.polygon([(0, 0), (math.inf, 1), (1, 1)]), "inf.*finite"),
+        (lambda: Footprint.polygon([(0, 0), (1e200, 1), (1, 1)]), "1e100"),
+        (lambda: Footprint.polygon(SQUARE, concave="cut"), "'cut'.*'decompose' or 'hull'"),
+        (lambda: Footprint.box(1, 0, 0, 1), r"box\(1, 0, 0, 1\)"),
+        (lambda: Footprint.disc(0, 0, -1), "radius is -1.*0 or more"),
+        (lambda: Footprint.disc(0, 0, math.nan), "radius is nan"),
+        (lambda: Footprint.disc(0, 0, "wide"), "'wide'.*number"),
+        (lambda: Footprint.union([]), "without parts"),
+        (lambda: ConvexPart(np.array(L_SHAPE)), "Footprint.polygon"),
+    ],
+)
+def test_what_makes_no_footprint_is_refused_with_its_value(make, message):
+    with pytest.raises(GeometryError, match=message):
+        make()
+
+
+def test_vertices_cannot_be_written_to_nor_follow_their_source():
+    source = np.array(SQUARE, dtype=float)
+    part = ConvexPart(source)
+    source[0, 0] = 99
+    assert part.vertices[0, 0] == 0
+    with pytest.raises(ValueError, match="read-only"):
+        part.vertices[0, 0] = 1
+
+
+def test_footprints_compare_by_what_they_cover():
+    union = Footprint.union([Footprint.disc(0, 0, 1), Footprint.box(0, 0, 1, 1)])
+    assert union == Footprint.union([Footprint.box(0, 0, 1, 1), Footprint.disc(0, 0, 1)])
+    assert Footprint.disc(0, 0, 1) != Footprint.disc(0, 0, 2)
+    assert Footprint.box(0, 0, 1, 1) != Footprint.box(0, 0, 1, 2)
+    assert Footprint.box(0, 0, 1, 1) != "box"
+    assert (
+        repr(union) == "Footprint(ConvexPart((0, 0), radius=1), ConvexPart((0, 0), (1, 0), (1, 1), (0, 1)))"
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"yaw": math.inf}, "yaw is inf"),
+        ({"height": (2, 1)}, r"\(2.0, 1.0\).*bottom above"),
+        ({"height": (0, math.nan)}, "top is nan"),
+        ({"height": 3}, r"give \(bottom, top\)"),
+        ({"uncertainty": -0.5}, "uncertainty is -0.5"),
+        ({"uncertainty": math.nan}, "uncertainty is nan"),
+        ({"class_name": 7}, "class_name is 7"),
+    ],
+)
+def test_a_tracked_object_checks_what_is_known_of_it(options, message):
+    with pytest.raises(GeometryError, match=message):
+        TrackedObject(Footprint.disc(0, 0, 1), **options)
+
+
+def test_a_tracked_object_needs_a_footprint():
+    with pytest.raises(GeometryError, match="give a Footprint"):
+        TrackedObject(SQUARE)
