@@ -1,0 +1,54 @@
+"""One sample: what was known at one time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+from spatial_replay.errors import TraceError
+from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.trace.times import LATEST_NS
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """Every object and signal at one time.
+
+    Attributes:
+        time_ns: nanoseconds, 0 to 2**63 - 1.
+        objects: what was seen, by name; a bare footprint stands for a `TrackedObject` of it.
+        signals: numeric signals by name; NaN means that the value is not known.
+
+    Raises:
+        TraceError: for a time, a name or a value of another kind.
+    """
+
+    time_ns: int
+    objects: Mapping[str, TrackedObject | Footprint] = field(default_factory=dict)
+    signals: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.time_ns, bool) or not isinstance(self.time_ns, int):
+            raise TraceError(f"time_ns is {self.time_ns!r}; give integer nanoseconds")
+        if not 0 <= self.time_ns <= LATEST_NS:
+            raise TraceError(f"time_ns is {self.time_ns}; give a time from 0 to 2**63 - 1 ns")
+        objects: dict[str, TrackedObject | Footprint] = {}
+        for name, tracked in self.objects.items():
+            if not isinstance(name, str) or not name:
+                raise TraceError(f"an object is named {name!r}; give a text that is not empty")
+            if isinstance(tracked, Footprint):
+                tracked = TrackedObject(tracked)
+            elif not isinstance(tracked, TrackedObject):
+                raise TraceError(f"object {name!r} is {tracked!r}; give a Footprint or a TrackedObject")
+            objects[name] = tracked
+        signals: dict[str, float] = {}
+        for name, value in self.signals.items():
+            if not isinstance(name, str) or not name:
+                raise TraceError(f"a signal is named {name!r}; give a text that is not empty")
+            try:
+                signals[name] = float(value)
+            except (TypeError, ValueError) as error:
+                raise TraceError(f"signal {name!r} is {value!r}; give a number") from error
+        object.__setattr__(self, "objects", MappingProxyType(objects))
+        object.__setattr__(self, "signals", MappingProxyType(signals))

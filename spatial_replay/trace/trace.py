@@ -1,0 +1,324 @@
+"""A trace: the samples of a run, as columns."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+
+import numpy as np
+
+from spatial_replay.errors import TraceError
+from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
+from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.trace.memo import Memo
+from spatial_replay.trace.sample import Sample
+
+ABSENT = -1
+"""A row number that says: this object was not in the sample."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """T samples with strictly increasing times.
+
+    Objects are kept as observations: rows of flat arrays, one for each time an object was reported.
+    `rows[t, n]` is the observation of object n in sample t, or `ABSENT`. An observation with a number
+    that is not finite is kept too, so that nothing is lost, but its row number is stored as
+    -2 - row: the object is unknown there (`unreadable`).
+
+    Two traces are equal when they hold the same samples; `faults`, the order of observations and names
+    that no sample uses do not count.
+
+    Attributes:
+        times_ns: (T,) int64.
+        names: the N objects' names, in order of code points.
+        rows: (T, N) int64.
+        footprints: the R observations' footprints.
+        yaw: (R,) float64, radians; NaN where the observation has no orientation.
+        uncertainty: (R,) float64, radius in footprint units, at least 0.
+        class_code: (R,) int64, index into `classes`.
+        classes: class names; None for objects without one.
+        signals: numeric signals by name, each (T,) float64, NaN where not known.
+        faults: what was lost or set aside while reading, in words, each with its place.
+        memo: what has been computed from this trace.
+
+    Raises:
+        TraceError: columns whose lengths do not fit together, or times that do not increase.
+    """
+
+    times_ns: Integers
+    names: tuple[str, ...]
+    rows: Integers
+    footprints: FootprintBatch
+    yaw: Floats
+    uncertainty: Floats
+    class_code: Integers
+    classes: tuple[str | None, ...]
+    signals: Mapping[str, Floats] = field(default_factory=dict)
+    faults: tuple[str, ...] = ()
+    memo: Memo = field(default_factory=Memo, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        for name in ("times_ns", "rows", "class_code"):
+            object.__setattr__(self, name, read_only_integers(getattr(self, name)))
+        for name in ("yaw", "uncertainty"):
+            object.__setattr__(self, name, read_only_floats(getattr(self, name)))
+        signals = {name: read_only_floats(self.signals[name]) for name in sorted(self.signals)}
+        object.__setattr__(self, "signals", MappingProxyType(signals))
+        _check_shapes(self)
+        _check_times(self.times_ns)
+
+    def __len__(self) -> int:
+        return len(self.times_ns)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Trace):
+            return NotImplemented
+        return _same_samples(self.compact(), other.compact())
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        span = f", {self.times_ns[0]} to {self.times_ns[-1]} ns" if len(self) else ""
+        return f"<Trace: {len(self)} samples{span}; objects {', '.join(self.names) or 'none'}>"
+
+    @property
+    def unreadable_count(self) -> int:
+        """How many observations hold a number that is not finite."""
+        return int(np.count_nonzero(self.rows < ABSENT))
+
+    @classmethod
+    def from_samples(cls, samples: Iterable[Sample]) -> Trace:
+        """The trace of the given samples, in their order.
+
+        Raises:
+            TraceError: times that do not increase.
+        """
+        listed = list(samples)
+        times = [sample.time_ns for sample in listed]
+        names = tuple(sorted({name for sample in listed for name in sample.objects}))
+        number = {name: index for index, name in enumerate(names)}
+        rows = np.full((len(listed), len(names)), ABSENT, np.int64)
+        seen: list[TrackedObject] = []
+        for index, sample in enumerate(listed):
+            for name in sorted(sample.objects):
+                rows[index, number[name]] = len(seen)
+                seen.append(_tracked(sample.objects[name]))
+        classes = _class_order(tracked.class_name for tracked in seen)
+        signals = sorted({name for sample in listed for name in sample.signals})
+        return cls(
+            times_ns=np.array(times, np.int64),
+            names=names,
+            rows=rows,
+            footprints=FootprintBatch.from_footprints(
+                [tracked.footprint for tracked in seen], [tracked.height for tracked in seen]
+            ),
+            yaw=np.array([np.nan if tracked.yaw is None else tracked.yaw for tracked in seen], np.float64),
+            uncertainty=np.array([tracked.uncertainty for tracked in seen], np.float64),
+            class_code=np.array([classes.index(tracked.class_name) for tracked in seen], np.int64),
+            classes=classes,
+            signals={
+                name: np.array([sample.signals.get(name, np.nan) for sample in listed], np.float64)
+                for name in signals
+            },
+        )
+
+    def samples(self) -> Iterator[Sample]:
+        """Each sample as an object; unreadable observations and unknown signals are left out."""
+        for index, time_ns in enumerate(self.times_ns.tolist()):
+            yield Sample(
+                time_ns,
+                {
+                    name: self.observation(row)
+                    for name, row in zip(self.names, self.rows[index].tolist(), strict=True)
+                    if row >= 0
+                },
+                {
+                    name: float(values[index])
+                    for name, values in self.signals.items()
+                    if not np.isnan(values[index])
+                },
+            )
+
+    def observation(self, row: int) -> TrackedObject:
+        """The object as row `row` (at least 0) reports it."""
+        yaw = float(self.yaw[row])
+        return TrackedObject(
+            self.footprints.footprint(row),
+            class_name=self.classes[int(self.class_code[row])],
+            yaw=None if np.isnan(yaw) else yaw,
+            height=self.footprints.height(row),
+            uncertainty=float(self.uncertainty[row]),
+        )
+
+    def slice(self, start: int, stop: int) -> Trace:
+        """The samples start up to stop, with the observations they need."""
+        begin, end, _ = slice(start, stop).indices(len(self))
+        return self.take(np.arange(begin, max(begin, end), dtype=np.int64))
+
+    def take(self, samples: Integers) -> Trace:
+        """The samples with the given indices (K,), which must increase."""
+        rows = self.rows[samples]
+        used, renumbered = _renumber(rows)
+        return replace(
+            self,
+            times_ns=self.times_ns[samples],
+            rows=renumbered,
+            footprints=self.footprints.select(used),
+            yaw=self.yaw[used],
+            uncertainty=self.uncertainty[used],
+            class_code=self.class_code[used],
+            signals={name: values[samples] for name, values in self.signals.items()},
+        )
+
+    def compact(self) -> Trace:
+        """The same samples in the one form that equal traces share.
+
+        Observations are numbered by sample, then name; names, classes and signals that no sample uses
+        are dropped; classes are sorted, None first.
+        """
+        seen = (self.rows != ABSENT).any(axis=0)
+        whole = replace(
+            self,
+            names=tuple(name for name, used in zip(self.names, seen.tolist(), strict=True) if used),
+            rows=self.rows[:, seen],
+            signals={name: values for name, values in self.signals.items() if not np.isnan(values).all()},
+        ).take(np.arange(len(self), dtype=np.int64))
+        codes, inverse = np.unique(whole.class_code, return_inverse=True)
+        classes = _class_order(self.classes[code] for code in codes.tolist())
+        order = np.array([classes.index(self.classes[code]) for code in codes.tolist()], np.int64)
+        return replace(whole, class_code=order[inverse] if len(codes) else whole.class_code, classes=classes)
+
+    @classmethod
+    def concatenate(cls, traces: Sequence[Trace]) -> Trace:
+        """One trace of several that follow each other in time.
+
+        Raises:
+            TraceError: a trace that begins before the one ahead of it has ended.
+        """
+        names = tuple(sorted({name for trace in traces for name in trace.names}))
+        number = {name: index for index, name in enumerate(names)}
+        classes = _class_order(name for trace in traces for name in trace.classes)
+        code = {name: index for index, name in enumerate(classes)}
+        signals = sorted({name for trace in traces for name in trace.signals})
+        rows = np.full((sum(map(len, traces)), len(names)), ABSENT, np.int64)
+        sample = row = 0
+        for trace in traces:
+            shift = np.where(trace.rows >= 0, row, np.where(trace.rows == ABSENT, 0, -row))
+            columns = [number[name] for name in trace.names]
+            rows[sample : sample + len(trace), columns] = trace.rows + shift
+            sample += len(trace)
+            row += len(trace.footprints)
+        unknown = {len(trace): np.full(len(trace), np.nan) for trace in traces}
+        return cls(
+            times_ns=_joined_integers(trace.times_ns for trace in traces),
+            names=names,
+            rows=rows,
+            footprints=FootprintBatch.concatenate([trace.footprints for trace in traces]),
+            yaw=_joined_floats(trace.yaw for trace in traces),
+            uncertainty=_joined_floats(trace.uncertainty for trace in traces),
+            class_code=_joined_integers(_recoded(trace, code) for trace in traces),
+            classes=classes,
+            signals={
+                name: _joined_floats(trace.signals.get(name, unknown[len(trace)]) for trace in traces)
+                for name in signals
+            },
+            faults=tuple(fault for trace in traces for fault in trace.faults),
+        )
+
+
+def window_of(times_ns: Integers, start_ns: int, end_ns: int) -> tuple[int, int]:
+    """Where the times from `start_ns` up to, not including, `end_ns` begin and end.
+
+    Args:
+        times_ns: (T,) int64, in order.
+        start_ns, end_ns: integers of any size.
+    """
+    # numpy's own search would round to doubles for an end that no int64 holds
+    return bisect_left(times_ns, start_ns), bisect_left(times_ns, end_ns)
+
+
+def _check_shapes(trace: Trace) -> None:
+    samples, observations = len(trace.times_ns), len(trace.footprints)
+    if trace.times_ns.ndim != 1 or trace.rows.shape != (samples, len(trace.names)):
+        raise TraceError(
+            f"rows have the shape {trace.rows.shape}; {samples} times and {len(trace.names)} names"
+            f" need ({samples}, {len(trace.names)})"
+        )
+    if list(trace.names) != sorted(set(trace.names)):
+        raise TraceError(f"names are {trace.names}; give each once, in order of code points")
+    for column in ("yaw", "uncertainty", "class_code"):
+        if getattr(trace, column).shape != (observations,):
+            raise TraceError(
+                f"{column} has the shape {getattr(trace, column).shape}; {observations} footprints need"
+                f" ({observations},)"
+            )
+    if trace.rows.size and (trace.rows.max() >= observations or trace.rows.min() < -1 - observations):
+        raise TraceError(f"a row number lies outside the {observations} observations")
+    for name, values in trace.signals.items():
+        if values.shape != (samples,):
+            raise TraceError(f"signal {name!r} has the shape {values.shape}; the times need ({samples},)")
+
+
+def _check_times(times_ns: Integers) -> None:
+    if len(times_ns) and times_ns[0] < 0:
+        raise TraceError(f"the first sample is at {times_ns[0]} ns; give times from 0 on")
+    late = np.flatnonzero(times_ns[1:] <= times_ns[:-1])
+    if len(late):
+        at = int(late[0])
+        raise TraceError(
+            f"sample {at + 1} is at {times_ns[at + 1]} ns and the one before it at {times_ns[at]} ns;"
+            " give times that increase"
+        )
+
+
+def _same_samples(a: Trace, b: Trace) -> bool:
+    if (a.names, a.classes, tuple(a.signals)) != (b.names, b.classes, tuple(b.signals)):
+        return False
+    columns = ("times_ns", "rows", "class_code")
+    measures = ("yaw", "uncertainty")
+    shapes = ("part_start", "vertex_start", "vertices", "radius", "bottom", "top")
+    return (
+        all(np.array_equal(getattr(a, name), getattr(b, name)) for name in columns)
+        and all(np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True) for name in measures)
+        and all(
+            np.array_equal(getattr(a.footprints, name), getattr(b.footprints, name), equal_nan=True)
+            for name in shapes
+        )
+        and all(np.array_equal(a.signals[name], b.signals[name], equal_nan=True) for name in a.signals)
+    )
+
+
+def _renumber(rows: Integers) -> tuple[Integers, Integers]:
+    """The rows in use, in the order of sample and name, and the row numbers that point at them."""
+    present = rows != ABSENT
+    marked = rows[present]
+    unreadable = marked < ABSENT
+    used = np.where(unreadable, -2 - marked, marked)
+    number = np.arange(len(used), dtype=np.int64)
+    renumbered = np.full(rows.shape, ABSENT, np.int64)
+    renumbered[present] = np.where(unreadable, -2 - number, number)
+    return used, renumbered
+
+
+def _tracked(tracked: TrackedObject | Footprint) -> TrackedObject:
+    return TrackedObject(tracked) if isinstance(tracked, Footprint) else tracked
+
+
+def _class_order(classes: Iterable[str | None]) -> tuple[str | None, ...]:
+    return tuple(sorted(set(classes), key=lambda name: (name is not None, name or "")))
+
+
+def _recoded(trace: Trace, code: Mapping[str | None, int]) -> Integers:
+    return np.array([code[name] for name in trace.classes], np.int64)[trace.class_code]
+
+
+def _joined_integers(arrays: Iterable[Integers]) -> Integers:
+    return np.concatenate([np.empty(0, np.int64), *arrays])
+
+
+def _joined_floats(arrays: Iterable[Floats]) -> Floats:
+    return np.concatenate([np.empty(0, np.float64), *arrays])
