@@ -1,0 +1,134 @@
+"""Which formulas are evaluated over which samples: specs, and templates once per object."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from spatial_replay.errors import UsageError
+from spatial_replay.monitor.operands import Bindings
+from spatial_replay.monitor.program import Program, compile_formula
+from spatial_replay.spec.formula import Formula, NamedSpec, Specification
+from spatial_replay.trace.trace import ABSENT, Trace, window_of
+
+
+@dataclass(frozen=True, eq=False)
+class Instance:
+    """One formula to evaluate.
+
+    Attributes:
+        name: the spec's name.
+        object: the object that the template's parameter stands for, or None.
+        bindings: that object by the parameter's name.
+        start_ns, end_ns: it is evaluated over the samples from the one to before the other.
+    """
+
+    name: str
+    object: str | None
+    formula: Formula
+    program: Program
+    bindings: Bindings
+    start_ns: int
+    end_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Which objects a template's parameter stands for: all, or those of a class.
+
+    Attributes:
+        class_name: compared without regard to case; None for all.
+    """
+
+    class_name: str | None
+
+    @classmethod
+    def parse(cls, parameter: str, text: str) -> Choice:
+        """Read `all` or `class:NAME`.
+
+        Raises:
+            UsageError: anything else.
+        """
+        if text == "all":
+            return cls(None)
+        kind, _, name = text.partition(":")
+        if kind == "class" and name:
+            return cls(name)
+        raise UsageError(
+            f"{parameter}={text!r} chooses no objects; write {parameter}=all or {parameter}=class:NAME"
+        )
+
+    def fits(self, class_name: str | None) -> bool:
+        return self.class_name is None or (class_name or "").casefold() == self.class_name.casefold()
+
+
+def find_instances(
+    specification: Specification, each: Mapping[str, str], traces: Iterable[Trace], start_ns: int, end_ns: int
+) -> list[Instance]:
+    """The instances of a specification over the samples from `start_ns` to before `end_ns`.
+
+    A template has one per object chosen, in order of names, over the samples from the object's first to its
+    last appearance among them.
+
+    Args:
+        traces: the samples, in stretches; read only if there is a template.
+
+    Raises:
+        UsageError: no choice for a template's parameter, a choice for a parameter that no template has.
+    """
+    templates = [spec for spec in specification.results if spec.parameter is not None]
+    check_choices(templates, each)
+    choices = {
+        spec.parameter: Choice.parse(spec.parameter or "", each[spec.parameter or ""]) for spec in templates
+    }
+    chosen = _appearances(choices, traces, start_ns, end_ns) if choices else {}
+    instances: list[Instance] = []
+    for spec in specification.results:
+        program = compile_formula(spec.formula)
+        if spec.parameter is None:
+            instances.append(Instance(spec.name, None, spec.formula, program, {}, start_ns, end_ns))
+            continue
+        for name, (first_ns, last_ns) in sorted(chosen[spec.parameter].items()):
+            bindings = {spec.parameter: name}
+            instances.append(
+                Instance(spec.name, name, spec.formula, program, bindings, first_ns, last_ns + 1)
+            )
+    return instances
+
+
+def check_choices(templates: list[NamedSpec], each: Mapping[str, str]) -> None:
+    """That each template's parameter has its objects chosen, and nothing else has."""
+    for spec in templates:
+        if spec.parameter not in each:
+            raise UsageError(
+                f"{spec.name}({spec.parameter}) is a template: say what {spec.parameter} stands for, "
+                f"--each {spec.parameter}=class:NAME or --each {spec.parameter}=all"
+            )
+    for parameter in each:
+        if parameter not in {spec.parameter for spec in templates}:
+            known = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates) or "none"
+            raise UsageError(f"no template has a parameter {parameter!r}; templates here: {known}")
+
+
+def _appearances(
+    choices: Mapping[str | None, Choice], traces: Iterable[Trace], start_ns: int, end_ns: int
+) -> dict[str | None, dict[str, tuple[int, int]]]:
+    """For each choice, the objects that are ever of that kind, with their first and last times."""
+    spans: dict[str, tuple[int, int]] = {}
+    fitting: dict[str | None, set[str]] = {parameter: set() for parameter in choices}
+    for trace in traces:
+        begin, end = window_of(trace.times_ns, start_ns, end_ns)
+        times = trace.times_ns[begin:end]
+        for name, rows in zip(trace.names, trace.rows[begin:end].T, strict=True):
+            seen = np.flatnonzero(rows != ABSENT)
+            if not len(seen):
+                continue
+            first_ns = spans[name][0] if name in spans else int(times[seen[0]])
+            spans[name] = (first_ns, int(times[seen[-1]]))
+            codes = np.unique(trace.class_code[np.where(rows < ABSENT, -2 - rows, rows)[seen]])
+            for parameter, choice in choices.items():
+                if any(choice.fits(trace.classes[code]) for code in codes.tolist()):
+                    fitting[parameter].add(name)
+    return {parameter: {name: spans[name] for name in names} for parameter, names in fitting.items()}

@@ -1,0 +1,136 @@
+"""Numbers that leaves are computed from: measured once per trace, kept for the next edit."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.geometry.measure import Operand, Quantity, Request, measure
+from spatial_replay.geometry.orientation import misalignment
+from spatial_replay.monitor.operands import Scene
+from spatial_replay.spec.formula import (
+    CentroidProjection,
+    Earlier,
+    Enlarged,
+    Measurement,
+    Misalignment,
+    Projection,
+    Protrusion,
+    RegionName,
+    SignedDistance,
+    Term,
+)
+
+
+def measured(scene: Scene, measurements: Sequence[Measurement]) -> tuple[Floats, Floats]:
+    """Each measurement in each sample of a scene.
+
+    Returns:
+        Values (K, T), NaN where unknown, and how far each may be off for uncertainty (K, T).
+    """
+    keys = [_key(scene, measurement) for measurement in measurements]
+    memo = scene.trace.memo
+    found = {key: memo.get(key) for key in keys}
+    missing = [index for index, key in enumerate(keys) if found[key] is None]
+    if missing:
+        computed = _measure(scene, [measurements[index] for index in missing])
+        for index, array in zip(missing, computed, strict=True):
+            memo.keep(keys[index], array)
+            found[keys[index]] = array
+    if not keys:
+        return np.empty((0, len(scene))), np.empty((0, len(scene)))
+    stacked = np.array([found[key] for key in keys])
+    return stacked[:, 0], stacked[:, 1]
+
+
+def _measure(scene: Scene, measurements: Sequence[Measurement]) -> list[Floats]:
+    """(2, T) for each: value, NaN where unknown, and uncertainty; all in one kernel call."""
+    numbers: dict[Term, int] = {}
+    operands: list[Operand] = []
+
+    def operand(term: Term) -> int:
+        if term not in numbers:
+            numbers[term] = len(operands)
+            operands.append(scene.find(term).operand)
+        return numbers[term]
+
+    requests = [
+        Request(_quantity(each), *(operand(term) for term in terms_of(each)))
+        for each in measurements
+        if not isinstance(each, Misalignment)
+    ]
+    values = iter(measure(scene.batch, operands, requests) if requests else ())
+    result = []
+    for each in measurements:
+        found = [scene.find(term) for term in terms_of(each)]
+        if isinstance(each, Misalignment):
+            value, spread = misalignment(found[0].yaw, found[1].yaw), np.zeros(len(scene))
+        else:
+            value, spread = next(values), np.sum([one.spread for one in found], axis=0)
+        unknown = np.logical_or.reduce([one.unknown for one in found])
+        if unknown.any():
+            value = np.where(unknown, np.nan, value)
+        array = np.array((value, spread))
+        array.flags.writeable = False
+        result.append(array)
+    return result
+
+
+def terms_of(measurement: Measurement) -> tuple[Term, ...]:
+    """The one or two terms that a measurement is of."""
+    match measurement:
+        case SignedDistance() | Misalignment():
+            return measurement.first, measurement.second
+        case Protrusion():
+            return measurement.inner, measurement.outer
+        case Projection() | CentroidProjection():
+            return (measurement.term,)
+
+
+def _quantity(measurement: Measurement) -> Quantity:
+    match measurement:
+        case SignedDistance():
+            return "signed_distance"
+        case Protrusion():
+            return "protrusion"
+        case Projection():
+            return f"{measurement.side}_{measurement.axis}"  # type: ignore[return-value]
+        case CentroidProjection():
+            return f"centroid_{measurement.side}_{measurement.axis}"  # type: ignore[return-value]
+        case Misalignment():
+            raise TypeError("an orientation is no quantity of footprints")
+
+
+def _key(scene: Scene, measurement: Measurement) -> Hashable:
+    """What a measurement is apart from the specification it stands in: regions by shape, not by name."""
+    shapes = tuple(scene.regions[name] for name in map(_region, terms_of(measurement)) if name is not None)
+    if not shapes:
+        return scene.skip, measurement
+    nameless: Measurement
+    match measurement:
+        case SignedDistance():
+            nameless = replace(
+                measurement, first=_unnamed(measurement.first), second=_unnamed(measurement.second)
+            )
+        case Protrusion():
+            nameless = replace(
+                measurement, inner=_unnamed(measurement.inner), outer=_unnamed(measurement.outer)
+            )
+        case _:
+            return scene.skip, measurement, shapes
+    return scene.skip, nameless, shapes
+
+
+def _region(term: Term) -> str | None:
+    while isinstance(term, (Enlarged, Earlier)):
+        term = term.term
+    return term.name if isinstance(term, RegionName) else None
+
+
+def _unnamed(term: Term) -> Term:
+    if isinstance(term, Enlarged):
+        return Enlarged(_unnamed(term.term), term.radius)
+    return RegionName("") if _region(term) is not None else term

@@ -1,0 +1,224 @@
+"""Terms of a specification found in a trace: which footprints, how sure, in which samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spatial_replay.geometry.arrays import Flags, Floats, Integers
+from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import Footprint
+from spatial_replay.geometry.measure import Operand
+from spatial_replay.spec.formula import (
+    ANY_CLASS,
+    Earlier,
+    Enlarged,
+    Group,
+    Outline,
+    RegionName,
+    Term,
+    TrackedName,
+    Variable,
+)
+from spatial_replay.trace.trace import ABSENT, Trace
+
+Booleans = NDArray[np.bool_]
+
+Bindings = Mapping[str, str]
+"""Names of the objects that variables stand for."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """A term over the samples of a scene.
+
+    Attributes:
+        operand: its footprints.
+        unknown: (T,), where it is unknown as a whole.
+        spread: (T,), its uncertainty; the largest of a group's members.
+        yaw: (T,), its orientation, NaN where it has none.
+    """
+
+    operand: Operand
+    unknown: Booleans
+    spread: Floats
+    yaw: Floats
+
+
+_Base: TypeAlias = TrackedName | Variable | RegionName | Group
+
+
+class Scene:
+    """The samples `skip` and after of a trace, and the regions of a specification.
+
+    Earlier samples are there for terms that look back (`a[-3]`).
+    """
+
+    def __init__(self, trace: Trace, regions: Mapping[str, Outline], skip: int = 0) -> None:
+        self.trace = trace
+        self.regions = regions
+        self.skip = skip
+        self._column = {name: index for index, name in enumerate(trace.names)}
+        self._found: dict[Term, Found] = {}
+
+    def __len__(self) -> int:
+        return len(self.trace) - self.skip
+
+    @cached_property
+    def batch(self) -> FootprintBatch:
+        """The trace's footprints, and after them the regions'."""
+        regions = [footprint_from_outline(outline) for outline in self.regions.values()]
+        if not regions:
+            return self.trace.footprints
+        heights = [outline.height for outline in self.regions.values()]
+        return FootprintBatch.concatenate(
+            [self.trace.footprints, FootprintBatch.from_footprints(regions, heights)]
+        )
+
+    def find(self, term: Term) -> Found:
+        """A term without variables (see `bind`)."""
+        if term not in self._found:
+            self._found[term] = self._find(term)
+        return self._found[term]
+
+    def members(self, group: Term) -> tuple[tuple[str, ...], Flags, Booleans]:
+        """Who is in an open group.
+
+        Returns:
+            Names of those who ever are (M,), (T, M) with 1 where they are and 0 where not, and (T,) where
+            that is unknown because the group is that of a time before the trace.
+        """
+        if not isinstance(group, (Group, Earlier)):
+            raise TypeError(f"{group!r} is not a group")
+        base, source = self._base_and_source(group)
+        if not isinstance(base, Group) or base.members is not None:
+            raise TypeError(f"{group!r} is not an open group")
+        names, rows = self._open_rows(base)
+        before = source < 0
+        present = (rows != ABSENT)[np.maximum(source, 0)] & ~before[:, None]
+        return names, present.astype(np.int8), before
+
+    def _find(self, term: Term) -> Found:
+        if isinstance(term, Enlarged):
+            inner = self.find(term.term)
+            operand = Operand(inner.operand.rows, inner.operand.enlargement + term.radius)
+            return Found(operand, inner.unknown, inner.spread, inner.yaw)
+        base, source = self._base_and_source(term)
+        if isinstance(base, RegionName):
+            return self._found_region(base, source < 0)
+        at = np.maximum(source, 0)
+        if isinstance(base, Group):
+            is_open = base.members is None
+            rows = (self._open_rows(base)[1] if is_open else self._named_rows(base))[at]
+            unknown = (rows < (ABSENT if is_open else 0)).any(axis=1)
+        else:
+            rows = self._rows_of(base.name)[at, None]
+            unknown = rows[:, 0] < 0
+        return self._found_rows(rows, unknown | (source < 0))
+
+    def _base_and_source(self, term: _Base | Earlier) -> tuple[_Base, Integers]:
+        """What a term is about, and which sample of the trace each of the scene's looks at (-1: none)."""
+        now = np.arange(self.skip, len(self.trace), dtype=np.int64)
+        if not isinstance(term, Earlier):
+            return term, now
+        if term.samples is not None:
+            return term.term, np.asarray(np.maximum(now - term.samples, -1), np.int64)
+        times = self.trace.times_ns
+        wanted = times[self.skip :] - (term.duration_ns or 0)
+        return term.term, np.searchsorted(times, wanted, side="right").astype(np.int64) - 1
+
+    def _found_rows(self, rows: Integers, unknown: Booleans) -> Found:
+        seen = rows >= 0
+        at = np.maximum(rows, 0)
+        if len(self.trace.uncertainty) and seen.shape[1]:
+            spread = np.where(seen, self.trace.uncertainty[at], 0.0).max(axis=1)
+            yaw = np.where(seen[:, 0], self.trace.yaw[at[:, 0]], np.nan)
+        else:
+            spread, yaw = np.zeros(len(rows)), np.full(len(rows), np.nan)
+        return Found(Operand(rows), unknown, spread, yaw)
+
+    def _found_region(self, region: RegionName, unknown: Booleans) -> Found:
+        row = len(self.trace.footprints) + list(self.regions).index(region.name)
+        count = len(self)
+        return Found(
+            Operand(np.full((count, 1), row, np.int64)),
+            unknown,
+            np.zeros(count),
+            np.full(count, np.nan),
+        )
+
+    def _rows_of(self, name: str) -> Integers:
+        """(T,) of the whole trace; everywhere absent for an object that it does not have."""
+        if name in self._column:
+            return self.trace.rows[:, self._column[name]]
+        return np.full(len(self.trace), ABSENT, np.int64)
+
+    def _named_rows(self, group: Group) -> Integers:
+        left_out = _left_out(group)
+        columns = [self._rows_of(name) for name in group.members or () if name not in left_out]
+        if not columns:
+            return np.empty((len(self.trace), 0), np.int64)
+        return np.stack(columns, axis=1)
+
+    def _open_rows(self, group: Group) -> tuple[tuple[str, ...], Integers]:
+        """Names that can be members, and their rows over the whole trace: `ABSENT` where they are not."""
+        left_out = _left_out(group)
+        names = tuple(name for name in self.trace.names if name not in left_out)
+        rows = self.trace.rows[:, [self._column[name] for name in names]]
+        if group.class_name == ANY_CLASS or not names:
+            return names, rows
+        wanted = (group.class_name or "").casefold()
+        fits = np.array([(name or "").casefold() == wanted for name in self.trace.classes], np.bool_)
+        observation = np.where(rows < ABSENT, -2 - rows, np.maximum(rows, 0))
+        if len(self.trace.class_code) == 0:
+            return names, rows
+        is_member = (rows != ABSENT) & fits[self.trace.class_code[observation]]
+        ever = is_member.any(axis=0)
+        kept = tuple(name for name, is_kept in zip(names, ever.tolist(), strict=True) if is_kept)
+        return kept, np.where(is_member, rows, ABSENT)[:, ever]
+
+
+def footprint_from_outline(outline: Outline) -> Footprint:
+    """The shape of a region; a polygon that is not convex is decomposed.
+
+    Raises:
+        GeometryError: an outline that makes no footprint.
+    """
+    if len(outline.vertices) == 1 and outline.radius > 0.0:
+        (x, y), *_ = outline.vertices
+        return Footprint.disc(x, y, outline.radius)
+    return Footprint.polygon(outline.vertices)
+
+
+def bind(term: Term, bindings: Bindings) -> Term:
+    """A term with its variables replaced by the objects they stand for."""
+    match term:
+        case Enlarged():
+            return Enlarged(bind(term.term, bindings), term.radius)
+        case Earlier():
+            return replace(term, term=_bind_base(term.term, bindings))
+        case _:
+            return _bind_base(term, bindings)
+
+
+def _bind_base(term: _Base, bindings: Bindings) -> _Base:
+    match term:
+        case Variable():
+            return _bind_variable(term, bindings)
+        case Group():
+            return replace(term, excluded=tuple(_bind_variable(each, bindings) for each in term.excluded))
+        case _:
+            return term
+
+
+def _bind_variable(term: TrackedName | Variable, bindings: Bindings) -> TrackedName | Variable:
+    return TrackedName(bindings[term.name]) if isinstance(term, Variable) and term.name in bindings else term
+
+
+def _left_out(group: Group) -> frozenset[str]:
+    return frozenset(each.name for each in group.excluded)

@@ -1,0 +1,120 @@
+"""One program on one stream of samples: the compiled step that a monitor and a replay share.
+
+Samples are taken in by tiles: first the signals of a tile, then each part, then the tree. A tile of one
+sample and a tile of many give the same bits, because the only arithmetic is minima, maxima and negation.
+
+All numbers exist in up to four *channels*: the ends of the interval with every uncertainty at 0 (nominal low
+and high), and the ends with uncertainty (wide low and high). They are equal, and only the first is kept, for
+as long as everything is known; the second appears with the first unknown, the rest with uncertainty. A
+negation swaps low and high: channel ^ 1.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.memory import CHANNELS, TILE, doubled, first_memory, forget, scratch_for, widen
+from spatial_replay.monitor.program import Program
+from spatial_replay.monitor.reports import report
+from spatial_replay.monitor.signals import step_signals
+from spatial_replay.monitor.tables import step_tables
+from spatial_replay.monitor.windows import kept_from, step_windows
+
+
+class Run:
+    """The state that a compiled formula carries from sample to sample.
+
+    Its size depends on the formula and on how many samples its windows span, never on how long the stream
+    is. It is the one place that changes while a monitor or a replay goes on.
+    """
+
+    def __init__(self, program: Program, *, room: int = 2 * TILE) -> None:
+        """Start before the first sample, with room for so many recent ones (it doubles when needed)."""
+        self._program = program
+        if not program.keeps_history:
+            room = TILE
+        self._memory = first_memory(program, room)
+        self._scratch = scratch_for(program, room)
+        self._final = np.zeros((len(program.reports), 2))
+        self._windowed = [index for index, part in enumerate(program.parts) if not part[6]]
+        self._channels = 1
+        self._position = 0
+        self._offset = 0
+        self._start_ns = 0
+
+    def __len__(self) -> int:
+        """How many samples were taken in."""
+        return self._position
+
+    @property
+    def final(self) -> Floats:
+        """(N, 2): lower and upper end of each node's value if the run ends here."""
+        return self._final.copy()
+
+    def extend(self, leaves: Floats, times_ns: Integers) -> Floats:
+        """Take in more samples.
+
+        Args:
+            leaves: (C, A, T), the program's leaves: with C = 1 exact values, with C = 2 the ends of the
+                interval that what is unknown leaves open, with C = 4 those and the same ends with
+                uncertainty.
+            times_ns: (T,), increasing, also beyond the samples before.
+
+        Returns:
+            (N, 4, T): value, now, lower and upper of each node.
+        """
+        if len(leaves) > self._channels:
+            widen(self._memory, self._channels)
+            self._channels = len(leaves)
+        elif len(leaves) < self._channels:
+            leaves = leaves[_SPREAD[len(leaves)][: self._channels]]
+        leaves = np.ascontiguousarray(leaves)
+        series = np.empty((len(self._program.reports), 4, len(times_ns)))
+        done = 0
+        while done < len(times_ns):
+            count = self._make_room(min(TILE, len(times_ns) - done))
+            self._step(leaves, times_ns, done, count, series)
+            done += count
+        return series
+
+    def _step(self, leaves: Floats, times_ns: Integers, t: int, count: int, series: Floats) -> None:
+        """Take in the samples t up to t + count, for which there is room."""
+        program, memory, scratch, channels = self._program, self._memory, self._scratch, self._channels
+        nodes, parts, position, offset = program.nodes, program.parts, self._position, self._offset
+        begin = position - offset
+        memory.stamps[begin : begin + count] = times_ns[t : t + count]
+        if position == 0:
+            self._start_ns = int(times_ns[t])
+        step_signals(program.signals, leaves, t, count, position, offset, memory)
+        if len(self._windowed) < len(parts):
+            start_ns = self._start_ns
+            step_tables(nodes, parts, memory, scratch, channels, position, start_ns, begin, count)
+        for index in self._windowed:
+            numbers = scratch.parts[index]
+            step_windows(nodes, parts[index], memory, scratch, channels, position, offset, count, numbers)
+        reports, operands, final = program.reports, program.operands, self._final
+        report(reports, operands, memory, scratch, channels, begin, count, t, series, final)
+        self._position += count
+
+    def _make_room(self, wanted: int) -> int:
+        """How many of the wanted samples there is room for, at least one."""
+        room = len(self._memory.stamps)
+        if not self._program.keeps_history:
+            self._offset = self._position
+        used = self._position - self._offset
+        if used + wanted > room:
+            signals, nodes, parts = self._program.signals, self._program.nodes, self._program.parts
+            last = self._position - 1
+            keep = kept_from(signals, nodes, parts, self._memory, self._scratch, self._offset, last)
+            if 2 * (keep - self._offset) >= room:
+                forget(self._memory, keep - self._offset, used)
+                self._offset = keep
+            elif used == room:
+                self._memory = doubled(self._memory)
+                self._scratch = scratch_for(self._program, 2 * room)
+        return min(wanted, len(self._memory.stamps) - (self._position - self._offset))
+
+
+_SPREAD = {1: np.zeros(CHANNELS, np.int64), 2: np.array([0, 1, 0, 1]), 4: np.arange(CHANNELS)}
+"""Which channel of fewer stands for each of more."""

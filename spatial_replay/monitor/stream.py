@@ -1,0 +1,140 @@
+"""A specification evaluated over samples as they come, in stretches of any length.
+
+A monitor feeds it sample by sample, a replay block by block, `evaluate` a whole trace at once: all three get
+the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+
+import numpy as np
+
+from spatial_replay.errors import TraceError
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.instances import Instance
+from spatial_replay.monitor.leaves import leaf_values
+from spatial_replay.monitor.operands import Scene
+from spatial_replay.monitor.run import Run
+from spatial_replay.monitor.verdict import Verdict, final_verdict
+from spatial_replay.spec.formula import Atom, Earlier, Enlarged, Formula, Outline, Quantified
+from spatial_replay.spec.terms import iter_formulas, terms_of
+from spatial_replay.trace.trace import Trace, window_of
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """What one instance says about some samples.
+
+    Attributes:
+        times_ns: (T,) int64; T may be 0.
+        series: (N, 4, T): value, now, lower and upper of each node.
+    """
+
+    times_ns: Integers
+    series: Floats
+
+
+class InstanceStream:
+    """One instance on its way through the samples, and what is known of it so far."""
+
+    def __init__(self, instance: Instance) -> None:
+        self.instance = instance
+        self.first_satisfied_ns: int | None = None
+        self._run = Run(instance.program)
+        self._robustness = np.full(len(instance.program.reports), np.nan)
+
+    def __len__(self) -> int:
+        """How many samples it was evaluated over."""
+        return len(self._run)
+
+    @property
+    def final(self) -> Floats:
+        """(N, 2): lower and upper end of each node's value if the log ends here."""
+        return self._run.final
+
+    @property
+    def robustness(self) -> Floats:
+        """(N,): each node's value on the samples so far."""
+        return self._robustness.copy()
+
+    @property
+    def verdict(self) -> Verdict:
+        """The root's verdict if the log ends here; unknown before the first sample."""
+        return final_verdict(*self.final[0]) if len(self) else Verdict.UNKNOWN
+
+    def extend(self, scene: Scene) -> Stretch:
+        """Take in the samples of a scene that fall into the instance's window."""
+        times = scene.trace.times_ns[scene.skip :]
+        begin, end = window_of(times, self.instance.start_ns, self.instance.end_ns)
+        times = times[begin:end]
+        if not len(times):
+            return Stretch(times, np.empty((len(self._robustness), 4, 0)))
+        leaves = leaf_values(scene, self.instance.program.leaves, self.instance.bindings)
+        series = self._run.extend(leaves[:, :, begin:end], times)
+        self._robustness = series[:, 0, -1].copy()
+        if self.first_satisfied_ns is None:
+            satisfied = np.flatnonzero(series[0, 0] >= 0.0)
+            self.first_satisfied_ns = int(times[satisfied[0]]) if len(satisfied) else None
+        return Stretch(times, series)
+
+
+class EvaluationStream:
+    """The instances of a specification, and the recent samples that they may still look back at."""
+
+    def __init__(self, instances: Sequence[Instance], regions: Mapping[str, Outline]) -> None:
+        self.streams = tuple(InstanceStream(instance) for instance in instances)
+        self._regions = regions
+        self._reach = look_back([instance.formula for instance in instances])
+        self._before: Trace | None = None
+
+    def extend(self, trace: Trace) -> list[Stretch]:
+        """Take in the next samples; one stretch for each of `streams`.
+
+        Raises:
+            TraceError: samples that do not come after those before.
+        """
+        if not len(trace):
+            return [stream.extend(Scene(trace, self._regions)) for stream in self.streams]
+        skip = 0
+        if self._before is not None:
+            before_ns = self._before.times_ns[-1]
+            if before_ns >= trace.times_ns[0]:
+                raise TraceError(
+                    f"a sample at {trace.times_ns[0]} ns follows one at {before_ns} ns; "
+                    "give samples in the order of their times"
+                )
+            if self._reach != (0, 0):
+                recent = _tail(self._before, *self._reach)
+                skip = len(recent)
+                trace = Trace.concatenate([recent, trace])
+        self._before = trace
+        scene = Scene(trace, self._regions, skip)
+        return [stream.extend(scene) for stream in self.streams]
+
+
+def _tail(trace: Trace, samples: int, duration_ns: int) -> Trace:
+    """The samples that the next one may look back at."""
+    begin = len(trace) - samples
+    if duration_ns:
+        at_or_before = (
+            int(np.searchsorted(trace.times_ns, trace.times_ns[-1] - duration_ns, side="right")) - 1
+        )
+        begin = min(begin, at_or_before)
+    return trace.slice(max(begin, 0), len(trace))
+
+
+def look_back(formulas: Sequence[Formula]) -> tuple[int, int]:
+    """How far terms look back: the most samples (`a[-3]`) and the longest duration in ns (`a[-2s]`)."""
+    samples = duration_ns = 0
+    for formula in chain.from_iterable(map(iter_formulas, formulas)):
+        terms = terms_of(formula.expression) if isinstance(formula, Atom) else ()
+        for term in chain(terms, (formula.group,) if isinstance(formula, Quantified) else ()):
+            while isinstance(term, Enlarged):
+                term = term.term
+            if isinstance(term, Earlier):
+                samples = max(samples, term.samples or 0)
+                duration_ns = max(duration_ns, term.duration_ns or 0)
+    return samples, duration_ns

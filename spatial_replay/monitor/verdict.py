@@ -1,0 +1,38 @@
+"""Verdicts, online and at the end of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from enum import StrEnum
+
+
+class Verdict(StrEnum):
+    """What is known of a formula.
+
+    At the end of a log a formula is satisfied, violated or unknown. While samples still come it is
+    satisfied or violated where no continuation can change that, and pending otherwise.
+    """
+
+    SATISFIED = "satisfied"
+    VIOLATED = "violated"
+    PENDING = "pending"
+    UNKNOWN = "unknown"
+
+
+def final_verdict(lower: float, upper: float) -> Verdict:
+    """The verdict of a finished log, from the interval of its value."""
+    if lower >= 0.0:
+        return Verdict.SATISFIED
+    return Verdict.VIOLATED if upper < 0.0 else Verdict.UNKNOWN
+
+
+def online_verdict(lower: float, upper: float) -> Verdict:
+    """The verdict while samples still come, from the interval of the value over every continuation."""
+    verdict = final_verdict(lower, upper)
+    return Verdict.PENDING if verdict is Verdict.UNKNOWN else verdict
+
+
+def worst_verdict(verdicts: Iterable[Verdict]) -> Verdict:
+    """Violated before unknown before pending before satisfied; satisfied if there are none."""
+    order = (Verdict.SATISFIED, Verdict.PENDING, Verdict.UNKNOWN, Verdict.VIOLATED)
+    return max(verdicts, key=order.index, default=Verdict.SATISFIED)

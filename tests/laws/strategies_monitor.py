@@ -1,0 +1,250 @@
+"""Runs to try laws of meaning on: formulas with any values of their leaves, and recordings of objects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from hypothesis import strategies as st
+
+from laws.reference import ANYTHING, Interval
+from laws.strategies_geometry import convex_parts
+from laws.strategies_spec import Vocabulary, formula_texts
+from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.spec.formula import Atom, Boolean, Bound, Signal, Temporal, Truth
+from spatial_replay.spec.specification import parse_specification
+from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Trace
+
+# ------------------------------------------------------------------- formulas over leaves of any value
+
+LEAVES = tuple(Atom(name, "signal", Signal(name)) for name in ("p", "q", "r"))
+_leaves = st.sampled_from(LEAVES)
+
+
+@st.composite
+def sample_bounds(draw):
+    lower = draw(st.integers(0, 3))
+    return Bound(lower, draw(st.one_of(st.none(), st.integers(lower, lower + 4))), "samples")
+
+
+@st.composite
+def time_bounds(draw):
+    """Ends that often coincide with the time between two samples of `leaf_runs`, and often do not."""
+    lower = draw(st.sampled_from([0, 100, 200, 250, 500]))
+    upper = draw(st.sampled_from([None, 0, 100, 250, 400, 8 * 10**18]))
+    return Bound(lower, None if upper is None else lower + upper, "ns")
+
+
+bounds = st.one_of(st.none(), st.none(), sample_bounds(), time_bounds())
+
+
+def combinations_of(operands):
+    """One operator over the given formulas."""
+    single = operands.map(lambda operand: (operand,))
+    pairs = st.tuples(operands, operands)
+    several = st.lists(operands, min_size=2, max_size=3).map(tuple)
+    return st.one_of(
+        st.builds(Boolean, st.just("not"), single),
+        st.builds(Boolean, st.sampled_from(["and", "or"]), several),
+        st.builds(Boolean, st.sampled_from(["xor", "->", "<->"]), pairs),
+        st.builds(Temporal, st.sampled_from(["X", "WX", "Y"]), single),
+        st.builds(Temporal, st.sampled_from(["F", "G", "F", "G", "O", "H"]), single, bounds),
+        st.builds(Temporal, st.sampled_from(["U", "R", "W", "S"]), pairs, bounds),
+    )
+
+
+def _nested(depth):
+    """Formulas up to so many operators deep, mostly just as deep."""
+    leaves = st.one_of(_leaves, _leaves, _leaves, st.builds(Truth, st.booleans()))
+    if depth == 0:
+        return leaves
+    deeper = combinations_of(_nested(depth - 1))
+    return st.one_of(leaves, deeper, deeper, deeper)
+
+
+_windows_within = st.builds(
+    Temporal,
+    st.sampled_from(["F", "G", "O", "H"]),
+    st.tuples(
+        st.builds(
+            Temporal,
+            st.sampled_from(["U", "R", "W", "S"]),
+            st.tuples(_leaves, _leaves),
+            st.one_of(sample_bounds(), time_bounds()),
+        )
+    ),
+    bounds,
+)
+"""A bounded operator below another: what looks through windows has rules of its own."""
+
+formulas_of_leaves = st.one_of(_nested(1), _nested(2), _nested(3), _nested(4), _windows_within)
+
+
+@dataclass(frozen=True)
+class LeafRun:
+    """Times of samples, and what each leaf is in them.
+
+    Attributes:
+        nominal, wide: by leaf, an interval per sample; the second holds the first.
+        channels: how many of their ends are given to a run.
+    """
+
+    times_ns: tuple[int, ...]
+    nominal: dict[str, tuple[Interval, ...]]
+    wide: dict[str, tuple[Interval, ...]]
+    channels: int
+
+    def __len__(self):
+        return len(self.times_ns)
+
+    def values(self, leaves):
+        """(C, A, T)."""
+        ends = [
+            [[getattr(interval, end) for interval in kind[leaf.text]] for leaf in leaves]
+            for kind in (self.nominal, self.wide)
+            for end in ("low", "high")
+        ]
+        return np.array(ends).reshape(4, len(leaves), len(self))[: self.channels]
+
+    def nominal_leaf(self, formula, t):
+        return self.nominal[formula.text][t]
+
+    def wide_leaf(self, formula, t):
+        return self.wide[formula.text][t]
+
+
+@st.composite
+def leaf_runs(draw, max_size=14):
+    size = draw(st.integers(1, max_size))
+    channels = draw(st.sampled_from([1, 2, 4]))
+    times = [draw(st.sampled_from([0, 7, 1_790_000_000 * 10**9]))]
+    for _ in range(size - 1):
+        times.append(times[-1] + draw(st.sampled_from([50, 100, 100, 130, 400])))
+    nominal, wide = {}, {}
+    for leaf in LEAVES:
+        cells = [draw(_cells(channels)) for _ in times]
+        nominal[leaf.text] = tuple(cell[0] for cell in cells)
+        wide[leaf.text] = tuple(cell[1] for cell in cells)
+    return LeafRun(tuple(times), nominal, wide, channels)
+
+
+@st.composite
+def _cells(draw, channels):
+    value = float(draw(st.integers(-9, 9)))
+    if channels > 1 and draw(st.integers(0, 6)) == 0:
+        return ANYTHING, ANYTHING
+    spread = draw(st.sampled_from([0.0, 0.0, 1.0, 2.5])) if channels > 2 else 0.0
+    return Interval(value, value), Interval(value - spread, value + spread)
+
+
+@st.composite
+def widened(draw, run):
+    """The same run, with all four channels, and some of its cells known less well."""
+    nominal, wide = {}, {}
+    for leaf in LEAVES:
+        lost = [draw(st.integers(0, 4)) == 0 for _ in run.times_ns]
+        more = [draw(st.sampled_from([0.0, 0.0, 1.0])) for _ in run.times_ns]
+        nominal[leaf.text] = tuple(
+            ANYTHING if gone else cell for gone, cell in zip(lost, run.nominal[leaf.text], strict=True)
+        )
+        wide[leaf.text] = tuple(
+            ANYTHING if gone else Interval(cell.low - e, cell.high + e)
+            for gone, e, cell in zip(lost, more, run.wide[leaf.text], strict=True)
+        )
+    return LeafRun(run.times_ns, nominal, wide, 4)
+
+
+def cuts(size):
+    """Where to cut so many samples into stretches."""
+    return st.sets(st.integers(1, max(1, size - 1)), max_size=4).map(
+        lambda inside: sorted({0, size, *(cut for cut in inside if cut < size)})
+    )
+
+
+# -------------------------------------------------------------------------- recordings and specifications
+
+NAMES = ("a", "b", "c")
+CLASSES = ("person", "cart")
+HEADER = """\
+region goal = box(-2, -2, 3, 2)
+region table = circle((1, 0.5), 1.5) height (0, 1)
+region corner = polygon((0, 0), (4, 0), (4, 1), (1, 1), (1, 3), (0, 3))
+group pair = a, b
+group people = class "person"
+group everyone = all
+"""
+WORDS = Vocabulary(
+    objects=NAMES,
+    classes=CLASSES,
+    signals=("battery",),
+    regions=("goal", "table", "corner"),
+    groups=("pair", "people", "everyone"),
+    axes=("x", "y", "z"),
+    oriented=True,
+    quantifiers=True,
+    max_depth=3,
+)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Samples, and which observations in them hold numbers that are not finite."""
+
+    samples: tuple[Sample, ...]
+    unreadable: frozenset[tuple[int, str]] = frozenset()
+
+    def trace(self):
+        trace = Trace.from_samples(self.samples)
+        rows = trace.rows.copy()
+        for t, name in self.unreadable:
+            at = (t, trace.names.index(name))
+            rows[at] = -2 - rows[at]
+        return replace(trace, rows=rows)
+
+
+_heights = st.tuples(st.integers(-2, 2), st.integers(0, 3)).map(lambda pair: (pair[0], pair[0] + pair[1]))
+
+
+@st.composite
+def tracked_objects(draw, *, certain=False):
+    parts = draw(st.lists(convex_parts(), min_size=1, max_size=2))
+    return TrackedObject(
+        Footprint(tuple(parts)),
+        class_name=draw(st.sampled_from([None, "person", "Person", "cart"])),
+        yaw=draw(st.one_of(st.none(), st.floats(-3, 3))),
+        height=draw(st.one_of(st.none(), _heights)),
+        uncertainty=0.0 if certain else draw(st.sampled_from([0.0, 0.0, 0.25, 1.0])),
+    )
+
+
+@st.composite
+def recordings(draw, max_size=5):
+    size = draw(st.integers(1, max_size))
+    certain = draw(st.booleans())
+    shapes = draw(st.lists(tracked_objects(certain=certain), min_size=2, max_size=4))
+    complete = draw(st.booleans())
+    time, samples, unreadable = draw(st.integers(0, 10**9)), [], set()
+    for t in range(size):
+        objects = {
+            name: draw(st.sampled_from(shapes))
+            for name in NAMES
+            if complete or draw(st.integers(0, 3)) > 0
+        }  # fmt: skip
+        battery = draw(st.sampled_from([0.5, 1.0, 3.25, float("nan")]))
+        samples.append(Sample(time, objects, {"battery": battery} if draw(st.booleans()) else {}))
+        if not complete:
+            unreadable |= {(t, name) for name in objects if draw(st.integers(0, 6)) == 0}
+        time += draw(st.sampled_from([50, 100, 250, 400, 500])) * 10**6
+    return Recording(tuple(samples), frozenset(unreadable))
+
+
+@st.composite
+def specifications(draw, words=WORDS, templates=True):
+    """One spec, or a template over `ego`, in either profile."""
+    profile = draw(st.sampled_from(["paper", "spatial_spec"]))
+    is_template = templates and draw(st.booleans())
+    if is_template:
+        words = replace(words, objects=(*words.objects, "ego"))
+    head = "spec s(ego)" if is_template else "spec s"
+    return parse_specification(f"{HEADER}{head} = {draw(formula_texts(words))}\n", profile=profile)

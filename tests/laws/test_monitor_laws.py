@@ -1,0 +1,435 @@
+"""What holds for every formula on every run, against a slow reading of the definitions."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from laws.reference import Interval, Observed, numbers_of
+from laws.strategies_monitor import (
+    LEAVES,
+    NAMES,
+    WORDS,
+    Recording,
+    bounds,
+    cuts,
+    formulas_of_leaves,
+    leaf_runs,
+    recordings,
+    specifications,
+    tracked_objects,
+    widened,
+)
+from spatial_replay.monitor.evaluation import evaluate
+from spatial_replay.monitor.instances import find_instances
+from spatial_replay.monitor.monitor import Monitor
+from spatial_replay.monitor.program import compile_formula
+from spatial_replay.monitor.run import Run
+from spatial_replay.monitor.stream import EvaluationStream
+from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
+from spatial_replay.spec.formula import Boolean, Temporal, Truth
+from spatial_replay.trace.times import FOREVER
+
+VALUE, NOW, LOWER, UPPER = range(4)
+
+few = settings(max_examples=50)
+"""For laws whose examples are whole evaluations."""
+
+
+def run_of(formula, run, *, room=256, cuts=()):
+    """(N, 4, T) and (N, 2): what a run says of some leaves, in stretches."""
+    program = compile_formula(formula)
+    going = Run(program, room=room)
+    leaves, times = run.values(program.leaves), np.array(run.times_ns)
+    ends = cuts or (0, len(run))
+    series = [going.extend(fewest(leaves[:, :, i:j]), times[i:j]) for i, j in pairwise(ends)]
+    return np.concatenate(series, axis=2), going.final
+
+
+def fewest(leaves):
+    """As few channels as say all that these do, so that more of them come up while a run goes on."""
+    for channels in (1, 2):
+        spread = leaves[np.arange(len(leaves)) % channels]
+        if np.array_equal(spread, leaves):
+            return leaves[:channels]
+    return leaves
+
+
+def root_of(formula, run):
+    """(4, T) and (2,) of the root."""
+    series, final = run_of(formula, run)
+    return series[0], final[0]
+
+
+def assert_same(first, second):
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def negated(formula):
+    return Boolean("not", (formula,))
+
+
+def both(*formulas):
+    return Boolean("and", formulas)
+
+
+def either(*formulas):
+    return Boolean("or", formulas)
+
+
+# ------------------------------------------------------------------------------------- the definitions
+
+
+@settings(max_examples=500)
+@given(data=st.data(), formula=formulas_of_leaves, run=leaf_runs(), room=st.integers(2, 8))
+def test_every_node_on_every_prefix_is_what_the_definitions_say(data, formula, run, room):
+    series, final = run_of(formula, run, room=room, cuts=data.draw(cuts(len(run))))
+    wide_leaf = run.wide_leaf if run.channels == 4 else run.nominal_leaf
+    expected = numbers_of(formula, run.times_ns, run.nominal_leaf, wide_leaf)
+    assert_same((series, final), (expected.series, expected.final))
+
+
+@settings(max_examples=150)
+@given(data=st.data(), specification=specifications(), recording=recordings())
+def test_specifications_over_recordings_are_what_the_definitions_say(data, specification, recording):
+    times = [sample.time_ns for sample in recording.samples]
+    begin = data.draw(st.integers(0, len(times) - 1))
+    end = data.draw(st.integers(begin + 1, len(times)))
+    window = (times[begin], times[end] if end < len(times) else None)
+    evaluation = evaluate(
+        specification,
+        recording.trace(),
+        start_ns=window[0],
+        end_ns=window[1],
+        each={"ego": "all"} if specification.specs[0].parameter else None,
+    )
+    observed = observed_in(recording, specification)
+    assert {result.object: result.times_ns.tolist() for result in evaluation} == {
+        name: times[first : last + 1]
+        for name, (first, last) in spans(specification, recording, begin, end).items()
+    }
+    for result in evaluation:
+        bindings = {} if result.object is None else {"ego": result.object}
+        start = times.index(result.times_ns[0])
+        nominal, wide = (observed.leaf(start, bindings, uncertain=uncertain) for uncertain in (False, True))
+        expected = numbers_of(result.formula, result.times_ns.tolist(), nominal, wide)
+        assert_close(result.series, expected)
+        np.testing.assert_allclose(result.final, expected.final, rtol=0, atol=1e-9)
+
+
+def observed_in(recording, specification):
+    samples = recording.samples
+    return Observed(
+        [sample.time_ns for sample in samples],
+        [sample.objects for sample in samples],
+        recording.unreadable,
+        [sample.signals for sample in samples],
+        specification.regions,
+    )
+
+
+def spans(specification, recording, begin, end):
+    """First and last sample of each instance by its object; None for a spec that is no template."""
+    if specification.specs[0].parameter is None:
+        return {None: (begin, end - 1)}
+    seen = {
+        name: [t for t in range(begin, end) if name in recording.samples[t].objects] for name in NAMES
+    }  # fmt: skip
+    return {name: (at[0], at[-1]) for name, at in seen.items() if at}
+
+
+def assert_close(series, expected):
+    """Equal but for rounding, which may also decide whether two ends of `value` are one."""
+    undecided = np.isnan(series) ^ np.isnan(expected.series)
+    assert (expected.slack[undecided[:, :2]] <= 1e-9).all()
+    assert not undecided[:, 2:].any()
+    np.testing.assert_allclose(
+        np.where(undecided, 0.0, series), np.where(undecided, 0.0, expected.series), rtol=0, atol=1e-9
+    )
+
+
+# ---------------------------------------------------------------------------------- stretches of samples
+
+
+@given(data=st.data(), formula=formulas_of_leaves, run=leaf_runs(max_size=40))
+def test_stretches_and_room_change_no_bit(data, formula, run):
+    whole = run_of(formula, run)
+    parts = run_of(formula, run, room=data.draw(st.integers(2, 8)), cuts=data.draw(cuts(len(run))))
+    assert [array.tobytes() for array in whole] == [array.tobytes() for array in parts]
+
+
+@few
+@given(data=st.data(), specification=specifications(), recording=recordings(max_size=8))
+def test_a_stream_in_stretches_says_what_an_evaluation_of_the_whole_says(data, specification, recording):
+    trace = recording.trace()
+    start_ns = int(data.draw(st.sampled_from([0, *trace.times_ns])))
+    each = {"ego": "all"} if specification.specs[0].parameter else {}
+    whole = evaluate(specification, trace, start_ns=start_ns, each=each)
+    instances = find_instances(specification, each, [trace], start_ns, FOREVER)
+    stream = EvaluationStream(instances, specification.regions)
+    ends = data.draw(cuts(len(trace)))
+    stretches = [stream.extend(trace.slice(i, j)) for i, j in pairwise(ends)]
+    for number, result in enumerate(whole):
+        series = np.concatenate([stretch[number].series for stretch in stretches], axis=2)
+        assert series.tobytes() == result.series.tobytes()
+        assert stream.streams[number].final.tobytes() == result.final.tobytes()
+        assert stream.streams[number].first_satisfied_ns == result.first_satisfied_ns
+
+
+@few
+@given(data=st.data(), specification=specifications(templates=False), recording=recordings())
+def test_a_monitor_says_sample_by_sample_what_an_evaluation_says(data, specification, recording):
+    assume(not recording.unreadable)
+    trace = recording.trace()
+    start_ns = int(data.draw(st.sampled_from([0, *trace.times_ns])))
+    monitor = Monitor(specification, start_ns=start_ns)
+    numbers = [monitor.update(sample).specs[0].numbers for sample in recording.samples]
+    seen = [each for each in numbers if each is not None]
+    series = evaluate(specification, trace, start_ns=start_ns).result().series
+    assert np.stack(seen, axis=2).tobytes() == series.tobytes()
+
+
+# ------------------------------------------------------------------------------------------- equivalences
+
+small = st.one_of(st.sampled_from(LEAVES), formulas_of_leaves)
+
+
+@given(p=small, q=small, run=leaf_runs())
+def test_de_morgan(p, q, run):
+    assert_same(root_of(negated(both(p, q)), run), root_of(either(negated(p), negated(q)), run))
+    assert_same(root_of(negated(either(p, q)), run), root_of(both(negated(p), negated(q)), run))
+
+
+@given(p=small, bound=bounds, run=leaf_runs())
+def test_eventually_is_until_after_true(p, bound, run):
+    assert_same(
+        root_of(Temporal("F", (p,), bound), run), root_of(Temporal("U", (Truth(True), p), bound), run)
+    )
+    assert_same(
+        root_of(Temporal("O", (p,), bound), run), root_of(Temporal("S", (Truth(True), p), bound), run)
+    )
+
+
+@given(p=small, bound=bounds, run=leaf_runs(), names=st.sampled_from(["FG", "GF", "OH", "HO"]))
+def test_always_is_never_not(p, bound, run, names):
+    strong, weak = names
+    dual = negated(Temporal(strong, (negated(p),), bound))
+    assert_same(root_of(Temporal(weak, (p,), bound), run), root_of(dual, run))
+
+
+@given(p=small, run=leaf_runs())
+def test_weak_next_is_not_next_not(p, run):
+    assert_same(root_of(Temporal("WX", (p,)), run), root_of(negated(Temporal("X", (negated(p),))), run))
+
+
+@given(p=small, q=small, bound=bounds, run=leaf_runs())
+def test_release_is_the_dual_of_until(p, q, bound, run):
+    dual = negated(Temporal("U", (negated(p), negated(q)), bound))
+    assert_same(root_of(Temporal("R", (p, q), bound), run), root_of(dual, run))
+
+
+@given(p=small, q=small, bound=bounds, run=leaf_runs())
+def test_weak_until_is_until_or_always(p, q, bound, run):
+    parts = either(Temporal("U", (p, q), bound), Temporal("G", (p,), bound))
+    assert_same(root_of(Temporal("W", (p, q), bound), run), root_of(parts, run))
+
+
+@given(p=small, run=leaf_runs())
+def test_negation_mirrors_every_number(p, run):
+    series, final = root_of(p, run)
+    mirrored, mirrored_final = root_of(negated(p), run)
+    np.testing.assert_array_equal(mirrored[VALUE], -series[VALUE])
+    np.testing.assert_array_equal(mirrored[NOW], -series[NOW])
+    np.testing.assert_array_equal(mirrored[[LOWER, UPPER]], -series[[UPPER, LOWER]])
+    np.testing.assert_array_equal(mirrored_final, -final[::-1])
+
+
+# ---------------------------------------------------------------------------- what is known, and how well
+
+
+@given(formula=formulas_of_leaves, run=leaf_runs())
+def test_samples_only_narrow_the_interval_and_value_lies_in_it(formula, run):
+    series, final = run_of(formula, run)
+    value, lower, upper = series[:, VALUE], series[:, LOWER], series[:, UPPER]
+    assert (lower[:, 1:] >= lower[:, :-1]).all()
+    assert (upper[:, 1:] <= upper[:, :-1]).all()
+    known = ~np.isnan(value)
+    assert (lower[known] <= value[known]).all()
+    assert (value[known] <= upper[known]).all()
+    assert (lower[:, -1] <= final[:, 0]).all()
+    assert (final[:, 0] <= final[:, 1]).all()
+    assert (final[:, 1] <= upper[:, -1]).all()
+
+
+@given(formula=formulas_of_leaves, run=leaf_runs())
+def test_a_verdict_stays_once_it_is_settled(formula, run):
+    series, final = run_of(formula, run)
+    for lower, upper, ends in zip(series[:, LOWER], series[:, UPPER], final, strict=True):
+        verdicts = [online_verdict(*interval) for interval in zip(lower, upper, strict=True)]
+        settled = [verdict for verdict in verdicts if verdict is not Verdict.PENDING]
+        assert verdicts == [Verdict.PENDING] * (len(verdicts) - len(settled)) + settled
+        assert set(settled) <= {final_verdict(*ends)}
+
+
+@given(data=st.data(), formula=formulas_of_leaves, run=leaf_runs())
+def test_knowing_less_only_widens(data, formula, run):
+    run = replace(run, channels=4)
+    series, final = run_of(formula, run)
+    less, less_final = run_of(formula, data.draw(widened(run)))
+    assert (less[:, LOWER] <= series[:, LOWER]).all()
+    assert (less[:, UPPER] >= series[:, UPPER]).all()
+    assert (less_final[:, 0] <= final[:, 0]).all()
+    assert (less_final[:, 1] >= final[:, 1]).all()
+
+
+@given(formula=formulas_of_leaves, run=leaf_runs(max_size=6))
+def test_a_verdict_holds_for_whatever_was_unknown(formula, run):
+    """Any numbers in the place of what is unknown or uncertain lead to the verdict, where there is one."""
+    run = replace(run, channels=4)
+    verdict = final_verdict(*run_of(formula, run)[1][0])
+    for end in ("low", "high"):
+        exact = {
+            leaf: tuple(Interval(getattr(interval, end), getattr(interval, end)) for interval in intervals)
+            for leaf, intervals in run.wide.items()
+        }
+        filled = replace(run, nominal=exact, wide=exact)
+        assert verdict in (Verdict.UNKNOWN, final_verdict(*run_of(formula, filled)[1][0]))
+
+
+@few
+@given(data=st.data(), specification=specifications(), recording=recordings(), more=st.floats(0, 5))
+def test_more_uncertainty_makes_no_verdict_more_certain(data, specification, recording, more):
+    names = data.draw(st.sets(st.sampled_from(NAMES)))
+    before = everything_of(specification, recording)
+    after = everything_of(specification, less_certain(recording, names, more))
+    assert_no_more_certain(before, after)
+    for first, second in zip(before, after, strict=True):
+        np.testing.assert_array_equal(second.series[:, [VALUE, NOW]], first.series[:, [VALUE, NOW]])
+
+
+def everything_of(specification, recording):
+    """A specification's evaluation, over a template for every object."""
+    each = {"ego": "all"} if specification.specs[0].parameter else None
+    return evaluate(specification, recording.trace(), each=each)
+
+
+def assert_no_more_certain(before, after):
+    for first, second in zip(before, after, strict=True):
+        assert second.verdict in (first.verdict, Verdict.UNKNOWN)
+        assert (second.final[:, 0] <= first.final[:, 0]).all()
+        assert (second.final[:, 1] >= first.final[:, 1]).all()
+
+
+def less_certain(recording, names, more):
+    samples = tuple(
+        replace(
+            sample,
+            objects={
+                name: replace(tracked, uncertainty=tracked.uncertainty + more * (name in names))
+                for name, tracked in sample.objects.items()
+            },
+        )
+        for sample in recording.samples
+    )
+    return replace(recording, samples=samples)
+
+
+@few
+@given(data=st.data(), specification=specifications(), recording=recordings())
+def test_an_object_that_turns_unreadable_reads_neither_as_satisfied_nor_as_violated(
+    data, specification, recording
+):
+    seen = [(t, name) for t, sample in enumerate(recording.samples) for name in sample.objects]
+    assume(seen)
+    lost = recording.unreadable | data.draw(st.sets(st.sampled_from(seen), min_size=1))
+    before = everything_of(specification, recording)
+    # A class is not lost with the coordinates: the object stays in its groups
+    after = everything_of(specification, replace(recording, unreadable=lost))
+    assert_no_more_certain(before, after)
+
+
+CLOSED_WORDS = replace(WORDS, classes=(), groups=("pair", "people"), quantifiers=False)
+
+
+@few
+@given(
+    data=st.data(),
+    specification=specifications(CLOSED_WORDS),
+    recording=recordings(),
+    stranger=tracked_objects(certain=True),
+)
+def test_an_object_that_no_group_takes_in_changes_nothing(data, specification, recording, stranger):
+    joined = tuple(
+        replace(sample, objects={**sample.objects, "stranger": replace(stranger, class_name="bird")})
+        if data.draw(st.booleans())
+        else sample
+        for sample in recording.samples
+    )
+    each = {"ego": "class:person"} if specification.specs[0].parameter else None
+    before = evaluate(specification, recording.trace(), each=each)
+    after = evaluate(specification, Recording(joined, recording.unreadable).trace(), each=each)
+    assert bits(before) == bits(after)
+
+
+# -------------------------------------------------------------------------------------- the same every time
+
+
+def bits(evaluation):
+    return [(result.object, result.series.tobytes(), result.final.tobytes()) for result in evaluation]
+
+
+@few
+@given(first=specifications(), second=specifications(), recording=recordings())
+def test_what_is_kept_with_a_trace_changes_no_later_evaluation(first, second, recording):
+    trace = recording.trace()
+    for specification in (first, second, first):
+        each = {"ego": "all"} if specification.specs[0].parameter else None
+        kept = evaluate(specification, trace, each=each)
+        assert bits(kept) == bits(everything_of(specification, recording))
+
+
+_PRINT_BITS = """
+import hashlib
+from spatial_replay import Footprint, Sample, Trace, TrackedObject
+from spatial_replay.monitor.evaluation import evaluate
+from spatial_replay.spec.specification import parse_specification
+
+text = '''
+region goal = box(0, 0, 4, 4)
+group pair = d, a
+group people = class "person"
+spec s = G ((forall x, y in people: x dist y >= 1) and F[0,2] (pair ovlp goal) xor (a leftof c) U (b ovlp c))
+spec t(ego) = H ((all except ego) dist ego >= 1)
+'''
+samples = [
+    Sample(t, {
+        name: TrackedObject(Footprint.disc(i + t / 3, i * t % 5, 1), "person" if i % 2 else "cart")
+        for i, name in enumerate("abcde")
+    })
+    for t in range(9)
+]
+evaluation = evaluate(parse_specification(text), Trace.from_samples(samples), each={"ego": "all"})
+print([(r.name, r.object, hashlib.sha256(r.series.tobytes()).hexdigest()) for r in evaluation])
+"""
+
+
+def test_hash_seeds_change_no_bit():
+    printed = {
+        subprocess.run(
+            [sys.executable, "-c", _PRINT_BITS],
+            env={**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": os.pathsep.join(sys.path)},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for seed in ("1", "2")
+    }
+    assert len(printed) == 1

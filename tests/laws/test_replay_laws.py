@@ -1,0 +1,139 @@
+"""Replays: equal inputs give equal files, and a replay of a replay is the replay."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from laws.strategies_monitor import NAMES, Recording, recordings, specifications
+from replay.runs import PiecewiseSource, content_of, record, run, write_tracks
+from spatial_replay.errors import SpecificationError
+from spatial_replay.logs.source import open_source
+from spatial_replay.recording import Recorder, record_source
+from spatial_replay.replay import Replayed, Window, load_files, run_replay
+from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.specification import parse_specification
+from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Trace
+
+FEW = settings(max_examples=25)
+
+
+def _choices(spec: Specification) -> dict[str, str]:
+    return {each.parameter: "all" for each in spec.results if each.parameter is not None}
+
+
+@st.composite
+def replays(draw: st.DrawFn) -> tuple[Trace, Specification]:
+    """Samples, and a specification of which they have every name."""
+    trace, spec = draw(recordings(max_size=8)).trace(), draw(specifications())
+    tracked = run(1).observation(0)
+    last = Sample(int(trace.times_ns[-1]) + 10**9, dict.fromkeys(NAMES, tracked), {"battery": 0.25})
+    return Trace.concatenate([trace, Trace.from_samples([last])]), spec
+
+
+@FEW
+@given(replays())
+def test_a_replay_of_a_replay_is_the_replay(replay: tuple[Trace, Specification]) -> None:
+    trace, spec = replay
+    with TemporaryDirectory() as folder:
+        first, second, third = (Path(folder, name) for name in ("run.mcap", "once.mcap", "twice.mcap"))
+        record(trace, first)
+        once = run_replay(open_source(first), [spec], each=_choices(spec), output=second)
+        twice = run_replay(open_source(second), [spec], each=_choices(spec), output=third)
+        assert second.read_bytes() == third.read_bytes()
+        assert once.certificate == twice.certificate
+        own = load_files((), open_source(second))
+        run_replay(open_source(second), own, each=_choices(spec), output=third)
+        assert second.read_bytes() == third.read_bytes()
+
+
+@FEW
+@given(replays(), st.integers(1, 4), st.integers(1, 3), st.data())
+def test_how_a_source_is_cut_changes_nothing(
+    replay: tuple[Trace, Specification], size: int, every: int, data: st.DataObject
+) -> None:
+    trace, spec = replay
+    at = data.draw(st.integers(0, len(trace) - 1))
+    window = Window(start_ns=int(trace.times_ns[at // every * every]), every=every)
+    with TemporaryDirectory() as folder:
+        whole, pieces = Path(folder, "whole.mcap"), Path(folder, "pieces.mcap")
+        results = [
+            run_replay(
+                PiecewiseSource(trace, blocks), [spec], window=window, each=_choices(spec), output=output
+            )
+            for blocks, output in ((len(trace), whole), (size, pieces))
+        ]
+        assert whole.read_bytes() == pieces.read_bytes()
+        assert results[0].certificate == results[1].certificate
+
+
+@FEW
+@given(recordings(max_size=8))
+def test_a_track_file_and_its_recorded_log_are_one_recording(drawn: Recording) -> None:
+    certain = Trace.from_samples(drawn.trace().samples())
+    spec = parse_specification("spec s = G battery >= 1\nspec t = F battery <= 0.75")
+    with TemporaryDirectory() as folder:
+        tracks = write_tracks(certain, Path(folder, "run.jsonl"))
+        log = Path(folder, "run.mcap")
+        record_source(open_source(tracks), log)
+        try:
+            from_tracks = run_replay(open_source(tracks), [spec])
+        except SpecificationError:
+            assert "battery" not in certain.signals
+            return
+        from_log = run_replay(open_source(log), [spec])
+        assert from_tracks.certificate == from_log.certificate
+        assert _verdicts(from_tracks) == _verdicts(from_log)
+
+
+@FEW
+@given(replays())
+def test_what_was_evaluated_live_is_what_a_replay_finds(replay: tuple[Trace, Specification]) -> None:
+    trace, spec = replay
+    if _choices(spec):
+        return
+    samples = list(trace.samples())
+    with TemporaryDirectory() as folder:
+        live, replayed = Path(folder, "live.mcap"), Path(folder, "replayed.mcap")
+        with Recorder(live, specifications=[spec]) as recorder:
+            for sample in samples:
+                recorder.write(sample)
+        run_replay(open_source(live), load_files((), open_source(live)), output=replayed)
+        ours, theirs = content_of(live), content_of(replayed)
+        assert ours.messages == theirs.messages
+
+
+def test_neither_the_process_nor_its_hash_seed_shows_in_a_file(tmp_path: Path) -> None:
+    write_tracks(run(), tmp_path / "run.jsonl")
+    (tmp_path / "a.spatial").write_text(
+        "group all_of = all\nregion z = box(0, 0, 1, 1)\nregion a = box(1, 0, 3, 1)\n"
+        "spec s = F (cube ovlp a or cube ovlp z)\nspec t = G exists o in all_of: o ovlp cube\n"
+    )
+
+    def program(seed: int, *arguments: str) -> None:
+        command = [sys.executable, "-m", "spatial_replay", *arguments]
+        subprocess.run(command, cwd=tmp_path, env=_environment(seed), check=True, capture_output=True)
+
+    files: list[Sequence[bytes]] = []
+    for seed in (1, 2):
+        program(seed, "record", "tracks", "run.jsonl", "--spec", "a.spatial", "-o", "run.mcap")
+        program(seed, "replay", "run.mcap", "-o", "out.mcap", "--json", "out.json", "--series")
+        program(seed, "export", "out.mcap", "-o", "out.csv")
+        files.append([(tmp_path / f).read_bytes() for f in ("run.mcap", "out.mcap", "out.json", "out.csv")])
+    assert files[0] == files[1]
+
+
+def _environment(seed: int) -> dict[str, str]:
+    return {**os.environ, "PYTHONHASHSEED": str(seed)}
+
+
+def _verdicts(replayed: Replayed) -> list[tuple[str, str | None, str, str]]:
+    return [(r.name, r.object, str(r.verdict), repr(r.robustness)) for r in replayed.results]

@@ -1,0 +1,56 @@
+"""A monitor beside a running system."""
+
+from __future__ import annotations
+
+from math import inf
+
+import pytest
+
+from monitor.scenes import SECOND
+from spatial_replay.errors import TraceError, UsageError
+from spatial_replay.geometry.footprint import Footprint
+from spatial_replay.monitor.monitor import Monitor
+from spatial_replay.spec.specification import parse_specification
+from spatial_replay.trace.sample import Sample
+
+
+def at(second, **signals):
+    return Sample(second * SECOND, signals=signals)
+
+
+def test_a_verdict_settles_as_samples_come():
+    monitor = Monitor(
+        parse_specification("spec up = F p >= 0\nspec steady = G q >= 0\nspec s = up and steady")
+    )
+    first = monitor.update(at(0, p=-1, q=2))
+    assert (first.time_ns, first.verdict) == (0, "pending")
+    assert first.node("up").upper == inf
+    second = monitor.update(at(1, p=1, q=1))
+    assert (second.node("up").verdict, second.node("steady").verdict) == ("satisfied", "pending")
+    assert (second.node("s").value, second.node("s").now) == (1, 1)
+    third = monitor.update(at(2, p=-5, q=-2))
+    assert (third.verdict, third.node("s").upper) == ("violated", -2)
+    assert third.node("up").value == 1
+
+
+def test_samples_before_the_start_are_there_to_be_looked_back_at():
+    monitor = Monitor(parse_specification("H a dist a[-1] <= 2"), start_ns=SECOND)
+    before = monitor.update(Sample(0, {"a": Footprint.disc(0, 0, 0)}))
+    assert (before.verdict, before.specs[0].nodes) == ("pending", ())
+    started = monitor.update(Sample(SECOND, {"a": Footprint.disc(1.5, 0, 0)}))
+    assert (started.verdict, started.specs[0].nodes[0].value) == ("satisfied", 0.5)
+
+
+def test_what_a_monitor_refuses():
+    with pytest.raises(UsageError, match=r"s\(ego\) is a template; name its object"):
+        Monitor(parse_specification("spec s(ego) = G ego ovlp ego"))
+    with pytest.raises(UsageError, match="no semantics 'stl'"):
+        Monitor(parse_specification("p >= 0"), semantics="stl")
+    monitor = Monitor(parse_specification("spec low = p >= 0"), start_ns=SECOND)
+    with pytest.raises(UsageError, match=r"no node is named 'low'; there are none yet"):
+        monitor.update(at(0, p=1)).node("low")
+    monitor.update(at(2, p=1))
+    with pytest.raises(UsageError, match=r"no node is named 'high'; there are low"):
+        monitor.update(at(3, p=1)).node("high")
+    with pytest.raises(TraceError, match="give samples in the order of their times"):
+        monitor.update(at(3, p=1))
