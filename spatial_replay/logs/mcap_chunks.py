@@ -1,0 +1,189 @@
+"""Chunks of an MCAP log: found, checked, decompressed, walked."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import BinaryIO, TypeAlias
+
+import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
+import zstandard
+from mcap import records
+from mcap.opcode import Opcode
+
+from spatial_replay.logs.mcap_records import RECORD_HEAD, DamageError, decoded
+from spatial_replay.logs.mcap_walk import walk_records
+
+LARGEST_CHUNK = 2**30
+"""Bytes, uncompressed; a chunk that claims more is taken for damage, not for data."""
+
+_CHUNK_HEAD = struct.Struct("<QQQII")
+_FIXED_HEAD = RECORD_HEAD.size + _CHUNK_HEAD.size
+_LONGEST_HEAD = 80
+_MESSAGE_FIELDS = 22
+_TOGETHER, _AHEAD = 8, 24
+
+
+RawMessage: TypeAlias = tuple[int, int, int, int, bytes]
+"""A message as it stands in a chunk: log time, channel, sequence, publish time, payload."""
+
+Declaration: TypeAlias = records.Schema | records.Channel
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkPlace:
+    """Where a stretch of records stands in the file.
+
+    Attributes:
+        offset, length: of the record with its head, in bytes.
+        start_ns, end_ns: log times of its first and last message.
+        compressed: whether it is a chunk; else records that stand in the file as they are.
+    """
+
+    offset: int
+    length: int
+    start_ns: int
+    end_ns: int
+    compressed: bool = True
+
+
+def chunk_place(offset: int, record: bytes, length: int) -> ChunkPlace:
+    """The place of a chunk by the beginning of its record, if that is consistent in itself.
+
+    Args:
+        record: the first bytes of the record, at least 64 unless the file ends.
+        length: of the record with its head.
+
+    Raises:
+        DamageError: it is not.
+    """
+    if len(record) < _FIXED_HEAD:
+        raise DamageError("a chunk breaks off")
+    start, end, size, _, name_length = _CHUNK_HEAD.unpack_from(record, RECORD_HEAD.size)
+    data_length = _FIXED_HEAD + name_length
+    if name_length > 16 or len(record) < data_length + 8:
+        raise DamageError("a chunk's head makes no sense")
+    stored = int.from_bytes(record[data_length : data_length + 8], "little")
+    if data_length + 8 + stored != length or size > LARGEST_CHUNK or not start <= end < 2**63:
+        raise DamageError("a chunk's head makes no sense")
+    return ChunkPlace(offset, length, start, end)
+
+
+def read_records(stream: BinaryIO, place: ChunkPlace) -> bytes:
+    """The records in a place, decompressed.
+
+    Raises:
+        DamageError: the chunk is cut off, does not decompress, or has another checksum than it says.
+    """
+    stream.seek(place.offset)
+    record = stream.read(place.length)
+    if len(record) < place.length:
+        raise DamageError("the chunk breaks off")
+    if not place.compressed:
+        return record
+    chunk_place(place.offset, record[:_LONGEST_HEAD], len(record))
+    _, _, size, checksum, name_length = _CHUNK_HEAD.unpack_from(record, RECORD_HEAD.size)
+    begin = _FIXED_HEAD + name_length
+    content = _decompressed(record[_FIXED_HEAD:begin], record[begin + 8 :], size)
+    if len(content) != size:
+        raise DamageError(f"the chunk holds {len(content)} bytes instead of {size}")
+    if checksum and zlib.crc32(content) != checksum:
+        raise DamageError("the chunk's checksum does not fit its content")
+    return content
+
+
+def iter_contents(
+    stream: BinaryIO, places: Sequence[ChunkPlace]
+) -> Iterator[tuple[ChunkPlace, Callable[[], bytes]]]:
+    """Each place with its records, as `read_records` gives them when called.
+
+    The next places are read and decompressed by another thread while the caller works on one: the stream
+    belongs to it meanwhile.
+    """
+    groups = [places[begin : begin + _TOGETHER] for begin in range(0, len(places), _TOGETHER)]
+    waiting: deque[tuple[Sequence[ChunkPlace], Future[list[Callable[[], bytes]]]]] = deque()
+    with ThreadPoolExecutor(1, "chunk-reading") as reader:
+        for group in groups:
+            waiting.append((group, reader.submit(_read_all, stream, group)))
+            if len(waiting) > _AHEAD:
+                ready, contents = waiting.popleft()
+                yield from zip(ready, contents.result(), strict=True)
+        for ready, contents in waiting:
+            yield from zip(ready, contents.result(), strict=True)
+
+
+def _read_all(stream: BinaryIO, places: Sequence[ChunkPlace]) -> list[Callable[[], bytes]]:
+    """What each place gives when asked: its records, or its damage."""
+    return [_outcome(stream, place) for place in places]
+
+
+def _outcome(stream: BinaryIO, place: ChunkPlace) -> Callable[[], bytes]:
+    try:
+        content = read_records(stream, place)
+    except DamageError as damage:
+        lost = damage
+
+        def fail() -> bytes:
+            raise lost
+
+        return fail
+    return lambda: content
+
+
+def _decompressed(compression: bytes, data: bytes, size: int) -> bytes:
+    try:
+        if compression == b"zstd":
+            if zstandard.frame_content_size(data) > size:
+                raise DamageError("the chunk holds more than it says")
+            return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+        if compression == b"lz4":
+            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
+    except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+        raise DamageError(f"the chunk does not decompress ({error})") from None
+    if compression:
+        raise DamageError(f"the chunk is compressed as {compression!r}; known are zstd and lz4")
+    return data
+
+
+@dataclass(frozen=True, slots=True)
+class Records:
+    """The records of a chunk that a reader needs, in the order in which they stand.
+
+    Attributes:
+        damage: why the chunk's end could not be read, or None.
+    """
+
+    messages: list[RawMessage]
+    declarations: list[Declaration]
+    damage: str | None = None
+
+
+def split_records(content: bytes, passed_over: frozenset[int] = frozenset()) -> Records:
+    """The messages and the declarations in decompressed records, up to where one breaks off.
+
+    Args:
+        passed_over: channels whose messages are not wanted.
+    """
+    heads, breaks_off = walk_records(content)
+    is_message = (heads.opcode == Opcode.MESSAGE) & (heads.end - heads.begin >= _MESSAGE_FIELDS)
+    for channel in passed_over:
+        is_message &= heads.channel != channel
+    wanted = np.flatnonzero(is_message)
+    begins, ends = (heads.begin[wanted] + _MESSAGE_FIELDS).tolist(), heads.end[wanted].tolist()
+    fields = (heads.log_time, heads.channel, heads.sequence, heads.publish_time)
+    payloads = [content[begin:end] for begin, end in zip(begins, ends, strict=True)]
+    messages = list(zip(*(field[wanted].tolist() for field in fields), payloads, strict=True))
+    declarations: list[Declaration] = []
+    for index in np.flatnonzero((heads.opcode == Opcode.SCHEMA) | (heads.opcode == Opcode.CHANNEL)).tolist():
+        read = records.Schema.read if heads.opcode[index] == Opcode.SCHEMA else records.Channel.read
+        try:
+            declarations.append(decoded(read, content[heads.begin[index] : heads.end[index]]))
+        except DamageError as damage:
+            whole = int(np.searchsorted(wanted, index))
+            return Records(messages[:whole], declarations, str(damage))
+    return Records(messages, declarations, "a record breaks off" if breaks_off else None)

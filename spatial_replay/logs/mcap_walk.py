@@ -1,0 +1,78 @@
+"""The heads of the records in a chunk, found in one compiled pass."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spatial_replay.compiled import kernel, piece
+from spatial_replay.geometry.arrays import Integers
+
+Bytes = NDArray[np.uint8]
+Words = NDArray[np.uint64]
+
+_RECORD_HEAD = 9
+_MESSAGE_FIELDS = 22
+_MESSAGE = 5
+
+
+class RecordHeads(NamedTuple):
+    """N records.
+
+    Attributes:
+        opcode: (N,) int64.
+        begin, end: (N,) int64, where their bodies stand.
+        channel, sequence, log_time, publish_time: (N,) uint64, of messages; 0 for other records.
+    """
+
+    opcode: Integers
+    begin: Integers
+    end: Integers
+    channel: Words
+    sequence: Words
+    log_time: Words
+    publish_time: Words
+
+
+def walk_records(content: bytes) -> tuple[RecordHeads, bool]:
+    """The records in some bytes, and whether the last of them breaks off."""
+    most = len(content) // _RECORD_HEAD
+    places = np.empty((3, most), np.int64)
+    fields = np.empty((4, most), np.uint64)
+    count, end = _walk(np.frombuffer(content, np.uint8), places, fields)
+    return RecordHeads(*places[:, :count], *fields[:, :count]), end < len(content)
+
+
+@piece
+def _word(content: Bytes, begin: int, size: int) -> int:
+    """A little-endian number of `size` bytes."""
+    word = np.uint64(0)
+    for k in range(size):
+        word |= np.uint64(content[begin + k]) << np.uint64(8 * k)
+    return word  # type: ignore[return-value]
+
+
+@kernel
+def _walk(content: Bytes, places: Integers, fields: Words) -> tuple[int, int]:
+    """Fill in the records' places and fields; how many there are, and where the last whole one ends."""
+    size = content.shape[0]
+    position = 0
+    count = 0
+    while position + _RECORD_HEAD <= size:
+        length = _word(content, position + 1, 8)
+        begin = position + _RECORD_HEAD
+        if length > np.uint64(size - begin):
+            break
+        end = position + _RECORD_HEAD + int(length)
+        places[0, count], places[1, count], places[2, count] = content[position], begin, end
+        fields[0, count] = fields[1, count] = fields[2, count] = fields[3, count] = 0
+        if content[position] == _MESSAGE and end - begin >= _MESSAGE_FIELDS:
+            fields[0, count] = _word(content, begin, 2)
+            fields[1, count] = _word(content, begin + 2, 4)
+            fields[2, count] = _word(content, begin + 6, 8)
+            fields[3, count] = _word(content, begin + 14, 8)
+        position = end
+        count += 1
+    return count, position

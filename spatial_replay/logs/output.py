@@ -1,0 +1,110 @@
+"""Files that appear under their name only when they are whole."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from spatial_replay.errors import OutputError, UsageError
+
+
+@contextmanager
+def replacing(output: Path, inputs: Iterable[Path] = ()) -> Iterator[BinaryIO]:
+    """A stream to write `output` with: under another name, moved into place when all went well.
+
+    Whatever ends the block early, an interruption included, leaves neither a half-written file nor a changed
+    one. Errors of the block's own pass through as they are.
+
+    Raises:
+        UsageError: the output is one of the inputs, a folder, or in none.
+        OutputError: the machine cannot write it.
+    """
+    refuse_inputs(output, inputs)
+    if output.exists() and not output.is_file():
+        # a device or a pipe takes what it gets, and must never be replaced by a file
+        with open_output(output) as stream:
+            yield stream
+        return
+    # a link stays a link, to what was written
+    output = output.resolve()
+    with _writing(output):
+        descriptor, partial = tempfile.mkstemp(
+            prefix=f".{output.name}.", suffix=".partial", dir=output.parent
+        )
+    try:
+        with _stream(descriptor, output) as stream:
+            yield stream
+        with _writing(output):
+            _move(Path(partial), output)
+    finally:
+        Path(partial).unlink(missing_ok=True)
+
+
+def _move(partial: Path, output: Path) -> None:
+    """Give a whole file its name, and the permissions that a new file has."""
+    umask = os.umask(0)
+    os.umask(umask)
+    partial.chmod(0o666 & ~umask)
+    partial.replace(output)
+
+
+def open_output(output: Path) -> BinaryIO:
+    """A stream to a file, in place; opening, writing and closing it fail with an OutputError."""
+    return _stream(output, output)
+
+
+def _stream(file: int | Path, output: Path) -> BinaryIO:
+    with _writing(output):
+        return io.BufferedWriter(_OutputFile(file, output), 1 << 20)
+
+
+class _OutputFile(io.FileIO):
+    """An unbuffered file whose failures are those of an output, whoever writes to it."""
+
+    def __init__(self, file: int | Path, output: Path) -> None:
+        super().__init__(file, "wb")
+        self._output = output
+
+    # the type of what holds bytes has a name from Python 3.12 on
+    def write(self, data: Any, /) -> int:
+        with _writing(self._output):
+            return super().write(data)
+
+    def close(self) -> None:
+        with _writing(self._output):
+            super().close()
+
+
+@contextmanager
+def _writing(output: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise output_error(output, error) from error
+
+
+def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
+    """That an output may be written.
+
+    Raises:
+        UsageError: it is one of the inputs, a folder, or in none.
+    """
+    if output.is_dir():
+        raise UsageError(f"{output} is a folder; give the name of a file in it")
+    if not output.parent.is_dir():
+        raise UsageError(f"{output} cannot be written: there is no folder {output.parent}; make it first")
+    for each in inputs:
+        if output.exists() and each.exists() and output.samefile(each):
+            raise UsageError(f"{output} is an input too and would be lost; give the output another name")
+
+
+def output_error(output: Path, error: OSError) -> OutputError:
+    """The error of an output that the machine could not write."""
+    reason = "no space left on the device" if error.errno == errno.ENOSPC else error.strerror or str(error)
+    return OutputError(f"{output} could not be written: {reason}")

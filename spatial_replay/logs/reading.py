@@ -1,0 +1,28 @@
+"""Sources as they are read: how, and what is said when that fails."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from spatial_replay.errors import LogError
+from spatial_replay.logs.block import Block
+from spatial_replay.logs.source import Source
+
+
+def read_blocks(source: Source, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+    """The blocks of a source, as `Source.iter_blocks` gives them.
+
+    Raises:
+        LogError: what that raises, and when the machine cannot read the source: a disk that fails or is gone.
+    """
+    try:
+        yield from source.iter_blocks(start_ns, end_ns)
+    except OSError as error:
+        reason = error.strerror or error
+        raise LogError(f"{source.name} could not be read: {reason}; copy it to another disk") from error
+
+
+def reading_options(source: Source) -> dict[str, object]:
+    """How a source is read, where that is not the default, as a log's metadata says it."""
+    concave = getattr(source, "concave", "decompose")
+    return {} if concave == "decompose" else {"concave": concave}

@@ -1,0 +1,222 @@
+"""Sources: where samples come from, chosen by what a file holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from reprlib import repr as shortened
+from typing import Protocol
+
+from spatial_replay.errors import LogError, MissingFileError, UsageError
+from spatial_replay.geometry.footprint import Concave
+from spatial_replay.logs.block import BLOCK_SAMPLES, Block
+from spatial_replay.logs.csv_tracks import COLUMNS, iter_csv
+from spatial_replay.logs.faults import FaultList
+from spatial_replay.logs.lines import open_text
+from spatial_replay.logs.mcap_reader import McapSource
+from spatial_replay.logs.mcap_records import MAGIC
+from spatial_replay.logs.sink import Attachment
+from spatial_replay.logs.tracks import iter_jsonl
+from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.times import FOREVER
+from spatial_replay.trace.trace import Trace, window_of
+
+_HEAD = 4096
+"""Bytes by which a file's format is told."""
+
+
+class Source(Protocol):
+    """A log that can be read, any number of times, in blocks of bounded size."""
+
+    @property
+    def name(self) -> str:
+        """What the log is called: a file's base name."""
+
+    @property
+    def kind(self) -> str:
+        """The format, in a word."""
+
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        """The samples from the first at or after `start_ns` to the last before `end_ns`.
+
+        What could not be read stands in the blocks' `trace.faults`; the last block may hold nothing else.
+
+        Raises:
+            LogError: nothing in the log can be read as a sample.
+            UsageError: a sound log of something else, without any topic for samples.
+        """
+
+    def attachments(self) -> tuple[Attachment, ...]:
+        """The files kept in the log."""
+
+    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
+        """The metadata records of the log, with their names."""
+
+
+class _Bare:
+    """A source that keeps nothing beside its samples."""
+
+    def attachments(self) -> tuple[Attachment, ...]:
+        """See `Source.attachments`."""
+        return ()
+
+    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
+        """See `Source.metadata`."""
+        return ()
+
+
+@dataclass(frozen=True)
+class MemorySource(_Bare):
+    """A trace, or samples, that are in memory already."""
+
+    trace: Trace
+    name: str = "memory"
+    kind: str = "memory"
+
+    @classmethod
+    def from_samples(cls, samples: Iterable[Sample], name: str = "memory") -> MemorySource:
+        return cls(Trace.from_samples(samples), name)
+
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        """See `Source.iter_blocks`."""
+        window = within(self.trace, start_ns, end_ns)
+        if len(window) <= BLOCK_SAMPLES:
+            yield Block(window)
+            return
+        for begin in range(0, len(window), BLOCK_SAMPLES):
+            block = window.slice(begin, begin + BLOCK_SAMPLES)
+            yield Block(block if begin == 0 else replace(block, faults=()))
+
+
+IterTraces = Callable[..., Iterator[Trace]]
+
+
+@dataclass(frozen=True)
+class TrackSource(_Bare):
+    """A track file."""
+
+    path: Path
+    kind: str
+    concave: Concave
+    iter_traces: IterTraces
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        """See `Source.iter_blocks`."""
+        faults = FaultList()
+        any_sample = False
+        first_fault: str | None = None
+        for trace in self.iter_traces(self.path, faults, concave=self.concave):
+            any_sample = any_sample or len(trace) > 0
+            lost = faults.take()
+            first_fault = first_fault or next(iter(lost), None)
+            yield Block(replace(within(trace, start_ns, end_ns), faults=lost))
+        rest = faults.take(last=True)
+        if not any_sample:
+            reason = first_fault or next(iter(rest), f"{self.name} is empty")
+            raise LogError(f"{self.name} holds no sample: {reason}")
+        if rest:
+            yield Block(replace(Trace.from_samples(()), faults=rest))
+
+
+def open_source(path: str | PathLike[str], *, concave: Concave = "decompose") -> Source:
+    """The log in a file, in whatever format it is; the content decides, not the name.
+
+    Args:
+        concave: what becomes of polygons that are not convex.
+
+    Raises:
+        UsageError: no path was given.
+        MissingFileError: there is no such file, or it cannot be opened.
+        LogError: the file is none of the known formats.
+    """
+    _require_path(path)
+    path = Path(path)
+    head = _head(path)
+    for kind, (recognise, open_format) in FORMATS.items():
+        if recognise(head):
+            return open_format(path, kind, concave)
+    if not head:
+        raise LogError(f"{path.name} is empty; give a log with at least one sample")
+    known = ", ".join(FORMATS)
+    raise LogError(f"{path.name} is no log that can be read here; known formats are {known}")
+
+
+def read_trace(
+    path: str | PathLike[str],
+    *,
+    mapping: str | PathLike[str] | None = None,
+    concave: Concave = "decompose",
+    allow_damage: bool = False,
+) -> Trace:
+    """A whole log in memory.
+
+    Args:
+        path: an MCAP log of ours, a track file (`.jsonl`, `.csv`, plain or gzip).
+        mapping: which topics carry which objects; none of the formats above takes one.
+        concave: what becomes of polygons that are not convex.
+        allow_damage: return what can be read of a damaged log, with its `faults`.
+
+    Raises:
+        UsageError: no path, or a mapping was given.
+        MissingFileError: there is no such file.
+        LogError: the file is no log, or is damaged and `allow_damage` is not set.
+    """
+    if mapping is not None:
+        raise UsageError(
+            f"mapping {str(mapping)!r} is not needed: logs of spatial-replay and track files name their"
+            " objects themselves; leave it out"
+        )
+    source = open_source(path, concave=concave)
+    trace = Trace.concatenate([block.trace for block in source.iter_blocks()])
+    if trace.faults and not allow_damage:
+        more = f"\n… and {len(trace.faults) - 1} more" if len(trace.faults) > 1 else ""
+        raise LogError(f"{trace.faults[0]}{more}; allow_damage=True reads the rest")
+    return trace
+
+
+def within(trace: Trace, start_ns: int | None, end_ns: int | None) -> Trace:
+    """The samples of a trace from `start_ns` up to, not including, `end_ns`."""
+    begin, end = window_of(trace.times_ns, start_ns or 0, FOREVER if end_ns is None else end_ns)
+    return trace if (begin, end) == (0, len(trace)) else trace.slice(begin, end)
+
+
+def _require_path(value: object) -> None:
+    if not isinstance(value, (str, PathLike)):
+        remedy = "give the path of a log; Trace.from_samples(samples) takes samples"
+        raise UsageError(f"path is {shortened(value)}; {remedy}")
+
+
+def _head(path: Path) -> bytes:
+    """The first bytes of a file, decompressed; what is missing from a broken one is left out."""
+    try:
+        with open_text(path) as stream:
+            return stream.read(_HEAD)
+    except (EOFError, ValueError):
+        return b"{"
+    except OSError as error:
+        raise MissingFileError.of(path, error) from None
+
+
+def _is_jsonl(head: bytes) -> bool:
+    return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{")
+
+
+def _is_csv(head: bytes) -> bool:
+    first = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 1)[0]
+    return any(name.encode() in first.split(b",") for name in COLUMNS)
+
+
+Recognise = Callable[[bytes], bool]
+OpenFormat = Callable[[Path, str, Concave], Source]
+
+FORMATS: dict[str, tuple[Recognise, OpenFormat]] = {
+    "MCAP": (lambda head: head.startswith(MAGIC), McapSource),
+    "track JSONL": (_is_jsonl, lambda path, kind, concave: TrackSource(path, kind, concave, iter_jsonl)),
+    "track CSV": (_is_csv, lambda path, kind, concave: TrackSource(path, kind, concave, iter_csv)),
+}

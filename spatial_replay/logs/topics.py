@@ -1,0 +1,36 @@
+"""Names that our logs use: topics, metadata, attachments."""
+
+from __future__ import annotations
+
+from google.protobuf.message import Message
+from mcap_protobuf.schema import build_file_descriptor_set
+
+from spatial_replay.logs.block import Channel, Schema
+
+OBJECTS = "/spatial/objects"
+SCENE = "/spatial/scene"
+SPECIFICATION = "/spatial/specification"
+ROBUSTNESS = "/spatial/robustness"
+
+DERIVED = frozenset(
+    {SCENE, SPECIFICATION, ROBUSTNESS, "/spatial/automaton", "/spatial/events", "/spatial/log"}
+)
+"""Topics computed from the samples and a specification: a replay replaces them."""
+
+METADATA = "spatial_replay"
+"""The metadata record that comes first: who wrote the log, from what, with which options."""
+
+CERTIFICATE = "spatial_replay_certificate"
+"""The metadata record that comes last: hashes of what went in and what came out."""
+
+RECORDED_PREFIX = "recorded/"
+"""Attachments that a recording was made with; they stay in every copy."""
+
+REPLAYED_PREFIX = "replayed/"
+"""Attachments that a replay was made with; the next replay replaces them."""
+
+
+def protobuf_channel(topic: str, message: type[Message]) -> Channel:
+    """The channel of a topic whose messages are of one protobuf type, with everything needed to read them."""
+    descriptors = build_file_descriptor_set(message).SerializeToString(deterministic=True)
+    return Channel(topic, "protobuf", Schema(message.DESCRIPTOR.full_name, "protobuf", descriptors))

@@ -1,0 +1,181 @@
+"""Many messages of one layout at once.
+
+In protobuf's encoding, numbers of a fixed width stand at the same place in every message that has the
+same fields, texts and list lengths. So one message, encoded by the protobuf library, serves as a template
+for all of its layout: only the slots differ, and those of many messages are filled or read together.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from google.protobuf.descriptor import FieldDescriptor
+from google.protobuf.message import Message
+from numpy.typing import NDArray
+
+from spatial_replay.compiled import kernel
+from spatial_replay.geometry.arrays import Integers
+
+Bytes = NDArray[np.uint8]
+Words = NDArray[np.uint64]
+
+_WIDE = (FieldDescriptor.TYPE_DOUBLE, FieldDescriptor.TYPE_FIXED64)
+_NARROW = FieldDescriptor.TYPE_ENUM
+
+# Two sets of sentinels that differ in every byte, and are finite as doubles: where two encodings differ,
+# there is a slot.
+_SENTINELS = ((0x40404040 << 32, 1), (0xBFBFBFBF << 32 | 0xFFFFFFFF, 2))
+
+
+class LayoutError(ValueError):
+    """A message that cannot serve as a template."""
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """The layout that some messages share.
+
+    Slots are numbered in the order of the fields. A word is a slot of 8 bytes, little-endian: a double or
+    a fixed64. A mark is an enumeration with values from 1 to 127, a slot of one byte.
+
+    Attributes:
+        payload: (L,) uint8, an encoded message with every slot 0.
+        word_offsets: (W,) int64, where the words begin.
+        mark_offsets: (M,) int64, where the marks stand.
+    """
+
+    payload: Bytes
+    word_offsets: Integers
+    mark_offsets: Integers
+
+    @classmethod
+    def of(cls, message: Message) -> Template:
+        """The layout of a message; numbers that shall be slots must be present in it.
+
+        Raises:
+            LayoutError: a layout with fields that the schema does not know.
+        """
+        first, second = (_encoded(message, *sentinels) for sentinels in _SENTINELS)
+        if len(first) != len(second):
+            raise LayoutError("the message's length depends on its numbers")
+        differing = np.flatnonzero(first != second)
+        offsets = {8: list[int](), 1: list[int]()}
+        begin = 0
+        for width in _slot_widths(message):
+            slot = differing[begin : begin + width]
+            if len(slot) < width or slot[-1] - slot[0] != width - 1:
+                raise LayoutError("the message's slots are not where its fields are")
+            offsets[width].append(int(slot[0]))
+            begin += width
+        payload = first.copy()
+        payload[differing] = 0
+        return cls(payload, np.array(offsets[8], np.int64), np.array(offsets[1], np.int64))
+
+    def __len__(self) -> int:
+        return len(self.payload)
+
+    def fill(self, words: Words, marks: Bytes | None = None) -> Bytes:
+        """Encode n messages: words (n, W) and marks (n, M) → (n, L) uint8."""
+        rows = np.empty((len(words), len(self)), np.uint8)
+        contents = np.ascontiguousarray(words, "<u8").view(np.uint8)
+        _scatter(self.payload, contents, self.word_offsets, rows)
+        if marks is not None:
+            rows[:, self.mark_offsets] = marks
+        return rows
+
+    def matches(self, rows: Bytes) -> NDArray[np.bool_]:
+        """(n,) which of n encoded messages (n, L) have this layout."""
+        fixed = np.ones(len(self), np.bool_)
+        fixed[self.mark_offsets] = False
+        for offset in self.word_offsets.tolist():
+            fixed[offset : offset + 8] = False
+        result = np.empty(len(rows), np.bool_)
+        _compare(self.payload, np.flatnonzero(fixed), rows, result)
+        return result
+
+    def words(self, rows: Bytes) -> Words:
+        """(n, W) the words of n messages (n, L) of this layout."""
+        contents = np.empty((len(rows), 8 * len(self.word_offsets)), np.uint8)
+        for offset, word, count in self._runs():
+            contents[:, 8 * word : 8 * (word + count)] = rows[:, offset : offset + 8 * count]
+        return contents.view("<u8")
+
+    def _runs(self) -> Iterator[tuple[int, int, int]]:
+        """Offset, number of the first word and count of words that stand side by side."""
+        breaks = np.flatnonzero(np.diff(self.word_offsets, prepend=-9) != 8).tolist()
+        for word, after in pairwise([*breaks, len(self.word_offsets)]):
+            yield int(self.word_offsets[word]), word, after - word
+
+
+@kernel
+def _scatter(payload: Bytes, contents: Bytes, offsets: NDArray[np.int64], rows: Bytes) -> None:
+    """Copies of a payload (L,) as rows (n, L), with the words of contents (n, 8 W) at the offsets (W,)."""
+    for i in range(rows.shape[0]):
+        for k in range(rows.shape[1]):
+            rows[i, k] = payload[k]
+        for word in range(offsets.shape[0]):
+            for k in range(8):
+                rows[i, offsets[word] + k] = contents[i, 8 * word + k]
+
+
+@kernel
+def _compare(payload: Bytes, places: NDArray[np.int64], rows: Bytes, result: NDArray[np.bool_]) -> None:
+    """Which rows (n, L) agree with a payload (L,) in all the places given; into result (n,)."""
+    for i in range(rows.shape[0]):
+        agrees = True
+        for k in places:
+            if rows[i, k] != payload[k]:
+                agrees = False
+                break
+        result[i] = agrees
+
+
+def rows_of(payloads: list[bytes]) -> Bytes:
+    """n payloads of one length L → (n, L) uint8."""
+    return np.frombuffer(b"".join(payloads), np.uint8).reshape(len(payloads), -1)
+
+
+def payloads_of(rows: Bytes) -> list[bytes]:
+    """(n, L) uint8 → n payloads."""
+    count, length = rows.shape
+    if not length:
+        return [b""] * count
+    joined = rows.tobytes()
+    return [joined[begin : begin + length] for begin in range(0, count * length, length)]
+
+
+def _encoded(message: Message, word: int, mark: int) -> Bytes:
+    """The message's encoding with sentinels in all slots."""
+    copy = type(message)()
+    copy.CopyFrom(message)
+    _write_sentinels(copy, word, mark)
+    return np.frombuffer(copy.SerializeToString(deterministic=True), np.uint8)
+
+
+def _write_sentinels(message: Message, word: int, mark: int) -> None:
+    double = struct.unpack("<d", struct.pack("<Q", word))[0]
+    values = {FieldDescriptor.TYPE_DOUBLE: double, FieldDescriptor.TYPE_FIXED64: word, _NARROW: mark}
+    for field, value in message.ListFields():
+        single = isinstance(value, Message | int | float)
+        if field.type == FieldDescriptor.TYPE_MESSAGE:
+            for inner in (value,) if single else value:
+                _write_sentinels(inner, word, mark)
+        elif field.type in values and single:
+            setattr(message, field.name, values[field.type])
+        elif field.type in values:
+            value[:] = [values[field.type]] * len(value)
+
+
+def _slot_widths(message: Message) -> Iterator[int]:
+    """The widths in bytes of all slots, in the order in which the library encodes fields."""
+    for field, value in message.ListFields():
+        single = isinstance(value, Message | int | float)
+        if field.type == FieldDescriptor.TYPE_MESSAGE:
+            for inner in (value,) if single else value:
+                yield from _slot_widths(inner)
+        elif field.type in (*_WIDE, _NARROW):
+            yield from [1 if field.type == _NARROW else 8] * (1 if single else len(value))

@@ -1,0 +1,47 @@
+"""Outputs: they appear when they are whole, and only their own errors are told as theirs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from spatial_replay.errors import OutputError
+from spatial_replay.logs.output import open_output, replacing
+
+
+def test_an_output_appears_when_it_is_whole(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    with replacing(output) as stream:
+        stream.write(b"whole")
+        assert not output.exists()
+    assert output.read_bytes() == b"whole"
+    assert list(tmp_path.iterdir()) == [output]
+
+
+def test_an_error_of_the_block_is_not_the_output_s_and_changes_nothing(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    output.write_bytes(b"before")
+    with pytest.raises(FileNotFoundError, match="absent"), replacing(output) as stream:
+        stream.write(b"half")
+        (tmp_path / "absent").read_bytes()
+    assert output.read_bytes() == b"before"
+    assert list(tmp_path.iterdir()) == [output]
+
+
+@pytest.mark.parametrize("size", [1, 1 << 22], ids=["when it is closed", "while it is written"])
+@pytest.mark.parametrize("opened", [replacing, open_output])
+def test_a_full_disk_is_the_output_s_error(opened: type, size: int) -> None:
+    full = Path("/dev/full")
+    if not full.is_char_device():
+        pytest.skip("no /dev/full here")
+    with (
+        pytest.raises(OutputError, match="/dev/full could not be written: no space left"),
+        opened(full) as stream,
+    ):
+        stream.write(bytes(size))
+
+
+def test_what_cannot_be_opened_is_the_output_s_error(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="absent/out could not be written: "):
+        open_output(tmp_path / "absent" / "out")
