@@ -1,0 +1,110 @@
+"""Entities of a scene: what a viewer draws of one object or region.
+
+Coordinates and colours that are NaN are left to be filled in; see `layout`.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.inspection.palette import LABEL
+
+FRAME: Final = "world"
+
+_LINE_PIXELS: Final = 2.0
+_LABEL_PIXELS: Final = 14.0
+_FILL_OPACITY: Final = 0.55
+_NAN: Final = float("nan")
+
+
+class Elevation(NamedTuple):
+    """Where an entity lies along the vertical axis, in footprint units; NaN to be filled in.
+
+    Attributes:
+        fill: of its filled face, the upper one of a prism.
+        sides: from where to where a prism's sides reach: bottom and height; None for a flat entity.
+        label: of its name.
+    """
+
+    fill: float
+    sides: tuple[float, float] | None
+    label: float
+
+
+def draw(
+    entity: SceneEntity,
+    name: str,
+    outlines: list[Floats],
+    faces: list[Floats],
+    anchor: tuple[float, float],
+    elevation: Elevation,
+) -> None:
+    """Add outlines, filled faces and the label to an entity; every colour but the label's is to be filled in.
+
+    The order in which numbers are to be filled in is that of `words_of_object` in `layout`.
+
+    Args:
+        outlines, faces: rings (n, 2); a face is convex.
+        anchor: where the label stands.
+    """
+    for ring in outlines:
+        _add_outline(entity, ring, elevation.fill)
+    for ring in faces:
+        if len(ring) > 2:
+            _add_face(entity, ring, elevation.fill)
+    if elevation.sides is not None:
+        for ring in outlines:
+            if len(ring) > 1:
+                _add_sides(entity, ring, *elevation.sides)
+    label = entity.texts.add(
+        billboard=True,
+        font_size=_LABEL_PIXELS,
+        scale_invariant=True,
+        text=name,
+        pose=_lying_at(elevation.label),
+    )
+    label.pose.position.x, label.pose.position.y = anchor
+    label.color.r, label.color.g, label.color.b, label.color.a = *LABEL, 1.0
+
+
+def _add_outline(entity: SceneEntity, ring: Floats, z: float) -> None:
+    line = entity.lines.add(
+        type=LinePrimitive.LINE_LOOP, thickness=_LINE_PIXELS, scale_invariant=True, pose=_lying_at(z)
+    )
+    for x, y in ring.tolist():
+        line.points.add(x=x, y=y)
+    line.color.r, line.color.g, line.color.b, line.color.a = _NAN, _NAN, _NAN, 1.0
+
+
+def _add_face(entity: SceneEntity, ring: Floats, z: float) -> None:
+    face = entity.triangles.add(pose=_lying_at(z))
+    for x, y in ring.tolist():
+        face.points.add(x=x, y=y)
+    for corner in range(1, len(ring) - 1):
+        face.indices.extend((0, corner, corner + 1))
+    face.color.r, face.color.g, face.color.b, face.color.a = _NAN, _NAN, _NAN, _FILL_OPACITY
+
+
+def _add_sides(entity: SceneEntity, ring: Floats, bottom: float, height: float) -> None:
+    sides = entity.triangles.add(pose=_lying_at(bottom))
+    for x, y in ring.tolist():
+        sides.points.add(x=x, y=y)
+    for x, y in ring.tolist():
+        sides.points.add(x=x, y=y, z=height)
+    count = len(ring)
+    for low in range(count):
+        following = (low + 1) % count
+        sides.indices.extend((low, following, count + low, following, count + following, count + low))
+    sides.color.r, sides.color.g, sides.color.b, sides.color.a = _NAN, _NAN, _NAN, _FILL_OPACITY
+
+
+def _lying_at(z: float) -> Pose:
+    pose = Pose()
+    pose.position.z = z
+    pose.orientation.w = 1.0
+    return pose

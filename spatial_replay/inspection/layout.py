@@ -1,0 +1,196 @@
+"""Messages of /spatial/scene of one layout: the same entities with the same primitives, many at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.timestamp_pb2 import Timestamp
+
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.inspection.drawing import FRAME, Elevation, draw
+from spatial_replay.inspection.rings import Form
+from spatial_replay.logs.wire import Bytes, Template
+from spatial_replay.spec.formula import Outline
+
+OBJECT: Final = "object/"
+REGION: Final = "region/"
+
+
+class Layout(NamedTuple):
+    """What decides where the numbers of a message stand.
+
+    Attributes:
+        deleted: objects that were in the message before and are not seen now.
+        objects: name and form of those seen.
+    """
+
+    deleted: tuple[str, ...]
+    objects: tuple[tuple[str, Form], ...]
+
+
+class Region(NamedTuple):
+    """A region as it is drawn.
+
+    Attributes:
+        name: its name.
+        outline: its border, as the specification says it.
+        rings: its convex parts, each (n, 2).
+    """
+
+    name: str
+    outline: Outline
+    rings: tuple[Floats, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SceneTemplate:
+    """Messages of one layout, but for their times, coordinates and colours.
+
+    Attributes:
+        template: its words are what is to be filled in.
+        stamps: where a timestamp's content begins.
+    """
+
+    template: Template
+    stamps: tuple[int, ...]
+
+    def fill(self, times_ns: Integers, words: Floats) -> Bytes:
+        """(S,) times and (S, W) numbers → (S, L) encoded messages."""
+        rows = self.template.fill(words.view(np.uint64))
+        stamps = _encoded_stamps(times_ns)
+        for begin in self.stamps:
+            rows[:, begin : begin + _STAMP] = stamps
+        return rows
+
+
+def make_template(layout: Layout, regions: tuple[Region, ...], lift: float) -> SceneTemplate:
+    """The template of a layout.
+
+    Args:
+        lift: how far flat objects are drawn above the plane, so that they cover regions.
+    """
+    message = SceneUpdate()
+    for name in layout.deleted:
+        message.deletions.add(id=OBJECT + name, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
+    for region in regions:
+        _add_region(_add_entity(message, REGION + region.name), region)
+    for name, form in layout.objects:
+        _add_object(_add_entity(message, OBJECT + name), name, form, lift)
+    payload = np.frombuffer(message.SerializeToString(deterministic=True), np.uint8).copy()
+    words = Template.of(message).word_offsets
+    slots = words[np.isnan(payload[words[:, None] + np.arange(8)].view("<f8")[:, 0])]
+    payload[slots[:, None] + np.arange(8)] = 0
+    return SceneTemplate(Template(payload, slots, np.empty(0, np.int64)), _stamp_offsets(payload.tobytes()))
+
+
+def words_of_region(region: Region, colour: Floats) -> list[Floats]:
+    """What a template leaves open in a region: the colours (S, 3) of its lines and faces."""
+    primitives = _region_entity(region)
+    return [colour] * (len(primitives.lines) + len(primitives.triangles))
+
+
+def words_of_object(form: Form, points: Floats, bottom: Floats, top: Floats, colour: Floats) -> list[Floats]:
+    """What a template leaves open in an object, in the order of its primitives' fields.
+
+    Args:
+        points: (S, P, 2), its rings, one after the other.
+        bottom, top: (S,) its height interval, if it has one.
+        colour: (S, 3).
+
+    Returns:
+        columns (S, n), each of one or more words.
+    """
+    rings = _split(points, form.rings)
+    upper = [top[:, None]] if form.has_height else []
+    words = []
+    for ring in rings:
+        words += [*upper, _flat(ring), colour]
+    for ring in rings:
+        if ring.shape[1] > 2:
+            words += [*upper, _flat(ring), colour]
+    if form.has_height:
+        for ring in rings:
+            if ring.shape[1] > 1:
+                words += [bottom[:, None], _flat(ring), _raised(ring, top - bottom), colour]
+    # half the sum of the ends does not depend on the order in which points are added up
+    words.append((points.min(axis=1) + points.max(axis=1)) / 2.0)
+    return words + upper
+
+
+def _add_entity(message: SceneUpdate, identifier: str) -> SceneEntity:
+    return message.entities.add(id=identifier, frame_id=FRAME, timestamp=_A_STAMP)
+
+
+def _add_region(entity: SceneEntity, region: Region) -> None:
+    """A region's border as it was written, or for a disc its ring, and its convex parts as faces."""
+    corners = np.array(region.outline.vertices, np.float64)
+    outlines = list(region.rings) if region.outline.is_disc else [corners]
+    bottom, top = region.outline.height or (0.0, 0.0)
+    sides = None if region.outline.height is None else (bottom, top - bottom)
+    everything = np.concatenate(region.rings)
+    x, y = ((everything.min(axis=0) + everything.max(axis=0)) / 2.0).tolist()
+    draw(entity, region.name, outlines, list(region.rings), (x, y), Elevation(top, sides, top))
+
+
+def _region_entity(region: Region) -> SceneEntity:
+    entity = SceneEntity()
+    _add_region(entity, region)
+    return entity
+
+
+def _add_object(entity: SceneEntity, name: str, form: Form, lift: float) -> None:
+    rings = [np.full((length, 2), np.nan) for length in form.rings]
+    elevation = Elevation(lift, None, 2.0 * lift)
+    if form.has_height:
+        elevation = Elevation(np.nan, (np.nan, np.nan), np.nan)
+    draw(entity, name, rings, rings, (np.nan, np.nan), elevation)
+
+
+def _split(points: Floats, lengths: tuple[int, ...]) -> list[Floats]:
+    ends = np.cumsum(lengths).tolist()
+    return [points[:, end - length : end] for end, length in zip(ends, lengths, strict=True)]
+
+
+def _flat(ring: Floats) -> Floats:
+    return ring.reshape(len(ring), -1)
+
+
+def _raised(ring: Floats, height: Floats) -> Floats:
+    """(S, n, 2) points and (S,) heights → (S, 3 n): x, y, z, x, y, z …"""
+    z = np.broadcast_to(height[:, None, None], (*ring.shape[:2], 1))
+    return _flat(np.concatenate([ring, z], axis=2))
+
+
+# ------------------------------------------------------------------------------------------- timestamps
+
+# Numbers of variable length may be padded: written with five bytes each, all stamps have one length.
+_SECONDS, _NANOS = (1 << 34) - 1, (1 << 30) - 1
+_A_STAMP: Final = Timestamp(seconds=_SECONDS, nanos=_NANOS)
+# its bytes of all ones are in no text, and every other number is a slot or an ordinary constant
+_STAMP_BYTES: Final = _A_STAMP.SerializeToString()
+_STAMP: Final = len(_STAMP_BYTES)
+_NS: Final = 1_000_000_000
+
+
+def _stamp_offsets(payload: bytes) -> tuple[int, ...]:
+    offsets = []
+    begin = payload.find(_STAMP_BYTES)
+    while begin >= 0:
+        offsets.append(begin)
+        begin = payload.find(_STAMP_BYTES, begin + _STAMP)
+    return tuple(offsets)
+
+
+def _encoded_stamps(times_ns: Integers) -> Bytes:
+    """(S,) nanoseconds → (S, 12) the contents of timestamps."""
+    rows = np.tile(np.frombuffer(_STAMP_BYTES, np.uint8), (len(times_ns), 1))
+    shifts = np.arange(0, 35, 7)
+    more = np.array([0x80, 0x80, 0x80, 0x80, 0x00])
+    for begin, number in ((1, times_ns // _NS), (7, times_ns % _NS)):
+        rows[:, begin : begin + 5] = number[:, None] >> shifts & 0x7F | more
+    return rows

@@ -1,0 +1,236 @@
+"""Objects, regions and how well they do → messages of /spatial/scene."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.inspection.involvement import Evaluated, Seen, worst_robustness
+from spatial_replay.inspection.layout import (
+    Layout,
+    Region,
+    SceneTemplate,
+    make_template,
+    words_of_object,
+    words_of_region,
+)
+from spatial_replay.inspection.palette import colours
+from spatial_replay.inspection.rings import Form, Rings, extents, rings_of
+from spatial_replay.logs.wire import payloads_of
+from spatial_replay.monitor.operands import footprint_from_outline
+from spatial_replay.spec.formula import Outline
+from spatial_replay.trace.trace import Trace
+
+PERIOD_NS: Final = 20_000_000
+"""The least time between two messages: what viewers draw without a warning."""
+
+_LIFT: Final = 0.01
+_POINT: Final = 0.02
+"""Height of flat objects above the plane, and radius of a point, by the scale of the scene."""
+
+_UNSCALED: Final = 1.0
+"""The scale before any object is seen, and that of a scene of points, which have no size."""
+
+_TEMPLATES_KEPT: Final = 256
+_ABSENT, _DELETED, _FIRST_FORM = -1, 0, 1
+
+
+@dataclass(frozen=True, eq=False)
+class SceneState:
+    """What the next message depends on besides its own sample.
+
+    Attributes:
+        written_ns: the time of the last message, or None before the first.
+        shown: the objects in it.
+        scale: the robustness at which colours are full: the median size (longer side of the bounding box) of
+            the objects in the first message that shows any; None before that.
+        templates: the layouts met so far; they save time and change no message.
+    """
+
+    written_ns: int | None = None
+    shown: tuple[str, ...] = ()
+    scale: float | None = None
+    templates: Mapping[Layout, SceneTemplate] = field(default_factory=lambda: MappingProxyType({}))
+
+
+class SceneMessages(NamedTuple):
+    """Encoded messages, their times (S,) int64, and the state to go on from."""
+
+    times_ns: Integers
+    payloads: list[bytes]
+    state: SceneState
+
+
+class _Cast(NamedTuple):
+    """Who is in S samples, and where.
+
+    Attributes:
+        names: objects that are, or just were, in sight.
+        rows: (S, names), rows of the trace; below 0 where an object is not seen.
+        forms: (S, names), `_ABSENT`, `_DELETED`, or from `_FIRST_FORM` on the number of its form.
+        observations: (S, names), rows of `rings` and `footprints`.
+    """
+
+    names: tuple[str, ...]
+    rows: Integers
+    forms: Integers
+    observations: Integers
+    footprints: FootprintBatch
+    rings: Rings
+
+
+@dataclass(frozen=True, eq=False)
+class SceneEncoder:
+    """Draws traces over the regions of a specification.
+
+    Every message holds all regions and all objects seen, so that a viewer that jumps to it misses nothing;
+    objects no longer seen are deleted. Blue, vermillion and grey say how the worst of what is asked of an
+    object or region stands now (see `palette` and `involvement`).
+
+    Attributes:
+        regions: by name.
+    """
+
+    regions: Mapping[str, Outline]
+    _drawn: tuple[Region, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        drawn = tuple(_region(name, self.regions[name]) for name in sorted(self.regions))
+        object.__setattr__(self, "_drawn", drawn)
+
+    def encode(
+        self, trace: Trace, evaluated: Sequence[Evaluated] = (), state: SceneState | None = None
+    ) -> SceneMessages:
+        """The messages of the next samples; it does not matter into how many blocks a run is cut.
+
+        Args:
+            trace: the next samples, after those of the state.
+            evaluated: what specifications say of these samples; others have no say in the colours.
+            state: what the call before returned, or None to begin.
+        """
+        state = state or SceneState()
+        written = _spaced(trace.times_ns, state.written_ns)
+        times_ns = trace.times_ns[written]
+        if not len(written):
+            return SceneMessages(times_ns, [], state)
+        state, scales = _scaled(state, trace, trace.rows[written])
+        scale = state.scale or _UNSCALED
+        cast = _cast(trace, trace.rows[written], state.shown, scale)
+        seen = Seen(times_ns, cast.names, _class_codes(trace, cast.rows), trace.classes)
+        objects, regions = worst_robustness(evaluated, seen, [region.name for region in self._drawn])
+        shades = colours(objects, scales), colours(regions, scales)
+        templates = dict(state.templates)
+        payloads = [b""] * len(written)
+        for layout, samples in _by_layout(cast):
+            if layout not in templates:
+                templates[layout] = make_template(layout, self._drawn, _LIFT * scale)
+            words = self._words(layout, samples, cast, *shades)
+            rows = templates[layout].fill(times_ns[samples], words)
+            for sample, payload in zip(samples.tolist(), payloads_of(rows), strict=True):
+                payloads[sample] = payload
+        last = cast.forms[-1] >= _FIRST_FORM
+        after = SceneState(
+            written_ns=int(times_ns[-1]),
+            shown=tuple(name for name, is_shown in zip(cast.names, last.tolist(), strict=True) if is_shown),
+            scale=state.scale,
+            templates=MappingProxyType(dict(list(templates.items())[-_TEMPLATES_KEPT:])),
+        )
+        return SceneMessages(times_ns, payloads, after)
+
+    def _words(
+        self, layout: Layout, samples: Integers, cast: _Cast, objects: Floats, regions: Floats
+    ) -> Floats:
+        """(S, W) what the layout's template leaves open."""
+        columns = []
+        for index, region in enumerate(self._drawn):
+            columns += words_of_region(region, regions[samples, index])
+        for name, form in layout.objects:
+            column = cast.names.index(name)
+            rows = cast.observations[samples, column]
+            points = cast.rings.points[cast.rings.start[rows][:, None] + np.arange(sum(form.rings))]
+            bottom, top = cast.footprints.bottom[rows], cast.footprints.top[rows]
+            columns += words_of_object(form, points, bottom, top, objects[samples, column])
+        return np.concatenate([np.empty((len(samples), 0)), *columns], axis=1)
+
+
+def _region(name: str, outline: Outline) -> Region:
+    rings = rings_of(FootprintBatch.from_footprints([footprint_from_outline(outline)]), 0.0)
+    ends = np.cumsum(rings.forms[0].rings)[:-1]
+    return Region(name, outline, tuple(np.split(rings.points, ends)))
+
+
+def _spaced(times_ns: Integers, written_ns: int | None) -> Integers:
+    """Indices of the samples to write: each at least a period after the one written before."""
+    if not len(times_ns):
+        return np.empty(0, np.int64)
+    earliest = int(times_ns[0]) if written_ns is None else written_ns + PERIOD_NS
+    if times_ns[0] >= earliest and (np.diff(times_ns) >= PERIOD_NS).all():
+        return np.arange(len(times_ns))
+    chosen = []
+    at = bisect_left(times_ns, earliest)
+    while at < len(times_ns):
+        chosen.append(at)
+        at = bisect_left(times_ns, int(times_ns[at]) + PERIOD_NS, at + 1)
+    return np.array(chosen, np.int64)
+
+
+def _scaled(state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState, Floats]:
+    """The state with its scale, if an object is in sight by now, and the scale (S, 1) for each message."""
+    if state.scale is not None:
+        return state, np.full((len(rows), 1), state.scale)
+    scales = np.full((len(rows), 1), _UNSCALED)
+    is_shown = (rows >= 0).any(axis=1)
+    if not is_shown.any():
+        return state, scales
+    first = int(is_shown.argmax())
+    seen = rows[first][rows[first] >= 0]
+    scale = float(np.median(extents(trace.footprints.select(seen)))) or _UNSCALED
+    scales[first:] = scale
+    return SceneState(state.written_ns, state.shown, scale, state.templates), scales
+
+
+def _cast(trace: Trace, rows: Integers, shown: tuple[str, ...], scale: float) -> _Cast:
+    names = tuple(sorted({*trace.names, *shown}))
+    of_all = np.full((len(rows), len(names)), -1, np.int64)
+    of_all[:, [names.index(name) for name in trace.names]] = rows
+    is_seen = of_all >= 0
+    was_seen = np.concatenate([[[name in shown for name in names]], is_seen[:-1]])
+    footprints = trace.footprints.select(of_all[is_seen])
+    rings = rings_of(footprints, _POINT * scale)
+    observations = np.full(of_all.shape, -1, np.int64)
+    observations[is_seen] = np.arange(len(footprints))
+    forms = np.where(was_seen, _DELETED, _ABSENT)
+    forms[is_seen] = _FIRST_FORM + rings.form
+    return _Cast(names, of_all, forms, observations, footprints, rings)
+
+
+def _class_codes(trace: Trace, rows: Integers) -> Integers:
+    codes = np.full(rows.shape, -1, np.int64)
+    codes[rows >= 0] = trace.class_code[rows[rows >= 0]]
+    return codes
+
+
+def _by_layout(cast: _Cast) -> Iterator[tuple[Layout, Integers]]:
+    """The layouts, and the samples (S,) that have each."""
+    if (cast.forms == cast.forms[0]).all():
+        yield _layout(cast, cast.forms[0]), np.arange(len(cast.forms))
+        return
+    rows, which = np.unique(cast.forms, axis=0, return_inverse=True)
+    for number, row in enumerate(rows):
+        yield _layout(cast, row), np.flatnonzero(which.reshape(-1) == number)
+
+
+def _layout(cast: _Cast, forms: NDArray[np.int64]) -> Layout:
+    listed: list[tuple[str, int]] = list(zip(cast.names, forms.tolist(), strict=True))
+    seen: list[tuple[str, Form]] = [
+        (name, cast.rings.forms[form - _FIRST_FORM]) for name, form in listed if form >= _FIRST_FORM
+    ]
+    return Layout(tuple(name for name, form in listed if form == _DELETED), tuple(seen))

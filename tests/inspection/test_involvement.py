@@ -1,0 +1,94 @@
+"""Which objects a formula is about, and in which sign."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spatial_replay.inspection.involvement import (
+    Concern,
+    Evaluated,
+    OpenGroup,
+    Seen,
+    concerns_of,
+    worst_robustness,
+)
+from spatial_replay.spec.formula import (
+    Atom,
+    Boolean,
+    Earlier,
+    Enlarged,
+    Group,
+    Number,
+    Quantified,
+    RegionName,
+    Temporal,
+    TrackedName,
+    Variable,
+    iter_nodes,
+)
+
+
+def atom(*terms) -> Atom:
+    return Atom("…", "closeto", Number(0.0), terms=terms)
+
+
+A, B, GOAL = TrackedName("a"), TrackedName("b"), RegionName("goal")
+NOTHING: frozenset[str] = frozenset()
+
+
+def signs(formula) -> list[tuple[int, float]]:
+    return [(concern.node, concern.sign) for concern in concerns_of(formula)]
+
+
+def test_a_formula_without_temporal_operators_is_one_concern():
+    formula = Boolean("not", (Boolean("->", (atom(A, B), atom(A, GOAL))),))
+    assert concerns_of(formula) == (Concern(0, 1.0, frozenset("ab"), frozenset({"goal"}), frozenset()),)
+
+
+def test_concerns_are_the_largest_subformulas_below_temporal_operators():
+    both = Boolean("and", (atom(A, B), atom(A, GOAL)))
+    formula = Boolean("and", (Temporal("F", (both,)), Temporal("U", (atom(A), Temporal("G", (atom(B),))))))
+    assert signs(formula) == [(2, 1.0), (6, 1.0), (8, 1.0)]
+
+
+def test_negations_and_the_left_of_an_implication_turn_the_sign():
+    later = Temporal("F", (atom(B),))
+    assert signs(Boolean("not", (later,))) == [(2, -1.0)]
+    assert signs(Boolean("->", (atom(A), later))) == [(1, -1.0), (3, 1.0)]
+    assert signs(Boolean("->", (Boolean("not", (later,)), later))) == [(3, 1.0), (5, 1.0)]
+    assert signs(Boolean("<->", (atom(A), later))) == []
+    assert signs(Boolean("xor", (atom(A), later))) == []
+
+
+def test_terms_are_looked_through():
+    named = Group("reds", members=("red1", "red2"), excluded=(TrackedName("red2"),))
+    [concern] = concerns_of(atom(Enlarged(Earlier(A, samples=2), 1.0), Earlier(named, samples=1)))
+    assert concern.objects == {"a", "red1"}
+
+
+def test_a_parameter_stands_for_its_object():
+    others = Group("people", class_name="Pedestrian", excluded=(Variable("ego"),))
+    [concern] = concerns_of(atom(Variable("ego"), others), "7")
+    assert concern.objects == {"7"}
+    assert concern.groups == {OpenGroup("pedestrian", frozenset({"7"}))}
+
+
+def test_a_quantifier_is_about_the_members_of_its_group():
+    everyone = Group("everyone", class_name="*")
+    formula = Quantified("forall", ("x",), Earlier(everyone, samples=1), atom(Variable("x"), A))
+    [concern] = concerns_of(formula)
+    assert (concern.objects, concern.groups) == ({"a"}, {OpenGroup("*", NOTHING)})
+
+
+def test_open_groups_have_the_members_of_each_sample():
+    cups = Group("cups", class_name="cup", excluded=(B,))
+    formula = atom(cups)
+    times = np.array([0, 1, 2])
+    codes = np.array([[0, 0, 1], [0, -1, 0], [-1, 0, 1]])
+    seen = Seen(times, ["a", "b", "c"], codes, ["Cup", None])
+    series = np.array([[[0.0] * 3, [-1.0, 2.0, 3.0], [0.0] * 3, [0.0] * 3]])
+    assert len(list(iter_nodes(formula))) == len(series)
+    objects, regions = worst_robustness([Evaluated(concerns_of(formula), times, series)], seen, ["goal"])
+    nan = np.nan
+    assert np.array_equal(objects, [[-1.0, nan, nan], [2.0, nan, 2.0], [nan] * 3], equal_nan=True)
+    assert np.isnan(regions).all()

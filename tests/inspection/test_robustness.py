@@ -1,0 +1,89 @@
+"""What a message of /spatial/robustness says, to others' decoders and to ours."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from spatial_replay.errors import LogError
+from spatial_replay.inspection.robustness import VERDICTS, decode_robustness, encode_robustness
+from spatial_replay.logs.messages.Robustness_pb2 import Robustness
+from spatial_replay.monitor.verdict import online_verdict
+
+NAMES = st.lists(st.none() | st.text(min_size=1, max_size=5), min_size=1, max_size=6)
+NUMBERS = st.floats(width=64)
+
+
+@st.composite
+def numbered(draw: st.DrawFn):
+    """Names of nodes, times, and (N, 4, T) numbers of which lower and upper are never NaN."""
+    names = draw(NAMES)
+    times = np.array(sorted(draw(st.sets(st.integers(0, 2**63 - 1), max_size=5))), np.int64)
+    values = draw(arrays(np.float64, (len(names), 2, len(times)), elements=NUMBERS))
+    ends = draw(arrays(np.float64, (len(names), 2, len(times)), elements=st.floats(allow_nan=False)))
+    return names, times, np.concatenate([values, np.sort(ends, axis=1)], axis=1)
+
+
+@given(numbered(), st.none() | st.text(min_size=1, max_size=5))
+def test_the_protobuf_library_reads_every_number(given_numbers, instance):
+    names, times, series = given_numbers
+    payloads = encode_robustness("blocks", instance, names, times, series)
+    assert len(payloads) == len(times)
+    for sample, payload in enumerate(payloads):
+        message = Robustness.FromString(payload)
+        assert (message.specification, message.object) == ("blocks", instance or "")
+        assert message.time_ns == times[sample]
+        for index, (node, name) in enumerate(zip(message.nodes, names, strict=True)):
+            assert (node.id, node.name) == (index, name or "")
+            numbers = [node.value, node.now, node.lower, node.upper]
+            assert np.array_equal(numbers, series[index, :, sample], equal_nan=True)
+            assert VERDICTS[node.verdict] == online_verdict(node.lower, node.upper)
+
+
+@given(numbered())
+def test_decoding_gives_back_what_was_encoded(given_numbers):
+    names, times, series = given_numbers
+    decoded = decode_robustness(encode_robustness("blocks", None, names, times, series))
+    assert len(decoded) == min(1, len(times))
+    for read in decoded:
+        assert (read.specification, read.object, read.names) == ("blocks", None, tuple(names))
+        assert read.times_ns.tolist() == times.tolist()
+        assert np.array_equal(read.series, series, equal_nan=True)
+
+
+@given(numbered(), numbered())
+def test_interleaved_specifications_come_apart(first, second):
+    payloads = encode_robustness("a", "ego", *first), encode_robustness("bcd", None, *second)
+    tagged = [("a", payload) for payload in payloads[0]] + [("bcd", payload) for payload in payloads[1]]
+    tagged.sort(key=lambda entry: entry[1])
+    by_name = {read.specification: read for read in decode_robustness([payload for _, payload in tagged])}
+    assert by_name.keys() == {name for name, _ in tagged}
+    for name, read in by_name.items():
+        assert {tagged[index][0] for index in read.messages.tolist()} == {name}
+        times = [Robustness.FromString(tagged[index][1]).time_ns for index in read.messages.tolist()]
+        assert read.times_ns.tolist() == times
+
+
+def test_a_writer_that_leaves_out_zeros_is_read_too():
+    message = Robustness(specification="s")
+    message.nodes.add(value=1.5, lower=-2.0, upper=2.0)
+    full = encode_robustness("s", None, [None], np.array([7]), np.array([[[1.0], [2.0], [3.0], [4.0]]]))
+    [read] = decode_robustness([message.SerializeToString(), *full])
+    assert read.times_ns.tolist() == [0, 7]
+    assert read.series[0].T.tolist() == [[1.5, 0.0, -2.0, 2.0], [1.0, 2.0, 3.0, 4.0]]
+    assert [VERDICTS[code] for code in read.verdicts[0]] == ["unknown", "satisfied"]
+
+
+def test_what_is_no_message_of_ours_is_named():
+    with pytest.raises(LogError, match=r"message 0 of 3 bytes is no spatial_replay\.Robustness"):
+        decode_robustness([b"\xff\xff\xff"])
+
+
+def test_a_verdict_of_another_version_is_named():
+    message = Robustness(specification="s")
+    message.nodes.add(verdict=9)
+    with pytest.raises(LogError, match="code 9"):
+        decode_robustness([message.SerializeToString()])

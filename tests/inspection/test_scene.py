@@ -1,0 +1,322 @@
+"""What a viewer finds in the messages of /spatial/scene."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
+from spatial_replay.inspection.involvement import Evaluated, concerns_of
+from spatial_replay.inspection.scene import PERIOD_NS, SceneEncoder
+from spatial_replay.spec.formula import Atom, Outline, RegionName, SignedDistance, TrackedName, iter_nodes
+from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Trace
+
+FRAME_NS = 1_000_000_000 // 30
+REGIONS = {
+    "goal": Outline(((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))),
+    "shelf": Outline(((2.0, 0.0),), 0.5, (1.0, 1.5)),
+    "corner": Outline(((0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (1.0, 1.0), (1.0, 2.0), (0.0, 2.0))),
+}
+
+
+def near(first: str, second: str) -> Atom:
+    terms = TrackedName(first), RegionName(second) if second in REGIONS else TrackedName(second)
+    return Atom(f"{first} closeto[1] {second}", "closeto", 1.0 - SignedDistance(*terms), terms=terms)
+
+
+def says(formula, trace: Trace, now) -> Evaluated:
+    """A formula with the given numbers (N, T) or (T,) of its nodes now."""
+    series = np.full((len(list(iter_nodes(formula))), 4, len(trace)), np.nan)
+    series[:, 1] = now
+    return Evaluated(concerns_of(formula), trace.times_ns, series)
+
+
+def run(*samples: dict, period_ns: int = FRAME_NS) -> Trace:
+    return Trace.from_samples(Sample(index * period_ns, objects) for index, objects in enumerate(samples))
+
+
+def messages(trace: Trace, *evaluated: Evaluated, regions=None) -> list[SceneUpdate]:
+    encoded = SceneEncoder(regions or {}).encode(trace, evaluated)
+    return [SceneUpdate.FromString(payload) for payload in encoded.payloads]
+
+
+def entity(message: SceneUpdate, identifier: str):
+    [found] = [each for each in message.entities if each.id == identifier]
+    return found
+
+
+def tint(message: SceneUpdate, identifier: str) -> str:
+    """The colour of an entity's lines and faces, in words."""
+    drawn = entity(message, identifier)
+    [(red, _, blue)] = {
+        (each.color.r, each.color.g, each.color.b) for each in [*drawn.lines, *drawn.triangles]
+    }
+    return "grey" if red == blue else "blue" if blue > red else "red"
+
+
+def points(primitive) -> list[tuple[float, float]]:
+    return [(point.x, point.y) for point in primitive.points]
+
+
+BOX = Footprint.box(0.0, 0.0, 2.0, 1.0)
+DISC = Footprint.disc(3.0, 0.0, 0.5)
+
+# ------------------------------------------------------------------------------------------------ laws
+
+COORDINATES = st.integers(-50, 50).map(lambda number: number / 8)
+
+
+@st.composite
+def tracked(draw: st.DrawFn):
+    x, y = draw(COORDINATES), draw(COORDINATES)
+    footprint = draw(
+        st.sampled_from(
+            [
+                Footprint.box(x, y, x + 1.0, y + 2.0),
+                Footprint.disc(x, y, 0.5),
+                Footprint.disc(x, y, 0.0),
+                Footprint.capsule((x, y), (x + 1.0, y), 0.25),
+                Footprint.union([Footprint.box(x, y, x + 1.0, y + 1.0), Footprint.disc(x, y, 1.0)]),
+            ]
+        )
+    )
+    return TrackedObject(
+        footprint, draw(st.sampled_from([None, "cup"])), height=draw(st.none() | st.just((0.0, y * y)))
+    )
+
+
+@st.composite
+def runs(draw: st.DrawFn) -> Trace:
+    names = ["a", "b", "ccc"]
+    gaps = draw(st.lists(st.integers(1, 3 * PERIOD_NS), min_size=1, max_size=8))
+    samples = [
+        Sample(time, {name: draw(tracked()) for name in names if draw(st.booleans())})
+        for time in np.cumsum(gaps).tolist()
+    ]
+    return Trace.from_samples(samples)
+
+
+@settings(max_examples=60)
+@given(runs(), st.data())
+def test_how_a_run_is_cut_into_blocks_changes_no_byte(trace, data):
+    said = says(near("a", "goal"), trace, np.linspace(-1.0, 1.0, len(trace)))
+    encoder = SceneEncoder(REGIONS)
+    whole = encoder.encode(trace, [said])
+    cuts = sorted(data.draw(st.sets(st.integers(0, len(trace)))) | {0, len(trace)})
+    times, payloads, state = [], [], None
+    for begin, end in pairwise(cuts):
+        # blocks read from a log know only the names that are in them
+        block = trace.slice(begin, end).compact()
+        part = encoder.encode(block, [said], state)
+        times += part.times_ns.tolist()
+        payloads += part.payloads
+        state = part.state
+    assert times == whole.times_ns.tolist()
+    assert payloads == whole.payloads
+
+
+@settings(max_examples=60)
+@given(runs())
+def test_a_viewer_shows_exactly_the_objects_seen(trace):
+    encoded = SceneEncoder({}).encode(trace)
+    shown: set[str] = set()
+    samples = {sample.time_ns: sample for sample in trace.samples()}
+    for time_ns, payload in zip(encoded.times_ns.tolist(), encoded.payloads, strict=True):
+        message = SceneUpdate.FromString(payload)
+        for deletion in message.deletions:
+            assert deletion.type == SceneEntityDeletion.MATCHING_ID
+            assert deletion.timestamp.ToNanoseconds() == time_ns
+            shown.remove(deletion.id)
+        shown |= {each.id for each in message.entities}
+        assert shown == {f"object/{name}" for name in samples[time_ns].objects}
+        for each in message.entities:
+            assert each.timestamp.ToNanoseconds() == time_ns
+            assert (each.frame_id, each.HasField("lifetime")) == ("world", False)
+
+
+@settings(max_examples=60)
+@given(runs())
+def test_messages_keep_their_distance_in_time(trace):
+    times = SceneEncoder({}).encode(trace).times_ns
+    assert times[0] == trace.times_ns[0]
+    assert (np.diff(times) >= PERIOD_NS).all()
+    for time_ns in set(trace.times_ns.tolist()) - set(times.tolist()):
+        before = times[np.searchsorted(times, time_ns) - 1]
+        assert time_ns - before < PERIOD_NS
+
+
+@given(st.integers(0, 2**63 - 1))
+def test_every_time_is_written_exactly(time_ns):
+    trace = Trace.from_samples([Sample(time_ns, {"a": BOX})])
+    [message] = messages(trace)
+    assert message.entities[0].timestamp.ToNanoseconds() == time_ns
+
+
+# --------------------------------------------------------------------------------------------- shapes
+
+
+def test_a_polygon_is_outlined_filled_and_labelled():
+    [message] = messages(run({"cup": BOX}))
+    drawn = entity(message, "object/cup")
+    corners = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
+    [line], [face], [label] = drawn.lines, drawn.triangles, drawn.texts
+    assert line.type == line.LINE_LOOP
+    assert points(line) == corners
+    assert points(face) == corners
+    assert list(face.indices) == [0, 1, 2, 0, 2, 3]
+    assert label.text == "cup"
+    assert (label.pose.position.x, label.pose.position.y) == (1.0, 0.5)
+    assert line.pose.orientation.w == face.pose.orientation.w == label.pose.orientation.w == 1.0
+
+
+@pytest.mark.parametrize(
+    ("footprint", "distance"),
+    [
+        (Footprint.disc(3.0, 1.0, 0.5), lambda x, y: np.hypot(x - 3.0, y - 1.0)),
+        (
+            Footprint.capsule((0.0, 0.0), (2.0, 0.0), 0.5),
+            lambda x, y: np.hypot(x - np.clip(x, 0.0, 2.0), y),
+        ),
+    ],
+)
+def test_the_ring_of_a_rounded_part_lies_on_its_border(footprint, distance):
+    [message] = messages(run({"a": footprint}))
+    for primitive in (*entity(message, "object/a").lines, *entity(message, "object/a").triangles):
+        ring = np.array(points(primitive))
+        assert len(ring) == 32
+        assert np.allclose(distance(*ring.T), 0.5)
+
+
+def test_every_part_of_a_union_is_drawn():
+    parts = Footprint(
+        (ConvexPart(np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])), ConvexPart(np.array([(5.0, 5.0)]), 1.0))
+    )
+    [message] = messages(run({"a": parts}))
+    assert [len(line.points) for line in entity(message, "object/a").lines] == [3, 32]
+
+
+def test_a_point_is_a_small_disc_and_a_segment_a_line():
+    shapes = {
+        "point": Footprint.disc(1.0, 1.0, 0.0),
+        "segment": Footprint.capsule((0.0, 0.0), (1.0, 0.0), 0.0),
+    }
+    [message] = messages(run(shapes | {"box": BOX}))
+    x, y = np.array(points(entity(message, "object/point").lines[0])).T
+    assert 0.0 < np.hypot(x - 1.0, y - 1.0).max() < 0.1
+    assert not entity(message, "object/segment").triangles
+
+
+def test_an_object_with_height_is_a_prism():
+    [message] = messages(run({"cup": TrackedObject(BOX, height=(0.5, 2.0))}))
+    drawn = entity(message, "object/cup")
+    face, sides = drawn.triangles
+    assert drawn.lines[0].pose.position.z == face.pose.position.z == drawn.texts[0].pose.position.z == 2.0
+    assert sides.pose.position.z == 0.5
+    assert [point.z for point in sides.points] == [0.0] * 4 + [1.5] * 4
+    assert points(sides) == points(face) * 2
+    triangles = np.array(sides.indices).reshape(-1, 3)
+    # two triangles for each side, upright: the corners of a side are neighbours
+    assert len({frozenset(corners) for corners in triangles.tolist()}) == 2 * 4
+    for corners in triangles % 4:
+        assert len(set(corners.tolist())) == 2
+        assert (corners.max() - corners.min()) in (1, 3)
+
+
+def test_regions_are_in_every_message():
+    for message in messages(run({"a": BOX}, {}), regions=REGIONS):
+        goal, shelf, corner = (entity(message, f"region/{name}") for name in ("goal", "shelf", "corner"))
+        assert points(goal.lines[0]) == list(REGIONS["goal"].vertices)
+        assert len(shelf.lines[0].points) == 32
+        assert [face.pose.position.z for face in shelf.triangles] == [1.5, 1.0]
+        assert len(corner.lines) == 1
+        assert len(corner.triangles) > 1
+        assert [each.texts[0].text for each in (goal, shelf, corner)] == ["goal", "shelf", "corner"]
+
+
+def test_flat_objects_lie_above_flat_regions():
+    [message] = messages(run({"a": BOX}), regions=REGIONS)
+    assert entity(message, "object/a").triangles[0].pose.position.z > 0.0
+    assert entity(message, "region/goal").triangles[0].pose.position.z == 0.0
+
+
+def test_unreadable_coordinates_are_not_drawn():
+    seen = run({"a": BOX, "b": DISC}, {"a": BOX, "b": DISC})
+    rows = seen.rows.copy()
+    rows[1, 0] = -2 - rows[1, 0]
+    trace = Trace(
+        seen.times_ns,
+        seen.names,
+        rows,
+        seen.footprints,
+        seen.yaw,
+        seen.uncertainty,
+        seen.class_code,
+        seen.classes,
+    )
+    message = messages(trace)[1]
+    assert [each.id for each in message.entities] == ["object/b"]
+    assert [each.id for each in message.deletions] == ["object/a"]
+
+
+# -------------------------------------------------------------------------------------------- colours
+
+
+def test_the_colour_follows_the_sign_of_the_robustness():
+    trace = run(*[{"a": BOX, "b": DISC, "c": BOX}] * 3)
+    shown = messages(trace, says(near("a", "b"), trace, [0.5, -0.5, np.nan]))
+    assert [tint(message, "object/a") for message in shown] == ["blue", "red", "grey"]
+    assert [tint(message, "object/b") for message in shown] == ["blue", "red", "grey"]
+    assert [tint(message, "object/c") for message in shown] == ["grey"] * 3
+
+
+def test_the_worst_of_several_specifications_counts():
+    trace = run(*[{"a": BOX, "b": DISC}] * 2)
+    first = says(near("a", "goal"), trace, [0.5, np.nan])
+    second = says(near("a", "b"), trace, [-0.1, 0.2])
+    shown = messages(trace, first, second, regions=REGIONS)
+    assert [tint(message, "object/a") for message in shown] == ["red", "blue"]
+    assert [tint(message, "region/goal") for message in shown] == ["blue", "grey"]
+
+
+def test_a_stronger_robustness_has_a_fuller_colour():
+    trace = run(*[{"a": BOX}] * 4)
+    shown = messages(trace, says(near("a", "a"), trace, [0.0, 0.5, 2.0, 50.0]))
+    blue = [entity(message, "object/a").lines[0].color.b for message in shown]
+    assert blue[0] < blue[1] < blue[2] == blue[3]
+
+
+def test_samples_that_nothing_was_said_about_are_grey():
+    trace = run(*[{"a": BOX}] * 4)
+    late = says(near("a", "a"), trace.slice(2, 4), 1.0)
+    shown = messages(trace, late)
+    assert [tint(message, "object/a") for message in shown] == ["grey", "grey", "blue", "blue"]
+
+
+def test_no_robustness_left_is_still_blue():
+    trace = run({"a": BOX})
+    [message] = messages(trace, says(near("a", "a"), trace, 0.0))
+    assert tint(message, "object/a") == "blue"
+
+
+def test_colours_are_full_at_the_median_size_of_the_objects_first_seen():
+    # longer sides: 4, 2 and 1, far from the origin
+    sizes = {"a": Footprint.box(100.0, 7.0, 104.0, 8.0), "b": Footprint.disc(-50.0, 0.0, 1.0)}
+    sizes["c"] = Footprint.box(0.0, 0.0, 1.0, 1.0)
+    trace = run({}, sizes, sizes, sizes, {"a": Footprint.box(0.0, 0.0, 90.0, 90.0)})
+    shown = messages(trace, says(near("a", "a"), trace, [1.9, 1.9, 2.0, 3.0, 2.0]))
+    first, *rest = [entity(message, "object/a").lines[0].color.b for message in shown[1:]]
+    assert first < rest[0]
+    assert rest == [rest[0]] * 3
+
+
+def test_what_is_seen_later_does_not_change_earlier_colours():
+    trace = run({}, {"a": Footprint.box(0.0, 0.0, 90.0, 90.0)})
+    said = says(near("a", "goal"), trace, 0.5)
+    assert messages(trace, said, regions=REGIONS)[0] == messages(trace.slice(0, 1), said, regions=REGIONS)[0]
