@@ -1,0 +1,9 @@
+"""Recording: samples in, a log out, with what specifications say of them."""
+
+from __future__ import annotations
+
+from spatial_replay.recording.recorder import Recorder
+from spatial_replay.recording.recording import ENDING, Recording
+from spatial_replay.recording.tracks import Recorded, record_source
+
+__all__ = ["ENDING", "Recorded", "Recorder", "Recording", "record_source"]

@@ -1,0 +1,125 @@
+"""A log as it is recorded: samples in, and beside them what specifications say of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+
+from spatial_replay import __version__
+from spatial_replay.errors import UsageError
+from spatial_replay.inspection.annotation import (
+    AnnotatedEvaluation,
+    kept_files,
+    messages_of,
+    specification_attachments,
+)
+from spatial_replay.inspection.certificate import (
+    MessageHash,
+    ResultHash,
+    SampleHash,
+    certificate,
+    described,
+)
+from spatial_replay.logs.merging import merge
+from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.objects import encode_objects
+from spatial_replay.logs.sink import Sink
+from spatial_replay.logs.topics import CERTIFICATE, METADATA, OBJECTS, RECORDED_PREFIX, protobuf_channel
+from spatial_replay.monitor.instances import find_instances
+from spatial_replay.spec.formula import Specification
+from spatial_replay.trace.times import FOREVER
+from spatial_replay.trace.trace import Trace
+
+
+class Recording:
+    """Writes samples to a sink as they come, in stretches of any length."""
+
+    def __init__(
+        self, sink: Sink, files: Sequence[Specification] = (), about: Mapping[str, str] | None = None
+    ) -> None:
+        """Write what comes before the first sample: metadata and specifications.
+
+        Args:
+            files: specifications to evaluate and write beside the samples.
+            about: what else the metadata says: where the samples come from, a seed.
+
+        Raises:
+            UsageError: a template, since it stands for objects that are not known yet.
+        """
+        refuse_templates(files)
+        self._files = files = kept_files(files)
+        self._sink = sink
+        self._evaluation = AnnotatedEvaluation(
+            files, [find_instances(file, {}, (), 0, FOREVER) for file in files]
+        )
+        self._samples = 0
+        self._sample_hash, self._message_hash = SampleHash(), MessageHash()
+        self._result_hash = ResultHash([(tree.name, tree.object) for tree in self._evaluation.trees])
+        sink.add_metadata(METADATA, _metadata(files, about or {}))
+        for attachment in specification_attachments(files, RECORDED_PREFIX):
+            sink.add_attachment(attachment.name, attachment.media_type, attachment.data)
+
+    def __len__(self) -> int:
+        """How many samples were taken in."""
+        return self._samples
+
+    def add(self, trace: Trace) -> None:
+        """Take in the next samples.
+
+        Raises:
+            TraceError: samples that do not come after those before.
+        """
+        stretches = self._evaluation.extend(trace)
+        own = messages_of(_OBJECTS, trace.times_ns, encode_objects(trace), self._samples)
+        derived = self._evaluation.messages(trace, stretches)
+        self._sink.write_messages(merge([own, *derived]))
+        self._samples += len(trace)
+        self._sample_hash.add(trace)
+        self._message_hash.add(own)
+        for index, stretch in enumerate(stretches):
+            self._result_hash.add(index, stretch.series)
+
+    def end(self, *, interrupted: bool = False, dropped: int = 0) -> None:
+        """Write what comes after the last sample; the certificate is that of a replay of the log."""
+        ending = {
+            "samples": str(self._samples),
+            "dropped": str(dropped),
+            "interrupted": json.dumps(interrupted),
+        }
+        layout = self._evaluation.layout()
+        self._sink.add_attachment(layout.name, layout.media_type, layout.data)
+        self._sink.add_metadata(ENDING, ending)
+        hashes = certificate(self._sample_hash, self._message_hash, self._files, self._result_hash)
+        self._sink.add_metadata(CERTIFICATE, hashes)
+
+
+ENDING = "spatial_replay_ending"
+"""The metadata record at the end of a recording: how many samples it holds, and how it came to its end."""
+
+
+def _metadata(files: Sequence[Specification], about: Mapping[str, str]) -> dict[str, str]:
+    return {
+        "version": __version__,
+        "written_by": "record",
+        "specifications": described(files),
+        "options": "{}",
+        **about,
+    }
+
+
+def refuse_templates(files: Sequence[Specification]) -> None:
+    """That specifications can be evaluated as samples come.
+
+    Raises:
+        UsageError: a template, since it stands for objects that are not known yet.
+    """
+    for file in files:
+        for spec in file.results:
+            if spec.parameter is not None:
+                raise UsageError(
+                    f"{spec.name}({spec.parameter}) in {file.filename} is a template: it stands for objects "
+                    "that are not known before the end; record without it and replay it over the log"
+                )
+
+
+_OBJECTS = protobuf_channel(OBJECTS, ObjectStates)

@@ -1,0 +1,43 @@
+"""Compiled code loaded before the first sample, so that no sample waits for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.logs.sink import MemorySink
+from spatial_replay.recording.recording import Recording
+from spatial_replay.spec import object_names, signal_names
+from spatial_replay.spec.formula import Specification
+from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Trace
+
+
+def warm_up(files: Sequence[Specification]) -> None:
+    """Record some samples into nothing, as the specifications will have it done.
+
+    With nothing in the compiler's cache this takes many seconds, otherwise a fraction of one.
+    """
+    recording = Recording(MemorySink(), files)
+    objects = ["object", *(name for file in files for name in object_names(file))]
+    signals = {name: 0.0 for file in files for name in signal_names(file)}
+    samples = [
+        Sample(
+            time_s * 10**9,
+            {
+                name: _tracked(index + time_s, 0.1 * index + time_s)
+                for index, name in enumerate(dict.fromkeys(objects))
+            },
+            signals,
+        )
+        for time_s in range(4)
+    ]
+    recording.add(Trace.from_samples(samples[:1]))
+    recording.add(Trace.from_samples(samples[1:]))
+    recording.end()
+
+
+def _tracked(kind: int, x: float) -> TrackedObject:
+    box, disc = Footprint.box(x, 0, x + 1, 1), Footprint.disc(x + 0.5, 0.5, 0.5)
+    footprint = (box, disc, Footprint((*box.parts, *disc.parts)))[kind % 3]
+    return TrackedObject(footprint, class_name="thing", yaw=x, height=(0.0, 1.0), uncertainty=0.01)

@@ -1,0 +1,267 @@
+"""The recorder in a loop: what is written stays, whatever happens to the process."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from hashlib import sha256
+from pathlib import Path
+
+import pytest
+from mcap.exceptions import EndOfFile
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+
+from replay.runs import PAST, SPECIFICATION, content_of, run, sample
+from spatial_replay.errors import OutputError, TraceError, UsageError
+from spatial_replay.logs.source import open_source, read_trace
+from spatial_replay.recording import ENDING, Recorder
+from spatial_replay.replay import load_files, run_replay
+from spatial_replay.spec import format_specification
+from spatial_replay.spec.specification import parse_specification
+
+SPEC = parse_specification(SPECIFICATION, filename="blocks.spatial")
+
+
+def _ending(path: Path) -> dict[str, str]:
+    return dict(content_of(path).metadata)[ENDING]
+
+
+def test_samples_are_read_back_as_they_were_written(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Recorder(path, specifications=[SPEC], about={"seed": "7"}) as recorder:
+        for index in range(12):
+            recorder.write(sample(index))
+    assert read_trace(path) == run(12)
+    content = content_of(path)
+    assert content.topics() == {
+        "/spatial/objects",
+        "/spatial/robustness",
+        "/spatial/scene",
+        "/spatial/specification",
+    }
+    assert ("recorded/blocks.spatial", SPECIFICATION.encode()) in content.attachments
+    assert content.metadata[0][0] == "spatial_replay"
+    assert content.metadata[0][1]["seed"] == "7"
+    assert _ending(path) == {"samples": "12", "dropped": "0", "interrupted": "false"}
+
+
+def test_an_error_in_the_loop_closes_the_log_and_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with pytest.raises(ZeroDivisionError), Recorder(path) as recorder:
+        recorder.write(sample(0))
+        recorder.write(sample(1))
+        raise ZeroDivisionError
+    assert len(read_trace(path)) == 2
+    assert _ending(path)["interrupted"] == "true"
+
+
+def test_times_must_increase(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Recorder(path) as recorder:
+        recorder.write(sample(3))
+        for late in (3, 2):
+            with pytest.raises(TraceError, match="give times that increase"):
+                recorder.write(sample(late))
+        recorder.write(sample(4))
+    assert len(read_trace(path)) == 2
+
+
+def test_a_closed_recorder_takes_no_more_and_closes_once(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "run.mcap")
+    recorder.close()
+    recorder.close()
+    with pytest.raises(UsageError, match=r"run\.mcap is closed"):
+        recorder.write(sample(0))
+
+
+def test_a_loop_that_may_not_wait_drops_and_counts(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Recorder(path, specifications=[SPEC], waiting=1, block=False) as recorder:
+        for index in range(3000):
+            recorder.write(sample(index))
+    kept = len(read_trace(path))
+    assert kept + recorder.dropped == 3000
+    assert _ending(path) == {"samples": str(kept), "dropped": str(recorder.dropped), "interrupted": "false"}
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"waiting": 0}, "waiting is 0"),
+        ({"specifications": [parse_specification("spec s(ego) = F ego ovlp a")]}, "is a template"),
+    ],
+)
+def test_what_cannot_be_recorded_touches_no_file(tmp_path: Path, options: dict[str, int], said: str) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"before")
+    with pytest.raises(UsageError, match=said):
+        Recorder(path, **options)  # type: ignore[arg-type]
+    assert path.read_bytes() == b"before"
+
+
+def test_a_full_disk_reaches_the_loop() -> None:
+    if not Path("/dev/full").is_char_device():
+        pytest.skip("no /dev/full here")
+    with pytest.raises(OutputError, match="no space left on the device"), Recorder("/dev/full") as recorder:
+        for index in range(10**6):
+            recorder.write(sample(index))
+
+
+def test_one_specification_needs_no_list(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "run.mcap", specifications=SPEC) as recorder:
+        recorder.write(sample(0))
+    attachments = content_of(tmp_path / "run.mcap").attachments
+    assert ("recorded/blocks.spatial", SPECIFICATION.encode()) in attachments
+
+
+def test_what_is_no_sample_is_named(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "run.mcap") as recorder, pytest.raises(UsageError, match="3 is no sample"):
+        recorder.write(3)  # type: ignore[arg-type]
+
+
+def test_what_describes_the_log_is_there_before_the_first_sample(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Recorder(path, specifications=SPEC):
+        begun = path.read_bytes()
+    assert SPECIFICATION.encode() in begun
+
+
+_CLOSING = """
+import os, signal, threading, time
+from spatial_replay import Footprint, Recorder, Sample, parse_specification
+spec = parse_specification("G (cube dist cube >= 0) & F (cube ovlp cube)")
+recorder = Recorder("run.mcap", specifications=spec)
+for index in range(3000):
+    recorder.write(Sample(index, {"cube": Footprint.box(0, 0, 1, 1)}))
+interrupt = threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGINT))
+try:
+    interrupt.start()
+    recorder.close()
+    # where closing was faster than the interruption
+    time.sleep(60)
+except KeyboardInterrupt:
+    print("interrupted", flush=True)
+recorder.close()
+"""
+
+
+def test_closing_is_not_interrupted(tmp_path: Path) -> None:
+    # a process of its own: the interruption must not reach the one that runs the tests
+    ended = subprocess.run(
+        [sys.executable, "-c", _CLOSING], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True
+    )
+    assert (ended.stdout, ended.stderr) == ("interrupted\n", "")
+    path = tmp_path / "run.mcap"
+    assert len(read_trace(path)) == 3000
+    assert _ending(path) == {"samples": "3000", "dropped": "0", "interrupted": "false"}
+
+
+def test_a_program_keeps_its_own_way_with_sigterm(tmp_path: Path) -> None:
+    came: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda number, frame: came.append(number))
+    try:
+        with Recorder(tmp_path / "run.mcap"):
+            signal.raise_signal(signal.SIGTERM)
+        assert came == [signal.SIGTERM]
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        with Recorder(tmp_path / "run.mcap"):
+            assert signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+_LOOP = """
+import sys, time
+from spatial_replay import Footprint, Recorder, Sample, parse_specification
+spec = parse_specification("G (cube dist cube >= 0) & F (cube ovlp cube)")
+with Recorder("run.mcap", specifications=spec) as recorder:
+    while True:
+        now_ns = time.monotonic_ns()
+        recorder.write(Sample(now_ns, {"cube": Footprint.box(0, 0, 1, 1)}))
+        print(now_ns, flush=True)
+        time.sleep(0.01)
+"""
+
+
+def _loop(folder: Path, **environment: str) -> subprocess.Popen[str]:
+    """A process that records a cube until it is ended, and says what it has written."""
+    return subprocess.Popen(
+        [sys.executable, "-c", _LOOP],
+        cwd=folder,
+        env={**os.environ, **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_ended_process_leaves_a_proper_log(tmp_path: Path, number: signal.Signals) -> None:
+    with _loop(tmp_path) as process:
+        assert process.stdout is not None
+        for _ in range(20):
+            process.stdout.readline()
+        process.send_signal(number)
+        process.communicate(timeout=60)
+    assert process.returncode == (143 if number == signal.SIGTERM else -signal.SIGINT)
+    path = tmp_path / "run.mcap"
+    count = len(read_trace(path))
+    assert count >= 20
+    assert _ending(path) == {"samples": str(count), "dropped": "0", "interrupted": "true"}
+
+
+@pytest.mark.parametrize("is_cold", [False, True], ids=["warm", "cold"])
+def test_what_is_older_than_a_second_survives_a_kill(tmp_path: Path, is_cold: bool) -> None:
+    # without a cache of compiled code, a process compiles all that it uses
+    with _loop(tmp_path, **({"NUMBA_CACHE_DIR": str(tmp_path / "cache")} if is_cold else {})) as process:
+        assert process.stdout is not None
+        written = [int(process.stdout.readline())]
+        while written[-1] - written[0] < 2 * 10**9:
+            written.append(int(process.stdout.readline()))
+        killed_ns = time.monotonic_ns()
+        process.kill()
+        process.communicate(timeout=60)
+    safe = {time_ns for time_ns in written if time_ns < killed_ns - 10**9}
+    assert safe
+    path = tmp_path / "run.mcap"
+    assert safe <= set(read_trace(path, allow_damage=True).times_ns.tolist())
+    found = set()
+    with path.open("rb") as stream:
+        try:
+            for record in StreamReader(stream).records:
+                if isinstance(record, Message):
+                    found.add(record.log_time)
+        except EndOfFile:
+            # where the file breaks off
+            pass
+    assert safe <= found
+
+
+def test_metadata_is_text(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "run.mcap", specifications=[SPEC, parse_specification("F cube ovlp cube")]):
+        pass
+    about = dict(content_of(tmp_path / "run.mcap").metadata)["spatial_replay"]
+    kept = json.loads(about["specifications"])
+    assert [each["name"] for each in kept] == ["blocks.spatial", "text.spatial"]
+    canonical = [format_specification(SPEC), format_specification(parse_specification("F cube ovlp cube"))]
+    assert [each["sha256"] for each in kept] == [sha256(text.encode()).hexdigest() for text in canonical]
+    assert json.loads(about["options"]) == {}
+
+
+@pytest.mark.parametrize("count", [0, 1, 12])
+def test_a_replay_of_a_recording_has_its_certificate(tmp_path: Path, count: int) -> None:
+    path = tmp_path / "run.mcap"
+    with Recorder(path, specifications=[SPEC, parse_specification(PAST)]) as recorder:
+        for index in range(count):
+            recorder.write(sample(index))
+    last, certificate = content_of(path).metadata[-1]
+    assert last == "spatial_replay_certificate"
+    if count:
+        source = open_source(path)
+        assert run_replay(source, load_files([], source)).certificate == certificate

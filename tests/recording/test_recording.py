@@ -1,0 +1,48 @@
+"""A recording in memory: what is written when."""
+
+from __future__ import annotations
+
+import pytest
+
+from replay.runs import SPECIFICATION, run
+from spatial_replay.errors import TraceError
+from spatial_replay.logs.sink import MemorySink
+from spatial_replay.recording import ENDING, Recording
+from spatial_replay.spec.specification import parse_specification
+
+
+def test_what_describes_the_log_comes_before_the_samples() -> None:
+    sink = MemorySink()
+    Recording(sink, [parse_specification(SPECIFICATION)], {"seed": "7"})
+    assert [name for name, _ in sink.metadata] == ["spatial_replay"]
+    assert sink.metadata[0][1]["seed"] == "7"
+    assert [each.name for each in sink.attachments] == ["recorded/text.spatial"]
+    assert sink.messages == []
+
+
+def test_messages_do_not_depend_on_how_samples_come() -> None:
+    sinks = [MemorySink() for _ in range(2)]
+    for sink, size in zip(sinks, (1, 100), strict=True):
+        recording = Recording(sink, [parse_specification(SPECIFICATION)])
+        for begin in range(0, 12, size):
+            recording.add(run().slice(begin, begin + size))
+        recording.end()
+        assert len(recording) == 12
+    payloads = [[payload for block in sink.messages for payload in block.payloads] for sink in sinks]
+    assert payloads[0] == payloads[1]
+    assert sinks[0].metadata == sinks[1].metadata
+
+
+def test_the_end_counts_what_came() -> None:
+    sink = MemorySink()
+    recording = Recording(sink)
+    recording.add(run())
+    recording.end(interrupted=True, dropped=3)
+    assert sink.metadata[-2] == (ENDING, {"samples": "12", "dropped": "3", "interrupted": "true"})
+
+
+def test_samples_follow_each_other() -> None:
+    recording = Recording(MemorySink(), [parse_specification(SPECIFICATION)])
+    recording.add(run())
+    with pytest.raises(TraceError, match="order of their times"):
+        recording.add(run())
