@@ -1,0 +1,19 @@
+"""Replay: a log and specifications in, verdicts and an annotated log out."""
+
+from __future__ import annotations
+
+from spatial_replay.replay.annotated import load_files, run_replay
+from spatial_replay.replay.document import document
+from spatial_replay.replay.replay import Replay, Replayed, ReplayedSpec
+from spatial_replay.replay.window import Window, first_sample_ns
+
+__all__ = [
+    "Replay",
+    "Replayed",
+    "ReplayedSpec",
+    "Window",
+    "document",
+    "first_sample_ns",
+    "load_files",
+    "run_replay",
+]

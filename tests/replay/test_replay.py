@@ -1,0 +1,307 @@
+"""Replays: what stays, what is added, which samples count, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from replay.runs import PAST, SPECIFICATION, STEP_NS, PiecewiseSource, content_of, record, run, sample
+from spatial_replay.errors import LogError, OutputError, SpecificationError, UsageError
+from spatial_replay.logs.block import Block
+from spatial_replay.logs.source import open_source
+from spatial_replay.recording import record_source
+from spatial_replay.replay import Replayed, Window, load_files, run_replay
+from spatial_replay.spec.specification import load_specification, parse_specification
+from spatial_replay.trace.trace import Trace
+
+SPEC = parse_specification(SPECIFICATION, filename="blocks.spatial")
+ANNOTATION = {"/spatial/scene", "/spatial/specification", "/spatial/robustness"}
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return record(run(), tmp_path / "run.mcap")
+
+
+@pytest.fixture
+def foreign(log: Path, tmp_path: Path) -> Path:
+    """The samples among messages of others, as another program wrote them: other numbers, another order."""
+    path = tmp_path / "foreign.mcap"
+    with log.open("rb") as stream:
+        objects = list(make_reader(stream).iter_messages(topics=["/spatial/objects"]))
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=400, compression=CompressionType.LZ4)
+        writer.start(profile="other", library="another program")
+        notes = writer.register_channel("/notes", "json", 0, {"by": "someone"})
+        schema, _, _ = objects[0]
+        assert schema is not None
+        samples = writer.register_channel(
+            "/spatial/objects", "protobuf", writer.register_schema(schema.name, schema.encoding, schema.data)
+        )
+        early = writer.register_channel("/a", "json", writer.register_schema("A", "jsonschema", b"{}"))
+        for number, (_, _, message) in enumerate(objects):
+            note, published_ns = b'{"n": %d}' % number, message.log_time + 7
+            writer.add_message(notes, message.log_time, note, published_ns, 90 - number)
+            writer.add_message(samples, message.log_time, message.data, message.publish_time, number)
+            writer.add_message(early, message.log_time, b"{}", message.log_time, 3)
+        writer.add_metadata("theirs", {"b": "1", "a": "2"})
+        writer.add_attachment(1, 2, "photo.png", "image/png", b"\x89PNG")
+        writer.finish()
+    return path
+
+
+def test_messages_metadata_and_attachments_of_others_stay_as_they_are(foreign: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out.mcap"
+    run_replay(open_source(foreign), [SPEC], output=output)
+    before, after = content_of(foreign), content_of(output)
+    theirs = before.topics()
+    assert sorted(after.of(*theirs)) == sorted(before.messages)
+    assert after.topics() == theirs | ANNOTATION
+    assert ("theirs", {"b": "1", "a": "2"}) in after.metadata
+    assert ("photo.png", b"\x89PNG") in after.attachments
+    again = tmp_path / "again.mcap"
+    run_replay(open_source(output), [SPEC], output=again)
+    assert output.read_bytes() == again.read_bytes()
+
+
+def test_messages_come_by_time_then_topic(foreign: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out.mcap"
+    run_replay(open_source(foreign), [SPEC], output=output)
+    order = [(time_ns, topic) for topic, time_ns, *_ in content_of(output).messages]
+    assert order == sorted(order)
+
+
+def test_our_metadata_comes_first_and_the_certificate_last(log: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out.mcap"
+    replayed = run_replay(open_source(log), [SPEC], output=output)
+    (first, about), *_, (last, certificate) = content_of(output).metadata
+    assert (first, last) == ("spatial_replay", "spatial_replay_certificate")
+    assert about["source"] == "run.mcap"
+    assert [each["name"] for each in json.loads(about["specifications"])] == ["blocks.spatial"]
+    assert certificate == dict(replayed.certificate)
+
+
+def test_a_layer_holds_what_was_found_alone(foreign: Path, tmp_path: Path) -> None:
+    layer, whole = tmp_path / "layer.mcap", tmp_path / "whole.mcap"
+    in_layer = run_replay(open_source(foreign), [SPEC], output=layer, layer=True)
+    in_whole = run_replay(open_source(foreign), [SPEC], output=whole)
+    assert content_of(layer).topics() == ANNOTATION
+    assert content_of(layer).messages == content_of(whole).of(*ANNOTATION)
+    assert "photo.png" not in dict(content_of(layer).attachments)
+    assert "theirs" not in dict(content_of(layer).metadata)
+    assert in_layer.certificate == in_whole.certificate
+
+
+def _spans(replayed: Replayed) -> list[int]:
+    (result,) = replayed.results
+    assert result.times_ns is not None
+    return (result.times_ns // STEP_NS).tolist()
+
+
+def _replayed(text: str, window: Window) -> Replayed:
+    return run_replay(PiecewiseSource(run(), 3), [parse_specification(text)], window=window, keep_series=True)
+
+
+def test_a_window_is_from_a_time_to_before_another() -> None:
+    replayed = _replayed(PAST, Window(3 * STEP_NS, 7 * STEP_NS))
+    assert _spans(replayed) == [3, 4, 5, 6]
+    assert (replayed.samples, replayed.start_ns, replayed.end_ns) == (4, 3 * STEP_NS, 6 * STEP_NS)
+
+
+def test_terms_look_before_a_window() -> None:
+    (result,) = _replayed(PAST, Window(3 * STEP_NS)).results
+    assert result.verdict == "satisfied"
+    (at_the_start,) = _replayed(PAST, Window()).results
+    assert at_the_start.verdict == "unknown"
+
+
+def test_every_nth_sample_of_the_log_counts() -> None:
+    assert _spans(_replayed(PAST, Window(every=5))) == [0, 5, 10]
+    assert _spans(_replayed(PAST, Window(4 * STEP_NS, every=5))) == [5, 10]
+
+
+def test_bounds_and_looks_back_count_kept_samples() -> None:
+    text = "spec s = F[1, 1] (cube[-1] leftof cube)"
+    (all_samples,) = _replayed(text, Window()).results
+    (kept,) = _replayed(text, Window(every=4)).results
+    # the cube is a unit wide and moves half a unit a sample
+    assert all_samples.robustness[0] == pytest.approx(0.5 - 1)
+    assert kept.robustness[0] == pytest.approx(4 * 0.5 - 1)
+
+
+def test_an_every_below_one_and_an_empty_window_are_refused() -> None:
+    with pytest.raises(UsageError, match="every is 0"):
+        Window(every=0)
+    with pytest.raises(UsageError, match="empty"):
+        Window(5, 5)
+
+
+def test_a_window_without_samples_names_those_that_there_are() -> None:
+    with pytest.raises(UsageError, match=r"no sample in the window asked for.*from 0 to 2750000000 ns"):
+        _replayed(PAST, Window(10**12))
+
+
+def test_a_template_is_evaluated_for_each_object_chosen() -> None:
+    spec = parse_specification("spec near(ego) = G (ego dist cube <= 9)")
+    source = PiecewiseSource(run(), 4)
+    everyone = run_replay(source, [spec], each={"ego": "all"})
+    assert [(r.name, r.object) for r in everyone.results] == [("near", "cube"), ("near", "cup 物")]
+    dishes = run_replay(source, [spec], each={"ego": "class:DISH"})
+    assert [r.object for r in dishes.results] == ["cup 物"]
+
+
+def test_the_objects_of_templates_take_one_pass() -> None:
+    passes = []
+
+    class Counted(PiecewiseSource):
+        def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+            passes.append((start_ns, end_ns))
+            return super().iter_blocks(start_ns, end_ns)
+
+    spec = parse_specification("spec near(a) = G (a dist cube <= 9)\nspec far(b) = F (b dist cube >= 1)")
+    run_replay(Counted(run(), 4), [spec], each={"a": "class:dish", "b": "class:block"})
+    assert len(passes) == 2
+
+
+@pytest.mark.parametrize(
+    ("each", "said"),
+    [
+        ({}, "near.ego. is a template"),
+        ({"egg": "all"}, "no template has a parameter 'egg'"),
+        ({"ego": "dish"}, "ego='dish' chooses no objects"),
+        ({"ego": "class:dosh"}, "no object of run is of the class 'dosh'; its classes are: Block, dish"),
+    ],
+)
+def test_objects_that_cannot_be_chosen_are_said(each: dict[str, str], said: str) -> None:
+    spec = parse_specification("spec near(ego) = G (ego dist cube <= 9)")
+    with pytest.raises(UsageError, match=said):
+        run_replay(PiecewiseSource(run(), 4), [spec], each=each)
+
+
+def test_a_class_that_is_elsewhere_in_the_log_stands_for_nobody_here() -> None:
+    spec = parse_specification("spec near(ego) = G (ego dist cube <= 9)")
+    only_cube = Window(3 * STEP_NS, 4 * STEP_NS)
+    replayed = run_replay(PiecewiseSource(run(), 4), [spec], each={"ego": "class:dish"}, window=only_cube)
+    assert replayed.results == ()
+
+
+def test_names_that_the_log_never_has_are_all_told_at_once() -> None:
+    spec = parse_specification("spec s = F (cub ovlp hand)\nspec t = batery >= 1")
+    with pytest.raises(SpecificationError) as error:
+        run_replay(PiecewiseSource(run(), 4), [spec])
+    said = str(error.value)
+    assert [d.line for d in error.value.diagnoses] == [1, 1, 2]
+    assert "'cube'" in said
+    assert "cube, cup 物" in said
+    assert "'battery'" in said
+
+
+def test_a_name_need_not_be_in_the_window() -> None:
+    replayed = run_replay(PiecewiseSource(run(), 4), [SPEC], window=Window(3 * STEP_NS, 4 * STEP_NS))
+    assert [str(r.verdict) for r in replayed.results] == ["violated", "unknown"]
+
+
+def test_specifications_of_one_file_name_keep_their_results_apart(tmp_path: Path) -> None:
+    paths = [tmp_path / folder / "a.spatial" for folder in ("one", "two")]
+    for path, bound in zip(paths, (1, 20), strict=True):
+        path.parent.mkdir()
+        path.write_text(f"region goal = box(-1, -1, {bound}, 2)\nspec s = G cube enclosedin goal\n")
+    log = record(run(), tmp_path / "run.mcap")
+    files = load_files(paths, open_source(log))
+    once = run_replay(open_source(log), files, output=tmp_path / "once.mcap")
+    assert [(r.name, str(r.verdict)) for r in once.results] == [("a.s", "violated"), ("a-2.s", "satisfied")]
+    own = load_files((), open_source(tmp_path / "once.mcap"))
+    run_replay(open_source(log), own, output=tmp_path / "own.mcap")
+    assert (tmp_path / "own.mcap").read_bytes() == (tmp_path / "once.mcap").read_bytes()
+
+
+def test_a_specification_of_a_chosen_profile_is_read_back_with_it(log: Path, tmp_path: Path) -> None:
+    text = tmp_path / "published.txt"
+    text.write_text('F (cube closeto "cup 物")')
+    spec = load_specification(text, profile="spatial_spec")
+    run_replay(open_source(log), [spec], output=tmp_path / "once.mcap")
+    annotated = open_source(tmp_path / "once.mcap")
+    assert load_files((), annotated) == [spec]
+    run_replay(annotated, load_files((), annotated), output=tmp_path / "own.mcap")
+    assert (tmp_path / "own.mcap").read_bytes() == (tmp_path / "once.mcap").read_bytes()
+
+
+def test_the_last_replay_s_specification_goes_before_the_recorded_one(tmp_path: Path) -> None:
+    log = tmp_path / "run.mcap"
+    record_source(PiecewiseSource(run(), 5), log, [SPEC])
+    assert load_files((), open_source(log)) == [SPEC]
+    edited = parse_specification(PAST, filename="edited.spatial")
+    run_replay(open_source(log), [edited], output=tmp_path / "out.mcap")
+    assert load_files((), open_source(tmp_path / "out.mcap")) == [edited]
+    assert ("recorded/blocks.spatial", SPEC.source.encode()) in content_of(tmp_path / "out.mcap").attachments
+
+
+def test_a_log_without_a_specification_says_what_to_give(log: Path) -> None:
+    with pytest.raises(
+        UsageError, match=r"run\.mcap holds no specification of its own; give one with --spec"
+    ):
+        load_files((), open_source(log))
+
+
+def test_a_source_without_samples_is_no_verdict() -> None:
+    with pytest.raises(LogError, match="run has no sample"):
+        run_replay(PiecewiseSource(Trace.from_samples(()), 3), [SPEC])
+
+
+@pytest.mark.parametrize("last_ns", [2**63 - 1, 2**62])
+def test_times_may_be_as_large_as_a_log_holds(last_ns: int, tmp_path: Path) -> None:
+    late = Trace.from_samples(replace(sample(i), time_ns=last_ns - 10 + 5 * i) for i in range(3))
+    log = record(late, tmp_path / "late.mcap")
+    replayed = run_replay(open_source(log), [SPEC], output=tmp_path / "out.mcap", keep_series=True)
+    assert (replayed.samples, replayed.end_ns) == (3, last_ns)
+    times = replayed.results[0].times_ns
+    assert times is not None
+    assert np.array_equal(times, late.times_ns)
+
+
+class TestOutputs:
+    def test_one_that_is_an_input_is_refused(self, log: Path) -> None:
+        before = log.read_bytes()
+        with pytest.raises(UsageError, match="is an input too"):
+            run_replay(open_source(log), [SPEC], output=log, inputs=[log])
+        link = log.with_name("link.mcap")
+        link.symlink_to(log)
+        with pytest.raises(UsageError, match="is an input too"):
+            run_replay(open_source(log), [SPEC], output=link, inputs=[log])
+        assert log.read_bytes() == before
+
+    def test_a_folder_and_a_file_in_no_folder_are_refused(self, log: Path, tmp_path: Path) -> None:
+        with pytest.raises(UsageError, match="is a folder"):
+            run_replay(open_source(log), [SPEC], output=tmp_path)
+        with pytest.raises(UsageError, match="there is no folder"):
+            run_replay(open_source(log), [SPEC], output=tmp_path / "none" / "out.mcap")
+
+    def test_one_behind_a_link_is_written_there(self, log: Path, tmp_path: Path) -> None:
+        link = tmp_path / "latest.mcap"
+        link.symlink_to("out.mcap")
+        run_replay(open_source(log), [SPEC], output=link)
+        assert link.is_symlink()
+        assert content_of(tmp_path / "out.mcap").topics() >= ANNOTATION
+
+    def test_a_failed_replay_leaves_the_file_of_before(self, log: Path, tmp_path: Path) -> None:
+        output = tmp_path / "out.mcap"
+        output.write_bytes(b"before")
+        with pytest.raises(SpecificationError):
+            run_replay(open_source(log), [parse_specification("G nobody ovlp cube")], output=output)
+        assert output.read_bytes() == b"before"
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["out.mcap", "run.mcap"]
+
+    def test_a_full_device_is_said_and_stays_a_device(self, log: Path) -> None:
+        full = Path("/dev/full")
+        if not full.is_char_device():
+            pytest.skip("no /dev/full here")
+        with pytest.raises(OutputError, match="no space left on the device"):
+            run_replay(open_source(log), [SPEC], output=full)
+        assert full.is_char_device()

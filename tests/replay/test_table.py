@@ -1,0 +1,113 @@
+"""Annotated logs as tables."""
+
+from __future__ import annotations
+
+import csv
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from replay.runs import SPECIFICATION, PiecewiseSource, record, run
+from spatial_replay.errors import UsageError
+from spatial_replay.logs.source import open_source
+from spatial_replay.replay import Replayed, run_replay
+from spatial_replay.replay.table import QUANTITIES, export_table
+from spatial_replay.spec.specification import parse_specification
+
+
+@pytest.fixture
+def annotated(tmp_path: Path) -> tuple[Path, Replayed]:
+    path = tmp_path / "annotated.mcap"
+    spec = parse_specification(f"{SPECIFICATION}spec near(ego) = G (ego dist cube <= 9)\n")
+    replayed = run_replay(
+        PiecewiseSource(run(), 5), [spec], each={"ego": "all"}, output=path, keep_series=True
+    )
+    return path, replayed
+
+
+def _rows(path: Path) -> list[list[str]]:
+    with path.open(encoding="utf-8", newline="") as stream:
+        return list(csv.reader(stream))
+
+
+@pytest.mark.parametrize("quantity", QUANTITIES)
+def test_every_number_is_there(annotated: tuple[Path, Replayed], tmp_path: Path, quantity: str) -> None:
+    path, replayed = annotated
+    output = tmp_path / "run.csv"
+    rows, columns, faults = export_table(open_source(path), output, quantity=quantity)  # type: ignore[arg-type]
+    titles, *body = _rows(output)
+    assert (rows, columns, faults) == (12, len(titles) - 1, ())
+    assert len(set(titles)) == len(titles)
+    at = QUANTITIES.index(quantity)  # type: ignore[arg-type]
+    expected: dict[tuple[int, int], str] = {}
+    column = 1
+    for result in replayed.results:
+        assert result.series is not None
+        assert result.times_ns is not None
+        for node in range(result.series.shape[0]):
+            for time_ns, number in zip(
+                result.times_ns.tolist(), result.series[node, at].tolist(), strict=True
+            ):
+                if number == number:
+                    expected[time_ns, column] = repr(number)
+            column += 1
+    assert expected == {
+        (int(row[0]), index): cell for row in body for index, cell in enumerate(row) if index and cell
+    }
+
+
+def test_columns_are_named_after_nodes(annotated: tuple[Path, Replayed], tmp_path: Path) -> None:
+    export_table(open_source(annotated[0]), tmp_path / "run.csv")
+    assert _rows(tmp_path / "run.csv")[0] == [
+        "time_ns",
+        "reach",
+        "reach#1",
+        "apart",
+        "apart#1",
+        "near(cube)",
+        "near(cube)#1",
+        "near(cup 物)",
+        "near(cup 物)#1",
+    ]
+
+
+def test_no_two_columns_are_named_alike(tmp_path: Path) -> None:
+    spec = parse_specification('spec time_ns = F cube ovlp "cup 物"\nspec s = G time_ns\n')
+    twin = parse_specification("spec s = F cube ovlp cube", filename="twin.spatial")
+    path = tmp_path / "annotated.mcap"
+    run_replay(PiecewiseSource(run(), 5), [spec, twin], output=path)
+    export_table(open_source(path), tmp_path / "run.csv")
+    titles = _rows(tmp_path / "run.csv")[0]
+    assert titles[0] == "time_ns"
+    assert titles.count("time_ns") == 1
+    assert len(set(titles)) == len(titles) > 4
+
+
+def test_parquet_holds_the_same_numbers(annotated: tuple[Path, Replayed], tmp_path: Path) -> None:
+    if find_spec("pyarrow") is None:
+        with pytest.raises(UsageError, match="Parquet needs pyarrow; pip install"):
+            export_table(open_source(annotated[0]), tmp_path / "run.parquet")
+        assert not (tmp_path / "run.parquet").exists()
+        return
+    parquet = import_module("pyarrow.parquet")
+    export_table(open_source(annotated[0]), tmp_path / "run.csv")
+    export_table(open_source(annotated[0]), tmp_path / "run.parquet")
+    table = parquet.read_table(tmp_path / "run.parquet")
+    titles, *body = _rows(tmp_path / "run.csv")
+    assert table.column_names == titles
+    cells = [[None if cell == "" else float(cell) for cell in row] for row in body]
+    assert [list(row) for row in zip(*table.to_pydict().values(), strict=True)] == cells
+
+
+def test_a_log_without_robustness_says_how_to_get_it(tmp_path: Path) -> None:
+    log = record(run(), tmp_path / "run.mcap")
+    with pytest.raises(UsageError, match="holds no /spatial/robustness; write it with spatial-replay replay"):
+        export_table(open_source(log), tmp_path / "run.csv")
+    assert not (tmp_path / "run.csv").exists()
+
+
+def test_the_ending_says_the_format(annotated: tuple[Path, Replayed], tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"run\.xls ends in neither \.csv nor \.parquet"):
+        export_table(open_source(annotated[0]), tmp_path / "run.xls")
