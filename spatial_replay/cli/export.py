@@ -1,0 +1,56 @@
+"""`spatial-replay export`: an annotated log's numbers as a table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from spatial_replay.cli.exit_codes import ExitCode
+from spatial_replay.cli.failures import say
+from spatial_replay.cli.options import output_option
+from spatial_replay.cli.progress import progress
+from spatial_replay.cli.verdicts import counted
+
+if TYPE_CHECKING:
+    from spatial_replay.replay.table import Quantity
+
+
+@click.command()
+@click.argument("annotated", type=click.Path(path_type=Path))
+@output_option("FILE.csv or FILE.parquet.", required=True)
+@click.option(
+    "--quantity",
+    type=click.Choice(["value", "now", "lower", "upper"]),
+    default="value",
+    show_default=True,
+    help="Which number of each node.",
+)
+def export(annotated: Path, output: Path, quantity: Quantity) -> int:
+    """Write the robustness in an annotated log as a table: one row per sample, one column per node.
+
+    A column is named after its node, or SPEC#ID for a node without a name that no other column has. An
+    empty cell is a number that is not determined.
+
+    \b
+    Example:
+      spatial-replay export annotated.mcap -o run.csv
+    """
+    # the numerical libraries load when there is work for them
+    from spatial_replay.logs.source import open_source
+    from spatial_replay.replay.table import export_table
+
+    source = open_source(annotated)
+    with progress("rows") as advance:
+        rows, columns, faults = export_table(
+            source,
+            output,
+            quantity=quantity,
+            inputs=(annotated,),
+            advance=advance,
+        )
+    for fault in faults:
+        say("warning", fault, colour="yellow")
+    click.echo(f"wrote {output}: {counted(rows, 'row')}, {counted(columns, 'node')}")
+    return ExitCode.DAMAGED if faults else ExitCode.SATISFIED

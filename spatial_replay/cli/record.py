@@ -1,0 +1,80 @@
+"""`spatial-replay record`: turn a run into a log."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from spatial_replay.cli.exit_codes import ExitCode
+from spatial_replay.cli.failures import say
+from spatial_replay.cli.options import concave_option, output_option, profile_option
+from spatial_replay.cli.progress import progress
+from spatial_replay.cli.verdicts import counted
+
+if TYPE_CHECKING:
+    from spatial_replay.geometry.footprint import Concave
+
+
+@click.group()
+def record() -> None:
+    """Record a run as an MCAP log.
+
+    \b
+    Example:
+      spatial-replay record tracks blocks.jsonl.gz -o run.mcap
+    """
+
+
+@record.command()
+@click.argument("file", type=click.Path(path_type=Path))
+@output_option("Write the log here.", required=True)
+@click.option(
+    "--spec",
+    "specs",
+    metavar="SPEC",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="Evaluate this specification meanwhile; repeat it for several.",
+)
+@profile_option
+@concave_option
+def tracks(file: Path, output: Path, specs: tuple[Path, ...], profile: str | None, concave: Concave) -> int:
+    """Record tracked objects from a file: JSON lines or CSV, plain or gzip.
+
+    What cannot be read of the file is reported and left out, and the exit code is then 3.
+
+    \b
+    Examples:
+      spatial-replay record tracks blocks.jsonl.gz -o run.mcap
+      spatial-replay record tracks people.csv -o run.mcap --spec social.spatial
+    """
+    # the numerical libraries load when there is work for them
+    from spatial_replay.logs.source import open_source
+    from spatial_replay.recording import record_source
+    from spatial_replay.spec import load_specification
+
+    source = open_source(file, concave=concave)
+    files = [load_specification(spec, profile=profile) for spec in specs]
+    with progress("samples") as advance:
+        recorded = record_source(source, output, files, inputs=(file, *specs), advance=advance)
+    for fault in recorded.faults:
+        say("warning", fault, colour="yellow")
+    if recorded.unreadable:
+        remark = f"{recorded.unreadable} observations hold a number that is not finite: unknown there"
+        say("warning", remark, colour="yellow")
+    for name in recorded.missing:
+        click.echo(replace(name, severity="warning"), err=True)
+    seconds = (recorded.end_ns - recorded.start_ns) / 1e9
+    click.echo(
+        f"wrote {output}: {counted(recorded.samples, 'sample')} over {seconds:.3f} s of "
+        f"{counted(len(recorded.objects), 'object')}: {_listed(recorded.objects)}"
+    )
+    return ExitCode.DAMAGED if recorded.faults else ExitCode.SATISFIED
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    shown = ", ".join(names[:8])
+    return shown if len(names) <= 8 else f"{shown}, …"

@@ -1,0 +1,50 @@
+"""Running the program as a user does, in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import pty
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+PROGRAM = (sys.executable, "-m", "spatial_replay")
+
+
+def environment(**variables: str) -> dict[str, str]:
+    """This process' environment without what changes colours, with some variables set."""
+    kept = {name: value for name, value in os.environ.items() if name not in ("NO_COLOR", "FORCE_COLOR")}
+    return {**kept, "TERM": "xterm", **variables}
+
+
+def run_program(*arguments: str, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run the program in a folder; standard output and error are pipes."""
+    return subprocess.run(
+        [*PROGRAM, *arguments],
+        cwd=cwd,
+        env=environment(**variables),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+
+
+def standard_error_on_terminal(command: tuple[str, ...], cwd: Path, variables: Mapping[str, str]) -> str:
+    """What a command writes to standard error if that is a terminal."""
+    ours, theirs = pty.openpty()
+    with subprocess.Popen(
+        command, cwd=cwd, env=environment(**variables), stdout=subprocess.DEVNULL, stderr=theirs
+    ):
+        os.close(theirs)
+        written = bytearray()
+        try:
+            while block := os.read(ours, 4096):
+                written += block
+        except OSError:
+            # how Linux says that the other end of a terminal is closed
+            pass
+        finally:
+            os.close(ours)
+    return written.decode()

@@ -1,0 +1,155 @@
+"""The program as a whole: streams, colours, signals, completion."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import spatial_replay
+from cli.program import PROGRAM, environment, run_program, standard_error_on_terminal
+from spatial_replay.cli.commands import COMMANDS
+
+
+def test_version_and_help_answer_on_standard_output(tmp_path: Path) -> None:
+    version = run_program("--version", cwd=tmp_path)
+    assert (version.returncode, version.stdout, version.stderr) == (
+        0,
+        f"spatial-replay {spatial_replay.__version__}\n",
+        "",
+    )
+    helped = run_program("--help", cwd=tmp_path)
+    assert (helped.returncode, helped.stderr) == (0, "")
+    for name, summary in COMMANDS.items():
+        assert name in helped.stdout
+        assert summary in helped.stdout
+
+
+def test_help_loads_no_command_and_no_numerical_library(tmp_path: Path) -> None:
+    program = (
+        "import sys\n"
+        "from spatial_replay.cli.application import run\n"
+        "run(['--help'])\n"
+        "heavy = {'numpy', 'numba', 'mcap', 'lark', 'rich', 'google.protobuf'} & set(sys.modules)\n"
+        "sys.exit(', '.join(heavy) or 0)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("chekc",), "No such command 'chekc'"),
+        (("check",), "Missing argument 'SPEC'"),
+        (("check", "a.spatial", "--loog", "x"), "No such option"),
+        (("check", "missing.spatial"), "missing.spatial"),
+        (("info", "missing.mcap"), "missing.mcap"),
+        (("completion", "tcsh"), "'tcsh' is not one of"),
+    ],
+)
+def test_wrong_usage_is_said_on_standard_error_with_code_2(
+    tmp_path: Path, arguments: tuple[str, ...], said: str
+) -> None:
+    done = run_program(*arguments, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("spatial-replay: error: ")
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) <= 3
+
+
+def test_a_traceback_is_shown_on_request_only(tmp_path: Path) -> None:
+    assert "Traceback" not in run_program("info", "missing.mcap", cwd=tmp_path).stderr
+    shown = run_program("info", "missing.mcap", cwd=tmp_path, SPATIAL_REPLAY_DEBUG="1")
+    assert shown.returncode == 2
+    assert "Traceback" in shown.stderr
+
+
+def test_colours_are_for_terminals_that_want_them(tmp_path: Path) -> None:
+    command = (*PROGRAM, "info", "missing.mcap")
+    assert "\x1b[" not in run_program("info", "missing.mcap", cwd=tmp_path).stderr
+    assert "\x1b[" in standard_error_on_terminal(command, tmp_path, {})
+    assert "\x1b[" not in standard_error_on_terminal(command, tmp_path, {"NO_COLOR": "1"})
+
+
+def test_a_reader_that_leaves_early_is_no_error(tmp_path: Path) -> None:
+    ours, theirs = os.pipe()
+    os.close(ours)
+    try:
+        done = subprocess.run(
+            [*PROGRAM, "--help"],
+            cwd=tmp_path,
+            env=environment(),
+            stdout=theirs,
+            stderr=subprocess.PIPE,
+            check=False,
+        )
+    finally:
+        os.close(theirs)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_an_interrupt_ends_with_code_130_and_one_line(tmp_path: Path) -> None:
+    endless = tmp_path / "endless.jsonl"
+    os.mkfifo(endless)
+    process = subprocess.Popen(
+        [*PROGRAM, "info", str(endless)], cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True
+    )
+    # opening waits until the program reads, so the signal meets it at work
+    with process, endless.open("w"):
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert said.strip() == "spatial-replay: error: interrupted"
+
+
+def test_a_shell_completes_commands_and_options(tmp_path: Path) -> None:
+    script = run_program("completion", "bash", cwd=tmp_path)
+    assert script.returncode == 0
+    assert "complete -o nosort -F _spatial_replay_completion spatial-replay" in script.stdout
+    for words, expected in (
+        ("spatial-replay ch", "plain,check"),
+        ("spatial-replay check --l", "plain,--log"),
+    ):
+        completed = run_program(
+            cwd=tmp_path,
+            _SPATIAL_REPLAY_COMPLETE="bash_complete",
+            COMP_WORDS=words,
+            COMP_CWORD=str(words.count(" ")),
+        )
+        assert completed.stdout.split() == [expected]
+
+
+_WORK = """
+import sys, time
+from spatial_replay.cli.progress import progress
+with progress("samples", total=3) as advance:
+    for _ in range(3):
+        time.sleep({pause})
+        advance(1)
+"""
+
+
+def test_long_work_shows_a_bar_on_a_terminal_and_short_work_nothing(tmp_path: Path) -> None:
+    def shown(pause: float) -> str:
+        return standard_error_on_terminal((sys.executable, "-c", _WORK.format(pause=pause)), tmp_path, {})
+
+    assert "samples" in shown(0.6)
+    assert shown(0.0) == ""
+
+
+def test_a_first_step_that_takes_long_shows_the_bar_already(tmp_path: Path) -> None:
+    work = "import time\nfrom spatial_replay.cli.progress import progress\n"
+    work += "with progress('samples'):\n    time.sleep(2.5)\n"
+    assert "samples" in standard_error_on_terminal((sys.executable, "-c", work), tmp_path, {})
+
+
+def test_long_work_shows_nothing_in_a_pipe(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _WORK.format(pause=0.4)], cwd=tmp_path, capture_output=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")

@@ -1,0 +1,99 @@
+"""`spatial-replay check`: how a specification is read."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from spatial_replay.cli.application import run
+
+SPECIFICATION = """\
+region goal = box(0, 0, 4, 4)
+spec reach = F[0, 3s] cube enclosedin goal
+spec safe = G (not cube ovlp hand)
+spec done = reach and safe
+"""
+LOG = """\
+{"time_ns": 0, "objects": [{"name": "cube", "polygon": [[0, 0], [1, 0], [1, 1]]}]}
+{"time_ns": 9, "objects": [{"name": "hans", "parts": [{"vertices": [[5, 5]], "radius": 1}]}]}
+"""
+
+
+@pytest.fixture
+def specification(tmp_path: Path) -> Path:
+    path = tmp_path / "done.spatial"
+    path.write_text(SPECIFICATION)
+    return path
+
+
+def test_the_tree_shows_every_node_under_its_id(
+    specification: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["check", str(specification)]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "spec done",
+        "  0  done = and",
+        "  1  ├─ reach = F[0s, 3s]",
+        "  2  │  └─ cube enclosedin goal",
+        "  3  └─ safe = G",
+        "  4     └─ not",
+        "  5        └─ cube ovlp hand",
+    ]
+
+
+def test_json_holds_the_same_nodes(specification: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["check", str(specification), "--json"]) == 0
+    (spec,) = json.loads(capsys.readouterr().out)["specifications"]
+    assert spec["name"] == "done"
+    assert [(node["id"], node["parent"], node["operator"], node["name"]) for node in spec["nodes"]] == [
+        (0, None, "and", "done"),
+        (1, 0, "F", "reach"),
+        (2, 1, "enclosedin", None),
+        (3, 0, "G", "safe"),
+        (4, 3, "not", None),
+        (5, 4, "ovlp", None),
+    ]
+
+
+def test_every_fault_is_shown_with_its_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    faulty = tmp_path / "faulty.spatial"
+    faulty.write_text("spec a = F (x ovlap y)\nspec b = G[5, 2] x ovlp y\n")
+    assert run(["check", str(faulty)]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "faulty.spatial:1:15: error" in said.err
+    assert "faulty.spatial:2:" in said.err
+    assert said.err.rstrip().endswith("the specification has 2 faults, shown above")
+
+
+def test_warnings_go_to_standard_error_and_change_no_code(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    odd = tmp_path / "odd.spatial"
+    odd.write_text("const unused = 3\nspec a = F x ovlp y\n")
+    assert run(["check", str(odd)]) == 0
+    said = capsys.readouterr()
+    assert "warning" in said.err
+    assert "warning" not in said.out
+
+
+def test_names_are_compared_with_a_log(
+    specification: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "run.jsonl"
+    log.write_text(LOG)
+    assert run(["check", str(specification), "--log", str(log)]) == 2
+    said = capsys.readouterr().err
+    assert "hand" in said
+    assert "hans" in said
+    log.write_text(LOG.replace("hans", "hand"))
+    assert run(["check", str(specification), "--log", str(log)]) == 0
+
+
+def test_the_profile_of_a_file_without_a_use_line_can_be_chosen(tmp_path: Path) -> None:
+    published = tmp_path / "published.spatial"
+    published.write_text("F (a closeto b)")
+    assert run(["check", str(published)]) == 2
+    assert run(["check", str(published), "--profile", "spatial_spec"]) == 0

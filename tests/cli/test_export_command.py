@@ -1,0 +1,69 @@
+"""`spatial-replay export`, from outside."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from cli.program import run_program
+from replay.runs import SPECIFICATION, PiecewiseSource, record, run
+from spatial_replay.cli.application import run as run_in_process
+from spatial_replay.replay import run_replay
+from spatial_replay.spec.specification import parse_specification
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, with an annotated log."""
+    monkeypatch.chdir(tmp_path)
+    spec = parse_specification(SPECIFICATION)
+    run_replay(PiecewiseSource(run(), 5), [spec], output=tmp_path / "annotated.mcap")
+    return tmp_path
+
+
+def test_it_says_what_it_wrote(folder: Path) -> None:
+    done = run_program("export", "annotated.mcap", "-o", "run.csv", cwd=folder)
+    said = "wrote run.csv: 12 rows, 4 nodes\n"
+    assert (done.returncode, done.stdout, done.stderr) == (0, said, "")
+    lines = (folder / "run.csv").read_text().splitlines()
+    assert lines[0] == "time_ns,reach,reach#1,apart,apart#1"
+    assert len(lines) == 13
+
+
+def test_the_quantity_can_be_chosen(folder: Path) -> None:
+    assert run_in_process(["export", "annotated.mcap", "-o", "value.csv"]) == 0
+    assert run_in_process(["export", "annotated.mcap", "-o", "upper.csv", "--quantity", "upper"]) == 0
+    assert (folder / "upper.csv").read_text() != (folder / "value.csv").read_text()
+
+
+@pytest.mark.parametrize(
+    ("log", "output", "code", "said"),
+    [
+        ("none.mcap", "run.csv", 2, "none.mcap: no such file"),
+        ("annotated.mcap", "run.txt", 2, "run.txt ends in neither .csv nor .parquet"),
+        ("annotated.mcap", "none/run.csv", 2, "there is no folder none"),
+        ("tracks.csv", "run.csv", 2, "tracks.csv is no annotated log; write one with"),
+        ("recorded.mcap", "run.csv", 2, "recorded.mcap holds no /spatial/robustness; write it with"),
+        ("annotated.mcap", "-", 2, "- is no file; name one"),
+    ],
+)
+def test_what_cannot_be_exported(
+    folder: Path, capsys: pytest.CaptureFixture[str], log: str, output: str, code: int, said: str
+) -> None:
+    (folder / "tracks.csv").write_text("time_ns,name,polygon\n0,a,0 0 1 0 1 1\n")
+    record(run(), folder / "recorded.mcap")
+    assert run_in_process(["export", log, "-o", output]) == code
+    assert said in capsys.readouterr().err
+    assert not (folder / "run.csv").exists()
+    assert not (folder / "-").exists()
+
+
+def test_a_damaged_log_gives_what_is_left_and_its_code(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = (folder / "annotated.mcap").read_bytes()
+    (folder / "broken.mcap").write_bytes(whole[:-200])
+    assert run_in_process(["export", "broken.mcap", "-o", "run.csv"]) == 3
+    assert "broken.mcap" in capsys.readouterr().err
+    assert len((folder / "run.csv").read_text().splitlines()) == 13

@@ -1,0 +1,109 @@
+"""`spatial-replay info`: what a log holds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from replay.runs import SPECIFICATION, PiecewiseSource
+from replay.runs import run as recorded_run
+from spatial_replay.cli.application import run
+from spatial_replay.replay import run_replay
+from spatial_replay.spec.specification import parse_specification
+
+CUBE = '{"name": "cube", "class": "block", "polygon": [[0, 0], [1, 0], [1, 1]]}'
+LOST_CUBE = '{"name": "cube", "class": "block", "polygon": [[NaN, 0], [1, 0], [1, 1]]}'
+HAND = '{"name": "hand", "parts": [{"vertices": [[9, 9]], "radius": 1}]}'
+SAMPLES = (
+    f'{{"time_ns": 1000000000, "objects": [{CUBE}], "signals": {{"battery": 0.5}}}}',
+    f'{{"time_ns": 3500000000, "objects": [{LOST_CUBE}, {HAND}]}}',
+)
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    path = tmp_path / "run.jsonl"
+    path.write_text("\n".join(SAMPLES) + "\n")
+    return path
+
+
+def test_samples_objects_and_signals_are_named(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["info", str(log)]) == 0
+    said = capsys.readouterr().out
+    assert "2 samples" in said
+    assert "(2.500 s)" in said
+    assert "cube" in said
+    assert "battery" in said
+
+
+def test_json_counts_what_was_seen(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["info", str(log), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert (document["samples"], document["start_ns"], document["end_ns"]) == (2, 10**9, 3_500_000_000)
+    assert document["objects"] == [
+        {"name": "cube", "classes": ["block"], "samples": 2, "unreadable": 1},
+        {"name": "hand", "classes": [], "samples": 1, "unreadable": 0},
+    ]
+    assert document["damaged"] is False
+
+
+def test_damage_is_told_and_has_its_own_code(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log.write_text("\n".join([*SAMPLES, "no sample"]))
+    assert run(["info", str(log), "--json"]) == 3
+    said = capsys.readouterr()
+    assert json.loads(said.out)["damaged"] is True
+    assert "run.jsonl:3" in said.err
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\n", b"hello\n"])
+def test_something_else_is_no_log(tmp_path: Path, content: bytes) -> None:
+    other = tmp_path / "other"
+    other.write_bytes(content)
+    assert run(["info", str(other)]) == 3
+
+
+@pytest.fixture
+def layer(tmp_path: Path) -> Path:
+    """A sound log without samples: what was found in a run, without the run."""
+    path = tmp_path / "layer.mcap"
+    spec = parse_specification(SPECIFICATION, filename="blocks.spatial")
+    run_replay(PiecewiseSource(recorded_run(), 5), [spec], output=path, layer=True)
+    return path
+
+
+def test_a_log_of_something_else_is_listed(layer: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["info", str(layer), "--json"]) == 0
+    said = capsys.readouterr()
+    document = json.loads(said.out)
+    assert (document["samples"], document["objects"], said.err) == (0, [], "")
+    assert "/spatial/robustness" in {each["topic"] for each in document["topics"]}
+    assert "replayed/blocks.spatial" in {each["name"] for each in document["attachments"]}
+    assert "spatial_replay_certificate" in {each["name"] for each in document["metadata"]}
+
+
+def test_a_log_of_something_else_cannot_be_evaluated_but_is_not_damaged(
+    layer: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec = tmp_path / "a.spatial"
+    spec.write_text("F cube ovlp cube")
+    for arguments in (["replay", str(layer), "--spec", str(spec)], ["check", str(spec), "--log", str(layer)]):
+        assert run(arguments) == 2
+        said = capsys.readouterr().err
+        assert "no topic '/spatial/objects' in layer.mcap; it has '/spatial/robustness'" in said
+
+
+def test_a_damaged_attachment_is_told_by_info_and_replay(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, spec = tmp_path / "whole.mcap", tmp_path / "a.spatial"
+    spec.write_text("F cube ovlp cube")
+    run_replay(PiecewiseSource(recorded_run(), 5), [parse_specification(SPECIFICATION)], output=log)
+    content = log.read_bytes()
+    log.write_bytes(content.replace(SPECIFICATION.encode(), SPECIFICATION.upper().encode()))
+    assert log.read_bytes() != content
+    for arguments in (["info", str(log)], ["replay", str(log), "--spec", str(spec)]):
+        assert run(arguments) == 3
+        said = capsys.readouterr().err
+        assert said.count("an attachment's checksum does not fit") == 1

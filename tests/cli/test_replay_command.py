@@ -1,0 +1,265 @@
+"""`spatial-replay replay`, from outside: streams, exit codes, and what bad input gets."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import random
+import re
+import signal
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from cli.interruptions import interrupted, write_many
+from cli.program import PROGRAM, run_program
+from replay.runs import SPECIFICATION, content_of, run, write_tracks
+from spatial_replay.cli.application import run as run_in_process
+from spatial_replay.trace.trace import Trace
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder, the current one, with a run and a specification."""
+    monkeypatch.chdir(tmp_path)
+    write_tracks(run(), tmp_path / "run.jsonl")
+    (tmp_path / "blocks.spatial").write_text(SPECIFICATION, encoding="utf-8")
+    return tmp_path
+
+
+REPLAY = ("replay", "run.jsonl", "--spec", "blocks.spatial")
+
+
+def test_verdicts_go_to_standard_output_in_words(folder: Path) -> None:
+    done = run_program(*REPLAY, "-o", "out.mcap", cwd=folder)
+    assert (done.returncode, done.stderr) == (4, "")
+    head, reach, apart, wrote = done.stdout.splitlines()
+    assert head == "run.jsonl: 12 samples over 2.750 s"
+    assert reach.split()[:2] == ["reach", "satisfied"]
+    assert apart.split()[:2] == ["apart", "unknown"]
+    assert wrote == "wrote out.mcap"
+
+
+def test_json_goes_where_it_is_asked_to(folder: Path) -> None:
+    to_stream = run_program(*REPLAY, "--json", "-", cwd=folder)
+    to_file = run_program(*REPLAY, "--json", "found.json", cwd=folder)
+    assert (to_stream.returncode, to_file.returncode) == (4, 4)
+    found = json.loads(to_stream.stdout)
+    assert [each["name"] for each in found["specifications"]] == ["reach", "apart"]
+    assert json.loads((folder / "found.json").read_text(encoding="utf-8")) == found
+    assert "reach" in to_file.stdout
+
+
+@pytest.mark.parametrize(
+    ("formula", "code"),
+    [
+        ("F cube ovlp cube", 0),
+        ("G cube dist cube >= 1", 1),
+        ('G "cup 物" ovlp "cup 物"', 4),
+        ('(G "cup 物" ovlp "cup 物") and G cube dist cube >= 1', 1),
+    ],
+)
+def test_the_exit_code_is_the_verdict(folder: Path, formula: str, code: int) -> None:
+    (folder / "a.spatial").write_text(formula, encoding="utf-8")
+    assert run_in_process(["replay", "run.jsonl", "--spec", "a.spatial"]) == code
+
+
+def test_each_and_times_reach_the_evaluation(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "near.spatial").write_text("spec near(ego) = G (ego dist cube <= 9)")
+    arguments = ["replay", "run.jsonl", "--spec", "near.spatial", "--each", "ego=class:dish", "--json", "-"]
+    assert run_in_process([*arguments, "--from", "1s", "--to", "2000ms", "--every", "2"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["log"]["samples"], found["log"]["start_ns"]) == (2, 10**9)
+    assert [each["object"] for each in found["specifications"]] == ["cup 物"]
+
+
+@pytest.mark.parametrize("window", [(), ("--from", "1s"), ("--from", "500000000", "--every", "2")])
+def test_the_time_that_is_told_can_be_given_back(
+    folder: Path, window: Sequence[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    odd = Trace.from_samples(replace(each, time_ns=each.time_ns * 10 // 7 + 5) for each in run().samples())
+    write_tracks(odd, folder / "run.jsonl")
+    run_in_process([*REPLAY, *window, "--json", "found.json"])
+    reach = json.loads((folder / "found.json").read_text())["specifications"][0]
+    told = re.search(r"reach .*first satisfied at (\S+)", capsys.readouterr().out)
+    assert told is not None
+    run_in_process([*REPLAY, "--from", told[1], "--json", "-"])
+    assert json.loads(capsys.readouterr().out)["log"]["start_ns"] == reach["first_satisfied_ns"]
+
+
+def test_numbers_that_are_not_finite_are_counted_and_unknown(folder: Path) -> None:
+    with (folder / "run.jsonl").open("a") as stream:
+        for index, bad in enumerate(("NaN", "Infinity")):
+            cube = f'{{"name": "cube", "polygon": [[{bad}, 0], [1, 0], [1, 1]]}}'
+            stream.write(f'{{"time_ns": {10**10 + index}, "objects": [{cube}]}}\n')
+    (folder / "a.spatial").write_text("G cube ovlp cube")
+    done = run_program("replay", "run.jsonl", "--spec", "a.spatial", cwd=folder)
+    assert done.returncode == 4
+    assert done.stderr == (
+        "spatial-replay: warning: 2 observations hold a number that is not finite: unknown there\n"
+    )
+
+
+def _log_of(*lines: str) -> bytes:
+    return "".join(f"{line}\n" for line in lines).encode()
+
+
+GOOD = '{"time_ns": 0, "objects": [{"name": "cube", "polygon": [[0, 0], [1, 0], [1, 1]]}]}'
+SAME_TIME = GOOD
+TWICE = GOOD.replace("0,", "9,", 1).replace("[{", '[{"name": "cube", "polygon": [[0, 0]]}, {')
+
+
+@pytest.mark.parametrize(
+    ("content", "code", "said"),
+    [
+        (b"\x89PNG\r\n\x1a\n" + bytes(64), 3, "run.bin is no log that can be read here"),
+        (random.Random(3).randbytes(5000), 3, "run.bin is no log that can be read here"),
+        (b"", 3, "run.bin is empty"),
+        (gzip.compress(b"x" * 9 + GOOD.encode())[:20], 3, "run.bin"),
+        (gzip.compress((GOOD + "\n").encode() * 1)[:-9], 3, "run.bin:"),
+        (_log_of(GOOD, "no sample"), 3, "run.bin:2: "),
+        (_log_of(GOOD, '{"time": 3}'), 3, "run.bin:2: "),
+        (_log_of(GOOD, SAME_TIME), 3, "run.bin:2: time_ns is 0, not after 0; give times that increase"),
+        (_log_of(GOOD.replace("0,", "9,", 1), GOOD), 3, "run.bin:2: time_ns is 0, not after 9"),
+        (_log_of(GOOD, TWICE), 3, "run.bin:2: object 'cube' is there twice"),
+    ],
+    ids=[
+        "a picture",
+        "noise",
+        "nothing",
+        "gzip without a line",
+        "gzip that breaks off",
+        "a line that is no JSON",
+        "a line that is no sample",
+        "a time twice",
+        "a time that decreases",
+        "an object twice",
+    ],
+)
+def test_a_log_that_is_none_or_damaged(folder: Path, content: bytes, code: int, said: str) -> None:
+    (folder / "run.bin").write_bytes(content)
+    (folder / "a.spatial").write_text("G cube ovlp cube")
+    done = run_program("replay", "run.bin", "--spec", "a.spatial", "-o", "out.mcap", cwd=folder)
+    assert (done.returncode, len(done.stderr.splitlines())) == (code, 1)
+    assert said in done.stderr
+    # of a damaged log, a marked verdict is given over what could be read
+    assert ("damaged" in done.stdout) == (folder / "out.mcap").exists()
+
+
+TEN_FAULTS = "\n".join(
+    [
+        "const near = ",
+        "region goal = box(0, 0, 1)",
+        "group reds = ",
+        "def d(a) = ",
+        "spec a = F (x ovlap y)",
+        "spec b = G[5, 2] x ovlp y",
+        "spec c = x closeto y",
+        "spec d = x ovlp",
+        "spec e = (x ovlp y",
+        ")",
+        "spec b = x ovlp y",
+        "spec f = (F x) ovlp y",
+        "",
+    ]
+)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("replay", "none.mcap", "--spec", "blocks.spatial"), "none.mcap: no such file; check the path"),
+        (("replay", "run.jsonl", "--spec", "none.spatial"), "none.spatial: no such file; check the path"),
+        (("replay", "run.jsonl"), "run.jsonl holds no specification of its own; give one with --spec"),
+        ((*REPLAY, "-o", "run.jsonl"), "run.jsonl is an input too"),
+        ((*REPLAY, "-o", "./blocks.spatial"), "blocks.spatial is an input too"),
+        ((*REPLAY, "--json", "run.jsonl"), "run.jsonl is an input too"),
+        ((*REPLAY, "-o", "out", "--json", "./out"), "-o and --json both name ./out"),
+        ((*REPLAY, "-o", "none/out.mcap"), "there is no folder none"),
+        ((*REPLAY, "-o", "."), "is a folder"),
+        ((*REPLAY, "--from", "soon"), "'soon' is not a time; write 12.5s"),
+        ((*REPLAY, "--from", "99s"), "run.jsonl has no sample in the window asked for; its samples are from"),
+        ((*REPLAY, "--from", "2s", "--to", "1000ms"), "the window --from 2s --to 1000ms is empty"),
+        ((*REPLAY, "--to", "0s"), "the window --to 0s is empty"),
+        ((*REPLAY, "-o", "-"), "- is no file; name one. `replay … --json -` writes to standard output"),
+        ((*REPLAY, "--every", "0"), "0 is not in the range x>=1"),
+        ((*REPLAY, "--layer"), "add -o FILE"),
+        ((*REPLAY, "--series"), "add --json FILE"),
+        ((*REPLAY, "--each", "ego=all"), "no template has a parameter 'ego'"),
+        ((*REPLAY, "--each", "ego"), "write --each VAR=class:NAME"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
+)
+def test_wrong_usage(
+    folder: Path, arguments: Sequence[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert run_in_process(arguments) == 2
+    streams = capsys.readouterr()
+    assert streams.out == ""
+    assert said in streams.err
+    assert len(streams.err.splitlines()) <= 3
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_template_needs_its_objects(folder: Path) -> None:
+    (folder / "near.spatial").write_text("spec near(ego) = G (ego dist cube <= 9)")
+    replay = ("replay", "run.jsonl", "--spec", "near.spatial")
+    without = run_program(*replay, cwd=folder)
+    assert (without.returncode, without.stdout) == (2, "")
+    assert "near(ego) is a template: say what ego stands for, --each ego=class:NAME" in without.stderr
+    unknown = run_program(*replay, "--each", "ego=class:dog", cwd=folder)
+    assert (unknown.returncode, unknown.stdout) == (2, "")
+    assert "is of the class 'dog'; its classes are: Block, dish" in unknown.stderr
+
+
+def test_every_fault_of_a_specification_is_told(folder: Path) -> None:
+    (folder / "faulty.spatial").write_text(TEN_FAULTS)
+    done = run_program("replay", "run.jsonl", "--spec", "faulty.spatial", cwd=folder)
+    assert (done.returncode, done.stdout) == (2, "")
+    places = {line.split(":")[1] for line in done.stderr.splitlines() if line.startswith("faulty.spatial:")}
+    assert len(places) >= 10
+    assert "Traceback" not in done.stderr
+
+
+def test_an_object_that_the_log_never_has(folder: Path) -> None:
+    (folder / "a.spatial").write_text("spec s = F (cub ovlp cube)\n")
+    done = run_program("replay", "run.jsonl", "--spec", "a.spatial", "-o", "out.mcap", cwd=folder)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "a.spatial:1:13: error: the log never has the object 'cub'" in done.stderr
+    assert "'cube'" in done.stderr
+    assert "its objects are cube, cup 物" in done.stderr
+    assert not (folder / "out.mcap").exists()
+
+
+def test_a_full_disk_has_its_code_and_leaves_nothing(folder: Path) -> None:
+    if not Path("/dev/full").is_char_device():
+        pytest.skip("no /dev/full here")
+    (folder / "full").symlink_to("/dev/full")
+    before = sorted(folder.iterdir())
+    done = run_program(*REPLAY, "-o", "full", cwd=folder)
+    assert (done.returncode, done.stdout) == (70, "")
+    assert done.stderr == "spatial-replay: error: full could not be written: no space left on the device\n"
+    assert sorted(folder.iterdir()) == before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_replay_leaves_nothing(tmp_path: Path, number: signal.Signals) -> None:
+    write_many(tmp_path / "run.jsonl")
+    (tmp_path / "a.spatial").write_text("F cube ovlp cube")
+    command = [*PROGRAM, "replay", "run.jsonl", "--spec", "a.spatial", "-o", "out.mcap"]
+    code, said = interrupted(command, number, tmp_path, lambda: any(tmp_path.glob(".out.mcap.*")))
+    assert (code, said) == (130, "spatial-replay: error: interrupted")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.spatial", "run.jsonl"]
+
+
+def test_a_log_is_replayed_with_its_own_specification(folder: Path) -> None:
+    assert (
+        run_in_process(["record", "tracks", "run.jsonl", "--spec", "blocks.spatial", "-o", "run.mcap"]) == 0
+    )
+    assert run_in_process(["replay", "run.mcap", "-o", "own.mcap"]) == 4
+    assert run_in_process(["replay", "run.mcap", "--spec", "blocks.spatial", "-o", "named.mcap"]) == 4
+    assert Path("own.mcap").read_bytes() == Path("named.mcap").read_bytes()
+    assert content_of(Path("own.mcap")).of("/spatial/robustness")

@@ -1,0 +1,109 @@
+"""Times as people write them on the command line."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta, timezone
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from spatial_replay.cli.times import (
+    TimePoint,
+    duration_ns_from_text,
+    text_from_duration_ns,
+    time_point_from_text,
+)
+from spatial_replay.errors import UsageError
+from spatial_replay.trace.times import LATEST_NS
+
+times_ns = st.integers(0, LATEST_NS)
+zones = st.integers(-14 * 60, 14 * 60).map(lambda minutes: timezone(timedelta(minutes=minutes)))
+
+
+@given(times_ns)
+def test_integers_are_nanoseconds_on_the_log_s_own_clock(time_ns: int) -> None:
+    assert time_point_from_text(str(time_ns)).absolute_ns(first_ns=17) == time_ns
+
+
+@given(times_ns, st.integers(0, 10**18))
+def test_seconds_count_from_the_first_sample_to_the_nanosecond(offset_ns: int, first_ns: int) -> None:
+    text = f"{offset_ns // 10**9}.{offset_ns % 10**9:09d}s"
+    assert time_point_from_text(text).absolute_ns(first_ns) == first_ns + offset_ns
+
+
+@given(st.integers(0, 10**12))
+def test_milliseconds_are_thousandths_of_seconds(count: int) -> None:
+    assert duration_ns_from_text(f"{count}ms") == count * 10**6 == duration_ns_from_text(f"{count}e-3s")
+
+
+@given(
+    st.datetimes(min_value=datetime(1970, 1, 3), max_value=datetime(2261, 12, 31)),
+    zones,
+    st.integers(0, 999),
+)
+def test_calendar_times_keep_nanoseconds_and_obey_their_zone(
+    local: datetime, zone: timezone, nanoseconds: int
+) -> None:
+    moment = local.replace(tzinfo=zone)
+    offset = moment.strftime("%z")
+    text = f"{local:%Y-%m-%dT%H:%M:%S}.{local.microsecond:06d}{nanoseconds:03d}{offset[:3]}:{offset[3:]}"
+    microseconds = (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1)
+    assert time_point_from_text(text) == TimePoint(microseconds * 1000 + nanoseconds, "zero")
+
+
+def test_z_is_utc_and_a_blank_may_stand_for_t() -> None:
+    expected = TimePoint(1_769_860_800 * 10**9, "zero")
+    assert time_point_from_text("2026-01-31T12:00:00Z") == expected
+    assert time_point_from_text("2026-01-31 13:00:00+01:00") == expected
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "soon",
+        "12.5",
+        "-1s",
+        "1 s",
+        "1e999s",
+        "1m",
+        "nans",
+        "2026-01-31",
+        "2026-01-31T12:00:00",
+        "2026-02-30T12:00:00Z",
+        "2026-01-31T25:00:00Z",
+        "1969-12-31T23:59:59Z",
+        "1e30s",
+        str(LATEST_NS + 1),
+        "٣s",
+    ],
+)
+def test_anything_else_is_refused_by_name(text: str) -> None:
+    with pytest.raises(UsageError) as refusal:
+        time_point_from_text(text)
+    assert repr(text) in str(refusal.value)
+
+
+@given(st.text(max_size=30))
+def test_no_text_raises_anything_but_a_usage_error(text: str) -> None:
+    try:
+        point = time_point_from_text(text)
+    except UsageError:
+        return
+    assert 0 <= point.nanoseconds <= LATEST_NS
+
+
+@given(st.integers(0, LATEST_NS))
+def test_a_duration_that_is_written_is_read_again(nanoseconds: int) -> None:
+    assert duration_ns_from_text(text_from_duration_ns(nanoseconds)) == nanoseconds
+
+
+def test_a_duration_is_written_without_idle_digits() -> None:
+    assert [text_from_duration_ns(ns) for ns in (0, 10 * 10**9, 250_000_000)] == ["0s", "10s", "0.25s"]
+
+
+def test_a_duration_names_its_unit() -> None:
+    assert duration_ns_from_text("2s") == 2 * 10**9
+    with pytest.raises(UsageError, match="write it as 2s"):
+        duration_ns_from_text("2")
