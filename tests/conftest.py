@@ -1,0 +1,42 @@
+"""Options and fixtures that every area of the tests shares."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+# a law is about values, not about how busy the machine is
+settings.register_profile("default", deadline=None)
+settings.register_profile("ci", deadline=None, derandomize=True, print_blob=True)
+settings.load_profile("ci" if os.environ.get("CI") else "default")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--forbid-skips", action="store_true", help="a skipped test fails the run")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if not session.config.getoption("--forbid-skips"):
+        return
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if reporter is not None and reporter.stats.get("skipped") and session.exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    if config.getoption("--forbid-skips") and terminalreporter.stats.get("skipped"):
+        terminalreporter.section("skipped tests", sep="=", red=True)
+        terminalreporter.line("--forbid-skips was given, and tests were skipped: the run fails")
+
+
+@pytest.fixture
+def data_folder() -> Path:
+    """The folder of recordings to compare with; the test skips where there is none."""
+    folder = os.environ.get("SPATIAL_REPLAY_DATA")
+    if not folder or not Path(folder).is_dir():
+        pytest.skip("SPATIAL_REPLAY_DATA names no folder of recordings")
+    return Path(folder)

@@ -1,0 +1,87 @@
+"""The package as it is installed: its names, what it loads, what it depends on."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import packages_distributions
+from importlib.resources import files
+from itertools import chain
+from pathlib import Path
+
+import pytest
+
+import spatial_replay
+
+PROJECT = Path(__file__).parent.parent / "pyproject.toml"
+
+
+def package_files() -> list[Path]:
+    folder = Path(str(files(spatial_replay)))
+    return sorted(folder.rglob("*.py"))
+
+
+def test_the_package_under_test_is_the_installed_one() -> None:
+    if "SPATIAL_REPLAY_INSTALLED" in os.environ:
+        assert "site-packages" in Path(spatial_replay.__file__).parts
+    else:
+        assert Path(spatial_replay.__file__).parent == PROJECT.parent / "spatial_replay"
+
+
+@pytest.mark.parametrize("name", spatial_replay.__all__)
+def test_every_public_name_is_there(name: str) -> None:
+    assert getattr(spatial_replay, name) is not None
+    assert name in dir(spatial_replay)
+
+
+def test_other_names_are_not_there() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'replay_everything'"):
+        _ = spatial_replay.replay_everything
+
+
+def test_importing_the_package_loads_nothing_but_itself() -> None:
+    program = (
+        "import sys; before = set(sys.modules); import spatial_replay\n"
+        "loaded = {name.partition('.')[0] for name in set(sys.modules) - before}\n"
+        "sys.exit(', '.join(loaded - {'spatial_replay'} - set(sys.stdlib_module_names)) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_the_package_says_that_it_is_typed() -> None:
+    assert (files(spatial_replay) / "py.typed").is_file()
+
+
+def test_dependencies_are_those_that_are_imported() -> None:
+    project = tomllib.loads(PROJECT.read_text())["project"]
+    required = {name_of(requirement) for requirement in project["dependencies"]}
+    optional = {name_of(requirement) for requirement in chain(*project["optional-dependencies"].values())}
+    imported = {module for path in package_files() for module in imported_modules(path)}
+    distributions = packages_distributions()
+    providers = {
+        module: {name.lower().replace("_", "-") for name in distributions.get(module, [module])}
+        for module in imported - set(sys.stdlib_module_names) - {"spatial_replay"}
+    }
+    undeclared = {module for module, names in providers.items() if not names & (required | optional)}
+    assert not undeclared
+    assert required <= set().union(*providers.values())
+
+
+def name_of(requirement: str) -> str:
+    return re.split(r"[<>=!~;\[ ]", requirement)[0]
+
+
+def imported_modules(path: Path) -> set[str]:
+    """First names of the modules that a file imports, wherever in it."""
+    modules: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            modules.update(alias.name.partition(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            modules.add(node.module.partition(".")[0])
+    return modules

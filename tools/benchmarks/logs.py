@@ -1,0 +1,130 @@
+"""Reading, replaying and writing logs of many samples: six quadrilaterals that move, 30 a second."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.logs.block import Block
+from spatial_replay.logs.source import open_source
+from spatial_replay.recording import record_source
+from spatial_replay.trace.trace import Trace
+
+OBJECTS = ("blue1", "blue2", "green1", "green2", "red1", "red2")
+PERIOD_NS = 33_333_333
+SPECIFICATION = """
+use spatial_spec
+region redGoal = box(50, 120, 250, 350)
+region greenGoal = box(600, 500, 800, 730)
+group reds = red1, red2
+group greens = green1, green2
+spec reach = (F (red1 enclosedin redGoal)) and (F (red2 enclosedin redGoal))
+    and (F (green1 enclosedin greenGoal)) and (F (green2 enclosedin greenGoal))
+spec passage = (G ((red1 closeto blue1) -> (red1 below blue1)))
+    and (G ((red2 closeto blue2) -> (red2 above blue2)))
+    and (G ((green1 closeto blue1) -> (green1 below blue1)))
+    and (G ((green2 closeto blue2) -> (green2 above blue2)))
+spec blocks = reach and passage
+"""
+_SQUARE = np.array([[-30.0, -30.0], [30.0, -30.0], [30.0, 30.0], [-30.0, 30.0]])
+
+
+@dataclass(frozen=True)
+class Moving:
+    """A source of quadrilaterals that turn and drift, made block by block."""
+
+    samples: int
+    name: str = "moving"
+    kind: str = "generated"
+    metadata: tuple[Any, ...] = ()
+    attachments: tuple[Any, ...] = ()
+
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        for begin in range(0, self.samples, 16_384):
+            yield Block(_moving(np.arange(begin, min(begin + 16_384, self.samples))))
+
+
+def _moving(samples: np.ndarray[Any, Any]) -> Trace:
+    count = len(samples) * len(OBJECTS)
+    phase = samples[:, None] * 1e-3 + np.arange(len(OBJECTS))
+    centre = 400.0 + 300.0 * np.stack([np.cos(phase), np.sin(1.3 * phase)], axis=-1)
+    cos, sin = np.cos(3.0 * phase), np.sin(3.0 * phase)
+    turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+    corners = centre[:, :, None, :] + np.einsum("tnij,kj->tnki", turn, _SQUARE)
+    return Trace(
+        times_ns=samples * PERIOD_NS,
+        names=OBJECTS,
+        rows=np.arange(count).reshape(len(samples), len(OBJECTS)),
+        footprints=FootprintBatch(
+            part_start=np.arange(count + 1),
+            vertex_start=4 * np.arange(count + 1),
+            vertices=corners.reshape(-1, 2),
+            radius=np.zeros(count),
+            bottom=np.full(count, np.nan),
+            top=np.full(count, np.nan),
+        ),
+        yaw=np.full(count, np.nan),
+        uncertainty=np.zeros(count),
+        class_code=np.zeros(count, np.int64),
+        classes=("block",),
+    )
+
+
+def _peak_bytes(*arguments: str) -> int:
+    """The peak memory of a command, the largest of this process' children so far."""
+    done = subprocess.run(
+        [sys.executable, "-m", "spatial_replay", *arguments], capture_output=True, check=False
+    )
+    if done.returncode not in (0, 1, 4):
+        raise RuntimeError(f"{arguments} ended with {done.returncode}: {done.stderr.decode()}")
+    return 1024 * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+
+
+def bench_reading(measure: Any) -> None:
+    """Reading our own log, all samples into columns."""
+    count = 200_000
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "run.mcap"
+        record_source(Moving(count), log)
+        measure(
+            "reading",
+            lambda _: sum(len(block.trace) for block in open_source(log).iter_blocks()),
+            per=count,
+            unit="sample",
+            runs=5,
+            limit_s=1 / 100_000,
+        )
+
+
+def bench_replay_large(measure: Any) -> None:
+    """`replay -o` of a large log: time of the whole command, and its peak memory."""
+    count = int(os.environ.get("SPATIAL_REPLAY_BENCH_SAMPLES", "1000000"))
+    with tempfile.TemporaryDirectory() as folder:
+        log, spec, annotated = (
+            Path(folder) / "run.mcap",
+            Path(folder) / "blocks.spatial",
+            f"{folder}/out.mcap",
+        )
+        spec.write_text(SPECIFICATION)
+        record_source(Moving(count), log)
+        peaks: list[int] = []
+        measure(
+            f"replay -o, {count:,} samples",
+            lambda _: peaks.append(_peak_bytes("replay", str(log), "--spec", str(spec), "-o", annotated)),
+            per=count,
+            unit="sample",
+            runs=1,
+            warmups=0,
+            limit_s=1 / 30_000,
+        )
+        print(f"{'':20} peak memory {max(peaks) / 1e6:,.0f} MB, limit 1,500 MB")
