@@ -153,7 +153,12 @@ recorder.close()
 def test_closing_is_not_interrupted(tmp_path: Path) -> None:
     # a process of its own: the interruption must not reach the one that runs the tests
     ended = subprocess.run(
-        [sys.executable, "-c", _CLOSING], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True
+        [sys.executable, "-c", _CLOSING],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
     )
     assert (ended.stdout, ended.stderr) == ("interrupted\n", "")
     path = tmp_path / "run.mcap"
