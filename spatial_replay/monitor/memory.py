@@ -7,10 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.channels import CHANNELS
 from spatial_replay.monitor.program import Program
-
-CHANNELS = 4
-"""Ends of the interval with every uncertainty at 0 (low, high), then with uncertainty (low, high)."""
 
 TILE = 256
 """How many samples are taken in together: enough to amortise the walk over a program's tables, few enough to

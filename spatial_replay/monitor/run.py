@@ -3,10 +3,7 @@
 Samples are taken in by tiles: first the signals of a tile, then each part, then the tree. A tile of one
 sample and a tile of many give the same bits, because the only arithmetic is minima, maxima and negation.
 
-All numbers exist in up to four *channels*: the ends of the interval with every uncertainty at 0 (nominal low
-and high), and the ends with uncertainty (wide low and high). They are equal, and only the first is kept, for
-as long as everything is known; the second appears with the first unknown, the rest with uncertainty. A
-negation swaps low and high: channel ^ 1.
+Numbers are kept in as many channels as are needed so far (see `channels`).
 """
 
 from __future__ import annotations
@@ -14,7 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.memory import CHANNELS, TILE, doubled, first_memory, forget, scratch_for, widen
+from spatial_replay.monitor.channels import in_channels
+from spatial_replay.monitor.memory import TILE, doubled, first_memory, forget, scratch_for, widen
 from spatial_replay.monitor.program import Program
 from spatial_replay.monitor.reports import report
 from spatial_replay.monitor.signals import step_signals
@@ -67,9 +65,7 @@ class Run:
         if len(leaves) > self._channels:
             widen(self._memory, self._channels)
             self._channels = len(leaves)
-        elif len(leaves) < self._channels:
-            leaves = leaves[_SPREAD[len(leaves)][: self._channels]]
-        leaves = np.ascontiguousarray(leaves)
+        leaves = np.ascontiguousarray(in_channels(leaves, self._channels))
         series = np.empty((len(self._program.reports), 4, len(times_ns)))
         done = 0
         while done < len(times_ns):
@@ -115,6 +111,3 @@ class Run:
                 self._scratch = scratch_for(self._program, 2 * room)
         return min(wanted, len(self._memory.stamps) - (self._position - self._offset))
 
-
-_SPREAD = {1: np.zeros(CHANNELS, np.int64), 2: np.array([0, 1, 0, 1]), 4: np.arange(CHANNELS)}
-"""Which channel of fewer stands for each of more."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from spatial_replay.errors import TraceError
 from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.channels import in_channels
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.leaves import leaf_values
 from spatial_replay.monitor.operands import Scene
@@ -31,10 +32,22 @@ class Stretch:
     Attributes:
         times_ns: (T,) int64; T may be 0.
         series: (N, 4, T): value, now, lower and upper of each node.
+        leaves: (C, A, T), what the numbers were made of: `leaf_values` of the same samples.
     """
 
     times_ns: Integers
     series: Floats
+    leaves: Floats
+
+
+def join_stretches(stretches: Sequence[Stretch]) -> Stretch:
+    """One stretch of one or more of the same instance that follow each other."""
+    channels = max(len(stretch.leaves) for stretch in stretches)
+    return Stretch(
+        np.concatenate([stretch.times_ns for stretch in stretches]),
+        np.concatenate([stretch.series for stretch in stretches], axis=2),
+        np.concatenate([in_channels(stretch.leaves, channels) for stretch in stretches], axis=2),
+    )
 
 
 class InstanceStream:
@@ -71,14 +84,15 @@ class InstanceStream:
         begin, end = window_of(times, self.instance.start_ns, self.instance.end_ns)
         times = times[begin:end]
         if not len(times):
-            return Stretch(times, np.empty((len(self._robustness), 4, 0)))
-        leaves = leaf_values(scene, self.instance.program.leaves, self.instance.bindings)
-        series = self._run.extend(leaves[:, :, begin:end], times)
+            no_leaves = np.empty((1, len(self.instance.program.leaves), 0))
+            return Stretch(times, np.empty((len(self._robustness), 4, 0)), no_leaves)
+        leaves = leaf_values(scene, self.instance.program.leaves, self.instance.bindings)[:, :, begin:end]
+        series = self._run.extend(leaves, times)
         self._robustness = series[:, 0, -1].copy()
         if self.first_satisfied_ns is None:
             satisfied = np.flatnonzero(series[0, 0] >= 0.0)
             self.first_satisfied_ns = int(times[satisfied[0]]) if len(satisfied) else None
-        return Stretch(times, series)
+        return Stretch(times, series, leaves)
 
 
 class EvaluationStream:

@@ -21,7 +21,7 @@ from spatial_replay.logs.sink import Attachment
 from spatial_replay.logs.source import Source, within
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
 from spatial_replay.monitor.instances import Choice, Instance, find_instances
-from spatial_replay.monitor.stream import InstanceStream, Stretch, look_back
+from spatial_replay.monitor.stream import InstanceStream, Stretch, join_stretches, look_back
 from spatial_replay.monitor.verdict import Verdict, final_verdict, worst_verdict
 from spatial_replay.replay.window import Window, first_sample_ns
 from spatial_replay.spec import check_names
@@ -245,7 +245,7 @@ class Replay:
 
     def _stretches(self) -> Iterator[Stretch | None]:
         for stretches in self._kept:
-            yield _joined(stretches) if self._keep_series else None
+            yield join_stretches(stretches) if self._keep_series else None
 
     def _check_names(self) -> None:
         """That the log has every object and signal that a specification names."""
@@ -289,13 +289,6 @@ def _replayed(tree: ReportedTree, stream: InstanceStream, stretch: Stretch | Non
         stream.first_satisfied_ns,
         None if stretch is None else stretch.times_ns,
         None if stretch is None else stretch.series,
-    )
-
-
-def _joined(stretches: Sequence[Stretch]) -> Stretch:
-    return Stretch(
-        np.concatenate([stretch.times_ns for stretch in stretches]),
-        np.concatenate([stretch.series for stretch in stretches], axis=2),
     )
 
 
