@@ -25,4 +25,4 @@ def read_blocks(source: Source, start_ns: int | None = None, end_ns: int | None 
 def reading_options(source: Source) -> dict[str, object]:
     """How a source is read, where that is not the default, as a log's metadata says it."""
     concave = getattr(source, "concave", "decompose")
-    return {} if concave == "decompose" else {"concave": concave}
+    return dict(getattr(source, "options", {})) | ({} if concave == "decompose" else {"concave": concave})

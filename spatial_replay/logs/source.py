@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as shortened
-from typing import Protocol
+from types import MappingProxyType
+from typing import NamedTuple, Protocol
 
 from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.geometry.footprint import Concave
@@ -17,6 +19,8 @@ from spatial_replay.logs.faults import FaultList
 from spatial_replay.logs.lines import open_text
 from spatial_replay.logs.mcap_reader import McapSource
 from spatial_replay.logs.mcap_records import MAGIC
+from spatial_replay.logs.options import Lost, OnTimeJump, ReadOptions
+from spatial_replay.logs.sdd import FRAMES_A_SECOND, is_annotations, iter_annotations
 from spatial_replay.logs.sink import Attachment
 from spatial_replay.logs.tracks import iter_jsonl
 from spatial_replay.trace.sample import Sample
@@ -95,12 +99,17 @@ IterTraces = Callable[..., Iterator[Trace]]
 
 @dataclass(frozen=True)
 class TrackSource(_Bare):
-    """A track file."""
+    """A track file.
+
+    Attributes:
+        options: how it is read where that is not the default.
+    """
 
     path: Path
     kind: str
     concave: Concave
     iter_traces: IterTraces
+    options: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
 
     @property
     def name(self) -> str:
@@ -124,23 +133,37 @@ class TrackSource(_Bare):
             yield Block(replace(Trace.from_samples(()), faults=rest))
 
 
-def open_source(path: str | PathLike[str], *, concave: Concave = "decompose") -> Source:
+def open_source(
+    path: str | PathLike[str],
+    *,
+    concave: Concave = "decompose",
+    mapping: str | PathLike[str] | None = None,
+    on_time_jump: OnTimeJump = "error",
+    rate: float | None = None,
+    lost: Lost = "drop",
+) -> Source:
     """The log in a file, in whatever format it is; the content decides, not the name.
 
     Args:
         concave: what becomes of polygons that are not convex.
+        mapping: a mapping file: which topics of a log of messages carry which objects.
+        on_time_jump: what becomes of a log of messages whose clock jumps back.
+        rate: frames a second of annotations that count frames; 30 unless given.
+        lost: whether annotations that are marked as lost are dropped or kept.
 
     Raises:
-        UsageError: no path was given.
+        UsageError: no path was given, or an option that says nothing to this format.
         MissingFileError: there is no such file, or it cannot be opened.
         LogError: the file is none of the known formats.
     """
     _require_path(path)
+    options = ReadOptions(concave, mapping, on_time_jump, rate, lost)
     path = Path(path)
     head = _head(path)
-    for kind, (recognise, open_format) in FORMATS.items():
-        if recognise(head):
-            return open_format(path, kind, concave)
+    for kind, format_ in FORMATS.items():
+        if format_.recognise(head):
+            options.refuse_except(format_.options, kind, path.name)
+            return format_.open(path, kind, options)
     if not head:
         raise LogError(f"{path.name} is empty; give a log with at least one sample")
     known = ", ".join(FORMATS)
@@ -152,27 +175,26 @@ def read_trace(
     *,
     mapping: str | PathLike[str] | None = None,
     concave: Concave = "decompose",
+    on_time_jump: OnTimeJump = "error",
+    rate: float | None = None,
+    lost: Lost = "drop",
     allow_damage: bool = False,
 ) -> Trace:
     """A whole log in memory.
 
     Args:
-        path: an MCAP log of ours, a track file (`.jsonl`, `.csv`, plain or gzip).
-        mapping: which topics carry which objects; none of the formats above takes one.
-        concave: what becomes of polygons that are not convex.
+        path: a log in any format that `open_source` knows.
+        mapping, concave, on_time_jump, rate, lost: how to read it, as for `open_source`.
         allow_damage: return what can be read of a damaged log, with its `faults`.
 
     Raises:
-        UsageError: no path, or a mapping was given.
+        UsageError: no path was given, or an option that says nothing to this format.
         MissingFileError: there is no such file.
         LogError: the file is no log, or is damaged and `allow_damage` is not set.
     """
-    if mapping is not None:
-        raise UsageError(
-            f"mapping {str(mapping)!r} is not needed: logs of spatial-replay and track files name their"
-            " objects themselves; leave it out"
-        )
-    source = open_source(path, concave=concave)
+    source = open_source(
+        path, concave=concave, mapping=mapping, on_time_jump=on_time_jump, rate=rate, lost=lost
+    )
     trace = Trace.concatenate([block.trace for block in source.iter_blocks()])
     if trace.faults and not allow_damage:
         more = f"\n… and {len(trace.faults) - 1} more" if len(trace.faults) > 1 else ""
@@ -212,11 +234,36 @@ def _is_csv(head: bytes) -> bool:
     return any(name.encode() in first.split(b",") for name in COLUMNS)
 
 
-Recognise = Callable[[bytes], bool]
-OpenFormat = Callable[[Path, str, Concave], Source]
+class Format(NamedTuple):
+    """A format of logs.
 
-FORMATS: dict[str, tuple[Recognise, OpenFormat]] = {
-    "MCAP": (lambda head: head.startswith(MAGIC), McapSource),
-    "track JSONL": (_is_jsonl, lambda path, kind, concave: TrackSource(path, kind, concave, iter_jsonl)),
-    "track CSV": (_is_csv, lambda path, kind, concave: TrackSource(path, kind, concave, iter_csv)),
+    Attributes:
+        recognise: whether a file that begins with the given bytes is of this format.
+        open: a source of the file, given what the format is called.
+        options: the names of the `ReadOptions` that it understands, but for `concave`.
+    """
+
+    recognise: Callable[[bytes], bool]
+    open: Callable[[Path, str, ReadOptions], Source]
+    options: frozenset[str] = frozenset()
+
+
+def _tracks(iter_traces: IterTraces) -> Callable[[Path, str, ReadOptions], Source]:
+    return lambda path, kind, options: TrackSource(path, kind, options.concave, iter_traces)
+
+
+def _open_annotations(path: Path, kind: str, options: ReadOptions) -> Source:
+    rate = FRAMES_A_SECOND if options.rate is None else options.rate
+    reader = partial(iter_annotations, rate=rate, lost=options.lost)
+    return TrackSource(path, kind, options.concave, reader, MappingProxyType(options.given()))
+
+
+FORMATS: dict[str, Format] = {
+    "MCAP": Format(
+        lambda head: head.startswith(MAGIC),
+        lambda path, kind, options: McapSource(path, kind, options.concave),
+    ),
+    "track JSONL": Format(_is_jsonl, _tracks(iter_jsonl)),
+    "track CSV": Format(_is_csv, _tracks(iter_csv)),
+    "drone annotations": Format(is_annotations, _open_annotations, frozenset({"rate", "lost"})),
 }
