@@ -1,9 +1,9 @@
 """Channels: what a number can be when something is unknown or uncertain.
 
-All numbers exist in up to four channels: the ends of the interval with every uncertainty at 0 (nominal low and
-high), and the ends with uncertainty (wide low and high). They are equal, and only the first is kept, for as
-long as everything is known; the second appears with the first unknown, the rest with uncertainty. A negation
-swaps low and high: channel ^ 1.
+All numbers exist in up to four channels: the ends of the interval with every uncertainty at 0 (nominal low
+and high), and the ends with uncertainty (wide low and high). They are equal, and only the first is kept, for
+as long as everything is known; the second appears with the first unknown, the rest with uncertainty. A
+negation swaps low and high: channel ^ 1.
 """
 
 from __future__ import annotations

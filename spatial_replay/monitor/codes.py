@@ -9,6 +9,7 @@ SAMPLES, NANOSECONDS = 0, 1
 # columns of signals
 SIGNAL_CODE, SIGNAL_A, SIGNAL_B, SIGNAL_UNIT, SIGNAL_LOW, SIGNAL_HIGH, SIGNAL_WINDOW = range(7)
 SIGNAL_WIDTH = 7
+FINISHED_WIDTH = 6  # the same without windows
 # codes of signals
 LEAF = 0  # leaf a
 CONSTANT = 1  # low times infinity
@@ -16,6 +17,7 @@ NOT, AND, OR, XOR, IFF = 2, 3, 4, 5, 6
 ONCE, HISTORICALLY, SINCE = 7, 8, 9
 WINDOW_MAX, WINDOW_MIN = 10, 11  # of a, over [low, high] back
 DELAY = 12  # a, low back; high times infinity where there is none
+AHEAD = 16  # added to a code from ONCE on: its mirror image in time (see `finished`)
 
 # columns of parts' nodes
 # a = -1 for the left operand of an until that is `true`, of a release that is `false`

@@ -55,10 +55,13 @@ class SignalTable:
         leaves: atoms and open quantifiers, by the number that their rows refer to.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, leaves: Sequence[Atom | Quantified] = ()) -> None:
+        """Begin with leaves that are numbered already."""
         self.leaves: list[Atom | Quantified] = []
         self._leaf_numbers: dict[tuple[object, ...], int] = {}
         self._rows: dict[Row, int] = {}
+        for leaf in leaves:
+            self._leaf_number(leaf)
 
     @property
     def windows(self) -> int:
@@ -85,26 +88,27 @@ class SignalTable:
         match formula:
             case Truth():
                 return self._row(codes.CONSTANT, low=1 if formula.value else -1)
-            case Atom():
-                return self._leaf(formula, (formula.expression,))
-            case Quantified():
-                return self._leaf(
-                    formula, (formula.quantifier, formula.variables, formula.group, formula.body)
-                )
+            case Atom() | Quantified():
+                return self._row(codes.LEAF, self._leaf_number(formula))
             case Boolean():
                 return self._boolean(formula.operator, [self.add(each) for each in formula.operands])
             case Temporal():
                 operands = [self.add(each) for each in formula.operands]
-                return self._past(formula.operator, operands, formula.bound)
+                return self._temporal(formula.operator, operands, formula.bound)
 
     def _row(self, code: int, a: int = 0, b: int = 0, unit: int = 0, low: int = 0, high: int = 0) -> int:
         return self._rows.setdefault((code, a, b, unit, low, high), len(self._rows))
 
-    def _leaf(self, formula: Atom | Quantified, key: tuple[object, ...]) -> int:
+    def _leaf_number(self, formula: Atom | Quantified) -> int:
+        key: tuple[object, ...]
+        if isinstance(formula, Atom):
+            key = (formula.expression,)
+        else:
+            key = (formula.quantifier, formula.variables, formula.group, formula.body)
         if key not in self._leaf_numbers:
             self._leaf_numbers[key] = len(self.leaves)
             self.leaves.append(formula)
-        return self._row(codes.LEAF, self._leaf_numbers[key])
+        return self._leaf_numbers[key]
 
     def _boolean(self, operator: str, operands: list[int]) -> int:
         first, *rest = operands
@@ -124,33 +128,35 @@ class SignalTable:
             case _:
                 return self._row(codes.IFF, first, rest[0])
 
-    def _past(self, operator: str, operands: list[int], bound: Bound | None) -> int:
+    def _temporal(self, operator: str, operands: list[int], bound: Bound | None, ahead: int = 0) -> int:
+        """A past operator; with `codes.AHEAD`, the future operator that is its mirror image in time."""
         unit, low, high = window_of(bound)
         match operator:
             case "Y":
-                return self._delay(operands[0], codes.SAMPLES, 1)
+                return self._delay(operands[0], codes.SAMPLES, 1, ahead)
             case "S":
                 left, right = operands
-                return self._since(left, right, unit, low, high)
+                return self._since(left, right, unit, low, high, ahead)
         is_weak = operator == "H"
         if high is not None:
             code = codes.WINDOW_MIN if is_weak else codes.WINDOW_MAX
-            return self._row(code, operands[0], 0, unit, low, high)
-        running = self._row(codes.HISTORICALLY if is_weak else codes.ONCE, operands[0])
-        return running if low == 0 else self._delay(running, unit, low, is_weak=is_weak)
+            return self._row(code + ahead, operands[0], 0, unit, low, high)
+        running = self._row((codes.HISTORICALLY if is_weak else codes.ONCE) + ahead, operands[0])
+        return running if low == 0 else self._delay(running, unit, low, ahead, is_weak=is_weak)
 
-    def _since(self, left: int, right: int, unit: int, low: int, high: int | None) -> int:
+    def _since(self, left: int, right: int, unit: int, low: int, high: int | None, ahead: int) -> int:
         """phi S[a,b] psi as O[a,b] psi and phi S[a,inf] psi, the latter as phi on the last a and
         phi S psi before: since min distributes over max, both are exact for robustness too."""
-        result = self._row(codes.SINCE, left, right)
+        result = self._row(codes.SINCE + ahead, left, right)
         if low > 0:
-            before = self._delay(result, unit, low)
-            since = self._row(codes.WINDOW_MIN, left, 0, unit, 0, low - 1)
+            before = self._delay(result, unit, low, ahead)
+            since = self._row(codes.WINDOW_MIN + ahead, left, 0, unit, 0, low - 1)
             result = self._row(codes.AND, since, before)
         if high is not None:
-            result = self._row(codes.AND, self._row(codes.WINDOW_MAX, right, 0, unit, low, high), result)
+            within = self._row(codes.WINDOW_MAX + ahead, right, 0, unit, low, high)
+            result = self._row(codes.AND, within, result)
         return result
 
-    def _delay(self, operand: int, unit: int, distance: int, *, is_weak: bool = False) -> int:
+    def _delay(self, operand: int, unit: int, distance: int, ahead: int, *, is_weak: bool = False) -> int:
         """An operand so far back: +inf where there is none for a weak operator, -inf for a strong one."""
-        return self._row(codes.DELAY, operand, 0, unit, distance, 1 if is_weak else -1)
+        return self._row(codes.DELAY + ahead, operand, 0, unit, distance, 1 if is_weak else -1)

@@ -1,0 +1,97 @@
+"""A formula over a finished stretch of samples: every node at every sample.
+
+This is the usual offline robustness, rho(t, node) from each sample to the end, beside the monitor's numbers,
+which are about the first and the newest sample. A window that slides over a run is a stretch of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.channels import low_and_high
+from spatial_replay.monitor.finished_kernel import run_finished, run_windows
+from spatial_replay.monitor.finished_table import FinishedTable
+from spatial_replay.spec.formula import Atom, Formula, Quantified, iter_nodes
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """Every node at every sample.
+
+    Attributes:
+        columns: (C, R, T), the ends of each row's interval (see `channels`).
+        rows: (N,), the row of each node.
+    """
+
+    columns: Floats
+    rows: Integers
+
+    def ends(self, node: int, *, wide: bool = True) -> tuple[Floats, Floats]:
+        """Low and high end (T,) of a node's robustness at each sample, with uncertainty unless not `wide`."""
+        low, high = low_and_high(len(self.columns), wide=wide)
+        row = self.rows[node]
+        return self.columns[low, row], self.columns[high, row]
+
+
+def finished(
+    formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
+) -> Finished:
+    """Evaluate every node over all samples.
+
+    Args:
+        order: which leaf is which.
+        leaves: (C, A, T), their intervals (see `leaf_values`).
+        times_ns: (T,), increasing.
+    """
+    table, rows = _compiled(formula, order)
+    columns = np.empty((len(leaves), len(table), len(times_ns)))
+    extrema = np.empty(len(times_ns))
+    run_finished(table, np.ascontiguousarray(leaves), times_ns, 0, len(times_ns), columns, extrema)
+    return Finished(columns, rows)
+
+
+def full_signal(
+    formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
+) -> Floats:
+    """(N, T): each node's robustness at each sample, to the end of the stretch; NaN where not determined."""
+    done = finished(formula, order, leaves[:2], times_ns)
+    return _determined(done.columns[:, done.rows])
+
+
+def window_signal(
+    formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers, width_ns: int
+) -> Floats:
+    """(N, T): each node's robustness over the samples in (t - width, t], for the sample at each t.
+
+    It is that at the first of these samples, on these samples alone: past operators start there. NaN where it
+    is not determined. Takes time in proportion to the samples in a window.
+    """
+    table, rows = _compiled(formula, order)
+    leaves = np.ascontiguousarray(leaves[:2])
+    starts = np.searchsorted(times_ns, times_ns - width_ns, side="right").astype(np.int64)
+    columns = np.empty((len(leaves), len(table), len(times_ns)))
+    result = np.empty((len(leaves), len(rows), len(times_ns)))
+    run_windows(table, rows, leaves, times_ns, starts, columns, np.empty(len(times_ns)), result)
+    return _determined(result)
+
+
+def _compiled(formula: Formula, order: Sequence[Atom | Quantified]) -> tuple[Integers, Integers]:
+    table = FinishedTable(order)
+    rows = np.array([table.add(node) for _, _, node in iter_nodes(formula)], np.int64)
+    return table.rows(), rows
+
+
+def _determined(ends: Floats) -> Floats:
+    """(C, N, T) ends, which are written to, as numbers (N, T).
+
+    Adding zero turns -0.0 into 0.0, so that equal numbers are equal bits.
+    """
+    determined = ends[0]
+    determined += 0.0
+    if len(ends) > 1:
+        determined[determined != ends[1]] = np.nan
+    return determined
