@@ -1,0 +1,100 @@
+"""Payloads to objects, by the encoding of their topic."""
+
+from __future__ import annotations
+
+import json
+from functools import lru_cache
+
+from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message import DecodeError, Message
+from google.protobuf.message_factory import GetMessageClass
+
+from spatial_replay.errors import LogError
+from spatial_replay.logs.block import Schema
+from spatial_replay.logs.foreign.messages import Decoder, Topic
+from spatial_replay.logs.foreign.ros_types import ros_decoder, ros_definitions
+
+ENCODINGS = ("ros1", "cdr", "protobuf", "json")
+
+
+def decoder_of(topic: Topic, distribution: str | None = None) -> Decoder:
+    """How to decode the messages of a topic.
+
+    Args:
+        distribution: the release of ROS that the log names, for types that it does not define.
+
+    Raises:
+        LogError: the definition is missing or cannot be understood, or the encoding is not known.
+    """
+    try:
+        match topic.encoding:
+            case "ros1" | "cdr":
+                return ros_decoder(topic.type, topic.encoding, topic.schema, distribution)
+            case "protobuf":
+                return _protobuf_decoder(topic.type, _message_class(topic.type, topic.schema))
+            case "json":
+                return _decode_json
+        raise LogError(f"the encoding {topic.encoding!r:.100} is not known; known are {', '.join(ENCODINGS)}")
+    except LogError as error:
+        raise LogError(f"topic {topic.name!r}: {error}") from None
+
+
+def why_unreadable(topic: Topic, distribution: str | None = None) -> str | None:
+    """Why the messages of a topic cannot be decoded, or None."""
+    try:
+        match topic.encoding:
+            case "ros1" | "cdr":
+                ros_definitions(topic.type, topic.encoding, topic.schema, distribution)
+            case _:
+                decoder_of(topic)
+    except LogError as error:
+        return str(error)
+    return None
+
+
+def _protobuf_decoder(type_name: str, message_class: type[Message]) -> Decoder:
+    from_string = message_class.FromString
+
+    def decode(payload: bytes) -> object:
+        try:
+            return from_string(payload)
+        except DecodeError as error:
+            raise LogError(f"a message is no {type_name}: {error}") from None
+
+    return decode
+
+
+@lru_cache(64)
+def _message_class(type_name: str, schema: Schema | None) -> type[Message]:
+    if schema is None or schema.encoding != "protobuf":
+        given = "missing" if schema is None else f"in {schema.encoding!r:.100}"
+        raise LogError(f"the definition of {type_name!r:.100} is {given}; protobuf needs a descriptor set")
+    pool = DescriptorPool()
+    try:
+        for file in _in_order(FileDescriptorSet.FromString(schema.data)):
+            pool.AddSerializedFile(file.SerializeToString())
+        return GetMessageClass(pool.FindMessageTypeByName(type_name))
+    # descriptors that contradict themselves or each other end in TypeError, and names without one in KeyError
+    except (DecodeError, TypeError, ValueError, KeyError, UnicodeError, RecursionError) as error:
+        reason = f"{error!s:.200}" or type(error).__name__
+        raise LogError(f"the definition of {type_name!r:.100} cannot be used: {reason}") from None
+
+
+def _in_order(described: FileDescriptorSet) -> list[FileDescriptorProto]:
+    """The files, each after those that it imports."""
+    waiting = {file.name: file for file in described.file}
+    ordered: list[FileDescriptorProto] = []
+    while waiting:
+        ready = [file for file in waiting.values() if not any(name in waiting for name in file.dependency)]
+        if not ready:
+            raise ValueError(f"{next(iter(waiting))!r:.100} imports itself")
+        ordered += [waiting.pop(file.name) for file in ready]
+    return ordered
+
+
+def _decode_json(payload: bytes) -> object:
+    try:
+        return json.loads(payload)
+    except (ValueError, RecursionError) as error:
+        raise LogError(f"a message is no JSON: {error!s:.200}") from None
