@@ -127,7 +127,7 @@ def _read_boxes(path: Path, faults: FaultList, last_frame: int) -> tuple[_Boxes,
 
 
 def _box(cells: list[str], frame: int) -> tuple[int, list[float], int, bool, str]:
-    number = _integer(cells[0], "id", 10**_LONGEST_INTEGER)
+    number = _integer(cells[0], "id", 10**_LONGEST_INTEGER - 1)
     try:
         corners = [float(cell) for cell in cells[1:5]]
     except ValueError:
@@ -143,16 +143,16 @@ def _box(cells: list[str], frame: int) -> tuple[int, list[float], int, bool, str
 
 
 def _integer(text: str, what: str, last: int) -> int:
-    value = int(text) if len(text) <= _LONGEST_INTEGER and text.isascii() and text.isdecimal() else -1
-    if not 0 <= value <= last:
+    is_number = len(text) <= _LONGEST_INTEGER and text.isascii() and text.isdecimal()
+    if not is_number or int(text) > last:
         raise _NoBoxError(f"{what} is {text[:60]!r}; give an integer from 0 to {last}")
-    return value
+    return int(text)
 
 
 def _last_frame(rate: float) -> int:
     """The last one whose time fits a sample."""
-    last: int = LATEST_NS // frame_times(rate) - 1
-    return min(max(last, 0), 10**_LONGEST_INTEGER)
+    last = LATEST_NS * frame_times(rate).denominator // frame_times(rate).numerator - 1
+    return min(max(last, 0), 10**_LONGEST_INTEGER - 1)
 
 
 def _observations(
