@@ -25,8 +25,8 @@ FRAMES_A_SECOND = 30.0
 
 COLUMNS = ("id", "xmin", "ymin", "xmax", "ymax", "frame", "lost", "occluded", "generated", "label")
 
-_LONGEST_INTEGER = 18
-"""Digits; any integer of so many fits 64 bits."""
+_LARGEST = 10**18 - 1
+"""Any integer of so many digits fits 64 bits."""
 
 
 class _NoBoxError(Exception):
@@ -127,7 +127,7 @@ def _read_boxes(path: Path, faults: FaultList, last_frame: int) -> tuple[_Boxes,
 
 
 def _box(cells: list[str], frame: int) -> tuple[int, list[float], int, bool, str]:
-    number = _integer(cells[0], "id", 10**_LONGEST_INTEGER - 1)
+    number = _integer(cells[0], "id", _LARGEST)
     try:
         corners = [float(cell) for cell in cells[1:5]]
     except ValueError:
@@ -143,7 +143,7 @@ def _box(cells: list[str], frame: int) -> tuple[int, list[float], int, bool, str
 
 
 def _integer(text: str, what: str, last: int) -> int:
-    is_number = len(text) <= _LONGEST_INTEGER and text.isascii() and text.isdecimal()
+    is_number = len(text) <= len(str(_LARGEST)) and text.isascii() and text.isdecimal()
     if not is_number or int(text) > last:
         raise _NoBoxError(f"{what} is {text[:60]!r}; give an integer from 0 to {last}")
     return int(text)
@@ -151,8 +151,8 @@ def _integer(text: str, what: str, last: int) -> int:
 
 def _last_frame(rate: float) -> int:
     """The last one whose time fits a sample."""
-    last = LATEST_NS * frame_times(rate).denominator // frame_times(rate).numerator - 1
-    return min(max(last, 0), 10**_LONGEST_INTEGER - 1)
+    last = LATEST_NS // frame_times(rate) - 1
+    return min(max(last, 0), _LARGEST)
 
 
 def _observations(
