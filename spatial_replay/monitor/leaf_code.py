@@ -1,15 +1,13 @@
-"""Atoms and open quantifiers, compiled for the objects that a trace has."""
+"""Atoms and open quantifiers, compiled for the objects that some samples have."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import permutations
-from math import perm
-
-import numpy as np
+from math import inf, perm
+from typing import NamedTuple, Protocol
 
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Flags
 from spatial_replay.monitor.leaf_kernel import (
     ADD,
     AND,
@@ -26,13 +24,15 @@ from spatial_replay.monitor.leaf_kernel import (
     SIGNAL,
     XOR,
 )
-from spatial_replay.monitor.operands import Bindings, Scene, bind
+from spatial_replay.monitor.operands import Bindings, bind, bind_group
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
     CentroidProjection,
+    Earlier,
     Expression,
     Formula,
+    Group,
     Maximum,
     Measurement,
     Minimum,
@@ -53,40 +53,65 @@ MAX_BINDINGS = 20_000
 """How many ways of binding their variables the open quantifiers of one formula may have in all."""
 
 
+class OpenGroups(Protocol):
+    """Who can be in the open groups of some samples."""
+
+    def candidates(self, group: Group | Earlier) -> tuple[str, ...]:
+        """Names of the objects that are members in any of the samples."""
+
+    def may_be_unknown(self, group: Group | Earlier) -> bool:
+        """Whether the group is that of a time before the first sample in any of them."""
+
+
+class Membership(NamedTuple):
+    """A binding of an open quantifier: 1 in samples where all of `chosen` are members, 0 elsewhere.
+
+    Attributes:
+        chosen: which of the group's candidates. With none it stands for the group itself: -1 in samples
+            where that is unknown, 0 elsewhere.
+    """
+
+    group: Group | Earlier
+    chosen: tuple[int, ...]
+
+
 class LeafCode:
     """Instructions for some leaves, operands first; equal ones share a column.
 
     Attributes:
         rows: operation, a, b, c of each instruction, with its number.
-        constants, measurements, signals: what instructions read, with the number they know it by.
-        members: for each binding of an open quantifier (T,): whether it is one in each sample (1, 0), or
-            that is unknown (-1).
+        constants, measurements, signals, members: what instructions read, with the number they know it by.
     """
 
-    def __init__(self, scene: Scene) -> None:
-        self._scene = scene
+    def __init__(self, groups: OpenGroups) -> None:
+        self._groups = groups
         self._bindings = 0
         self.rows: dict[tuple[int, int, int, int], int] = {}
         self.constants: dict[float, int] = {}
         self.measurements: dict[Measurement, int] = {}
         self.signals: dict[str, int] = {}
-        self.members: list[Flags] = []
+        self.members: dict[Membership, int] = {}
 
-    def add(self, formula: Formula, bindings: Bindings) -> int:
-        """The number of the instruction that gives a formula without temporal operators, as an interval.
+    def add_leaves(self, leaves: Sequence[Atom | Quantified], bindings: Bindings) -> list[int]:
+        """The number of the instruction that gives each leaf of a formula, as an interval.
 
         Raises:
             UsageError: more than `MAX_BINDINGS`.
         """
+        self._bindings = 0
+        return [self._add(leaf, bindings) for leaf in leaves]
+
+    def _add(self, formula: Formula, bindings: Bindings) -> int:
+        """The number of the instruction that gives a formula without temporal operators."""
         match formula:
             case Truth():
-                return self._constant(np.inf if formula.value else -np.inf)
+                return self._constant(inf if formula.value else -inf)
             case Atom():
                 return self._row(HOLDS, self._expression(formula.expression, bindings))
             case Quantified():
                 return self._quantified(formula, bindings)
             case Boolean():
-                first, *rest = [self.add(each, bindings) for each in formula.operands]
+                first, *rest = [self._add(each, bindings) for each in formula.operands]
                 return self._boolean(formula.operator, first, rest)
             case Temporal():
                 raise TypeError("a temporal operator in the body of an open quantifier")
@@ -133,19 +158,21 @@ class LeafCode:
 
     def _quantified(self, formula: Quantified, bindings: Bindings) -> int:
         is_forall = formula.quantifier == "forall"
-        names, members, unknown = self._scene.members(bind(formula.group, bindings))
+        group = bind_group(formula.group, bindings)
+        names = self._groups.candidates(group)
         self._check_bindings(formula, len(names))
         op = AND_MEMBER if is_forall else OR_MEMBER
-        result = self._constant(np.inf if is_forall else -np.inf)
-        if unknown.any():
-            self.members.append(np.where(unknown, -1, 0).astype(np.int8))
-            result = self._row(op, result, result, len(self.members) - 1)
+        result = self._constant(inf if is_forall else -inf)
+        if self._groups.may_be_unknown(group):
+            result = self._row(op, result, result, self._member(group, ()))
         for chosen in permutations(range(len(names)), len(formula.variables)):
             inner = {**bindings, **{v: names[n] for v, n in zip(formula.variables, chosen, strict=True)}}
-            body = self.add(formula.body, inner)
-            self.members.append(members[:, chosen].min(axis=1))
-            result = self._row(op, result, body, len(self.members) - 1)
+            body = self._add(formula.body, inner)
+            result = self._row(op, result, body, self._member(group, chosen))
         return result
+
+    def _member(self, group: Group | Earlier, chosen: tuple[int, ...]) -> int:
+        return self.members.setdefault(Membership(group, chosen), len(self.members))
 
     def _check_bindings(self, formula: Quantified, member_count: int) -> None:
         self._bindings += perm(member_count, len(formula.variables))

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from spatial_replay.geometry.arrays import Floats
-from spatial_replay.monitor.leaf_code import LeafCode
+from spatial_replay.geometry.arrays import Flags, Floats
+from spatial_replay.monitor.leaf_code import LeafCode, Membership
 from spatial_replay.monitor.leaf_kernel import run_instructions
 from spatial_replay.monitor.measurements import measured
 from spatial_replay.monitor.operands import Bindings, Scene
@@ -25,7 +25,7 @@ def leaf_values(scene: Scene, leaves: Sequence[Atom | Quantified], bindings: Bin
         UsageError: more than `MAX_BINDINGS`.
     """
     code = LeafCode(scene)
-    outputs = [code.add(leaf, bindings) for leaf in leaves]
+    outputs = code.add_leaves(leaves, bindings)
     values, spreads = measured(scene, list(code.measurements))
     missing = np.full(len(scene), np.nan)
     signals = np.array(
@@ -34,7 +34,8 @@ def leaf_values(scene: Scene, leaves: Sequence[Atom | Quantified], bindings: Bin
             for name in code.signals
         ]
     ).reshape(len(code.signals), len(scene))
-    members = np.array(code.members, np.int8).reshape(len(code.members), len(scene))
+    members = np.array([_flags(scene, each) for each in code.members], np.int8)
+    members = members.reshape(len(code.members), len(scene))
     is_known = np.isfinite(values).all() and np.isfinite(signals).all() and not (members < 0).any()
     channels = 4 if spreads.any() else 1 if is_known else 2
     result = np.empty((channels, len(outputs), len(scene)))
@@ -49,3 +50,11 @@ def leaf_values(scene: Scene, leaves: Sequence[Atom | Quantified], bindings: Bin
         result,
     )
     return result
+
+
+def _flags(scene: Scene, membership: Membership) -> Flags:
+    """(T,): what a binding is in each sample (see `Membership`)."""
+    _, members, unknown = scene.members(membership.group)
+    if not membership.chosen:
+        return np.where(unknown, -1, 0).astype(np.int8)
+    return np.asarray(members[:, membership.chosen].min(axis=1))

@@ -33,17 +33,16 @@ def measured(scene: Scene, measurements: Sequence[Measurement]) -> tuple[Floats,
     """
     keys = [_key(scene, measurement) for measurement in measurements]
     memo = scene.trace.memo
-    found = {key: memo.get(key) for key in keys}
-    missing = [index for index, key in enumerate(keys) if found[key] is None]
+    found = {key: array for key in keys if (array := memo.get(key)) is not None}
+    missing = {key: measurement for key, measurement in zip(keys, measurements, strict=True) if key not in found}
     if missing:
-        computed = _measure(scene, [measurements[index] for index in missing])
-        for index, array in zip(missing, computed, strict=True):
-            memo.keep(keys[index], array)
-            found[keys[index]] = array
+        for key, array in zip(missing, _measure(scene, list(missing.values())), strict=True):
+            memo.keep(key, array)
+            found[key] = array
     if not keys:
         return np.empty((0, len(scene))), np.empty((0, len(scene)))
-    stacked = np.array([found[key] for key in keys])
-    return stacked[:, 0], stacked[:, 1]
+    values, spreads = (np.array([found[key][row] for key in keys]) for row in (0, 1))
+    return values, spreads
 
 
 def _measure(scene: Scene, measurements: Sequence[Measurement]) -> list[Floats]:

@@ -65,6 +65,7 @@ class Scene:
         self.skip = skip
         self._column = {name: index for index, name in enumerate(trace.names)}
         self._found: dict[Term, Found] = {}
+        self._members: dict[Group | Earlier, tuple[tuple[str, ...], Flags, Booleans]] = {}
 
     def __len__(self) -> int:
         return len(self.trace) - self.skip
@@ -86,18 +87,28 @@ class Scene:
             self._found[term] = self._find(term)
         return self._found[term]
 
-    def members(self, group: Term) -> tuple[tuple[str, ...], Flags, Booleans]:
+    def candidates(self, group: Group | Earlier) -> tuple[str, ...]:
+        """Names of the objects that are ever in an open group."""
+        return self.members(group)[0]
+
+    def may_be_unknown(self, group: Group | Earlier) -> bool:
+        """Whether an open group is ever that of a time before the trace."""
+        return bool(self.members(group)[2].any())
+
+    def members(self, group: Group | Earlier) -> tuple[tuple[str, ...], Flags, Booleans]:
         """Who is in an open group.
 
         Returns:
             Names of those who ever are (M,), (T, M) with 1 where they are and 0 where not, and (T,) where
             that is unknown because the group is that of a time before the trace.
         """
-        if not isinstance(group, (Group, Earlier)):
-            raise TypeError(f"{group!r} is not a group")
-        base, source = self._base_and_source(group)
-        if not isinstance(base, Group) or base.members is not None:
-            raise TypeError(f"{group!r} is not an open group")
+        if group not in self._members:
+            self._members[group] = self._find_members(group)
+        return self._members[group]
+
+    def _find_members(self, group: Group | Earlier) -> tuple[tuple[str, ...], Flags, Booleans]:
+        base = open_group(group)
+        _, source = self._base_and_source(group)
         names, rows = self._open_rows(base)
         before = source < 0
         present = (rows != ABSENT)[np.maximum(source, 0)] & ~before[:, None]
@@ -159,7 +170,7 @@ class Scene:
         return np.full(len(self.trace), ABSENT, np.int64)
 
     def _named_rows(self, group: Group) -> Integers:
-        left_out = _left_out(group)
+        left_out = left_out_of(group)
         columns = [self._rows_of(name) for name in group.members or () if name not in left_out]
         if not columns:
             return np.empty((len(self.trace), 0), np.int64)
@@ -167,7 +178,7 @@ class Scene:
 
     def _open_rows(self, group: Group) -> tuple[tuple[str, ...], Integers]:
         """Names that can be members, and their rows over the whole trace: `ABSENT` where they are not."""
-        left_out = _left_out(group)
+        left_out = left_out_of(group)
         names = tuple(name for name in self.trace.names if name not in left_out)
         rows = self.trace.rows[:, [self._column[name] for name in names]]
         if group.class_name == ANY_CLASS or not names:
@@ -195,6 +206,13 @@ def footprint_from_outline(outline: Outline) -> Footprint:
     return Footprint.polygon(outline.vertices)
 
 
+def bind_group(group: Group | Earlier, bindings: Bindings) -> Group | Earlier:
+    """An open group with the variables that it leaves out replaced by the objects they stand for."""
+    if isinstance(group, Earlier):
+        return replace(group, term=_bind_base(group.term, bindings))
+    return replace(group, excluded=tuple(_bind_variable(each, bindings) for each in group.excluded))
+
+
 def bind(term: Term, bindings: Bindings) -> Term:
     """A term with its variables replaced by the objects they stand for."""
     match term:
@@ -220,5 +238,13 @@ def _bind_variable(term: TrackedName | Variable, bindings: Bindings) -> TrackedN
     return TrackedName(bindings[term.name]) if isinstance(term, Variable) and term.name in bindings else term
 
 
-def _left_out(group: Group) -> frozenset[str]:
+def open_group(term: Group | Earlier) -> Group:
+    """The open group that a term is, now or earlier."""
+    base = term.term if isinstance(term, Earlier) else term
+    if not isinstance(base, Group) or base.members is not None:
+        raise TypeError(f"{term!r} is not an open group")
+    return base
+
+
+def left_out_of(group: Group) -> frozenset[str]:
     return frozenset(each.name for each in group.excluded)
