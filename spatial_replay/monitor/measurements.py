@@ -34,7 +34,9 @@ def measured(scene: Scene, measurements: Sequence[Measurement]) -> tuple[Floats,
     keys = [_key(scene, measurement) for measurement in measurements]
     memo = scene.trace.memo
     found = {key: array for key in keys if (array := memo.get(key)) is not None}
-    missing = {key: measurement for key, measurement in zip(keys, measurements, strict=True) if key not in found}
+    missing = {
+        key: measurement for key, measurement in zip(keys, measurements, strict=True) if key not in found
+    }
     if missing:
         for key, array in zip(missing, _measure(scene, list(missing.values())), strict=True):
             memo.keep(key, array)
