@@ -14,6 +14,7 @@ from typing import NamedTuple, Protocol
 from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.block import BLOCK_SAMPLES, Block
+from spatial_replay.logs.commonroad import is_scenario, iter_scenario
 from spatial_replay.logs.csv_tracks import COLUMNS, iter_csv
 from spatial_replay.logs.faults import FaultList
 from spatial_replay.logs.lines import open_text
@@ -266,4 +267,5 @@ FORMATS: dict[str, Format] = {
     "track JSONL": Format(_is_jsonl, _tracks(iter_jsonl)),
     "track CSV": Format(_is_csv, _tracks(iter_csv)),
     "drone annotations": Format(is_annotations, _open_annotations, frozenset({"rate", "lost"})),
+    "CommonRoad scenario": Format(is_scenario, _tracks(iter_scenario)),
 }
