@@ -1,0 +1,62 @@
+"""Points that show a distance really are that far apart, and where they are said to be."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from hypothesis import given
+
+from laws.strategies_geometry import footprints, radii
+from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.contact import contact, enlarged, protrusion_contact
+from spatial_replay.geometry.footprint import Footprint
+from spatial_replay.geometry.measure import Operand, Request, measure
+
+TOLERANCE = 1e-6
+
+
+def measured(quantity, first, second):
+    batch = FootprintBatch.from_footprints([first, second])
+    operands = [Operand(np.array([[row]])) for row in range(2)]
+    return float(measure(batch, operands, [Request(quantity, 0, 1)])[0, 0])
+
+
+def to(point, footprint):
+    return measured("signed_distance", Footprint.disc(*point, 0.0), footprint)
+
+
+@given(footprints, footprints)
+def test_a_contact_is_the_signed_distance(a, b):
+    found = contact(a, b)
+    distance = measured("signed_distance", a, b)
+    assert math.isclose(found.distance, distance, abs_tol=TOLERANCE)
+    assert math.isclose(math.dist(found.first, found.second), abs(distance), abs_tol=TOLERANCE)
+    if distance > TOLERANCE:
+        assert abs(to(found.first, a)) < TOLERANCE
+        assert abs(to(found.second, b)) < TOLERANCE
+
+
+@given(footprints, footprints)
+def test_a_push_parts_them(a, b):
+    found = contact(a, b)
+    if found.distance < -TOLERANCE and len(a.parts) == len(b.parts) == 1:
+        push = np.subtract(found.first, found.second)
+        moved = Footprint.polygon(b.parts[0].vertices + push) if len(b.parts[0].vertices) > 2 else None
+        if moved is not None:
+            moved = enlarged(moved, b.parts[0].radius)
+            assert abs(measured("signed_distance", a, moved)) < TOLERANCE
+
+
+@given(footprints, footprints)
+def test_what_sticks_out_is_the_protrusion(inner, outer):
+    found = protrusion_contact(inner, outer)
+    protrusion = measured("protrusion", inner, outer)
+    assert math.isclose(found.distance, protrusion, abs_tol=TOLERANCE)
+    assert math.isclose(math.dist(found.first, found.second), abs(protrusion), abs_tol=TOLERANCE)
+
+
+@given(footprints, footprints, radii)
+def test_enlarging_takes_from_the_distance(a, b, radius):
+    before, after = contact(a, b).distance, contact(a, enlarged(b, radius)).distance
+    assert math.isclose(after, before - radius, abs_tol=TOLERANCE)
