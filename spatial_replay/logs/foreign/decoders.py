@@ -53,6 +53,19 @@ def why_unreadable(topic: Topic, distribution: str | None = None) -> str | None:
     return None
 
 
+def same_definition(one: Topic, other: Topic) -> bool:
+    """Whether one decoder serves two topics of the same type; texts may differ in comments."""
+    if one.schema == other.schema or one.encoding == "json":
+        return True
+    if one.encoding not in ("ros1", "cdr"):
+        return False
+    try:
+        definitions = [ros_definitions(each.type, each.encoding, each.schema) for each in (one, other)]
+    except LogError:
+        return False
+    return definitions[0] == definitions[1]
+
+
 def _protobuf_decoder(type_name: str, message_class: type[Message]) -> Decoder:
     from_string = message_class.FromString
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 from spatial_replay.logs.block import Schema
@@ -24,6 +25,7 @@ class Topic:
         schema: the definition as the log has it, or None.
         latched: whether its last message before a window still counts (latched, transient local).
         unreadable: why its messages cannot be decoded, or None.
+        metadata: of its channel, as an MCAP log keeps it.
     """
 
     name: str
@@ -33,6 +35,7 @@ class Topic:
     schema: Schema | None = None
     latched: bool = False
     unreadable: str | None = None
+    metadata: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}), hash=False)
 
 
 class Message(NamedTuple):
@@ -41,7 +44,8 @@ class Message(NamedTuple):
     Attributes:
         log_time_ns: when it was recorded.
         publish_time_ns: when it was sent; the log time where the container does not know.
-        sequence: number within its topic, as in the log or counted.
+        sequence: number within its topic as in the log, 0 where the log has none; of messages of one topic
+            and time, the later one comes later.
         payload: in its topic's encoding.
     """
 

@@ -1,0 +1,162 @@
+"""ROS 1 bags, whole or damaged."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import BinaryIO
+
+import numpy as np
+
+from spatial_replay.errors import LogError
+from spatial_replay.logs.block import Schema
+from spatial_replay.logs.faults import FaultList
+from spatial_replay.logs.foreign.decoders import decoder_of
+from spatial_replay.logs.foreign.definitions import full_type_name
+from spatial_replay.logs.foreign.messages import Decoder, Message, Topic
+from spatial_replay.logs.foreign.ordering import CountedTopics, in_order
+from spatial_replay.logs.foreign.ros1_directory import (
+    BagChunk,
+    BagDirectory,
+    Connection,
+    connections_in,
+    read_bag_directory,
+    read_chunk,
+)
+from spatial_replay.logs.foreign.ros1_records import MESSAGE, record_table
+from spatial_replay.logs.foreign.topic_table import topics_named
+from spatial_replay.logs.mcap_records import DamageError
+from spatial_replay.trace.times import LATEST_NS
+
+
+class Ros1Bag:
+    """A ROS 1 bag, read chunk by chunk; see `MessageReader`."""
+
+    kind = "ROS 1 bag"
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._faults = FaultList()
+        self._remarks = FaultList()
+
+    @property
+    def name(self) -> str:
+        return self._path.name
+
+    @cached_property
+    def _directory(self) -> BagDirectory:
+        with self._path.open("rb") as stream:
+            return read_bag_directory(stream, self._faults, self.name)
+
+    @cached_property
+    def _topics(self) -> tuple[Topic, ...]:
+        return topics_named([self._topic(each) for each in self._directory.connections.values()])
+
+    @property
+    def start_ns(self) -> int | None:
+        """Log time of the first message."""
+        return min((chunk.start_ns for chunk in self._directory.chunks), default=None)
+
+    def topics(self) -> tuple[Topic, ...]:
+        """See `MessageReader.topics`."""
+        if not self._topics:
+            reason = next(iter(self._faults.take()), "it is empty")
+            raise LogError(f"{self.name} holds no topic: {reason}")
+        return self._topics
+
+    def decoder(self, topic: str) -> Decoder:
+        """See `MessageReader.decoder`."""
+        return decoder_of(next(each for each in self._topics if each.name == topic))
+
+    def take_faults(self) -> tuple[str, ...]:
+        """See `MessageReader.take_faults`."""
+        return self._faults.take()
+
+    def take_remarks(self) -> tuple[str, ...]:
+        """See `MessageReader.take_remarks`."""
+        return self._remarks.take()
+
+    def iter_messages(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[Message]:
+        """See `MessageReader.iter_messages`."""
+        first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else end_ns
+        wanted = {c.number: c for c in self._directory.connections.values() if c.topic in topics}
+        chunks = [
+            chunk
+            for chunk in self._directory.chunks
+            if chunk.start_ns < last
+            and chunk.end_ns >= first
+            and (chunk.counts is None or not wanted.keys().isdisjoint(chunk.counts))
+        ]
+        chunks.sort(key=lambda chunk: (chunk.start_ns, chunk.offset))
+        with self._path.open("rb") as stream:
+            stretches = (self._messages(stream, chunk, wanted, first, last) for chunk in chunks)
+            messages = in_order([chunk.start_ns for chunk in chunks], stretches)
+            if (first, last) != (0, LATEST_NS + 1) or not self._directory.is_indexed:
+                yield from messages
+                return
+            counted = CountedTopics({each.name: each.count for each in self._topics if each.name in topics})
+            yield from counted.counted(messages)
+            counted.compare(self.name, self._faults)
+
+    def _messages(
+        self, stream: BinaryIO, chunk: BagChunk, wanted: dict[int, Connection], first: int, last: int
+    ) -> list[Message]:
+        """The messages of a chunk; what is lost of them goes to the faults."""
+        span = f"messages between {chunk.start_ns} and {chunk.end_ns} ns"
+        try:
+            content = read_chunk(stream, chunk.offset)
+        except DamageError as damage:
+            self._fault(chunk, f"{damage}; the {span} are lost")
+            return []
+        table, breaks_off = record_table(content)
+        if breaks_off:
+            self._fault(chunk, f"a record breaks off; some of the {span} are lost")
+        try:
+            for connection in connections_in(content, table):
+                if wanted.get(connection.number, connection) != connection:
+                    self._fault(chunk, f"connection {connection.number} is described in two ways")
+        except DamageError as damage:
+            self._fault(chunk, f"{damage}; a connection is described there")
+        is_message = table.opcode == MESSAGE
+        if (chunk.start_ns, chunk.end_ns) != _span(table.time_ns[is_message]):
+            self._fault(chunk, f"the {span} have other times than the index says")
+        rows = is_message & np.isin(table.connection, list(wanted))
+        rows &= (table.time_ns >= first) & (table.time_ns < last)
+        topics = [wanted[number].topic for number in table.connection[rows].tolist()]
+        times: Sequence[int] = table.time_ns[rows].tolist()
+        bounds = zip(table.begin[rows].tolist(), table.end[rows].tolist(), strict=True)
+        payloads = [content[begin:end] for begin, end in bounds]
+        return [
+            Message(topic, time_ns, time_ns, 0, payload)
+            for topic, time_ns, payload in zip(topics, times, payloads, strict=True)
+        ]
+
+    def _topic(self, connection: Connection) -> Topic:
+        definition = connection.data.get("message_definition", b"")
+        counts = [chunk.counts.get(connection.number, 0) for chunk in self._directory.chunks if chunk.counts]
+        return Topic(
+            name=connection.topic,
+            type=full_type_name(connection.type),
+            encoding="ros1",
+            count=sum(counts) if self._directory.is_indexed else None,
+            schema=Schema(connection.type, "ros1msg", definition),
+            latched=connection.is_latched,
+            metadata=MappingProxyType(
+                {
+                    key: connection.data[key].decode("utf-8", "replace")
+                    for key in ("callerid", "latching", "md5sum")
+                    if key in connection.data
+                }
+            ),
+        )
+
+    def _fault(self, chunk: BagChunk, what: str) -> None:
+        self._faults.add(f"{self.name}: at byte {chunk.offset}: {what}")
+
+
+def _span(times_ns: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> tuple[int, int]:
+    return (int(times_ns.min()), int(times_ns.max())) if len(times_ns) else (0, 0)
