@@ -43,6 +43,7 @@ class ChunkPlace:
         offset, length: of the record with its head, in bytes.
         start_ns, end_ns: log times of its first and last message.
         compressed: whether it is a chunk; else records that stand in the file as they are.
+        channels: those with messages in it, as the index says; None where it does not.
     """
 
     offset: int
@@ -50,6 +51,7 @@ class ChunkPlace:
     start_ns: int
     end_ns: int
     compressed: bool = True
+    channels: frozenset[int] | None = None
 
 
 def chunk_place(offset: int, record: bytes, length: int) -> ChunkPlace:

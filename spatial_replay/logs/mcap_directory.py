@@ -18,7 +18,8 @@ from spatial_replay.logs.mcap_records import MAGIC, RECORD_HEAD, DamageError, de
 
 _FOOTER_BYTES = RECORD_HEAD.size + 20
 _CHUNK_HEAD_BYTES = 64
-_CHUNK_INDEX = struct.Struct("<QQQQ")
+_CHUNK_INDEX = struct.Struct("<QQQQI")
+_MESSAGE_INDEX = struct.Struct("<HQ")
 _LOOSE_BYTES = 2**22
 _LARGEST_RECORD = 2**30
 _STRIDE = 2**20
@@ -134,14 +135,24 @@ def _take_in(directory: Directory, opcode: int, body: bytes) -> None:
     elif opcode == Opcode.CHUNK_INDEX:
         if len(body) < _CHUNK_INDEX.size:
             raise DamageError("the index breaks off")
-        start_ns, end_ns, offset, length = _CHUNK_INDEX.unpack_from(body)
-        directory.chunks.append(ChunkPlace(offset, length, start_ns, end_ns))
+        start_ns, end_ns, offset, length, indexed = _CHUNK_INDEX.unpack_from(body)
+        directory.chunks.append(
+            ChunkPlace(offset, length, start_ns, end_ns, channels=_indexed_channels(body, indexed))
+        )
     elif opcode == Opcode.ATTACHMENT_INDEX:
         attachment = decoded(records.AttachmentIndex.read, body)
         directory.attachments.append((attachment.offset, attachment.length))
     elif opcode == Opcode.METADATA_INDEX:
         metadata = decoded(records.MetadataIndex.read, body)
         directory.metadata.append((metadata.offset, metadata.length))
+
+
+def _indexed_channels(body: bytes, length: int) -> frozenset[int] | None:
+    """The channels for which a chunk has an index of messages; None without any such index."""
+    entries = body[_CHUNK_INDEX.size : _CHUNK_INDEX.size + length]
+    if not entries or len(entries) != length or length % _MESSAGE_INDEX.size:
+        return None
+    return frozenset(channel for channel, _ in _MESSAGE_INDEX.iter_unpack(entries))
 
 
 def _check_complete(directory: Directory, end: int) -> None:

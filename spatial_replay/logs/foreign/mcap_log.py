@@ -1,0 +1,170 @@
+"""MCAP logs by others, whole or damaged."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from mcap.opcode import Opcode
+
+from spatial_replay.errors import LogError
+from spatial_replay.logs.block import Channel
+from spatial_replay.logs.faults import FaultList
+from spatial_replay.logs.foreign.decoders import decoder_of
+from spatial_replay.logs.foreign.definitions import full_type_name
+from spatial_replay.logs.foreign.messages import Decoder, Message, Topic
+from spatial_replay.logs.foreign.ordering import CountedTopics, in_order
+from spatial_replay.logs.foreign.topic_table import topics_named
+from spatial_replay.logs.mcap_chunks import ChunkPlace, read_records
+from spatial_replay.logs.mcap_directory import Directory, read_directory
+from spatial_replay.logs.mcap_reader import ChunkWalk
+from spatial_replay.logs.mcap_records import DamageError
+from spatial_replay.logs.mcap_walk import walk_records
+from spatial_replay.trace.times import LATEST_NS
+
+_LATCHED = re.compile(r"durability: *(1|transient_local)\b")
+_MESSAGE_FIELDS = 22
+
+
+class McapLog:
+    """An MCAP log of any encoding, read chunk by chunk; see `MessageReader`."""
+
+    kind = "MCAP"
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._faults = FaultList()
+        self._remarks = FaultList()
+
+    @property
+    def name(self) -> str:
+        return self._path.name
+
+    @cached_property
+    def _contents(self) -> tuple[Directory, dict[int, Channel]]:
+        with self._path.open("rb") as stream:
+            directory = read_directory(stream, self._faults, self.name)
+            return directory, ChunkWalk(stream, directory, FaultList(), self.name).channels
+
+    @cached_property
+    def _topics(self) -> tuple[Topic, ...]:
+        directory, channels = self._contents
+        statistics = directory.statistics
+        counts = statistics.channel_message_counts if statistics else None
+        if statistics and sum(statistics.channel_message_counts.values()) != statistics.message_count:
+            # counts of channels are optional
+            counts = None
+        return topics_named(
+            _topic(channel, None if counts is None else counts.get(number, 0))
+            for number, channel in sorted(channels.items())
+        )
+
+    @property
+    def start_ns(self) -> int | None:
+        """Log time of the first message."""
+        return min((place.start_ns for place in self._contents[0].chunks), default=None)
+
+    def topics(self) -> tuple[Topic, ...]:
+        """See `MessageReader.topics`."""
+        if not self._topics:
+            reason = next(iter(self._faults.take()), "it is empty")
+            raise LogError(f"{self.name} holds no topic: {reason}")
+        return self._topics
+
+    def decoder(self, topic: str) -> Decoder:
+        """See `MessageReader.decoder`."""
+        return decoder_of(next(each for each in self._topics if each.name == topic))
+
+    def take_faults(self) -> tuple[str, ...]:
+        """See `MessageReader.take_faults`."""
+        return self._faults.take()
+
+    def take_remarks(self) -> tuple[str, ...]:
+        """See `MessageReader.take_remarks`."""
+        return self._remarks.take()
+
+    def iter_messages(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[Message]:
+        """See `MessageReader.iter_messages`."""
+        first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else end_ns
+        directory, channels = self._contents
+        wanted = {number: channel.topic for number, channel in channels.items() if channel.topic in topics}
+        places = [
+            place
+            for place in directory.chunks
+            if place.start_ns < last
+            and place.end_ns >= first
+            and (place.channels is None or not place.channels.isdisjoint(wanted))
+        ]
+        places.sort(key=lambda place: (place.start_ns, place.offset))
+        with self._path.open("rb") as stream:
+            stretches = (self._messages(stream, place, wanted, first, last) for place in places)
+            messages = in_order([place.start_ns for place in places], stretches)
+            if (first, last) != (0, LATEST_NS + 1):
+                yield from messages
+                return
+            counted = CountedTopics({each.name: each.count for each in self._topics if each.name in topics})
+            yield from counted.counted(messages)
+            counted.compare(self.name, self._faults)
+
+    def _messages(
+        self, stream: BinaryIO, place: ChunkPlace, wanted: dict[int, str], first: int, last: int
+    ) -> list[Message]:
+        """The messages in a place; what is lost of them goes to the faults."""
+        span = f"messages between {place.start_ns} and {place.end_ns} ns"
+        try:
+            content = read_records(stream, place)
+        except DamageError as damage:
+            self._fault(place, f"{damage}; the {span} are lost")
+            return []
+        heads, breaks_off = walk_records(content)
+        is_message = (heads.opcode == Opcode.MESSAGE) & (heads.end - heads.begin >= _MESSAGE_FIELDS)
+        if breaks_off:
+            self._fault(place, f"a record breaks off; of the {span}, {is_message.sum()} could be read")
+        beyond = is_message & (heads.log_time > LATEST_NS)
+        if beyond.any():
+            self._fault(place, f"{beyond.sum()} of the {span} have a time beyond 2**63 - 1 ns")
+        if len(unknown := set(np.unique(heads.channel[is_message]).tolist()) - self._contents[1].keys()):
+            self._fault(place, f"some of the {span} are of a channel {min(unknown)} that is not declared")
+        rows = is_message & np.isin(heads.channel, np.array(list(wanted), np.uint64))
+        rows &= (heads.log_time >= first) & (heads.log_time < last)
+        bounds = zip((heads.begin[rows] + _MESSAGE_FIELDS).tolist(), heads.end[rows].tolist(), strict=True)
+        return list(
+            map(
+                Message,
+                [wanted[number] for number in heads.channel[rows].tolist()],
+                heads.log_time[rows].tolist(),
+                heads.publish_time[rows].view(np.int64).tolist(),
+                heads.sequence[rows].tolist(),
+                [content[begin:end] for begin, end in bounds],
+            )
+        )
+
+    def _fault(self, place: ChunkPlace, what: str) -> None:
+        self._faults.add(f"{self.name}: at byte {place.offset}: {what}")
+
+
+def is_latched(qos: str) -> bool:
+    """Whether a ROS 2 publisher's quality of service keeps messages for who comes later."""
+    return _LATCHED.search(qos) is not None
+
+
+def _topic(channel: Channel, count: int | None) -> Topic:
+    schema = channel.schema
+    is_ros = channel.encoding in ("ros1", "cdr")
+    name = schema.name if schema else ""
+    return Topic(
+        name=channel.topic,
+        type=full_type_name(name) if is_ros else name,
+        encoding=channel.encoding,
+        count=count,
+        schema=schema,
+        latched=is_latched(channel.metadata.get("offered_qos_profiles", ""))
+        or channel.metadata.get("latching") in ("1", "true"),
+        metadata=channel.metadata,
+    )
