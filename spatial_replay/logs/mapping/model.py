@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping as Table
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from dataclasses import field as value_of
 from types import MappingProxyType
 from typing import Literal, TypeAlias
 
@@ -39,7 +40,7 @@ class Translation:
     """What a field's values mean: `table[str(value)]`, or `other` for values that are not in it."""
 
     field: str
-    table: Table[str, str | None] = field(default_factory=lambda: MappingProxyType({}), hash=False)
+    table: Table[str, str | None] = value_of(default_factory=lambda: MappingProxyType({}), hash=False)
     other: str | None = None
     has_other: bool = False
 
