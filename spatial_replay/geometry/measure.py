@@ -30,7 +30,9 @@ Quantity: TypeAlias = Literal[
 ]
 
 # The kernels know a quantity by its place in the list above.
-_CODES: Mapping[str, int] = MappingProxyType({name: code for code, name in enumerate(get_args(Quantity))})
+QUANTITY_CODES: Mapping[str, int] = MappingProxyType(
+    {name: code for code, name in enumerate(get_args(Quantity))}
+)
 _BETWEEN_TWO = frozenset({"signed_distance", "protrusion"})
 _NO_ROWS = np.empty(0, dtype=np.int64)
 
@@ -99,7 +101,7 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
         np.concatenate([[0], np.cumsum(size)]),
         width,
         np.array([operand.enlargement for operand in operands], dtype=np.float64),
-        np.array([_CODES[request.quantity] for request in requests], dtype=np.int64),
+        np.array([QUANTITY_CODES[request.quantity] for request in requests], dtype=np.int64),
         np.array([request.first for request in requests], dtype=np.int64),
         np.array([request.second for request in requests], dtype=np.int64),
         values,
@@ -108,8 +110,8 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
 
 
 def _check_request(request: Request, operand_count: int) -> None:
-    if request.quantity not in _CODES:
-        raise GeometryError(f"no quantity {request.quantity!r}; there are {', '.join(_CODES)}")
+    if request.quantity not in QUANTITY_CODES:
+        raise GeometryError(f"no quantity {request.quantity!r}; there are {', '.join(QUANTITY_CODES)}")
     needed = [request.first, request.second] if request.quantity in _BETWEEN_TWO else [request.first]
     for index in needed:
         if not 0 <= index < operand_count:

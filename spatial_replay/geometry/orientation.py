@@ -6,16 +6,22 @@ import math
 
 import numpy as np
 
-from spatial_replay.compiled import kernel
+from spatial_replay.compiled import inlined, kernel
 from spatial_replay.geometry.arrays import Floats
+
+
+@inlined
+def misalignment_of(first: float, second: float) -> float:
+    """`misalignment` of two angles, for kernels."""
+    x = math.cos(first) - math.cos(second)
+    y = math.sin(first) - math.sin(second)
+    return 0.5 * (x * x + y * y)
 
 
 @kernel
 def _misalignment(first: Floats, second: Floats, result: Floats) -> None:
     for k in range(len(first)):
-        x = math.cos(first[k]) - math.cos(second[k])
-        y = math.sin(first[k]) - math.sin(second[k])
-        result[k] = 0.5 * (x * x + y * y)
+        result[k] = misalignment_of(first[k], second[k])
 
 
 def misalignment(first: Floats, second: Floats) -> Floats:

@@ -35,7 +35,7 @@ def run_instructions(
 ) -> None:
     """Run the instructions over all samples; leaf j is what instruction outputs[j] gives."""
     channels, _, samples = leaves.shape
-    columns = np.empty((code.shape[0], channels, TILE))
+    columns = np.empty((code.shape[0], channels, min(TILE, samples)))
     for t in range(0, samples, TILE):
         count = min(TILE, samples - t)
         for i in range(code.shape[0]):

@@ -59,7 +59,7 @@ def _measure(scene: Scene, measurements: Sequence[Measurement]) -> list[Floats]:
         return numbers[term]
 
     requests = [
-        Request(_quantity(each), *(operand(term) for term in terms_of(each)))
+        Request(quantity_of(each), *(operand(term) for term in terms_of(each)))
         for each in measurements
         if not isinstance(each, Misalignment)
     ]
@@ -91,7 +91,7 @@ def terms_of(measurement: Measurement) -> tuple[Term, ...]:
             return (measurement.term,)
 
 
-def _quantity(measurement: Measurement) -> Quantity:
+def quantity_of(measurement: Measurement) -> Quantity:
     match measurement:
         case SignedDistance():
             return "signed_distance"

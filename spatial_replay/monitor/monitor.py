@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
+from types import MappingProxyType
+from typing import NamedTuple
 
-from spatial_replay.errors import UsageError
+from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.evaluation import no_such_node, require_specification
-from spatial_replay.monitor.instances import find_instances
-from spatial_replay.monitor.stream import EvaluationStream, Stretch
+from spatial_replay.monitor.live import LiveEvaluation, LiveRuns
+from spatial_replay.monitor.program import compile_formula
 from spatial_replay.monitor.verdict import Verdict, online_verdict, worst_verdict
 from spatial_replay.spec.formula import NamedSpec, Specification, iter_nodes
 from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.times import FOREVER
-from spatial_replay.trace.trace import Trace
 
 
-@dataclass(frozen=True, slots=True)
-class NodeUpdate:
+class NodeUpdate(NamedTuple):
     """One node after one sample (see `NodeResult` for what the numbers mean)."""
 
     id: int
@@ -40,22 +40,25 @@ class SpecUpdate:
 
     Attributes:
         numbers: (N, 4): value, now, lower and upper of each node; None before the monitor's start.
+        names: the name of each node, or None.
     """
 
     spec: NamedSpec
     numbers: Floats | None
+    names: tuple[str | None, ...] = field(repr=False)
 
     @cached_property
     def nodes(self) -> tuple[NodeUpdate, ...]:
         """Every node, by id; none before the monitor's start."""
         if self.numbers is None:
             return ()
-        return tuple(
-            NodeUpdate(identifier, node.name, *numbers)
-            for (identifier, _, node), numbers in zip(
-                iter_nodes(self.spec.formula), self.numbers.tolist(), strict=True
-            )
-        )
+        return tuple(map(NodeUpdate, range(len(self.names)), self.names, *self.numbers.T.tolist()))
+
+    def node(self, identifier: int) -> NodeUpdate:
+        """The node with a number, once the monitor has started."""
+        if self.numbers is None:
+            raise UsageError(f"{self.spec.name!r} has no numbers yet; the monitor's start is still to come")
+        return NodeUpdate(identifier, self.names[identifier], *self.numbers[identifier].tolist())
 
     @property
     def verdict(self) -> Verdict:
@@ -71,6 +74,7 @@ class Update:
 
     time_ns: int
     specs: tuple[SpecUpdate, ...]
+    places: Mapping[str, tuple[int, int]] = field(repr=False)
 
     @property
     def verdict(self) -> Verdict:
@@ -83,24 +87,24 @@ class Update:
         Raises:
             UsageError: no node has the name.
         """
-        for spec in self.specs:
-            for node in spec.nodes:
-                if node.name == name:
-                    return node
-        names = {node.name for spec in self.specs for node in spec.nodes if node.name}
-        raise UsageError(no_such_node(name, sorted(names)))
+        if name not in self.places or self.specs[0].numbers is None:
+            raise UsageError(no_such_node(name, sorted(self.places) if self.specs[0].nodes else ()))
+        spec, identifier = self.places[name]
+        return self.specs[spec].node(identifier)
 
 
 class Monitor:
     """Evaluates a specification as samples come.
 
-    A sample costs the same however long the run is, and gives the same bits as a replay of its log.
+    A sample costs the same however long the run is, and gives the same bits as a replay of its log. What is
+    kept depends on the specification alone: the samples that windows and delays (`a[-3]`) span.
     """
 
     def __init__(
         self, specification: Specification, *, semantics: str = "ltlf", start_ns: int | None = None
     ) -> None:
-        """Start before the first sample.
+        """Start before the first sample, with everything compiled: the first time on a machine, that takes
+        many seconds.
 
         Args:
             start_ns: samples before this time are only there to be looked back at (`a[-3]`).
@@ -117,18 +121,46 @@ class Monitor:
             names = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates)
             raise UsageError(f"{names} is a template; name its object, or evaluate it over a log")
         self._specs = specification.results
-        instances = find_instances(specification, {}, (), start_ns or 0, FOREVER)
-        self._stream = EvaluationStream(instances, specification.regions)
+        self._names = tuple(tuple(node.name for _, _, node in iter_nodes(s.formula)) for s in self._specs)
+        self._places = _places_of_names(self._names)
+        self._live = _live_evaluation(specification, start_ns or 0)
+        self._last_ns: int | None = None
 
     def update(self, sample: Sample) -> Update:
         """Take in the next sample.
 
         Raises:
             TraceError: a time that does not come after the last one's.
+            UsageError: what is no sample; more objects in open groups than can be bound.
         """
-        stretches = self._stream.extend(Trace.from_samples([sample]))
-        return Update(sample.time_ns, tuple(map(_spec_update, self._specs, stretches)))
+        if not isinstance(sample, Sample):
+            raise UsageError(f"{sample!r} is no sample; give a Sample(time_ns, objects)")
+        if self._last_ns is not None and sample.time_ns <= self._last_ns:
+            raise TraceError(
+                f"a sample at {sample.time_ns} ns follows one at {self._last_ns} ns; "
+                "give samples in the order of their times"
+            )
+        self._last_ns = sample.time_ns
+        numbers = map(_read_only, self._live.take(sample))
+        return Update(sample.time_ns, tuple(map(SpecUpdate, self._specs, numbers, self._names)), self._places)
 
 
-def _spec_update(spec: NamedSpec, stretch: Stretch) -> SpecUpdate:
-    return SpecUpdate(spec, stretch.series[:, :, -1] if len(stretch.times_ns) else None)
+def _live_evaluation(specification: Specification, start_ns: int) -> LiveEvaluation:
+    programs = [compile_formula(spec.formula) for spec in specification.results]
+    return LiveRuns(programs, specification.regions, start_ns)
+
+
+def _places_of_names(names: tuple[tuple[str | None, ...], ...]) -> Mapping[str, tuple[int, int]]:
+    """Which spec and node has a name; the first where several do."""
+    places: dict[str, tuple[int, int]] = {}
+    for index, of_spec in enumerate(names):
+        for identifier, name in enumerate(of_spec):
+            if name is not None:
+                places.setdefault(name, (index, identifier))
+    return MappingProxyType(places)
+
+
+def _read_only(numbers: Floats | None) -> Floats | None:
+    if numbers is not None:
+        numbers.flags.writeable = False
+    return numbers

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spatial_replay.compiled import kernel, piece
+from spatial_replay.compiled import piece
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.codes import (
     NOW_EITHER,
@@ -94,7 +94,7 @@ def _write_series(numbers: Floats, t: int, count: int, series: Floats) -> None:
                 series[n, 2 + which, t + k] = end[k] + 0.0
 
 
-@kernel
+@piece
 def report(
     reports: Integers, operands: Integers, memory: Memory, scratch: Scratch, channels: int, begin: int,
     count: int, t: int, series: Floats, final: Floats,

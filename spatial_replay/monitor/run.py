@@ -12,12 +12,11 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.channels import in_channels
+from spatial_replay.monitor.codes import PART_IS_FLAT
 from spatial_replay.monitor.memory import TILE, doubled, first_memory, forget, scratch_for, widen
 from spatial_replay.monitor.program import Program
-from spatial_replay.monitor.reports import report
-from spatial_replay.monitor.signals import step_signals
-from spatial_replay.monitor.tables import step_tables
-from spatial_replay.monitor.windows import kept_from, step_windows
+from spatial_replay.monitor.step import Tables, step, step_with_windows
+from spatial_replay.monitor.windows import kept_from
 
 
 class Run:
@@ -35,7 +34,8 @@ class Run:
         self._memory = first_memory(program, room)
         self._scratch = scratch_for(program, room)
         self._final = np.zeros((len(program.reports), 2))
-        self._windowed = [index for index, part in enumerate(program.parts) if not part[6]]
+        self._tables = Tables.of(program)
+        self._take_in = step if program.parts[:, PART_IS_FLAT].all() else step_with_windows
         self._channels = 1
         self._position = 0
         self._offset = 0
@@ -66,6 +66,7 @@ class Run:
             widen(self._memory, self._channels)
             self._channels = len(leaves)
         leaves = np.ascontiguousarray(in_channels(leaves, self._channels))
+        times_ns = np.array(times_ns, np.int64)  # writable, since kernels are compiled for that
         series = np.empty((len(self._program.reports), 4, len(times_ns)))
         done = 0
         while done < len(times_ns):
@@ -76,21 +77,12 @@ class Run:
 
     def _step(self, leaves: Floats, times_ns: Integers, t: int, count: int, series: Floats) -> None:
         """Take in the samples t up to t + count, for which there is room."""
-        program, memory, scratch, channels = self._program, self._memory, self._scratch, self._channels
-        nodes, parts, position, offset = program.nodes, program.parts, self._position, self._offset
-        begin = position - offset
-        memory.stamps[begin : begin + count] = times_ns[t : t + count]
-        if position == 0:
+        if self._position == 0:
             self._start_ns = int(times_ns[t])
-        step_signals(program.signals, leaves, t, count, position, offset, memory)
-        if len(self._windowed) < len(parts):
-            start_ns = self._start_ns
-            step_tables(nodes, parts, memory, scratch, channels, position, start_ns, begin, count)
-        for index in self._windowed:
-            numbers = scratch.parts[index]
-            step_windows(nodes, parts[index], memory, scratch, channels, position, offset, count, numbers)
-        reports, operands, final = program.reports, program.operands, self._final
-        report(reports, operands, memory, scratch, channels, begin, count, t, series, final)
+        self._take_in(
+            self._tables, self._memory, self._scratch, leaves, times_ns, self._start_ns,
+            self._position, self._offset, t, count, series, self._final,
+        )  # fmt: skip
         self._position += count
 
     def _make_room(self, wanted: int) -> int:
@@ -110,4 +102,3 @@ class Run:
                 self._memory = doubled(self._memory)
                 self._scratch = scratch_for(self._program, 2 * room)
         return min(wanted, len(self._memory.stamps) - (self._position - self._offset))
-

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spatial_replay.compiled import kernel, piece
+from spatial_replay.compiled import piece
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.codes import (
     AND,
@@ -25,7 +25,7 @@ from spatial_replay.monitor.memory import Memory
 from spatial_replay.monitor.positions import behind, first_behind
 
 
-@kernel
+@piece
 def step_signals(
     signals: Integers, leaves: Floats, t: int, count: int, position: int, offset: int, memory: Memory
 ) -> None:

@@ -6,9 +6,9 @@ the same bits.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
+from typing import Protocol
 
 import numpy as np
 
@@ -18,10 +18,10 @@ from spatial_replay.monitor.channels import in_channels
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.leaves import leaf_values
 from spatial_replay.monitor.operands import Scene
+from spatial_replay.monitor.recent import iter_delays
 from spatial_replay.monitor.run import Run
 from spatial_replay.monitor.verdict import Verdict, final_verdict
-from spatial_replay.spec.formula import Atom, Earlier, Enlarged, Formula, Outline, Quantified
-from spatial_replay.spec.terms import iter_formulas, terms_of
+from spatial_replay.spec.formula import Formula, Outline
 from spatial_replay.trace.trace import Trace, window_of
 
 
@@ -48,6 +48,35 @@ def join_stretches(stretches: Sequence[Stretch]) -> Stretch:
         np.concatenate([stretch.series for stretch in stretches], axis=2),
         np.concatenate([in_channels(stretch.leaves, channels) for stretch in stretches], axis=2),
     )
+
+
+class InstanceEvaluation(Protocol):
+    """One instance on its way through the samples, under some semantics."""
+
+    @property
+    def instance(self) -> Instance: ...
+
+    @property
+    def first_satisfied_ns(self) -> int | None:
+        """The first sample with a value of at least 0 at the root."""
+
+    @property
+    def final(self) -> Floats:
+        """(N, 2): lower and upper end of each node's value if the log ends here."""
+
+    @property
+    def robustness(self) -> Floats:
+        """(N,): each node's value on the samples so far."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """The root's verdict if the log ends here; unknown before the first sample."""
+
+    def extend(self, scene: Scene) -> Stretch:
+        """Take in the samples of a scene that fall into the instance's window."""
+
+    def __len__(self) -> int:
+        """How many samples it was evaluated over."""
 
 
 class InstanceStream:
@@ -98,8 +127,18 @@ class InstanceStream:
 class EvaluationStream:
     """The instances of a specification, and the recent samples that they may still look back at."""
 
-    def __init__(self, instances: Sequence[Instance], regions: Mapping[str, Outline]) -> None:
-        self.streams = tuple(InstanceStream(instance) for instance in instances)
+    def __init__(
+        self,
+        instances: Sequence[Instance],
+        regions: Mapping[str, Outline],
+        begin: Callable[[Instance], InstanceEvaluation] = InstanceStream,
+    ) -> None:
+        """Start before the first sample.
+
+        Args:
+            begin: how each instance is evaluated.
+        """
+        self.streams = tuple(begin(instance) for instance in instances)
         self._regions = regions
         self._reach = look_back([instance.formula for instance in instances])
         self._before: Trace | None = None
@@ -121,7 +160,7 @@ class EvaluationStream:
                     "give samples in the order of their times"
                 )
             if self._reach != (0, 0):
-                recent = _tail(self._before, *self._reach)
+                recent = tail(self._before, *self._reach)
                 skip = len(recent)
                 trace = Trace.concatenate([recent, trace])
         self._before = trace
@@ -129,7 +168,7 @@ class EvaluationStream:
         return [stream.extend(scene) for stream in self.streams]
 
 
-def _tail(trace: Trace, samples: int, duration_ns: int) -> Trace:
+def tail(trace: Trace, samples: int, duration_ns: int) -> Trace:
     """The samples that the next one may look back at."""
     begin = len(trace) - samples
     if duration_ns:
@@ -142,13 +181,7 @@ def _tail(trace: Trace, samples: int, duration_ns: int) -> Trace:
 
 def look_back(formulas: Sequence[Formula]) -> tuple[int, int]:
     """How far terms look back: the most samples (`a[-3]`) and the longest duration in ns (`a[-2s]`)."""
-    samples = duration_ns = 0
-    for formula in chain.from_iterable(map(iter_formulas, formulas)):
-        terms = terms_of(formula.expression) if isinstance(formula, Atom) else ()
-        for term in chain(terms, (formula.group,) if isinstance(formula, Quantified) else ()):
-            while isinstance(term, Enlarged):
-                term = term.term
-            if isinstance(term, Earlier):
-                samples = max(samples, term.samples or 0)
-                duration_ns = max(duration_ns, term.duration_ns or 0)
+    delays = list(iter_delays(formulas))
+    samples = max((delay.samples or 0 for delay in delays), default=0)
+    duration_ns = max((delay.duration_ns or 0 for delay in delays), default=0)
     return samples, duration_ns

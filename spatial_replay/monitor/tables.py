@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spatial_replay.compiled import kernel, piece
+from spatial_replay.compiled import piece
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.codes import (
     ANCHORED_RELEASE,
@@ -221,7 +221,7 @@ def _step_simple(
     table[0], table[1] = low, high
 
 
-@kernel
+@piece
 def step_tables(
     nodes: Integers, parts: Integers, memory: Memory, scratch: Scratch, channels: int, position: int,
     start_ns: int, begin: int, count: int,

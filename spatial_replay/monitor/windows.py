@@ -376,7 +376,7 @@ def _tables_of(part: Integers, channel: int, memory: Memory) -> Floats:
     return memory.tables[channel, start : start + (part[PART_TABLES] << part[PART_VARIABLES])]
 
 
-@kernel
+@piece
 def step_windows(
     nodes: Integers, part: Integers, memory: Memory, scratch: Scratch, channels: int, position: int,
     offset: int, count: int, numbers: Floats,

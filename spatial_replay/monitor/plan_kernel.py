@@ -1,0 +1,190 @@
+"""The leaves of one sample: measured and computed in one call.
+
+What does not change from sample to sample, which rows are measured with which and what becomes of the
+numbers, is in a plan's arrays. Rows stand for, in this order: each sample looked at, the regions, then the
+places, each an object in one of those samples. The class code of a row is `ABSENT` for what is not there.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from spatial_replay.compiled import kernel, piece
+from spatial_replay.geometry.arrays import Flags, Floats, Integers
+from spatial_replay.geometry.kernels import measure_rows
+from spatial_replay.geometry.orientation import misalignment_of
+from spatial_replay.monitor.leaf_kernel import run_instructions
+
+ABSENT = -1
+ANY = -1
+"""The class wanted where any will do."""
+
+NUMBERS_OF_PLACE = 4
+"""Bottom, top, yaw (NaN where there is none) and uncertainty."""
+
+
+class PlanArrays(NamedTuple):
+    """What a plan does with every sample; ragged lists come with where each begins and the last ends.
+
+    Attributes:
+        extent: (4,), how many samples, regions, places and signals there are.
+        region_parts, region_sizes, region_radius, region_vertices, region_heights: the regions' footprints:
+            parts of each, vertices of each part, radius of each part, all vertices, (bottom, top) of each.
+        operand_start, operand_rows, operand_classes: rows of each operand, and the class that each must have.
+        enlargement: of each operand.
+        geometric: numbers of the measurements between footprints, with their `quantity` and operands
+            `first` and `second` (-1: none).
+        yaws: (Y, 3), the number of each measurement between orientations, and its two rows.
+        required_start, required: the rows without which each measurement is unknown.
+        member_start, member_rows, member_classes: the rows that must be there for each binding, and classes.
+        is_group: for each binding, 1 where it stands for a group itself: not known without its row.
+        code, constants, outputs: what `run_instructions` takes.
+    """
+
+    extent: Integers
+    region_parts: Integers
+    region_sizes: Integers
+    region_radius: Floats
+    region_vertices: Floats
+    region_heights: Floats
+    operand_start: Integers
+    operand_rows: Integers
+    operand_classes: Integers
+    enlargement: Floats
+    geometric: Integers
+    quantity: Integers
+    first: Integers
+    second: Integers
+    yaws: Integers
+    required_start: Integers
+    required: Integers
+    member_start: Integers
+    member_rows: Integers
+    member_classes: Integers
+    is_group: Integers
+    code: Integers
+    constants: Floats
+    outputs: Integers
+
+
+@piece
+def _is_there(classes: Integers, row: int, wanted: int) -> bool:
+    return classes[row] != ABSENT and wanted in (ANY, classes[row])
+
+
+@piece
+def _starts(before: int, first: Integers, second: Integers) -> Integers:
+    """Where rows of lengths 0 (so many), `first` and `second` begin, and the last ends."""
+    starts = np.zeros(before + len(first) + len(second) + 1, np.int64)
+    at = before
+    for lengths in (first, second):
+        for k in range(len(lengths)):
+            starts[at + 1] = starts[at] + lengths[k]
+            at += 1
+    return starts
+
+
+@piece
+def _spread(plan: PlanArrays, members: Integers, operand: int, places: Floats, here: int) -> float:
+    """An operand's uncertainty: the largest of its members'."""
+    largest = 0.0
+    if operand >= 0:
+        for k in range(plan.operand_start[operand], plan.operand_start[operand + 1]):
+            if members[k] >= here:
+                largest = max(largest, places[members[k] - here, 3])
+    return largest
+
+
+@piece
+def _yaw(row: int, classes: Integers, places: Floats, here: int) -> float:
+    return places[row - here, 2] if row >= here and classes[row] != ABSENT else np.nan
+
+
+@piece
+def _measure(
+    plan: PlanArrays, classes: Integers, counts: Integers, sizes: Integers, radius: Floats, places: Floats,
+    vertices: Floats, values: Floats, spreads: Floats,
+) -> None:  # fmt: skip
+    """Fill `values` and `spreads` (K, 1), as `measurements.measured` gives them."""
+    here = len(classes) - len(places)
+    bottom, top = np.full(len(classes), np.nan), np.full(len(classes), np.nan)
+    for k in range(len(plan.region_heights)):
+        row = plan.extent[0] + k
+        bottom[row], top[row] = plan.region_heights[k, 0], plan.region_heights[k, 1]
+    bottom[here:], top[here:] = places[:, 0], places[:, 1]
+    members = np.empty(len(plan.operand_rows), np.int64)
+    for k in range(len(members)):
+        is_there = _is_there(classes, plan.operand_rows[k], plan.operand_classes[k])
+        members[k] = plan.operand_rows[k] if is_there else ABSENT
+    measured = np.empty((len(plan.geometric), 1))
+    measure_rows(
+        _starts(plan.extent[0], plan.region_parts, counts),
+        _starts(0, plan.region_sizes, sizes),
+        np.concatenate((plan.region_vertices, vertices)),
+        np.concatenate((plan.region_radius, radius)),
+        bottom,
+        top,
+        members,
+        plan.operand_start,
+        plan.operand_start[1:] - plan.operand_start[:-1],
+        plan.enlargement,
+        plan.quantity,
+        plan.first,
+        plan.second,
+        measured,
+    )
+    for g in range(len(plan.geometric)):
+        k = plan.geometric[g]
+        values[k, 0] = measured[g, 0]
+        first = _spread(plan, members, plan.first[g], places, here)
+        spreads[k, 0] = first + _spread(plan, members, plan.second[g], places, here)
+    for y in range(len(plan.yaws)):
+        k, a, b = plan.yaws[y]
+        yaws = _yaw(a, classes, places, here), _yaw(b, classes, places, here)
+        values[k, 0], spreads[k, 0] = misalignment_of(yaws[0], yaws[1]), 0.0
+    for k in range(len(values)):
+        for at in range(plan.required_start[k], plan.required_start[k + 1]):
+            if classes[plan.required[at]] == ABSENT:
+                values[k, 0] = np.nan
+
+
+@piece
+def _members(plan: PlanArrays, classes: Integers, members: Flags) -> None:
+    """Fill `members` (M, 1): whether each binding is one (1, 0), or that is not known (-1)."""
+    for m in range(len(members)):
+        members[m, 0] = 0 if plan.is_group[m] else 1
+        for k in range(plan.member_start[m], plan.member_start[m + 1]):
+            if not _is_there(classes, plan.member_rows[k], plan.member_classes[k]):
+                members[m, 0] = -1 if plan.is_group[m] else 0
+
+
+@kernel
+def leaves_of_sample(plan: PlanArrays, whole: Integers, numbers: Floats, vertices: Floats) -> Floats:
+    """(C, A, 1), as `leaf_values` gives them.
+
+    Args:
+        whole: class codes of the samples and of the places, parts of each place, vertices of each part.
+        numbers: `NUMBERS_OF_PLACE` of each place, radius of each part, value of each signal.
+        vertices: (V, 2), of all parts.
+    """
+    samples, regions, places, signals = plan.extent
+    counts = whole[samples + places : samples + 2 * places]
+    sizes = whole[samples + 2 * places :]
+    classes = np.zeros(samples + regions + places, np.int64)
+    classes[:samples] = whole[:samples]
+    classes[samples + regions :] = whole[samples : samples + places]
+    of_places = numbers[: NUMBERS_OF_PLACE * places].reshape((places, NUMBERS_OF_PLACE))
+    radius = numbers[NUMBERS_OF_PLACE * places : len(numbers) - signals]
+    of_signals = numbers[len(numbers) - signals :].reshape((signals, 1))
+    values = np.empty((len(plan.required_start) - 1, 1))
+    spreads = np.empty((len(plan.required_start) - 1, 1))
+    _measure(plan, classes, counts, sizes, radius, of_places, vertices, values, spreads)
+    members = np.empty((len(plan.is_group), 1), np.int8)
+    _members(plan, classes, members)
+    is_known = np.isfinite(values).all() and np.isfinite(of_signals).all() and not (members < 0).any()
+    channels = 4 if spreads.any() else 1 if is_known else 2
+    leaves = np.empty((channels, len(plan.outputs), 1))
+    run_instructions(plan.code, plan.constants, values, spreads, of_signals, members, plan.outputs, leaves)
+    return leaves
