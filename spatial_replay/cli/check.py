@@ -8,10 +8,10 @@ from pathlib import Path
 import click
 
 from spatial_replay.cli.failures import say
-from spatial_replay.cli.options import profile_option
+from spatial_replay.cli.options import Reading, profile_option, reading_options
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.tree import iter_tree_lines, node_rows
-from spatial_replay.errors import SpecificationError
+from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.spec import check_names, load_specification
 from spatial_replay.spec.formula import Diagnostic, NamedSpec, Specification
 
@@ -20,8 +20,11 @@ from spatial_replay.spec.formula import Diagnostic, NamedSpec, Specification
 @click.argument("specification", metavar="SPEC", type=click.Path(path_type=Path))
 @click.option("--log", type=click.Path(path_type=Path), help="Also compare names with what this log holds.")
 @profile_option
+@reading_options
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
-def check(specification: Path, log: Path | None, profile: str | None, as_json: bool) -> None:
+def check(
+    specification: Path, log: Path | None, profile: str | None, as_json: bool, reading: Reading
+) -> None:
     """Check a specification and show its tree.
 
     Faults and warnings go to standard error, the tree with the id of every node to standard output.
@@ -31,8 +34,10 @@ def check(specification: Path, log: Path | None, profile: str | None, as_json: b
     Example:
       spatial-replay check blocks.spatial --log run.mcap
     """
+    if log is None and reading["mapping"] is not None:
+        raise UsageError("--mapping is about a log to compare with; add --log LOG")
     parsed = load_specification(specification, profile=profile)
-    remarks = [*parsed.warnings, *(_compared_with_log(parsed, log) if log is not None else ())]
+    remarks = [*parsed.warnings, *(_compared_with_log(parsed, log, reading) if log is not None else ())]
     faults = [remark for remark in remarks if remark.severity == "error"]
     for remark in remarks:
         if remark.severity == "warning":
@@ -42,14 +47,14 @@ def check(specification: Path, log: Path | None, profile: str | None, as_json: b
     click.echo(_json_of(parsed, remarks) if as_json else _text_of(parsed))
 
 
-def _compared_with_log(specification: Specification, log: Path) -> tuple[Diagnostic, ...]:
+def _compared_with_log(specification: Specification, log: Path, reading: Reading) -> tuple[Diagnostic, ...]:
     # readers of logs load the numerical libraries, which a mere check does without
     from spatial_replay.logs.source import open_source
 
     names: set[str] = set()
     signals: set[str] = set()
     with progress("samples") as advance:
-        for block in open_source(log).iter_blocks():
+        for block in open_source(log, **reading).iter_blocks():
             names.update(block.trace.names)
             signals.update(block.trace.signals)
             for fault in block.trace.faults:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypedDict, TypeVar
 
 import click
 
@@ -34,10 +35,56 @@ profile_option = click.option(
     help="Relation profile of files without a `use` line.  [default: paper]",
 )
 
-concave_option = click.option(
-    "--concave",
-    type=click.Choice(["decompose", "hull"]),
-    default="decompose",
-    show_default=True,
-    help="A polygon that is not convex becomes convex parts, or its hull.",
+_READING = (
+    click.option(
+        "--mapping",
+        metavar="FILE",
+        type=click.Path(path_type=Path),
+        help="Which topics of a log by others carry which objects (YAML).",
+    ),
+    click.option(
+        "--on-time-jump",
+        type=click.Choice(["error", "split"]),
+        default="error",
+        help="What becomes of a log of messages whose clock jumps back.  [default: error]",
+    ),
+    click.option(
+        "--rate", metavar="N", type=float, help="Frames a second of drone annotations.  [default: 30]"
+    ),
+    click.option(
+        "--lost",
+        type=click.Choice(["drop", "keep"]),
+        default="drop",
+        help="What becomes of drone annotations marked as lost.  [default: drop]",
+    ),
+    click.option(
+        "--concave",
+        type=click.Choice(["decompose", "hull"]),
+        default="decompose",
+        help="A polygon that is not convex becomes convex parts, or its hull.  [default: decompose]",
+    ),
 )
+
+
+class Reading(TypedDict):
+    """How a log is to be read: what `open_source` takes beside its path."""
+
+    mapping: Path | None
+    on_time_jump: Literal["error", "split"]
+    rate: float | None
+    lost: Literal["drop", "keep"]
+    concave: Literal["decompose", "hull"]
+
+
+def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The options that say how a log is read; the command takes them together, as `reading`."""
+
+    @wraps(command)
+    def with_reading(**given: Any) -> Any:
+        reading: dict[str, Any] = {name: given.pop(name) for name in Reading.__annotations__}
+        return command(reading=reading, **given)
+
+    decorated: Callable[..., Any] = with_reading
+    for option in reversed(_READING):
+        decorated = option(decorated)
+    return decorated

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from spatial_replay.cli.exit_codes import ExitCode
 from spatial_replay.cli.failures import say
-from spatial_replay.cli.options import concave_option, output_option, profile_option
+from spatial_replay.cli.options import Reading, output_option, profile_option, reading_options
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.verdicts import counted
-
-if TYPE_CHECKING:
-    from spatial_replay.geometry.footprint import Concave
 
 
 @click.group()
@@ -40,9 +36,9 @@ def record() -> None:
     help="Evaluate this specification meanwhile; repeat it for several.",
 )
 @profile_option
-@concave_option
-def tracks(file: Path, output: Path, specs: tuple[Path, ...], profile: str | None, concave: Concave) -> int:
-    """Record tracked objects from a file: JSON lines or CSV, plain or gzip.
+@reading_options
+def tracks(file: Path, output: Path, specs: tuple[Path, ...], profile: str | None, reading: Reading) -> int:
+    """Record the objects of any log that can be read: tracks, annotations, scenarios, bags with a mapping.
 
     What cannot be read of the file is reported and left out, and the exit code is then 3.
 
@@ -50,16 +46,19 @@ def tracks(file: Path, output: Path, specs: tuple[Path, ...], profile: str | Non
     Examples:
       spatial-replay record tracks blocks.jsonl.gz -o run.mcap
       spatial-replay record tracks people.csv -o run.mcap --spec social.spatial
+      spatial-replay record tracks annotations.txt -o run.mcap --lost keep
     """
     # the numerical libraries load when there is work for them
     from spatial_replay.logs.source import open_source
     from spatial_replay.recording import record_source
     from spatial_replay.spec import load_specification
 
-    source = open_source(file, concave=concave)
+    mapping = reading["mapping"]
+    inputs = (file, *specs, *([] if mapping is None else [mapping]))
+    source = open_source(file, **reading)
     files = [load_specification(spec, profile=profile) for spec in specs]
     with progress("samples") as advance:
-        recorded = record_source(source, output, files, inputs=(file, *specs), advance=advance)
+        recorded = record_source(source, output, files, inputs=inputs, advance=advance)
     for fault in recorded.faults:
         say("warning", fault, colour="yellow")
     if recorded.unreadable:

@@ -9,14 +9,13 @@ import click
 
 from spatial_replay.cli.exit_codes import exit_code_from_verdicts
 from spatial_replay.cli.failures import say
-from spatial_replay.cli.options import concave_option, output_option, profile_option
+from spatial_replay.cli.options import Reading, output_option, profile_option, reading_options
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.times import time_point_from_text
 from spatial_replay.cli.verdicts import print_verdicts, write_document
 from spatial_replay.errors import UsageError
 
 if TYPE_CHECKING:
-    from spatial_replay.geometry.footprint import Concave
     from spatial_replay.logs.source import Source
     from spatial_replay.replay import Window
 
@@ -52,7 +51,7 @@ if TYPE_CHECKING:
     help="The objects that a template's parameter stands for; VAR=all for every one.",
 )
 @profile_option
-@concave_option
+@reading_options
 def replay(
     log: Path,
     specs: tuple[Path, ...],
@@ -65,7 +64,7 @@ def replay(
     every: int,
     choices: tuple[str, ...],
     profile: str | None,
-    concave: Concave,
+    reading: Reading,
 ) -> int:
     """Evaluate specifications over a recorded log.
 
@@ -79,6 +78,7 @@ def replay(
       spatial-replay replay run.mcap --spec blocks.spatial -o annotated.mcap
       spatial-replay replay run.mcap --spec edited.spatial --json -
       spatial-replay replay people.jsonl --spec social.spatial --each ego=class:pedestrian --from 10s
+      spatial-replay replay drive.bag --mapping drive.yaml --spec social.spatial -o annotated.mcap
     """
     # the numerical libraries load when there is work for them
     from spatial_replay.logs.source import open_source
@@ -88,9 +88,10 @@ def replay(
         raise UsageError("--series goes into the JSON object; add --json FILE or --json -")
     if layer and output is None:
         raise UsageError("--layer is about the annotated log; add -o FILE")
-    inputs = (log, *specs)
+    mapping = reading["mapping"]
+    inputs = (log, *specs, *([] if mapping is None else [mapping]))
     _check_outputs(output, json_file, inputs)
-    source = open_source(log, concave=concave)
+    source = open_source(log, **reading)
     files = load_files(specs, source, profile=profile)
     for warning in (warning for file in files for warning in file.warnings):
         click.echo(warning, err=True)
