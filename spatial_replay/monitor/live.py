@@ -16,6 +16,10 @@ from spatial_replay.spec.formula import Outline
 from spatial_replay.trace.sample import Sample
 
 
+_ROOM = 64
+"""Recent samples that there is room for at first: few, so that they stay in the processor's cache."""
+
+
 class LiveEvaluation(Protocol):
     """Some formulas under some semantics, on their way through the samples."""
 
@@ -34,7 +38,8 @@ class LiveRuns:
         """Start before the first sample; those before `start_ns` are only there to be looked back at."""
         ends = accumulate((len(program.leaves) for program in programs), initial=0)
         self._runs = [
-            (Run(program), slice(*ends)) for program, ends in zip(programs, pairwise(ends), strict=True)
+            (Run(program, room=_ROOM, tile=1), slice(*ends))
+            for program, ends in zip(programs, pairwise(ends), strict=True)
         ]
         self._leaves = SampleLeaves([program.leaves for program in programs], regions)
         self._start_ns = start_ns

@@ -56,9 +56,9 @@ class Scratch(NamedTuple):
         starts: values that past operators start from, one per table.
         fresh: a part's next tables.
         wedge: (room,), positions.
-        series: (3, TILE), what one part says in one channel.
-        parts: (P, NUMBERS, TILE), what each part says.
-        nodes: (N, NUMBERS, TILE), what each node of the tree says.
+        series: (3, tile), what one part says in one channel.
+        parts: (P, NUMBERS, tile), what each part says.
+        nodes: (N, NUMBERS, tile), what each node of the tree says.
     """
 
     columns: Floats
@@ -95,14 +95,14 @@ def first_memory(program: Program, room: int) -> Memory:
     )
 
 
-def scratch_for(program: Program, room: int) -> Scratch:
-    """Room to work in with so many recent samples."""
+def scratch_for(program: Program, room: int, tile: int) -> Scratch:
+    """Room to work in with so many recent samples, so many of them taken in together."""
     widest = max((int(end - first) for first, end, *_ in program.parts), default=0)
     largest = max(((1 << int(part[2])) * int(part[3]) for part in program.parts), default=1)
     most_tables = max((int(part[3]) for part in program.parts), default=1)
     low, high, plain = np.zeros((3, widest), np.int64)
     return Scratch(
-        columns=np.zeros((widest, max(room, TILE))),
+        columns=np.zeros((widest, max(room, tile))),
         low=low,
         high=high,
         plain=plain,
@@ -112,9 +112,9 @@ def scratch_for(program: Program, room: int) -> Scratch:
         starts=np.zeros(most_tables),
         fresh=np.zeros(largest),
         wedge=np.zeros(room, np.int64),
-        series=np.zeros((3, TILE)),
-        parts=np.zeros((len(program.parts), NUMBERS, TILE)),
-        nodes=np.zeros((len(program.reports), NUMBERS, TILE)),
+        series=np.zeros((3, tile)),
+        parts=np.zeros((len(program.parts), NUMBERS, tile)),
+        nodes=np.zeros((len(program.reports), NUMBERS, tile)),
     )
 
 

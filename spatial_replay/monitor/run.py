@@ -26,13 +26,20 @@ class Run:
     is. It is the one place that changes while a monitor or a replay goes on.
     """
 
-    def __init__(self, program: Program, *, room: int = 2 * TILE) -> None:
-        """Start before the first sample, with room for so many recent ones (it doubles when needed)."""
+    def __init__(self, program: Program, *, room: int = 2 * TILE, tile: int = TILE) -> None:
+        """Start before the first sample.
+
+        Args:
+            room: for how many recent samples there is room at first (it doubles when needed).
+            tile: how many samples are taken in together, at most. What comes one by one is faster with 1,
+                since the numbers worked with then lie closer together.
+        """
         self._program = program
+        self._tile = tile
         if not program.keeps_history:
-            room = TILE
+            room = tile
         self._memory = first_memory(program, room)
-        self._scratch = scratch_for(program, room)
+        self._scratch = scratch_for(program, room, tile)
         self._final = np.zeros((len(program.reports), 2))
         self._tables = Tables.of(program)
         self._take_in = step if program.parts[:, PART_IS_FLAT].all() else step_with_windows
@@ -70,7 +77,7 @@ class Run:
         series = np.empty((len(self._program.reports), 4, len(times_ns)))
         done = 0
         while done < len(times_ns):
-            count = self._make_room(min(TILE, len(times_ns) - done))
+            count = self._make_room(min(self._tile, len(times_ns) - done))
             self._step(leaves, times_ns, done, count, series)
             done += count
         return series
@@ -100,5 +107,5 @@ class Run:
                 self._offset = keep
             elif used == room:
                 self._memory = doubled(self._memory)
-                self._scratch = scratch_for(self._program, 2 * room)
+                self._scratch = scratch_for(self._program, 2 * room, self._tile)
         return min(wanted, len(self._memory.stamps) - (self._position - self._offset))
