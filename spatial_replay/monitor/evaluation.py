@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from reprlib import repr as shortened
-from typing import Literal, TypeAlias
 
 import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
 from spatial_replay.monitor.instances import find_instances
-from spatial_replay.monitor.stream import EvaluationStream, InstanceStream, Stretch
+from spatial_replay.monitor.semantics import Semantics, checked_semantics, instance_evaluation
+from spatial_replay.monitor.stream import EvaluationStream, InstanceEvaluation, Stretch
 from spatial_replay.monitor.verdict import Verdict, final_verdict, worst_verdict
 from spatial_replay.spec.faults import nearest_hint
 from spatial_replay.spec.format import format_formula
@@ -21,8 +21,6 @@ from spatial_replay.spec.formula import Diagnostic, Formula, Specification, iter
 from spatial_replay.spec.objects import check_names
 from spatial_replay.trace.times import FOREVER
 from spatial_replay.trace.trace import Trace, window_of
-
-Semantics: TypeAlias = Literal["ltlf"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,25 +237,26 @@ def evaluate(
     same trace measures only what the edit brought in.
 
     Args:
-        semantics: "ltlf", finite-trace robustness.
+        semantics: "ltlf", finite-trace robustness, or "paper", Def. 16 of the paper to the letter.
         start_ns, end_ns: from the first sample at or after the one to the last before the other; what
             looks back (`a[-3]`) may look before the start.
         each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
 
     Raises:
-        UsageError: no sample in the window, a template without its objects, unknown semantics, something
-            else than a specification or a trace.
+        UsageError: no sample in the window, a template without its objects, unknown semantics, an
+            operator that the semantics lacks, something else than a specification or a trace.
     """
     require_specification(specification)
     _require_trace(trace)
-    if semantics != "ltlf":
-        raise UsageError(f"no semantics {semantics!r}; there is 'ltlf'")
+    checked_semantics(semantics, [specification])
     window = (0 if start_ns is None else start_ns, FOREVER if end_ns is None else end_ns)
     begin, end = window_of(trace.times_ns, *window)
     if begin >= end:
         raise UsageError(_nothing_in_window(trace, start_ns, end_ns))
     stream = EvaluationStream(
-        find_instances(specification, each or {}, [trace], *window), specification.regions
+        find_instances(specification, each or {}, [trace], *window),
+        specification.regions,
+        partial(instance_evaluation, semantics=semantics),
     )
     stretches = stream.extend(trace)
     results = tuple(map(_result, stream.streams, stretches))
@@ -280,7 +279,7 @@ def _require_trace(value: object) -> None:
         raise UsageError(f"trace is {shortened(value)}; {remedy}")
 
 
-def _result(stream: InstanceStream, stretch: Stretch) -> SpecResult:
+def _result(stream: InstanceEvaluation, stretch: Stretch) -> SpecResult:
     return SpecResult(
         stream.instance.name,
         stream.instance.object,

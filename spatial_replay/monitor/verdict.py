@@ -27,9 +27,15 @@ def final_verdict(lower: float, upper: float) -> Verdict:
 
 
 def online_verdict(lower: float, upper: float) -> Verdict:
-    """The verdict while samples still come, from the interval of the value over every continuation."""
-    verdict = final_verdict(lower, upper)
-    return Verdict.PENDING if verdict is Verdict.UNKNOWN else verdict
+    """The verdict while samples still come, from the interval of the value over every continuation.
+
+    Without such an interval (NaN: the paper's semantics knows no continuation) it is unknown.
+    """
+    if lower >= 0.0:
+        return Verdict.SATISFIED
+    if upper < 0.0:
+        return Verdict.VIOLATED
+    return Verdict.PENDING if lower == lower else Verdict.UNKNOWN
 
 
 def worst_verdict(verdicts: Iterable[Verdict]) -> Verdict:
