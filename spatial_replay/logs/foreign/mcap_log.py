@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Iterator
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +17,7 @@ from spatial_replay.logs.foreign.decoders import decoder_of
 from spatial_replay.logs.foreign.definitions import full_type_name
 from spatial_replay.logs.foreign.messages import Decoder, Message, Topic
 from spatial_replay.logs.foreign.ordering import CountedTopics, in_order
-from spatial_replay.logs.foreign.topic_table import topics_named
+from spatial_replay.logs.foreign.topic_table import is_latched, topics_named
 from spatial_replay.logs.mcap_chunks import ChunkPlace, read_records
 from spatial_replay.logs.mcap_directory import Directory, read_directory
 from spatial_replay.logs.mcap_reader import ChunkWalk
@@ -26,7 +25,6 @@ from spatial_replay.logs.mcap_records import DamageError
 from spatial_replay.logs.mcap_walk import walk_records
 from spatial_replay.trace.times import LATEST_NS
 
-_LATCHED = re.compile(r"durability: *(1|transient_local)\b")
 _MESSAGE_FIELDS = 22
 
 
@@ -147,11 +145,6 @@ class McapLog:
 
     def _fault(self, place: ChunkPlace, what: str) -> None:
         self._faults.add(f"{self.name}: at byte {place.offset}: {what}")
-
-
-def is_latched(qos: str) -> bool:
-    """Whether a ROS 2 publisher's quality of service keeps messages for who comes later."""
-    return _LATCHED.search(qos) is not None
 
 
 def _topic(channel: Channel, count: int | None) -> Topic:

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from dataclasses import replace
 
 from spatial_replay.logs.foreign.decoders import same_definition, why_unreadable
 from spatial_replay.logs.foreign.messages import Topic
+
+_LATCHED = re.compile(r"durability: *(1|transient_local)\b")
+
+
+def is_latched(qos: str) -> bool:
+    """Whether a ROS 2 publisher's quality of service keeps messages for whoever comes later."""
+    return _LATCHED.search(qos) is not None
 
 
 def topics_named(described: Iterable[Topic], distribution: str | None = None) -> tuple[Topic, ...]:

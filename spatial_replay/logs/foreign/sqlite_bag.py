@@ -1,0 +1,118 @@
+"""`.db3` files of ROS 2 bags, whole or damaged."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from functools import cached_property
+from pathlib import Path
+
+from spatial_replay.errors import LogError
+from spatial_replay.logs.faults import FaultList
+from spatial_replay.logs.foreign.decoders import decoder_of
+from spatial_replay.logs.foreign.messages import Decoder, Message, Topic
+from spatial_replay.logs.foreign.ordering import CountedTopics
+from spatial_replay.logs.foreign.sqlite_tables import (
+    BagTables,
+    iter_rows,
+    missing_bytes,
+    opened,
+    read_tables,
+)
+from spatial_replay.logs.foreign.topic_table import topics_named
+from spatial_replay.trace.times import LATEST_NS
+
+_ROW_BYTES = 6
+"""The least that a message takes in a file."""
+
+
+class SqliteBag:
+    """A `.db3` file of a ROS 2 bag; see `MessageReader`."""
+
+    kind = "ROS 2 bag"
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._faults = FaultList()
+        self._remarks = FaultList()
+
+    @property
+    def name(self) -> str:
+        return self._path.name
+
+    @cached_property
+    def _tables(self) -> BagTables:
+        if missing := missing_bytes(self._path):
+            self._faults.add(f"{self.name}: at least {missing} bytes are missing from its end")
+        for ending in ("-wal", "-journal"):
+            beside = self._path.with_name(self.name + ending)
+            if beside.is_file() and beside.stat().st_size:
+                self._faults.add(
+                    f"{self.name}: its recorder was interrupted, and what {beside.name} holds was not read;"
+                    " open a copy of both with sqlite3 to bring them together"
+                )
+        with opened(self._path) as database:
+            return read_tables(database, self.name)
+
+    @cached_property
+    def _topics(self) -> tuple[Topic, ...]:
+        return topics_named(self._tables.topics.values(), self._tables.distribution)
+
+    @cached_property
+    def start_ns(self) -> int | None:
+        """Log time of the first message."""
+        try:
+            with opened(self._path) as database:
+                ((start_ns,),) = database.execute("SELECT min(timestamp) FROM messages")
+        except LogError:
+            # the damage is told when the messages are read
+            return 0
+        return start_ns if isinstance(start_ns, int) else None
+
+    def topics(self) -> tuple[Topic, ...]:
+        """See `MessageReader.topics`."""
+        if not self._topics:
+            raise LogError(f"{self.name} holds no topic")
+        return self._topics
+
+    def decoder(self, topic: str) -> Decoder:
+        """See `MessageReader.decoder`."""
+        named = next(each for each in self._topics if each.name == topic)
+        return decoder_of(named, self._tables.distribution)
+
+    def take_faults(self) -> tuple[str, ...]:
+        """See `MessageReader.take_faults`."""
+        return self._faults.take()
+
+    def take_remarks(self) -> tuple[str, ...]:
+        """See `MessageReader.take_remarks`."""
+        return self._remarks.take()
+
+    def iter_messages(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[Message]:
+        """See `MessageReader.iter_messages`."""
+        first, last = start_ns or 0, LATEST_NS if end_ns is None else min(end_ns - 1, LATEST_NS)
+        counts = {each.name: each.count for each in self._topics if each.name in topics}
+        messages = self._messages(counts, first, last)
+        if (first, last) != (0, LATEST_NS):
+            yield from messages
+            return
+        counted = CountedTopics(counts)
+        yield from counted.counted(messages)
+        counted.compare(self.name, self._faults)
+
+    def _messages(self, topics: Collection[str], first: int, last: int) -> Iterator[Message]:
+        wanted = {number: topic.name for number, topic in self._tables.topics.items() if topic.name in topics}
+        most = self._path.stat().st_size // _ROW_BYTES
+        with opened(self._path) as database:
+            rows = iter_rows(database, sorted(wanted), first, last, self._faults, self.name)
+            for _, number, time_ns, payload in rows:
+                most -= 1
+                if most < 0:
+                    raise LogError(f"{self.name} is damaged: it lists more messages than it has room for")
+                if type(payload) is bytes and type(time_ns) is int:
+                    yield Message(wanted[number], time_ns, time_ns, 0, payload)
+                else:
+                    self._faults.add(
+                        f"{self.name}: a message on {wanted[number]!r} has no time or no content"
+                    )

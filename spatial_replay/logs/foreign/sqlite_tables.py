@@ -1,0 +1,198 @@
+"""SQLite files of ROS 2 bags: opened without trust, and read past damage."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from itertools import count
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+from urllib.parse import quote
+
+from spatial_replay.errors import LogError
+from spatial_replay.logs.block import Schema
+from spatial_replay.logs.faults import FaultList
+from spatial_replay.logs.foreign.bag_metadata import BagMetadata, bag_metadata_from_text
+from spatial_replay.logs.foreign.definitions import LONGEST_TEXT, full_type_name
+from spatial_replay.logs.foreign.messages import Topic
+from spatial_replay.logs.foreign.topic_table import is_latched
+
+SQLITE_MAGIC = b"SQLite format 3\x00"
+_MOST_TOPICS = 100_000
+_STEPS = 10_000
+"""Steps of the database's machine between two looks at how many it has taken."""
+_STEPS_A_BYTE = 20
+_SKIPS = 64
+"""Damaged stretches are stepped over with twice the step each time: after so many no row can be left."""
+
+_COLUMNS = "SELECT id, topic_id, timestamp, data FROM messages"
+
+Row = tuple[int, int, Any, Any]
+"""Number, topic, time and content of a message; a damaged file may hold anything as the last two."""
+
+
+@dataclass(frozen=True, slots=True)
+class BagTables:
+    """What a file says of itself.
+
+    Attributes:
+        topics: by number.
+        metadata: what the recorder put down when it closed the file; None without it.
+        distribution: the release of ROS that wrote it.
+    """
+
+    topics: dict[int, Topic] = field(hash=False)
+    metadata: BagMetadata | None
+    distribution: str | None
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[sqlite3.Connection]:
+    """The database in a file, read only: nothing beside it is looked at, no function in it is trusted.
+
+    Raises:
+        LogError: it cannot be opened.
+    """
+    size = path.stat().st_size
+    try:
+        uri = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
+        with closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as database:
+            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(10**6, size))
+            database.text_factory = lambda text: text.decode("utf-8", "replace")
+            # a file that was cut is refused without this; nothing is ever written
+            database.execute("PRAGMA writable_schema=ON")
+            database.execute("PRAGMA trusted_schema=OFF")
+            database.execute("PRAGMA cell_size_check=ON")
+            taken = count(1)
+            most = 1_000 + size * _STEPS_A_BYTE // _STEPS
+            # a damaged tree of pages may lead in circles
+            database.set_progress_handler(lambda: next(taken) > most, _STEPS)
+            yield database
+    except sqlite3.Error as error:
+        raise LogError(f"{path.name}: the database is damaged ({error})") from None
+
+
+def missing_bytes(path: Path) -> int:
+    """How many bytes are missing from the end of a file, as its head counts its pages."""
+    with path.open("rb") as stream:
+        head = stream.read(100)
+    if len(head) < 100:
+        return 100 - len(head)
+    page = int.from_bytes(head[16:18], "big")
+    pages = int.from_bytes(head[28:32], "big")
+    if head[24:28] != head[92:96]:
+        # written by a version that does not count them
+        return 0
+    return max(0, pages * (65536 if page == 1 else page) - path.stat().st_size)
+
+
+def read_tables(database: sqlite3.Connection, name: str) -> BagTables:
+    """What a file says of itself.
+
+    Raises:
+        LogError: it is no bag.
+    """
+    kinds = dict(
+        database.execute(
+            "SELECT name, sql FROM sqlite_master WHERE type = 'table' AND rootpage > 0 LIMIT ?",
+            (_MOST_TOPICS,),
+        ).fetchall()
+    )
+    if not {"topics", "messages"} <= kinds.keys():
+        raise LogError(f"{name} is no ROS 2 bag: it has no tables 'topics' and 'messages'")
+    metadata = _metadata(database) if "metadata" in kinds else None
+    schemas = _schemas(database) if "message_definitions" in kinds else {}
+    rows = _records(database, "topics")
+    distribution = metadata.distribution if metadata else None
+    for row in _records(database, "schema") if "schema" in kinds else ():
+        distribution = str(row.get("ros_distro") or "") or distribution
+    counts = metadata.counts if metadata else {}
+    topics = {}
+    for row in rows:
+        number, topic, type_name = row.get("id"), row.get("name"), row.get("type")
+        if not (isinstance(number, int) and isinstance(topic, str) and isinstance(type_name, str)):
+            raise LogError(f"{name} is damaged: its table 'topics' has a row without number, name or type")
+        topics[number] = _topic(row, schemas.get(type_name), counts.get(topic))
+    return BagTables(topics, metadata, distribution)
+
+
+def iter_rows(
+    database: sqlite3.Connection,
+    topics: Sequence[int],
+    first_ns: int,
+    last_ns: int,
+    faults: FaultList,
+    name: str,
+) -> Iterator[Row]:
+    """The messages of some topics with times from `first_ns` to `last_ns`, in order.
+
+    Where the file is damaged, what can be reached of the rest follows in the order in which it was written.
+    """
+    marks = ", ".join("?" * len(topics))
+    inside = f"{_COLUMNS} WHERE topic_id IN ({marks}) AND timestamp BETWEEN ? AND ?"
+    time_ns, row_id = first_ns, -1
+    try:
+        for row in database.execute(f"{inside} ORDER BY timestamp, id", (*topics, first_ns, last_ns)):
+            yield row
+            row_id, _, time_ns, _ = row
+        return
+    except sqlite3.Error as error:
+        faults.add(f"{name}: after {time_ns} ns: the database is damaged ({error})")
+    rest = f"{inside} AND (timestamp, id) > (?, ?) AND id > ? ORDER BY id"
+    arguments = (*topics, first_ns, last_ns, time_ns, row_id)
+    reached, step = 0, 0
+    for _ in range(_SKIPS):
+        try:
+            for row in database.execute(rest, (*arguments, reached + step)):
+                yield row
+                reached, step = row[0], 0
+            return
+        except sqlite3.Error:
+            step = step * 2 or 1
+        except OverflowError:
+            return
+
+
+def _records(database: sqlite3.Connection, table: str) -> list[dict[str, object]]:
+    """The rows of a small table; columns vary with the release that wrote it."""
+    cursor = database.execute(f"SELECT * FROM {table} LIMIT {_MOST_TOPICS}")
+    names = [column[0] for column in cursor.description]
+    return [dict(zip(names, row, strict=True)) for row in cursor]
+
+
+def _schemas(database: sqlite3.Connection) -> dict[str, Schema]:
+    schemas = {}
+    for row in _records(database, "message_definitions"):
+        type_name, text = row.get("topic_type"), row.get("encoded_message_definition")
+        if (
+            isinstance(type_name, str)
+            and isinstance(text, str)
+            and text.strip()
+            and len(text) <= LONGEST_TEXT
+        ):
+            schemas[type_name] = Schema(type_name, str(row.get("encoding")), text.encode())
+    return schemas
+
+
+def _metadata(database: sqlite3.Connection) -> BagMetadata | None:
+    for row in _records(database, "metadata"):
+        text = row.get("metadata")
+        if isinstance(text, str) and text.strip():
+            return bag_metadata_from_text(text)
+    return None
+
+
+def _topic(row: dict[str, object], schema: Schema | None, count: int | None) -> Topic:
+    qos = str(row.get("offered_qos_profiles") or "")
+    return Topic(
+        name=str(row["name"]),
+        type=full_type_name(str(row["type"])),
+        encoding=str(row.get("serialization_format")),
+        count=count,
+        schema=schema,
+        latched=is_latched(qos),
+        metadata=MappingProxyType({"offered_qos_profiles": qos} if qos else {}),
+    )
