@@ -1,0 +1,88 @@
+"""A monitor says what an evaluation says, whoever comes and goes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from random import Random
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from laws.strategies_monitor import NAMES, WORDS, specifications, tracked_objects
+from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.monitor.evaluation import evaluate
+from spatial_replay.monitor.monitor import Monitor
+from spatial_replay.spec.specification import parse_specification
+from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Trace
+
+PASSERS_BY = tuple(f"p{number}" for number in range(6))
+ANYONE = st.sets(st.sampled_from((*NAMES, *PASSERS_BY)), max_size=6)
+
+LOOKING_BACK = """\
+group people = class "person"
+group everyone = all
+spec alone = G forall x in people: x dist (everyone except x) >= 1
+spec going = F exists x in everyone: x dist x[-{samples}] >= 1
+spec parted = H[0, {samples}] forall x in people[-{duration}ms]: x dist a[-{duration}ms] >= 0.5
+spec near = (everyone[-{samples}] dist b <= 3) S[0, {duration}ms] (a oriented[0.5] c)
+"""
+
+
+@st.composite
+def crowds(draw, max_size=10):
+    """Samples in which objects appear and vanish, change their shape and class, and new names come up."""
+    shapes = draw(st.lists(tracked_objects(certain=draw(st.booleans())), min_size=2, max_size=5))
+    time_ns, samples = draw(st.integers(0, 10**9)), []
+    for _ in range(draw(st.integers(1, max_size))):
+        objects = {name: draw(st.sampled_from(shapes)) for name in sorted(draw(ANYONE))}
+        samples.append(Sample(time_ns, objects, {"battery": 1.5} if draw(st.booleans()) else {}))
+        time_ns += draw(st.sampled_from([100, 250, 400])) * 10**6
+    return samples
+
+
+@st.composite
+def specifications_looking_back(draw):
+    samples, duration = draw(st.integers(1, 3)), draw(st.sampled_from([100, 250, 600]))
+    return parse_specification(LOOKING_BACK.format(samples=samples, duration=duration))
+
+
+def assert_monitor_agrees(specification, samples):
+    """Every node of every spec on every prefix, bit for bit."""
+    monitor = Monitor(specification)
+    updates = [monitor.update(sample) for sample in samples]
+    for number, result in enumerate(evaluate(specification, Trace.from_samples(samples))):
+        live = np.stack([update.specs[number].numbers for update in updates], axis=2)
+        assert live.tobytes() == result.series.tobytes()
+
+
+@settings(max_examples=60)
+@given(specification=specifications_looking_back(), samples=crowds())
+def test_whoever_comes_and_goes_a_monitor_says_what_an_evaluation_says(specification, samples):
+    assert_monitor_agrees(specification, samples)
+
+
+@settings(max_examples=60)
+@given(
+    specification=specifications(words=replace(WORDS, objects=(*NAMES, "p0")), templates=False),
+    samples=crowds(),
+)
+def test_any_specification_over_a_crowd(specification, samples):
+    assert_monitor_agrees(specification, samples)
+
+
+def test_more_sets_of_objects_than_a_monitor_remembers():
+    specification = parse_specification(
+        "group others = all\n"
+        "spec far = G forall x in (others except a): x dist a >= 1\n"
+        "spec stays = F exists x in (others except a): x dist x[-1] <= 1"
+    )
+    still = TrackedObject(Footprint.box(0, 0, 1, 1))
+    chosen = Random(0)
+    crowds = [chosen.sample(range(40), 6) for _ in range(300)]
+    samples = [
+        Sample(t, {"a": still, **{f"p{k}": Footprint.disc(3 + t % 7, k, 0.5) for k in crowd}})
+        for t, crowd in enumerate([*crowds, *reversed(crowds)])
+    ]
+    assert_monitor_agrees(specification, samples)
