@@ -1,0 +1,38 @@
+"""Logs of messages by what a file or folder holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from spatial_replay.errors import LogError, MissingFileError
+from spatial_replay.logs.foreign.bag_folder import BagFolder
+from spatial_replay.logs.foreign.mcap_log import McapLog
+from spatial_replay.logs.foreign.messages import MessageReader
+from spatial_replay.logs.foreign.ros1_bag import Ros1Bag
+from spatial_replay.logs.foreign.ros1_records import BAG_MAGIC
+from spatial_replay.logs.foreign.sqlite_bag import SqliteBag
+from spatial_replay.logs.foreign.sqlite_tables import SQLITE_MAGIC
+from spatial_replay.logs.mcap_records import MAGIC
+
+
+def open_messages(path: Path) -> MessageReader:
+    """A reader of the log in a file or a folder; the content decides, not the name.
+
+    Raises:
+        MissingFileError: there is no such file, or it cannot be opened.
+        LogError: it is no log of messages.
+    """
+    try:
+        if path.is_dir():
+            return BagFolder(path)
+        with path.open("rb") as stream:
+            head = stream.read(len(SQLITE_MAGIC))
+    except (OSError, ValueError) as error:
+        raise MissingFileError.of(path, error) from None
+    if head.startswith(BAG_MAGIC):
+        return Ros1Bag(path)
+    if head.startswith(SQLITE_MAGIC):
+        return SqliteBag(path)
+    if head.startswith(MAGIC):
+        return McapLog(path)
+    raise LogError(f"{path.name} is no ROS bag and no MCAP log")
