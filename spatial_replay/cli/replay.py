@@ -17,6 +17,7 @@ from spatial_replay.errors import UsageError
 
 if TYPE_CHECKING:
     from spatial_replay.logs.source import Source
+    from spatial_replay.monitor.semantics import Semantics
     from spatial_replay.replay import Window
 
 
@@ -50,6 +51,13 @@ if TYPE_CHECKING:
     metavar="VAR=class:C",
     help="The objects that a template's parameter stands for; VAR=all for every one.",
 )
+@click.option(
+    "--semantics",
+    type=click.Choice(["ltlf", "paper"]),
+    default="ltlf",
+    show_default=True,
+    help="What a formula means: robustness over finite traces, or the paper's Def. 16 to the letter.",
+)
 @profile_option
 @reading_options
 def replay(
@@ -63,6 +71,7 @@ def replay(
     end: str | None,
     every: int,
     choices: tuple[str, ...],
+    semantics: Semantics,
     profile: str | None,
     reading: Reading,
 ) -> int:
@@ -101,6 +110,7 @@ def replay(
             files,
             window=_window(source, start, end, every),
             each=_each(choices),
+            semantics=semantics,
             keep_series=series,
             output=output,
             inputs=inputs,

@@ -55,7 +55,7 @@ def _numbers(result: ReplayedSpec, first_ns: int) -> str:
     robustness = float(result.robustness[0])
     parts = [f"robustness {_shown(robustness)}"]
     lower, upper = result.final[0].tolist()
-    if not lower == upper == robustness:
+    if not (lower == upper == robustness or math.isnan(lower)):
         parts.append(f"between {_shown(lower)} and {_shown(upper)}")
     if robustness == 0.0:
         parts.append("marginal")

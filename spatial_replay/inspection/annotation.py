@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import PurePath
 
 import numpy as np
@@ -22,6 +23,7 @@ from spatial_replay.logs.messages.Specification_pb2 import Specification as Spec
 from spatial_replay.logs.sink import Attachment
 from spatial_replay.logs.topics import ROBUSTNESS, SCENE, SPECIFICATION, protobuf_channel
 from spatial_replay.monitor.instances import Instance
+from spatial_replay.monitor.semantics import Semantics, instance_evaluation
 from spatial_replay.monitor.stream import EvaluationStream, Stretch
 from spatial_replay.spec import format_specification, parse_specification
 from spatial_replay.spec.formula import Outline, Specification, iter_nodes
@@ -38,15 +40,21 @@ class AnnotatedEvaluation:
         streams: their evaluation, in the same order.
     """
 
-    def __init__(self, files: Sequence[Specification], instances: Sequence[Sequence[Instance]]) -> None:
+    def __init__(
+        self,
+        files: Sequence[Specification],
+        instances: Sequence[Sequence[Instance]],
+        semantics: Semantics = "ltlf",
+    ) -> None:
         """Start before the first sample.
 
         Args:
             instances: what to evaluate of each file.
         """
         self._files = files
+        begin = partial(instance_evaluation, semantics=semantics)
         self._evaluations = [
-            EvaluationStream(own, file.regions) for own, file in zip(instances, files, strict=True)
+            EvaluationStream(own, file.regions, begin) for own, file in zip(instances, files, strict=True)
         ]
         self.streams = [stream for evaluation in self._evaluations for stream in evaluation.streams]
         self.trees = reported_trees(files, instances)

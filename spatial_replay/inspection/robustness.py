@@ -78,10 +78,11 @@ def encode_robustness(
 
 
 def online_codes(lower: Floats, upper: Floats) -> Codes:
-    """The codes of the verdicts while samples still come, from intervals of any one shape."""
+    """The codes of the verdicts while samples still come, as `online_verdict` gives them."""
     codes = np.full(lower.shape, Robustness_pb2.VERDICT_PENDING, np.uint8)
     codes[upper < 0.0] = Robustness_pb2.VERDICT_VIOLATED
     codes[lower >= 0.0] = Robustness_pb2.VERDICT_SATISFIED
+    codes[np.isnan(lower)] = Robustness_pb2.VERDICT_UNKNOWN
     return codes
 
 

@@ -32,13 +32,11 @@ def check_operators(specification: Specification) -> None:
         for _, _, node in iter_nodes(spec.formula):
             if isinstance(node, Temporal) and node.operator not in OPERATORS:
                 source = Source.of(specification.source, specification.filename)
-                fault = source.diagnostic(
-                    "error",
-                    node.span,
-                    f"the semantics of the paper has no {node.operator}",
-                    "write it with X, F, G and U, or evaluate with the semantics 'ltlf'",
+                fault = source.diagnostic("error", node.span, f"the paper's semantics has no {node.operator}")
+                raise UsageError(
+                    f"{fault.filename}:{fault.line}:{fault.column}: {fault.message}, as {spec.name} has; "
+                    "write it with X, F, G and U, or evaluate with the semantics 'ltlf'"
                 )
-                raise UsageError(str(fault))
 
 
 class PaperStream:

@@ -18,6 +18,7 @@ from spatial_replay.logs.reading import reading_options
 from spatial_replay.logs.sink import Sink
 from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import CERTIFICATE, METADATA, RECORDED_PREFIX, REPLAYED_PREFIX
+from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.replay.replay import Replay, Replayed
 from spatial_replay.replay.window import Window
 from spatial_replay.spec import load_specification, parse_specification
@@ -30,6 +31,7 @@ def run_replay(
     *,
     window: Window | None = None,
     each: Mapping[str, str] | None = None,
+    semantics: Semantics = "ltlf",
     keep_series: bool = False,
     output: Path | None = None,
     inputs: Sequence[Path] = (),
@@ -43,6 +45,7 @@ def run_replay(
 
     Args:
         each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
+        semantics: "ltlf", or "paper": Def. 16 of the paper to the letter.
         keep_series: keep every sample's numbers in memory.
         output: the annotated log; it replaces a file of that name only when it is whole.
         inputs: files that the output must not be.
@@ -56,12 +59,12 @@ def run_replay(
         OutputError: the output cannot be written.
     """
     check_parameters(files, each or {})
-    replay = Replay(source, files, window=window, each=each, keep_series=keep_series)
+    replay = Replay(source, files, window=window, each=each, semantics=semantics, keep_series=keep_series)
     with ExitStack() as stack:
         sink: LogWriter | None = None
         if output is not None:
             sink = stack.enter_context(LogWriter(stack.enter_context(replacing(output, inputs))))
-            _begin(sink, source, replay.files, window or Window(), each or {}, layer=layer)
+            _begin(sink, source, replay.files, window or Window(), each or {}, semantics, layer=layer)
         for messages, samples in replay.iter_messages(annotate=sink is not None, layer=layer):
             if sink is not None:
                 sink.write_messages(messages)
@@ -80,6 +83,7 @@ def _begin(
     files: Sequence[Specification],
     window: Window,
     each: Mapping[str, str],
+    semantics: Semantics,
     *,
     layer: bool,
 ) -> None:
@@ -89,7 +93,7 @@ def _begin(
     about = {
         "version": __version__,
         "written_by": "replay",
-        "semantics": "ltlf",
+        "semantics": semantics,
         "source": before.get("source", source.name) if is_replayed else source.name,
         "specifications": described(files),
         "options": json.dumps(_options(source, window, each, layer=layer)),

@@ -25,7 +25,7 @@ def document(replayed: Replayed) -> Mapping[str, Any]:
             "faults": list(replayed.faults),
             "unreadable_observations": replayed.unreadable,
         },
-        "semantics": "ltlf",
+        "semantics": replayed.semantics,
         "certificate": dict(replayed.certificate),
         "specifications": [_result(result) for result in replayed.results],
     }

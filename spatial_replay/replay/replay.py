@@ -21,7 +21,8 @@ from spatial_replay.logs.sink import Attachment
 from spatial_replay.logs.source import Source, within
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
 from spatial_replay.monitor.instances import Choice, Instance, find_instances
-from spatial_replay.monitor.stream import InstanceStream, Stretch, join_stretches, look_back
+from spatial_replay.monitor.semantics import Semantics, checked_semantics
+from spatial_replay.monitor.stream import InstanceEvaluation, Stretch, join_stretches, look_back
 from spatial_replay.monitor.verdict import Verdict, final_verdict, worst_verdict
 from spatial_replay.replay.window import Window, first_sample_ns
 from spatial_replay.spec import check_names
@@ -69,6 +70,7 @@ class Replayed:
         unreadable: how many observations held a number that is not finite.
         results: one per spec and object.
         certificate: hashes of what went in and came out.
+        semantics: what the formulas meant.
     """
 
     log: str
@@ -80,6 +82,7 @@ class Replayed:
     unreadable: int
     results: tuple[ReplayedSpec, ...]
     certificate: Mapping[str, str]
+    semantics: Semantics = "ltlf"
 
     @property
     def verdict(self) -> Verdict:
@@ -101,19 +104,22 @@ class Replay:
         *,
         window: Window | None = None,
         each: Mapping[str, str] | None = None,
+        semantics: Semantics = "ltlf",
         keep_series: bool = False,
     ) -> None:
         """Prepare; templates read the source once for the objects that they stand for.
 
         Raises:
-            UsageError: a template without its objects, or objects for a parameter that no template has.
+            UsageError: a template without its objects, or objects for a parameter that no template has; an
+                operator that the semantics lacks.
         """
+        self._semantics = checked_semantics(semantics, files)
         self._source = source
         self._files = files
         self._window = window or Window()
         self.files = kept_files(files)
         instances = [self._instances(file, each or {}) for file in self.files]
-        self._evaluation = AnnotatedEvaluation(self.files, instances)
+        self._evaluation = AnnotatedEvaluation(self.files, instances, self._semantics)
         self.trees = self._evaluation.trees
         self._keep_series = keep_series
         self._kept: list[list[Stretch]] = [[] for _ in self.trees]
@@ -162,6 +168,7 @@ class Replay:
             unreadable=self._unreadable,
             results=tuple(map(_replayed, self.trees, self._evaluation.streams, self._stretches())),
             certificate=self.certificate(),
+            semantics=self._semantics,
         )
 
     def layout(self) -> Attachment:
@@ -279,7 +286,7 @@ class Replay:
         )
 
 
-def _replayed(tree: ReportedTree, stream: InstanceStream, stretch: Stretch | None) -> ReplayedSpec:
+def _replayed(tree: ReportedTree, stream: InstanceEvaluation, stretch: Stretch | None) -> ReplayedSpec:
     return ReplayedSpec(
         tree.name,
         tree.object,

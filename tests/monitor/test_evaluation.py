@@ -202,7 +202,7 @@ def test_no_sample_to_evaluate_is_refused():
 
 
 def test_unknown_semantics_are_refused():
-    with pytest.raises(UsageError, match=r"no semantics 'stl'; there is 'ltlf'"):
+    with pytest.raises(UsageError, match=r"no semantics 'stl'; there are 'ltlf' and 'paper'"):
         evaluate(parse_specification("p >= 0"), numbers(p=[1]), semantics="stl")
 
 
