@@ -1,0 +1,152 @@
+"""Mappings to start from: what is found in messages, and that it can be used as it is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from spatial_replay.logs.foreign.messages import Topic
+from spatial_replay.logs.mapping.load import parse_mapping
+from spatial_replay.logs.mapping.model import Mapping, Shape
+from spatial_replay.logs.mapping.suggest import suggest_mapping
+
+POINT = {"x": 1.0, "y": 2.0, "z": 0.0}
+TURN = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+STAMP = {"sec": 0, "nanosec": 0}
+
+
+def suggested(**examples: Any) -> tuple[str, Mapping]:
+    """What is suggested for topics with one example each, as text and as read."""
+    topics = [Topic(f"/{name}", f"a/msg/{name.title()}", "json") for name in examples]
+    text = suggest_mapping("run.bag", topics, {f"/{name}": [each] for name, each in examples.items()})
+    return text, parse_mapping(text)
+
+
+def test_a_pose_is_an_object_of_its_topic() -> None:
+    text, mapping = suggested(robot={"pose": {"position": POINT, "orientation": TURN}})
+    (topic,) = mapping.topics
+    assert (topic.topic, topic.name, topic.position) == ("/robot", "robot", "pose.position")
+    assert topic.orientation == "pose.orientation"
+    assert topic.shape == Shape("disc", (0.5,))
+    assert "no size" in text
+
+
+def test_bare_coordinates_are_a_position() -> None:
+    _, mapping = suggested(pose={"x": 1.0, "y": 2.0, "theta": 0.0, "velocity": POINT})
+    (topic,) = mapping.topics
+    assert (topic.position, topic.yaw, topic.orientation) == (("x", "y"), "theta", None)
+
+
+def test_a_list_of_objects_is_found_wherever_it_is() -> None:
+    vehicle = {
+        "id": {"value": 7},
+        "base": {"position": POINT, "dimension": {"length": 4.0, "width": 2.0, "height": 1.5}},
+        "velocity": POINT,
+    }
+    sign = {"id": {"value": 8}, "base": {"position": POINT}}
+    text, mapping = suggested(truth={"world": {"traffic_sign": [sign], "moving_object": [vehicle]}})
+    (topic,) = mapping.topics
+    assert topic.objects == "world.moving_object[*]"
+    assert topic.name == "moving_object{id.value}"
+    assert topic.position == "base.position"
+    assert topic.shape == Shape(
+        "box", ("base.dimension.length", "base.dimension.width", "base.dimension.height")
+    )
+    assert "world.traffic_sign[*]" in text
+
+
+def test_corners_are_an_outline() -> None:
+    tag = {"id": 3, "family": "mit", "center": POINT, "corners": [POINT] * 4}
+    _, mapping = suggested(detector={"tags": [tag]})
+    (topic,) = mapping.topics
+    assert (topic.objects, topic.polygon, topic.name) == ("tags[*]", "corners", "tag{id}")
+    assert topic.position is topic.shape is None
+
+
+def test_classes_are_texts() -> None:
+    people = {"name": "anna", "class_name": "person", "position": POINT, "radius": 0.4}
+    _, mapping = suggested(people={"tracks": [people]})
+    (topic,) = mapping.topics
+    assert topic.name == "track{name}"
+    assert topic.class_name is not None
+    assert topic.shape == Shape("disc", ("radius",))
+
+
+@pytest.mark.parametrize(
+    ("kind", "needs_shape"),
+    [
+        ("geometry_msgs/msg/PoseStamped", True),
+        ("nav_msgs/msg/Odometry", True),
+        ("visualization_msgs/msg/MarkerArray", False),
+        ("apriltag_msgs/msg/AprilTagDetectionArray", False),
+        ("foxglove.SceneUpdate", False),
+        ("foxglove.PosesInFrame", True),
+    ],
+)
+def test_known_types_need_no_fields(kind: str, needs_shape: bool) -> None:
+    (topic,) = parse_mapping(suggest_mapping("run", [Topic("/a", kind, "cdr")], {})).topics
+    assert (topic.shape is not None) == needs_shape
+    assert topic.position is topic.objects is None
+
+
+TRANSFORM = {"header": {"frame_id": "map", "stamp": STAMP}, "child_frame_id": "base"}
+
+
+def test_transforms_are_objects_only_where_nothing_else_is() -> None:
+    tf = Topic("/tf", "tf2_msgs/msg/TFMessage", "cdr")
+    pose = Topic("/pose", "geometry_msgs/msg/PoseStamped", "cdr")
+    (alone,) = parse_mapping(suggest_mapping("run", [tf], {})).topics
+    assert alone.topic == "/tf"
+    text = suggest_mapping("run", [pose, tf], {"/tf": [{"transforms": [TRANSFORM]}]})
+    mapping = parse_mapping(text)
+    assert [each.topic for each in mapping.topics] == ["/pose"]
+    assert mapping.fixed_frame is None
+    assert "# fixed_frame: map" in text
+
+
+def test_several_frames_are_brought_into_their_root() -> None:
+    pose = {"position": POINT}
+    examples = {
+        "/one": [{"header": {"frame_id": "map"}, "pose": pose}],
+        "/two": [{"header": {"frame_id": "/base"}, "pose": pose}],
+        "/tf": [{"transforms": [TRANSFORM]}],
+    }
+    kinds = {"/one": "a/msg/One", "/two": "a/msg/Two", "/tf": "tf2_msgs/msg/TFMessage"}
+    topics = [Topic(name, kind, "json") for name, kind in kinds.items()]
+    assert parse_mapping(suggest_mapping("run", topics, examples)).fixed_frame == "map"
+    # without the transforms nobody knows how the frames lie
+    assert parse_mapping(suggest_mapping("run", topics[:2], examples)).fixed_frame is None
+
+
+def test_numbers_are_offered_as_signals() -> None:
+    text, mapping = suggested(robot={"position": POINT}, battery={"header": {"seq": 1}, "percentage": 0.8})
+    assert len(mapping.topics) == 1
+    assert "# /battery: {signals: {battery_percentage: percentage}}" in text
+
+
+def test_what_is_no_object_is_listed() -> None:
+    topics = [
+        Topic("/rosout", "rcl_interfaces/msg/Log", "cdr", 12),
+        Topic("/odd name\n", "b\n: c", "x", unreadable="no\ndefinition"),
+        Topic("/text", "std_msgs/msg/String", "cdr"),
+    ]
+    text = suggest_mapping(
+        "run\n.bag", topics, {"/text": [{"data": "hello"}], "/rosout": [{"x": 1.0, "y": 1.0}]}
+    )
+    assert all(
+        line.startswith("#") or line.split(":")[0] in ("clock", "topics")
+        for line in map(str.strip, text.splitlines())
+        if line
+    )
+    assert "/rosout: rcl_interfaces/msg/Log, 12 messages" in text
+    assert "cannot be read: no definition" in text
+
+
+def test_names_that_need_quotes_get_them() -> None:
+    topics = [
+        Topic(name, "geometry_msgs/msg/PoseStamped", "cdr")
+        for name in ("no", "a: b", "#", "ünï", "'", '"', "a\n")
+    ]
+    mapping = parse_mapping(suggest_mapping("run", topics, {}))
+    assert [each.topic for each in mapping.topics] == [each.name for each in topics]
