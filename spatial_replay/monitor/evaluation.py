@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from reprlib import repr as shortened
 
@@ -11,10 +11,13 @@ import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
+from spatial_replay.monitor.finished import checked_width, full_signal, window_signal
 from spatial_replay.monitor.instances import find_instances
-from spatial_replay.monitor.semantics import Semantics, checked_semantics, instance_evaluation
+from spatial_replay.monitor.semantics import Semantics, checked_semantics, instance_evaluation, require_ltlf
 from spatial_replay.monitor.stream import EvaluationStream, InstanceEvaluation, Stretch
 from spatial_replay.monitor.verdict import Verdict, final_verdict, worst_verdict
+from spatial_replay.monitor.witness.evidence import Evidence
+from spatial_replay.monitor.witness.witness import Witness, find_witness
 from spatial_replay.spec.faults import nearest_hint
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Diagnostic, Formula, Specification, iter_nodes, operator_of
@@ -72,6 +75,7 @@ class SpecResult:
         times_ns: (T,) int64, the samples evaluated.
         series: (N, 4, T): value, now, lower, upper of each node (see `NodeResult`).
         final: (N, 2): lower and upper end of each node for the finished log.
+        semantics: what the formula meant.
     """
 
     name: str
@@ -80,6 +84,9 @@ class SpecResult:
     times_ns: Integers
     series: Floats
     final: Floats
+    semantics: Semantics
+    _leaves: Floats = field(repr=False)
+    _evidence: Evidence = field(repr=False)
 
     @cached_property
     def nodes(self) -> tuple[NodeResult, ...]:
@@ -133,6 +140,42 @@ class SpecResult:
         """The time of the first sample with a value of at least 0, even if that is lost later."""
         satisfied = np.flatnonzero(self.series[0, 0] >= 0.0)
         return int(self.times_ns[satisfied[0]]) if len(satisfied) else None
+
+    def full_signal(self) -> Floats:
+        """(N, T): each node's robustness at each sample, from there to the end of the log.
+
+        This is the usual offline robustness; NaN where it is not determined.
+
+        Raises:
+            UsageError: under the paper's semantics.
+        """
+        require_ltlf(self.semantics, "the signal of a whole log")
+        return full_signal(self.formula, self._evidence.instance.program.leaves, self._leaves, self.times_ns)
+
+    def window_signal(self, width_ns: int) -> Floats:
+        """(N, T): each node's robustness over the samples in (t - width, t], for the sample at each t.
+
+        Past operators start where the window does; `a[-3]` may look before it. NaN where not determined.
+
+        Raises:
+            UsageError: a width below 1 ns, or under the paper's semantics.
+        """
+        require_ltlf(self.semantics, "a sliding window")
+        order = self._evidence.instance.program.leaves
+        return window_signal(self.formula, order, self._leaves, self.times_ns, checked_width(width_ns))
+
+    def witness(self, node: int | str | None = None) -> Witness:
+        """What decides a node's verdict over the whole log, given its id or its name; by default the root's.
+
+        Raises:
+            UsageError: no such node, or under the paper's semantics.
+        """
+        require_ltlf(self.semantics, "a witness")
+        if isinstance(node, str):
+            node = self.node(node).id
+        if node is not None and not 0 <= node < len(self.series):
+            raise UsageError(f"no node has the id {node}; {self.name!r} has {len(self.series)}, from 0")
+        return find_witness(self._evidence, self._leaves, self.times_ns, node or 0)
 
     def __repr__(self) -> str:
         instance = f" for {self.object}" if self.object is not None else ""
@@ -210,6 +253,25 @@ class Evaluation:
             raise UsageError(f"{len(found)} nodes are named {name!r}; say of which object: object=…")
         return found[0]
 
+    def witness(self, node: str | None = None, object: str | None = None) -> Witness:
+        """What decides the verdict: of a named node or, by default, of the worst result.
+
+        Args:
+            object: whose instance of a template it is about.
+
+        Raises:
+            UsageError: no such node or object, nothing was evaluated, or under the paper's semantics.
+        """
+        results = [result for result in self.results if object in (None, result.object)]
+        if node is not None:
+            self.node(node, object)
+            results = [result for result in results if node in {each.name for each in result.nodes}]
+        if not results:
+            for_object = "" if object is None else f" for {object!r}"
+            raise UsageError(f"there is no result{for_object} to explain")
+        worst = worst_verdict(result.verdict for result in results)
+        return next(result for result in results if result.verdict is worst).witness(node)
+
     def __repr__(self) -> str:
         return f"<Evaluation: {self.verdict}; {', '.join(map(repr, self.results))}>"
 
@@ -259,7 +321,10 @@ def evaluate(
         partial(instance_evaluation, semantics=semantics),
     )
     stretches = stream.extend(trace)
-    results = tuple(map(_result, stream.streams, stretches))
+    results = tuple(
+        _result(own, stretch, semantics, Evidence(own.instance, specification.regions, lambda: [trace]))
+        for own, stretch in zip(stream.streams, stretches, strict=True)
+    )
     return Evaluation(results, semantics, specification, trace.names, tuple(trace.signals))
 
 
@@ -279,7 +344,9 @@ def _require_trace(value: object) -> None:
         raise UsageError(f"trace is {shortened(value)}; {remedy}")
 
 
-def _result(stream: InstanceEvaluation, stretch: Stretch) -> SpecResult:
+def _result(
+    stream: InstanceEvaluation, stretch: Stretch, semantics: Semantics, evidence: Evidence
+) -> SpecResult:
     return SpecResult(
         stream.instance.name,
         stream.instance.object,
@@ -287,6 +354,9 @@ def _result(stream: InstanceEvaluation, stretch: Stretch) -> SpecResult:
         read_only_integers(stretch.times_ns),
         read_only_floats(stretch.series),
         read_only_floats(stream.final),
+        semantics,
+        read_only_floats(stretch.leaves),
+        evidence,
     )
 
 

@@ -11,11 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.channels import low_and_high
 from spatial_replay.monitor.finished_kernel import run_finished, run_windows
 from spatial_replay.monitor.finished_table import FinishedTable
 from spatial_replay.spec.formula import Atom, Formula, Quantified, iter_nodes
+from spatial_replay.trace.times import LATEST_NS
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +79,23 @@ def window_signal(
     result = np.empty((len(leaves), len(rows), len(times_ns)))
     run_windows(table, rows, leaves, times_ns, starts, columns, np.empty(len(times_ns)), result)
     return _determined(result)
+
+
+def checked_width(width_ns: int) -> int:
+    """
+    Raises:
+        UsageError: a width of a window that is no positive number of ns.
+    """
+    if isinstance(width_ns, bool) or not isinstance(width_ns, int) or not 0 < width_ns <= LATEST_NS:
+        raise UsageError(f"a window of {width_ns!r} ns; give its width as an integer of at least 1 ns")
+    return width_ns
+
+
+def new_leaves(formula: Formula, order: Sequence[Atom | Quantified]) -> list[Atom | Quantified]:
+    """The leaves of a formula that are not among others."""
+    table = FinishedTable(order)
+    table.add(formula)
+    return table.leaves[len(order) :]
 
 
 def _compiled(formula: Formula, order: Sequence[Atom | Quantified]) -> tuple[Integers, Integers]:

@@ -92,7 +92,7 @@ class LeafCode:
         self.signals: dict[str, int] = {}
         self.members: dict[Membership, int] = {}
 
-    def add_leaves(self, leaves: Sequence[Atom | Quantified], bindings: Bindings) -> list[int]:
+    def add_leaves(self, leaves: Sequence[Formula], bindings: Bindings) -> list[int]:
         """The number of the instruction that gives each leaf of a formula, as an interval.
 
         Raises:

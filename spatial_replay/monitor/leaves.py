@@ -11,10 +11,10 @@ from spatial_replay.monitor.leaf_code import LeafCode, Membership
 from spatial_replay.monitor.leaf_kernel import run_instructions
 from spatial_replay.monitor.measurements import measured
 from spatial_replay.monitor.operands import Bindings, Scene
-from spatial_replay.spec.formula import Atom, Quantified
+from spatial_replay.spec.formula import Formula
 
 
-def leaf_values(scene: Scene, leaves: Sequence[Atom | Quantified], bindings: Bindings) -> Floats:
+def leaf_values(scene: Scene, leaves: Sequence[Formula], bindings: Bindings) -> Floats:
     """Each leaf in each sample of a scene.
 
     Returns:

@@ -1,0 +1,256 @@
+"""Within a leaf at one sample: which atom decides it, by which measurements of which objects."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations, product
+from typing import Any
+
+import numpy as np
+
+from spatial_replay.geometry.contact import Contact, contact, enlarged, protrusion_contact
+from spatial_replay.geometry.footprint import Footprint
+from spatial_replay.monitor.channels import low_and_high
+from spatial_replay.monitor.leaves import leaf_values
+from spatial_replay.monitor.measurements import measured, quantity_of, terms_of
+from spatial_replay.monitor.operands import Scene
+from spatial_replay.monitor.witness.extremum import End, Extremum, Interval, Operand, chosen, extremum_of
+from spatial_replay.monitor.witness.unknowns import unknowns_of
+from spatial_replay.spec.format import format_term
+from spatial_replay.spec.formula import (
+    Atom,
+    Boolean,
+    CentroidProjection,
+    Earlier,
+    Enlarged,
+    Expression,
+    Formula,
+    Group,
+    Maximum,
+    Measurement,
+    Minimum,
+    Misalignment,
+    Negative,
+    Number,
+    Projection,
+    Protrusion,
+    Quantified,
+    Signal,
+    SignedDistance,
+    Sum,
+    Term,
+    TrackedName,
+)
+from spatial_replay.spec.terms import base_of, substitute
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A number that decides an atom.
+
+    Attributes:
+        quantity: "signed_distance", "protrusion", "max_x", …, "misalignment", "signal".
+        names: the objects or regions that it is of, each with its delay and enlargement; or the signal.
+        value: the number.
+        spread: how far it may be off, for the uncertainty of the objects.
+        contact: for distances, where they are attained; None for others.
+    """
+
+    quantity: str
+    names: tuple[str, ...]
+    value: float
+    spread: float = 0.0
+    contact: Contact | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class DecidingAtom:
+    """An atom in one sample.
+
+    Attributes:
+        atom: with the objects that its variables stand for.
+        end: which end of its interval decides.
+        value: its robustness with every uncertainty at 0; NaN where it is unknown.
+        lower, upper: the ends of its interval.
+        branch: what its number is the sum of there: numbers, signals and measurements, each with its sign;
+            empty where it is unknown.
+        measured: the signals and measurements among them.
+        unknown: why it is unknown, in words.
+    """
+
+    atom: Atom
+    end: End
+    value: float
+    lower: float
+    upper: float
+    branch: tuple[tuple[int, Expression], ...]
+    measured: tuple[Measured, ...]
+    unknown: tuple[str, ...]
+
+
+def deciding_atom(scene: Scene, leaf: Formula, end: End) -> DecidingAtom | None:
+    """The atom that decides a leaf in the one sample of a scene; None where nobody is in its group."""
+    while not isinstance(leaf, Atom):
+        below = _below(scene, leaf, end)
+        if below is None:
+            return None
+        leaf, end = below
+    (nominal,), ((lower, upper),) = (_intervals(scene, [leaf], wide=wide) for wide in (False, True))
+    value = nominal[0] if nominal[0] == nominal[1] else float("nan")
+    unknown = unknowns_of(scene, leaf)
+    branch = () if unknown else tuple(_branch(scene, leaf.expression, end, 1))
+    found = tuple(_measured(scene, part) for _, part in branch if not isinstance(part, Number))
+    return DecidingAtom(leaf, end, value, lower, upper, branch, found, unknown)
+
+
+def _intervals(scene: Scene, formulas: Sequence[Formula], *, wide: bool = True) -> list[Interval]:
+    """The interval of each formula in the one sample of a scene."""
+    values = leaf_values(scene, formulas, {})[:, :, 0]
+    low, high = low_and_high(len(values), wide=wide)
+    return [(float(a), float(b)) for a, b in zip(values[low], values[high], strict=True)]
+
+
+def _below(scene: Scene, leaf: Formula, end: End) -> tuple[Formula, End] | None:
+    """The operand or the binding that decides a leaf, and which of its ends."""
+    match leaf:
+        case Boolean():
+            formulas = list(leaf.operands)
+            extremum = extremum_of(leaf.operator, range(len(formulas)))
+        case Quantified():
+            formulas = list(_bodies(scene, leaf))
+            extremum = Extremum(leaf.quantifier == "forall", tuple(map(Operand, range(len(formulas)))))
+        case _:
+            return None
+    if not formulas:
+        return None
+    intervals = _intervals(scene, formulas)
+    first, *_ = chosen(extremum, end, intervals.__getitem__)
+    return formulas[first.index], end.turned if first.negated else end
+
+
+def _bodies(scene: Scene, formula: Quantified) -> Iterator[Formula]:
+    """The body for each way of binding the variables to members of the group."""
+    names, members, _ = scene.members(formula.group)
+    present = [name for name, is_member in zip(names, members[0].tolist(), strict=True) if is_member]
+    for bound in permutations(present, len(formula.variables)):
+        yield substitute(formula.body, dict(zip(formula.variables, map(TrackedName, bound), strict=True)))
+
+
+# ------------------------------------------------------------------------------------------ expressions
+
+
+def _branch(scene: Scene, expression: Expression, end: End, sign: int) -> Iterator[tuple[int, Expression]]:
+    """What an expression is the sum of, once its minima and maxima have taken an operand."""
+    match expression:
+        case Sum():
+            yield from _branch(scene, expression.first, end, sign)
+            yield from _branch(scene, expression.second, end, sign)
+        case Negative():
+            yield from _branch(scene, expression.operand, end.turned, -sign)
+        case Minimum() | Maximum():
+            operands = expression.operands
+            intervals = _intervals(scene, [_as_atom(each) for each in operands])
+            extremum = Extremum(isinstance(expression, Minimum), tuple(map(Operand, range(len(operands)))))
+            first, *_ = chosen(extremum, end, intervals.__getitem__)
+            yield from _branch(scene, operands[first.index], end, sign)
+        case _:
+            yield sign, expression
+
+
+def _as_atom(expression: Expression) -> Atom:
+    return Atom("", "", expression)
+
+
+# ----------------------------------------------------------------------------------------- measurements
+
+
+def _measured(scene: Scene, part: Expression) -> Measured:
+    """A signal, or a measurement of single objects: of groups, the members that it is attained by."""
+    match part:
+        case Signal():
+            return Measured("signal", (part.name,), float(scene.trace.signals[part.name][scene.skip]))
+        case Misalignment():
+            single: Measurement = part
+        case SignedDistance():
+            single = _least(scene, _pairs(scene, part))
+        case Protrusion():
+            inners = [
+                _least(scene, (Protrusion(inner, outer) for outer in _singles(scene, part.outer)))
+                for inner in _singles(scene, part.inner)
+            ]
+            single = _greatest(scene, inners)
+        case Projection() | CentroidProjection():
+            projections = [replace(part, term=term) for term in _singles(scene, part.term)]
+            single = (_least if part.side == "min" else _greatest)(scene, projections)
+        case _:
+            raise TypeError(f"{part!r} is no measurement")
+    (value,), (spread,) = (column[:, 0].tolist() for column in measured(scene, [single]))
+    names = tuple(map(format_term, terms_of(single)))
+    quantity = "misalignment" if isinstance(single, Misalignment) else quantity_of(single)
+    return Measured(quantity, names, value, spread, _contact(scene, single))
+
+
+def _pairs(scene: Scene, part: SignedDistance) -> Iterator[SignedDistance]:
+    for first, second in product(_singles(scene, part.first), _singles(scene, part.second)):
+        yield SignedDistance(first, second)
+
+
+def _least(scene: Scene, candidates: Iterable[Any]) -> Any:
+    listed = list(candidates)
+    return listed[int(np.argmin(measured(scene, listed)[0][:, 0]))]
+
+
+def _greatest(scene: Scene, candidates: Iterable[Any]) -> Any:
+    listed = list(candidates)
+    return listed[int(np.argmax(measured(scene, listed)[0][:, 0]))]
+
+
+def _singles(scene: Scene, term: Term) -> list[Term]:
+    """The objects or regions that a term stands for in the sample; the term itself for none."""
+    base = base_of(term)
+    if not isinstance(base, Group):
+        return [term]
+    if base.members is None:
+        group = _without_enlargement(term)
+        names, members, _ = scene.members(group)
+        present = [name for name, is_member in zip(names, members[0].tolist(), strict=True) if is_member]
+    else:
+        left_out = {each.name for each in base.excluded}
+        present = [name for name in base.members if name not in left_out]
+    return [_of_member(term, name) for name in present] or [term]
+
+
+def _without_enlargement(term: Term) -> Any:
+    while isinstance(term, Enlarged):
+        term = term.term
+    return term
+
+
+def _of_member(term: Term, name: str) -> Term:
+    match term:
+        case Enlarged():
+            return Enlarged(_of_member(term.term, name), term.radius)
+        case Earlier():
+            return replace(term, term=TrackedName(name))
+    return TrackedName(name)
+
+
+def _contact(scene: Scene, part: Measurement) -> Contact | None:
+    match part:
+        case SignedDistance():
+            first, second = _footprint(scene, part.first), _footprint(scene, part.second)
+            return contact(first, second) if first and second else None
+        case Protrusion():
+            inner, outer = _footprint(scene, part.inner), _footprint(scene, part.outer)
+            return protrusion_contact(inner, outer) if inner and outer else None
+    return None
+
+
+def _footprint(scene: Scene, term: Term) -> Footprint | None:
+    """Of a single object or region; None for a group with nobody in it."""
+    operand = scene.find(term).operand
+    rows = operand.rows[0]
+    if len(rows) != 1 or rows[0] < 0:
+        return None
+    return enlarged(scene.batch.footprint(int(rows[0])), operand.enlargement)

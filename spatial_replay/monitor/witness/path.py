@@ -1,0 +1,189 @@
+"""From a node down to the leaf that decides it, by the operands that minima and maxima take.
+
+Robustness is made of minima and maxima alone, so each number is that of one leaf at one sample, perhaps with
+its sign turned. The way to it follows one end of the interval (see `extremum.End`).
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.finished import Finished
+from spatial_replay.monitor.witness.extremum import End, Interval, Operand, chosen, extremum_of
+from spatial_replay.spec.formula import Boolean, Formula, Temporal, iter_nodes
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A node at a sample, on the way to what decides.
+
+    Attributes:
+        node: its id.
+        sample: index among the samples evaluated.
+    """
+
+    node: int
+    sample: int
+
+
+@dataclass(frozen=True, slots=True)
+class DecidingPath:
+    """The way down, from the node asked about to where it ends.
+
+    Attributes:
+        steps: at least one; the last is at a leaf, at `true` or `false`, or at an operator that looks at no
+            sample: a window without any, a next sample that is not there.
+        end: which end of the last node's interval decides.
+    """
+
+    steps: tuple[Step, ...]
+    end: End
+
+
+def deciding_path(formula: Formula, done: Finished, times_ns: Integers, node: int, end: End) -> DecidingPath:
+    """What decides a node at the first sample.
+
+    Of equal operands it takes that which leads to the earliest sample, then the first; of equal samples in a
+    window the earliest.
+
+    Args:
+        done: every node at every sample of `times_ns` (T,).
+    """
+    return _Walk(formula, done, times_ns).follow(node, 0, end)
+
+
+class _Walk:
+    """The tree of a formula with every node's numbers."""
+
+    def __init__(self, formula: Formula, done: Finished, times_ns: Integers) -> None:
+        self._done = done
+        self._times = times_ns
+        self._nodes: list[Formula] = []
+        self._operands: list[list[int]] = []
+        for identifier, parent, node in iter_nodes(formula):
+            self._nodes.append(node)
+            self._operands.append([])
+            if parent is not None:
+                self._operands[parent].append(identifier)
+
+    def follow(self, node: int, sample: int, end: End) -> DecidingPath:
+        """The path from a node at a sample."""
+        here = Step(node, sample)
+        match self._nodes[node]:
+            case Boolean() as boolean:
+                extremum = extremum_of(boolean.operator, self._operands[node])
+                paths = [
+                    self.follow(operand.index, sample, end.turned if operand.negated else end)
+                    for operand in chosen(extremum, end, lambda index: self._interval(index, sample))
+                ]
+                below = min(paths, key=lambda path: path.steps[-1].sample)
+            case Temporal() as temporal:
+                taken = self._taken(temporal, self._operands[node], sample, end)
+                if taken is None:
+                    return DecidingPath((here,), end)
+                below = self.follow(taken.node, taken.sample, end)
+            case _:
+                return DecidingPath((here,), end)
+        return DecidingPath((here, *below.steps), below.end)
+
+    def _interval(self, node: int, sample: int) -> Interval:
+        low, high = self._done.ends(node)
+        return float(low[sample]), float(high[sample])
+
+    def _ends(self, operand: Operand, samples: slice) -> tuple[Floats, Floats]:
+        low, high = (column[samples] for column in self._done.ends(operand.index))
+        return (-high, -low) if operand.negated else (low, high)
+
+    def _taken(self, formula: Temporal, operands: Sequence[int], sample: int, end: End) -> Step | None:
+        """The operand and the sample that an operator takes its number from; None where it looks at none."""
+        *_, right = operands
+        window = self._window(formula, sample)
+        if not len(window):
+            return None
+        match formula.operator:
+            case "G" | "H" | "WX":
+                return self._extreme(Operand(right), window, end, is_minimum=True)
+            case "F" | "O" | "X" | "Y":
+                return self._extreme(Operand(right), window, end, is_minimum=False)
+            case "R":
+                left, right = operands
+                return self._until(Operand(left, True), Operand(right, True), sample, window, end.turned)
+            case "W":
+                return self._weak_until(operands, sample, window, end)
+        left, right = operands
+        is_ahead = formula.operator == "U"
+        return self._until(Operand(left), Operand(right), sample, window, end, is_ahead=is_ahead)
+
+    def _window(self, formula: Temporal, sample: int) -> range:
+        """The samples that an operator looks at."""
+        last = len(self._times) - 1
+        is_ahead = formula.operator in ("X", "WX", "F", "G", "U", "R", "W")
+        if formula.operator in ("X", "WX", "Y"):
+            at = sample + 1 if is_ahead else sample - 1
+            return range(at, at + 1) if 0 <= at <= last else range(0)
+        if formula.bound is None:
+            return range(sample, last + 1) if is_ahead else range(sample + 1)
+        low, high = formula.bound.lower, formula.bound.upper
+        if formula.bound.unit == "samples":
+            far = last if high is None else high
+            if is_ahead:
+                return range(sample + low, min(sample + far, last) + 1)
+            return range(max(sample - far, 0), sample - low + 1)
+        # integers of any size: a time and a duration may add up to more than 64 bits
+        now = int(self._times[sample])
+        if is_ahead:
+            end = last + 1 if high is None else bisect_right(self._times, now + high)
+            return range(bisect_left(self._times, now + low), end)
+        return range(
+            0 if high is None else bisect_left(self._times, now - high), bisect_right(self._times, now - low)
+        )
+
+    def _extreme(self, operand: Operand, window: range, end: End, *, is_minimum: bool) -> Step:
+        low, high = self._ends(operand, slice(window.start, window.stop))
+        if is_minimum:
+            return Step(operand.index, window[int(np.argmin(end.of_minimum(low, high)))])
+        return Step(operand.index, window[int(np.argmax(end.of_maximum(low, high)))])
+
+    def _until(
+        self, left: Operand, right: Operand, sample: int, window: range, end: End, *, is_ahead: bool = True
+    ) -> Step:
+        """Until or, looking back, since."""
+        span = slice(sample, window.stop) if is_ahead else slice(window.start, sample + 1)
+        lefts, rights = self._ends(left, span), self._ends(right, slice(window.start, window.stop))
+        kept = [_least_between(each, is_ahead=is_ahead) for each in lefts]
+        inside = slice(window.start - span.start, window.stop - span.start)
+        low, high = (np.minimum(each, then[inside]) for each, then in zip(rights, kept, strict=True))
+        at = window[int(np.argmax(end.of_maximum(low, high)))]
+        right_key = float(end.of_minimum(*rights)[at - window.start])
+        between = range(sample, at) if is_ahead else range(at + 1, sample + 1)
+        left_key = end.of_minimum(*lefts)[between.start - span.start : between.stop - span.start]
+        first = [Step(left.index, between[int(np.argmin(left_key))])] if len(between) else []
+        least = float(left_key.min()) if len(between) else np.inf
+        if right_key == least:
+            return min([*first, Step(right.index, at)], key=lambda step: step.sample)
+        return first[0] if least < right_key else Step(right.index, at)
+
+    def _weak_until(self, operands: Sequence[int], sample: int, window: range, end: End) -> Step:
+        """`phi U psi` or `G phi`, whichever is the greater."""
+        left, right = map(Operand, operands)
+        inside = slice(window.start, window.stop)
+        lefts, rights = self._ends(left, slice(sample, window.stop)), self._ends(right, inside)
+        kept = [_least_between(each, is_ahead=True)[window.start - sample :] for each in lefts]
+        until = [float(np.max(np.minimum(*pair))) for pair in zip(rights, kept, strict=True)]
+        always = [float(np.min(each)) for each in self._ends(left, inside)]
+        keys = [float(end.of_maximum(np.array(low), np.array(high))) for low, high in (until, always)]
+        if keys[0] >= keys[1]:
+            return self._until(left, right, sample, window, end)
+        return self._extreme(left, window, end, is_minimum=True)
+
+
+def _least_between(column: Floats, *, is_ahead: bool) -> Floats:
+    """The least of a column from its near end up to, not including, each place; +inf at the near end."""
+    ordered = column if is_ahead else column[::-1]
+    least = np.minimum.accumulate(np.concatenate([[np.inf], ordered[:-1]]))
+    return least if is_ahead else least[::-1]

@@ -1,0 +1,183 @@
+"""Which change of one number flips a verdict."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.channels import in_channels
+from spatial_replay.monitor.finished import finished, new_leaves
+from spatial_replay.monitor.verdict import Verdict, final_verdict
+from spatial_replay.monitor.witness.atom import DecidingAtom
+from spatial_replay.monitor.witness.dial import Dial, rewritten
+from spatial_replay.monitor.witness.evidence import Evidence
+from spatial_replay.monitor.witness.extremum import End
+from spatial_replay.spec.formula import Atom, Formula, Quantified
+from spatial_replay.spec.terms import iter_formulas
+
+_DOUBLINGS = 40
+_ROUNDS, _PARTS = 4, 16
+"""How a number is searched for that does not move all samples alike: in rounds, each of which reads the log
+once and tells apart so many places between a number that does not flip the verdict and one that does."""
+
+
+@dataclass(frozen=True, slots=True)
+class Threshold:
+    """The number that decides an atom, and where it would flip the verdict.
+
+    Attributes:
+        value: the number as written in the specification. Where none is (`a leftof b`), 0: the margin by
+            which the relation has to hold.
+        flips_at: with this number instead the verdict is another. Nearer ones leave it as it is (but for
+            rounding; of a relation under an open quantifier, or between two limits, to within 0.01 %).
+        is_written: whether the number is in the text.
+        verdict: what the verdict is then.
+    """
+
+    value: float
+    flips_at: float
+    is_written: bool
+    verdict: Verdict
+
+
+def threshold_of(
+    evidence: Evidence,
+    leaves: Floats,
+    times_ns: Integers,
+    node: int,
+    verdict: Verdict,
+    deciding: DecidingAtom,
+) -> Threshold | None:
+    """How far the deciding atom's number has to move to flip a verdict; None where no number of it does.
+
+    All atoms that were written in the same place move together: those that a quantifier over a named group,
+    or a macro, made of one text.
+
+    Args:
+        leaves: (C, A, T), the instance's leaves in each sample.
+        node: whose verdict.
+    """
+    if deciding.end is End.OPEN or not math.isfinite(deciding.lower) or not math.isfinite(deciding.upper):
+        return None
+    search = _Search(evidence, leaves, times_ns, node, verdict, deciding)
+    flips_at = search.number()
+    if flips_at is None:
+        return None
+    dial = search.dial
+    return Threshold(dial.value, flips_at, dial.kind != "margin", search.verdicts([flips_at])[0])
+
+
+class _Search:
+    def __init__(
+        self,
+        evidence: Evidence,
+        leaves: Floats,
+        times_ns: Integers,
+        node: int,
+        verdict: Verdict,
+        deciding: DecidingAtom,
+    ) -> None:
+        self._evidence = evidence
+        self._formula, self._order = evidence.instance.formula, evidence.instance.program.leaves
+        self._leaves, self._times, self._node = leaves, times_ns, node
+        self._verdict, self._deciding = verdict, deciding
+        self.dial = Dial.of(deciding)
+        self._moving = {
+            index: leaf
+            for index, leaf in enumerate(self._order)
+            if isinstance(leaf, Atom) and self._is_meant(leaf)
+        }
+        in_groups = (
+            each for leaf in self._order if isinstance(leaf, Quantified) for each in iter_formulas(leaf)
+        )
+        self._is_uniform = self.dial.is_uniform and not any(
+            isinstance(each, Atom) and self._is_meant(each) for each in in_groups
+        )
+        self._direction = self.dial.slope * (1 if deciding.end is End.HIGH else -1)
+
+    def number(self) -> float | None:
+        """The nearest number that flips the verdict."""
+        if self._direction == 0:
+            return None
+        nearest = abs(self._deciding.lower if self._deciding.end is End.LOW else self._deciding.upper)
+        if self._flips([nearest])[0]:
+            return self._moved(nearest)
+        size = self._size_by_samples(nearest) if self._is_uniform else self._size_by_rounds(nearest)
+        return None if size is None else self._moved(size)
+
+    def verdicts(self, numbers: Sequence[float]) -> list[Verdict]:
+        """The verdict with each number in place of the dial's."""
+        formulas = [self._turned(number) for number in numbers]
+        added = [new_leaves(formula, self._order) for formula in formulas]
+        if self._is_uniform:
+            columns = [self._shifted(leaves, number) for leaves, number in zip(added, numbers, strict=True)]
+        else:
+            every = self._evidence.columns([leaf for leaves in added for leaf in leaves])
+            ends = np.cumsum([0, *map(len, added)]).tolist()
+            columns = [every[:, begin:end] for begin, end in pairwise(ends)]
+        return [self._evaluated(*each) for each in zip(formulas, added, columns, strict=True)]
+
+    def _flips(self, sizes: Sequence[float]) -> list[bool]:
+        numbers = [self._moved(size) for size in sizes]
+        possible = [number for number in numbers if self._is_possible(number)]
+        verdicts = dict(zip(possible, self.verdicts(possible), strict=True)) if possible else {}
+        return [verdicts.get(number, self._verdict) is not self._verdict for number in numbers]
+
+    def _is_possible(self, number: float) -> bool:
+        return math.isfinite(number) and (self.dial.kind != "radius" or number >= 0.0)
+
+    def _moved(self, size: float) -> float:
+        """The number so far off, and a little further: rounding must not bring it back."""
+        value = self.dial.value
+        beyond = 0.0 if self.dial.is_exact else 8.0 * float(np.spacing(abs(value) + size))
+        return value + self._direction * (size + beyond)
+
+    def _size_by_samples(self, nearest: float) -> float | None:
+        """Where the dial moves the atom alike in every sample, one of them decides when the verdict flips."""
+        sizes = np.unique(np.abs(self._leaves[:, list(self._moving)]))
+        listed = sizes[np.isfinite(sizes) & (sizes > nearest)].tolist()
+        at = bisect_left(listed, True, key=lambda size: self._flips([size])[0])
+        return listed[at] if at < len(listed) else None
+
+    def _size_by_rounds(self, nearest: float) -> float | None:
+        unit = max(nearest, 1e-6 * (abs(self.dial.value) + 1.0))
+        sizes = [nearest, *(unit * 2.0**k for k in range(1, _DOUBLINGS))]
+        for _ in range(_ROUNDS):
+            flips = self._flips(sizes)
+            if not any(flips):
+                return None
+            first = max(flips.index(True), 1)
+            sizes = np.linspace(sizes[first - 1], sizes[first], _PARTS + 1).tolist()
+        return sizes[-1]
+
+    def _is_meant(self, atom: Atom) -> bool:
+        """Whether an atom was written where the deciding one was."""
+        meant = self._deciding.atom
+        if meant.span.start == meant.span.end:
+            return atom.expression == meant.expression
+        return (atom.span, atom.relation, atom.parameters) == (meant.span, meant.relation, meant.parameters)
+
+    def _turned(self, number: float) -> Formula:
+        return rewritten(self._formula, self._is_meant, lambda atom: self._turned_atom(atom, number))
+
+    def _turned_atom(self, atom: Atom, number: float) -> Atom:
+        return replace(atom, expression=self.dial.turned(atom.expression, number))
+
+    def _shifted(self, added: Sequence[Formula], number: float) -> Floats:
+        """Columns of turned atoms, from those of the atoms as they were."""
+        shift = self.dial.slope * (number - self.dial.value)
+        indices = {self._turned_atom(atom, number).expression: index for index, atom in self._moving.items()}
+        return self._leaves[:, [indices[leaf.expression] for leaf in added if isinstance(leaf, Atom)]] + shift
+
+    def _evaluated(self, formula: Formula, added: Sequence[Atom | Quantified], columns: Floats) -> Verdict:
+        channels = max(len(columns), len(self._leaves))
+        leaves = np.concatenate([in_channels(self._leaves, channels), in_channels(columns, channels)], axis=1)
+        done = finished(formula, (*self._order, *added), leaves, self._times)
+        low, high = done.ends(self._node)
+        return final_verdict(float(low[0]), float(high[0]))

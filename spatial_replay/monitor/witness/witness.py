@@ -1,0 +1,97 @@
+"""Why a formula has its verdict: the one atom at one sample that decides it, and how to flip it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.finished import finished
+from spatial_replay.monitor.verdict import Verdict, final_verdict
+from spatial_replay.monitor.witness.atom import DecidingAtom, deciding_atom
+from spatial_replay.monitor.witness.evidence import Evidence
+from spatial_replay.monitor.witness.extremum import End
+from spatial_replay.monitor.witness.path import deciding_path
+from spatial_replay.monitor.witness.threshold import Threshold, threshold_of
+from spatial_replay.spec.formula import Atom, Formula, Quantified, iter_nodes
+
+
+@dataclass(frozen=True, slots=True)
+class WitnessStep:
+    """A node on the way to what decides, at the sample where it counts.
+
+    Attributes:
+        node: its id.
+        time_ns: of the sample.
+    """
+
+    node: int
+    formula: Formula
+    time_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Witness:
+    """What decides a node's verdict over a finished log.
+
+    Robustness is made of minima and maxima, so that one atom at one sample gives it its number: of a violated
+    formula the upper end, of a satisfied one the lower, of an unknown one the ends that leave it open.
+
+    Attributes:
+        name: of the spec.
+        object: what a template's parameter stands for, or None.
+        verdict, lower, upper: of the node.
+        path: from the node to what decides, at least one step.
+        deciding: the atom; None where the path ends at `true` or `false`, at a window or a next sample
+            that the log does not have, or at a quantifier over an empty group.
+        threshold: which change of the atom's number flips the verdict; None where none does.
+    """
+
+    name: str
+    object: str | None
+    verdict: Verdict
+    lower: float
+    upper: float
+    path: tuple[WitnessStep, ...]
+    deciding: DecidingAtom | None
+    threshold: Threshold | None
+
+    @property
+    def node(self) -> int:
+        """The id of the node that it is about."""
+        return self.path[0].node
+
+    @property
+    def time_ns(self) -> int:
+        """The time of the sample that decides."""
+        return self.path[-1].time_ns
+
+
+def find_witness(evidence: Evidence, leaves: Floats, times_ns: Integers, node: int = 0) -> Witness:
+    """The witness of a node.
+
+    Ties go to the earliest sample, then to the first operand.
+
+    Args:
+        evidence: the samples that the instance was evaluated over.
+        leaves: (C, A, T), the instance's leaves in them.
+        times_ns: (T,), T at least 1.
+        node: its id.
+    """
+    instance = evidence.instance
+    done = finished(instance.formula, instance.program.leaves, leaves, times_ns)
+    lower, upper = (float(end[0]) + 0.0 for end in done.ends(node))
+    verdict = final_verdict(lower, upper)
+    end = {Verdict.SATISFIED: End.LOW, Verdict.VIOLATED: End.HIGH}.get(verdict, End.OPEN)
+    found = deciding_path(instance.formula, done, times_ns, node, end)
+    nodes = [formula for _, _, formula in iter_nodes(instance.formula)]
+    path = tuple(
+        WitnessStep(step.node, evidence.bound(nodes[step.node]), int(times_ns[step.sample]))
+        for step in found.steps
+    )
+    deciding = threshold = None
+    last = path[-1]
+    if isinstance(last.formula, Atom | Quantified):
+        deciding = deciding_atom(evidence.scene(last.time_ns), last.formula, found.end)
+    if deciding is not None:
+        threshold = threshold_of(evidence, leaves, times_ns, node, verdict, deciding)
+    return Witness(instance.name, instance.object, verdict, lower, upper, path, deciding, threshold)
