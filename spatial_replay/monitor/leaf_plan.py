@@ -2,7 +2,7 @@
 
 To a monitor most samples look alike: other numbers, the same names. A plan holds what follows from the names,
 as index arrays, so that a sample costs little more than its numbers. It serves every sample whose members of
-open groups are among its own; an object that is not in a sample is only a flag to it.
+open groups are among its own, under whatever names; an object that is not in a sample is only a flag to it.
 """
 
 from __future__ import annotations
@@ -146,7 +146,6 @@ class LeafPlan:
         Raises:
             UsageError: more bindings than `MAX_BINDINGS`.
         """
-        self.members = members
         self._classes = frame.classes
         rows = _Rows(frame, members)
         code = LeafCode(rows)
@@ -155,11 +154,12 @@ class LeafPlan:
         self._places = tuple(rows.places)
         self._signals = tuple(code.signals)
 
-    def leaf_values(self, samples: Sequence[Sample | None]) -> Floats:
+    def leaf_values(self, samples: Sequence[Sample | None], stands_for: Mapping[str, str]) -> Floats:
         """Each leaf of each formula, one after the other.
 
         Args:
             samples: the one at each of the frame's delays; None before the first.
+            stands_for: the objects that go by another name among the plan's members.
 
         Returns:
             (C, A, 1), in as many channels as `leaves.leaf_values` would give.
@@ -173,7 +173,7 @@ class LeafPlan:
         vertices: list[Floats] = [_NO_VERTICES]
         for number, name in self._places:
             sample = samples[number]
-            tracked = None if sample is None else sample.objects.get(name)
+            tracked = None if sample is None else sample.objects.get(stands_for.get(name, name))
             if tracked is None:
                 classes.append(ABSENT)
                 counts.append(0)

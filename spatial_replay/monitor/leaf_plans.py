@@ -1,22 +1,47 @@
-"""Which plan serves a sample: one for all where no group is open, else by who is in the open groups."""
+"""Which plan serves a sample: one for all where no group is open, else by how many are in the open groups.
+
+To a specification, objects that it does not name are all alike but for their classes. So a plan has stand-ins
+for them, and in each sample it is said whom they stand for: tracks that come and go under ever new names need
+no plan of their own.
+"""
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from itertools import chain
-from typing import cast
+from itertools import chain, zip_longest
+from typing import TypeAlias, cast
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.monitor.leaf_plan import Frame, LeafPlan, Leaves, Member, class_code
 from spatial_replay.monitor.recent import NO_DELAY, RecentSamples, iter_delays
-from spatial_replay.spec.formula import ANY_CLASS, Atom, Formula, Group, Outline, Quantified, RegionName, Term
+from spatial_replay.spec.formula import (
+    ANY_CLASS,
+    Atom,
+    Formula,
+    Group,
+    Outline,
+    Quantified,
+    RegionName,
+    Term,
+    TrackedName,
+)
 from spatial_replay.spec.terms import base_of, iter_formulas, terms_of
 from spatial_replay.trace.sample import Sample
 
 MOST_PLANS = 256
+"""How many plans are kept; the one used longest ago goes first."""
+
+_NOBODY = ""
+"""A name that no object has."""
+
+_Classes: TypeAlias = tuple[int, ...]
+"""Codes of the classes that one object has in the samples looked at: nearly always one."""
+
+_Counts: TypeAlias = tuple[tuple[_Classes, int], ...]
+"""How many stand-ins there are for the unnamed objects of each kind."""
 
 
 class SampleLeaves:
@@ -25,22 +50,24 @@ class SampleLeaves:
     def __init__(self, leaves: Sequence[Leaves], regions: Mapping[str, Outline]) -> None:
         formulas = list(chain.from_iterable(leaves))
         bases = [base_of(term) for term in _terms(formulas)]
-        wanted = {(base.class_name or "") for base in bases if isinstance(base, Group) and base.is_open}
-        named = {base.name for base in bases if isinstance(base, RegionName)}
-        self._is_any_wanted = ANY_CLASS in wanted
-        classes = sorted({name.casefold() for name in wanted if name != ANY_CLASS})
+        open_classes = {base.class_name or "" for base in bases if isinstance(base, Group) and base.is_open}
+        regions_named = {base.name for base in bases if isinstance(base, RegionName)}
+        classes = sorted({name.casefold() for name in open_classes if name != ANY_CLASS})
         self._frame = Frame(
             leaves,
             tuple(dict.fromkeys((NO_DELAY, *iter_delays(formulas)))),
             {name: code for code, name in enumerate(classes, start=1)},
-            {name: outline for name, outline in regions.items() if name in named},
+            {name: outline for name, outline in regions.items() if name in regions_named},
         )
         self._recent = RecentSamples(self._frame.delays)
-        self._plans: OrderedDict[frozenset[Member], LeafPlan] = OrderedDict()
-        self._plan: LeafPlan | None = None
-        if not wanted:
-            self._plan = LeafPlan(self._frame, frozenset())
-        self._has_open_groups = bool(wanted)
+        self._takes_any = ANY_CLASS in open_classes
+        self._own_names = _names(bases)
+        self._prefix = "?"
+        while any(name.startswith(self._prefix) for name in self._own_names):
+            self._prefix += "?"
+        self._own_members: frozenset[Member] = frozenset()  # grows, but no further than the specification
+        self._only_plan = None if open_classes else LeafPlan(self._frame, frozenset())
+        self._plans: OrderedDict[tuple[frozenset[Member], _Counts], LeafPlan] = OrderedDict()
 
     def look_at(self, sample: Sample) -> list[Sample | None]:
         """Take in the next sample; it and those that it looks back at."""
@@ -55,46 +82,69 @@ class SampleLeaves:
         Raises:
             UsageError: more bindings than `MAX_BINDINGS`.
         """
-        plan = self._plan
-        if plan is None or self._has_open_groups:
-            plan = self._plan = self._plan_for(self._members(samples))
-        return plan.leaf_values(samples)
-
-    def _members(self, samples: Sequence[Sample | None]) -> frozenset[Member]:
-        """Who is in any open group in any of the samples."""
-        classes = self._frame.classes
-        members = [
-            Member(name, class_code(cast(TrackedObject, tracked), classes))
-            for sample in samples
-            if sample is not None
-            for name, tracked in sample.objects.items()
-        ]
-        return frozenset(each for each in members if self._is_any_wanted or each.class_code)
-
-    def _plan_for(self, members: frozenset[Member]) -> LeafPlan:
-        """A plan that serves samples with these members, and has few others."""
-        plan = self._plan
-        if plan is not None and members <= plan.members and len(plan.members) <= _most(members):
-            return plan
-        if members in self._plans:
-            self._plans.move_to_end(members)
-            return self._plans[members]
-        together = members if plan is None else members | plan.members
-        if len(together) > _most(members):
-            together = members
+        if self._only_plan is not None:
+            return self._only_plan.leaf_values(samples, {})
+        unnamed = self._unnamed_members(samples)
+        counts = {classes: _room(len(names)) for classes, names in unnamed.items()}
         try:
-            plan = LeafPlan(self._frame, together)
+            plan = self._plan_for(counts)
         except UsageError:
-            plan = LeafPlan(self._frame, members)
-        self._plans[plan.members] = plan
+            counts = {classes: len(names) for classes, names in unnamed.items()}
+            plan = self._plan_for(counts)
+        stands_for: dict[str, str] = {}
+        for classes, names in unnamed.items():
+            stands_for.update(
+                zip_longest(self._stand_ins(classes, counts[classes]), names, fillvalue=_NOBODY)
+            )
+        return plan.leaf_values(samples, stands_for)
+
+    def _unnamed_members(self, samples: Sequence[Sample | None]) -> dict[_Classes, list[str]]:
+        """Who is in any open group in any of the samples and not named in the specification, by kind."""
+        found: dict[str, _Classes] = {}
+        own: list[Member] = []
+        for sample in samples:
+            for name, tracked in () if sample is None else sample.objects.items():
+                code = class_code(cast(TrackedObject, tracked), self._frame.classes)
+                if not (code or self._takes_any):
+                    continue
+                if name in self._own_names:
+                    own.append(Member(name, code))
+                elif code not in found.setdefault(name, (code,)):
+                    found[name] = tuple(sorted((*found[name], code)))
+        if not self._own_members.issuperset(own):
+            self._own_members |= frozenset(own)
+        kinds: dict[_Classes, list[str]] = {}
+        for name, classes in found.items():
+            kinds.setdefault(classes, []).append(name)
+        return kinds
+
+    def _stand_ins(self, classes: _Classes, count: int) -> list[str]:
+        """Names for so many unnamed objects: none that the specification names."""
+        return [f"{self._prefix}{classes} {number}" for number in range(count)]
+
+    def _plan_for(self, counts: Mapping[_Classes, int]) -> LeafPlan:
+        """The plan for so many unnamed members of each kind."""
+        key = self._own_members, tuple(sorted(counts.items()))
+        if key in self._plans:
+            self._plans.move_to_end(key)
+            return self._plans[key]
+        unnamed = {
+            Member(name, code)
+            for classes, count in counts.items()
+            for name in self._stand_ins(classes, count)
+            for code in classes
+        }
+        plan = LeafPlan(self._frame, self._own_members | unnamed)
+        self._plans[key] = plan
         if len(self._plans) > MOST_PLANS:
             self._plans.popitem(last=False)
         return plan
 
 
-def _most(members: frozenset[Member]) -> int:
-    """How many members a plan for these may have: some that come and go, not all that ever were."""
-    return len(members) + len(members) // 2 + 2
+def _room(count: int) -> int:
+    """For how many a plan for so many is made: 1, 2, 3, 4, 6, 8, 12, 16, …, so that there are few plans."""
+    power = 1 << (count - 1).bit_length()
+    return count if count < 4 else power * 3 // 4 if count <= power * 3 // 4 else power
 
 
 def _terms(formulas: Sequence[Formula]) -> list[Term]:
@@ -105,3 +155,15 @@ def _terms(formulas: Sequence[Formula]) -> list[Term]:
         elif isinstance(formula, Quantified):
             terms.append(formula.group)
     return terms
+
+
+def _names(bases: Sequence[Term]) -> frozenset[str]:
+    """The objects that terms name."""
+    names: set[str] = set()
+    for base in bases:
+        if isinstance(base, TrackedName):
+            names.add(base.name)
+        elif isinstance(base, Group):
+            names.update(base.members or ())
+            names.update(each.name for each in base.excluded if isinstance(each, TrackedName))
+    return frozenset(names)

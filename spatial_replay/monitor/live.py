@@ -15,7 +15,6 @@ from spatial_replay.monitor.run import Run
 from spatial_replay.spec.formula import Outline
 from spatial_replay.trace.sample import Sample
 
-
 _ROOM = 64
 """Recent samples that there is room for at first: few, so that they stay in the processor's cache."""
 

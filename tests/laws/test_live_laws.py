@@ -17,7 +17,7 @@ from spatial_replay.spec.specification import parse_specification
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
-PASSERS_BY = tuple(f"p{number}" for number in range(6))
+PASSERS_BY = (*(f"p{number}" for number in range(5)), "?", "?(0,) 0", "?(1,) 0")
 ANYONE = st.sets(st.sampled_from((*NAMES, *PASSERS_BY)), max_size=6)
 
 LOOKING_BACK = """\

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from math import inf
 
 import pytest
@@ -54,3 +55,25 @@ def test_what_a_monitor_refuses():
         monitor.update(at(3, p=1)).node("high")
     with pytest.raises(TraceError, match="give samples in the order of their times"):
         monitor.update(at(3, p=1))
+
+
+def test_nothing_is_kept_per_sample():
+    monitor = Monitor(
+        parse_specification(
+            "group everything = all\n"
+            "spec s = G (F[0, 20] a dist a[-5] >= 0) and F exists x in everything: x dist a[-300ms] <= 9"
+        )
+    )
+
+    def run(first, last):
+        for t in range(first, last):
+            place = Footprint.disc(t % 10, 0, 1)
+            monitor.update(Sample(t * SECOND // 10, {"a": place, f"b{t % 30}": place, f"new{t}": place}))
+
+    tracemalloc.start()
+    run(0, 500)
+    before, _ = tracemalloc.get_traced_memory()
+    run(500, 3000)
+    after, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert after - before < 50_000
