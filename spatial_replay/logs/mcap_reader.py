@@ -37,6 +37,7 @@ from spatial_replay.trace.trace import Trace
 BLOCK_BYTES = 64 * 2**20
 """A block of messages is closed when it holds this much, however few its samples are."""
 AFTER_ALL_NS = 2**64
+_SAMPLES = "spatial_replay.ObjectStates"
 _CHANNEL, _PAYLOAD = itemgetter(1), itemgetter(4)
 
 
@@ -102,7 +103,20 @@ class McapSource:
             return LogError(f"{self.name} holds no message" + (f": {fault}" if fault else ""))
         listed = ", ".join(map(repr, topics[:8])) + (", …" if len(topics) > 8 else "")
         what = f"no topic {OBJECTS!r} in {self.name}; it has {listed}"
-        return LogError(f"{what}: {fault}") if fault else UsageError(what)
+        if fault:
+            return LogError(f"{what}: {fault}")
+        return UsageError(f"{what}; a mapping file says which of them carry objects")
+
+
+def holds_samples(path: Path) -> bool:
+    """Whether a log has the topic of our samples."""
+    with path.open("rb") as stream:
+        faults = FaultList()
+        walk = ChunkWalk(stream, read_directory(stream, faults, path.name), faults, path.name)
+        return any(
+            channel.topic == OBJECTS and channel.schema is not None and channel.schema.name == _SAMPLES
+            for channel in walk.channels.values()
+        )
 
 
 class ChunkWalk:
@@ -259,10 +273,10 @@ class _BlockDecoder:
         if channel.topic != OBJECTS:
             return False
         schema = channel.schema.name if channel.schema else "none"
-        if (channel.encoding, schema) != ("protobuf", "spatial_replay.ObjectStates"):
+        if (channel.encoding, schema) != ("protobuf", _SAMPLES):
             raise LogError(
                 f"{self._source.name}: {OBJECTS!r} has messages of the schema {schema!r}, encoded as"
-                f" {channel.encoding!r}; spatial_replay.ObjectStates in protobuf belong there"
+                f" {channel.encoding!r}; {_SAMPLES} in protobuf belong there"
             )
         return True
 

@@ -18,7 +18,7 @@ from spatial_replay.logs.commonroad import is_scenario, iter_scenario
 from spatial_replay.logs.csv_tracks import COLUMNS, iter_csv
 from spatial_replay.logs.faults import FaultList
 from spatial_replay.logs.lines import open_text
-from spatial_replay.logs.mcap_reader import McapSource
+from spatial_replay.logs.mcap_reader import McapSource, holds_samples
 from spatial_replay.logs.mcap_records import MAGIC
 from spatial_replay.logs.options import Lost, OnTimeJump, ReadOptions
 from spatial_replay.logs.sdd import FRAMES_A_SECOND, is_annotations, iter_annotations
@@ -160,6 +160,9 @@ def open_source(
     _require_path(path)
     options = ReadOptions(concave, mapping, on_time_jump, rate, lost)
     path = Path(path)
+    if path.is_dir():
+        options.refuse_except(_MESSAGES, "ROS 2 bag", path.name)
+        return _open_messages(path, "ROS 2 bag", options)
     head = _head(path)
     for kind, format_ in FORMATS.items():
         if format_.recognise(head):
@@ -259,11 +262,35 @@ def _open_annotations(path: Path, kind: str, options: ReadOptions) -> Source:
     return TrackSource(path, kind, options.concave, reader, MappingProxyType(options.given()))
 
 
+def _open_messages(path: Path, kind: str, options: ReadOptions) -> Source:
+    """A log of messages that others recorded."""
+    if options.mapping is None:
+        raise UsageError(
+            f"{path.name} is a {kind}, which does not say what its objects are; give a mapping file that"
+            " does, with --mapping FILE or mapping=FILE"
+        )
+    # what reads the logs of others is loaded when there is one
+    from spatial_replay.logs.foreign.source import ForeignSource
+    from spatial_replay.logs.mapping.load import load_mapping
+
+    return ForeignSource(path, load_mapping(options.mapping), kind, options.concave, options.on_time_jump)
+
+
+def _open_mcap(path: Path, kind: str, options: ReadOptions) -> Source:
+    """A log of ours, which knows its objects, or one that others recorded, given a mapping."""
+    if not options.given():
+        return McapSource(path, kind, options.concave)
+    if holds_samples(path):
+        options.refuse_except(frozenset(), kind, path.name)
+    return _open_messages(path, kind, options)
+
+
+_MESSAGES = frozenset({"mapping", "on_time_jump"})
+
 FORMATS: dict[str, Format] = {
-    "MCAP": Format(
-        lambda head: head.startswith(MAGIC),
-        lambda path, kind, options: McapSource(path, kind, options.concave),
-    ),
+    "MCAP": Format(lambda head: head.startswith(MAGIC), _open_mcap, _MESSAGES),
+    "ROS 1 bag": Format(lambda head: head.startswith(b"#ROSBAG V2.0\n"), _open_messages, _MESSAGES),
+    "ROS 2 bag": Format(lambda head: head.startswith(b"SQLite format 3\x00"), _open_messages, _MESSAGES),
     "track JSONL": Format(_is_jsonl, _tracks(iter_jsonl)),
     "track CSV": Format(_is_csv, _tracks(iter_csv)),
     "drone annotations": Format(is_annotations, _open_annotations, frozenset({"rate", "lost"})),

@@ -216,3 +216,24 @@ def _check_field_names(name: str, fields: tuple[Field, ...]) -> None:
 
 def _used_by(above: tuple[str, ...]) -> str:
     return f"; it is used by {above[-1]!r}" if above else ""
+
+
+def msg_from_definitions(definitions: Definitions, type_name: str) -> str:
+    """A .msg text of a type and those that it uses, as `definitions_from_msg` reads it."""
+    others = [name for name in definitions if name != type_name]
+    texts = ["".join(f"{_written(field)} {field.name}\n" for field in definitions[type_name])]
+    for name in others:
+        head = f"{'=' * 80}\nMSG: {name.replace('/msg/', '/')}\n"
+        texts.append(head + "".join(f"{_written(field)} {field.name}\n" for field in definitions[name]))
+    return "".join(texts)
+
+
+def _written(field: Field) -> str:
+    name = field.type.replace("/msg/", "/") + (f"<={field.longest}" if field.longest else "")
+    match field.kind:
+        case "scalar":
+            return name
+        case "array":
+            return f"{name}[{field.size}]"
+        case "sequence":
+            return f"{name}[<={field.size}]" if field.size else f"{name}[]"

@@ -18,6 +18,7 @@ from spatial_replay.logs.foreign.definitions import (
     definitions_from_msg,
     full_type_name,
     iter_sections,
+    msg_from_definitions,
 )
 from spatial_replay.logs.foreign.messages import Decoder
 
@@ -201,3 +202,16 @@ def _description(field: Field) -> FieldDesc:
     if field.kind == "scalar":
         return item
     return (Nodetype.ARRAY if field.kind == "array" else Nodetype.SEQUENCE, (item, field.size))
+
+
+def standard_schema(type_name: str, encoding: RosEncoding, distribution: str | None = None) -> Schema:
+    """The definition of a standard type, for a copy of a log that has none.
+
+    Raises:
+        LogError: it is no standard type.
+    """
+    definitions = ros_definitions(type_name, encoding, None, distribution)[0]
+    text = msg_from_definitions(definitions, type_name).encode()
+    if encoding == "ros1":
+        return Schema(type_name.replace("/msg/", "/"), "ros1msg", text)
+    return Schema(type_name, "ros2msg", text)

@@ -1,0 +1,168 @@
+"""Logs of messages as sources of samples: read, mapped, and copied."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, islice
+from pathlib import Path
+
+from spatial_replay.errors import LogError
+from spatial_replay.geometry.footprint import Concave
+from spatial_replay.logs.block import Block
+from spatial_replay.logs.faults import FaultList
+from spatial_replay.logs.foreign.channels import CopiedMessages
+from spatial_replay.logs.foreign.messages import Message, MessageReader, Topic
+from spatial_replay.logs.foreign.opening import open_messages
+from spatial_replay.logs.mapping.assembler import Assembler
+from spatial_replay.logs.mapping.model import Mapping as TopicsMapping
+from spatial_replay.logs.mapping.plan import Plan
+from spatial_replay.logs.options import OnTimeJump
+from spatial_replay.logs.sink import Attachment
+from spatial_replay.trace.trace import Trace
+
+_FIRST_BATCH, _LARGEST_BATCH = 256, 8_192
+"""Messages handed over at once: few at first, for those who want the first sample only."""
+_BATCH_BYTES = 2**24
+_WAITING_BYTES = 2**26
+
+
+@dataclass(frozen=True)
+class ForeignSource:
+    """A log of messages that others recorded, with a mapping that says what in them are objects."""
+
+    path: Path
+    mapping: TopicsMapping
+    kind: str
+    concave: Concave = "decompose"
+    on_time_jump: OnTimeJump = "error"
+
+    @property
+    def name(self) -> str:
+        return self.path.name or self.path.absolute().name
+
+    @property
+    def options(self) -> Mapping[str, object]:
+        """How the log is read, for the metadata of a copy."""
+        mapping = {"mapping": self.mapping.name, "mapping_sha256": self.mapping.sha256}
+        return mapping | ({} if self.on_time_jump == "error" else {"on_time_jump": self.on_time_jump})
+
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        """See `Source.iter_blocks`; of an indexed log, only what the window needs is read.
+
+        Blocks hold the messages of mapped topics, raw, and the samples as messages of /spatial/objects.
+        """
+        reader = open_messages(self.path)
+        topics = reader.topics()
+        plan = Plan.of(self.mapping, topics)
+        read = _readable([topic for topic in topics if topic.name in plan.topics], self.name)
+        assembler = Assembler(
+            plan,
+            reader.decoder,
+            name=self.name,
+            start_ns=start_ns,
+            end_ns=end_ns,
+            on_time_jump=self.on_time_jump,
+            concave=self.concave,
+        )
+        blocks = _Blocks(assembler, reader, CopiedMessages(read, _WAITING_BYTES), start_ns, end_ns)
+        messages = _messages(reader, plan, start_ns, end_ns)
+        for batch in _batches(messages):
+            yield from blocks.of(assembler.add(batch), batch)
+            if assembler.is_finished:
+                break
+        yield from blocks.of(assembler.finish(), (), last=True)
+        if not blocks.any_sample and start_ns is None and end_ns is None:
+            reason = blocks.first_fault or "its messages make none with this mapping"
+            raise LogError(f"{self.name} holds no sample: {reason}")
+
+    def attachments(self) -> tuple[Attachment, ...]:
+        """See `Source.attachments`; a log of others keeps nothing that a replay needs."""
+        return ()
+
+    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
+        """See `Source.metadata`."""
+        return ()
+
+
+class _Blocks:
+    """Samples and messages to blocks, with what was lost on the way."""
+
+    def __init__(
+        self,
+        assembler: Assembler,
+        reader: MessageReader,
+        copied: CopiedMessages,
+        start_ns: int | None,
+        end_ns: int | None,
+    ) -> None:
+        self._assembler = assembler
+        self._reader = reader
+        self._copied = copied
+        self._window = start_ns or 0, end_ns
+        self._faults = FaultList()
+        self.any_sample = False
+        self.first_fault: str | None = None
+
+    def of(self, trace: Trace, messages: Sequence[Message], *, last: bool = False) -> Iterator[Block]:
+        """A block, or none while there is nothing to say."""
+        start_ns, end_ns = self._window
+        if start_ns or end_ns is not None:
+            messages = [
+                message
+                for message in messages
+                if start_ns <= message.log_time_ns and (end_ns is None or message.log_time_ns < end_ns)
+            ]
+        self._copied.add(messages)
+        for fault in chain(trace.faults, self._reader.take_faults(), self._assembler.take_faults()):
+            self._faults.add(fault)
+        faults = self._faults.take(last=last)
+        self.any_sample = self.any_sample or len(trace) > 0
+        self.first_fault = self.first_fault or next(iter(faults), None)
+        copied = self._copied.take(trace, last=last)
+        if len(trace) or len(copied) or faults:
+            yield Block(replace(trace, faults=faults), copied)
+
+
+def _readable(topics: Sequence[Topic], name: str) -> Sequence[Topic]:
+    """The topics, all of which can be decoded.
+
+    Raises:
+        LogError: one cannot.
+    """
+    reasons = [topic.unreadable for topic in topics if topic.unreadable]
+    if reasons:
+        raise LogError("\n".join(f"{name}: {reason}" for reason in reasons))
+    return topics
+
+
+def _messages(
+    reader: MessageReader, plan: Plan, start_ns: int | None, end_ns: int | None
+) -> Iterator[Message]:
+    """The messages that samples of a window depend on."""
+    if not plan.by_log_time or (not start_ns and end_ns is None):
+        return reader.iter_messages(plan.topics)
+    last = None if end_ns is None else end_ns + plan.margin_ns
+    lookback = {topic: plan.lookback_ns(topic) for topic in plan.topics}
+    known = [each for each in lookback.values() if each is not None]
+    first = max(0, (start_ns or 0) - max(known, default=0))
+    lasting = [topic for topic, each in lookback.items() if each is None]
+    before: Iterable[Message] = reader.iter_messages(lasting, None, first) if lasting and first else ()
+    return chain(before, reader.iter_messages(plan.topics, first or None, last))
+
+
+def _batches(messages: Iterator[Message]) -> Iterator[list[Message]]:
+    """Lists of messages of bounded size."""
+    size = _FIRST_BATCH
+    while batch := list(_up_to_bytes(islice(messages, size))):
+        yield batch
+        size = min(2 * size, _LARGEST_BATCH)
+
+
+def _up_to_bytes(messages: Iterable[Message]) -> Iterator[Message]:
+    held = 0
+    for message in messages:
+        yield message
+        held += len(message.payload)
+        if held > _BATCH_BYTES:
+            return
