@@ -31,7 +31,7 @@ def command_lines(text: str) -> Iterator[str]:
     for line in text.splitlines():
         line = line.strip().removeprefix("$ ").removeprefix("run 0 ").removeprefix("run 1 ")
         if line.startswith("spatial-replay "):
-            yield line.partition(" | ")[0]
+            yield re.split(r" [|>] ", line)[0]
 
 
 def leaves(name: str) -> Iterator[tuple[str, click.Command]]:
