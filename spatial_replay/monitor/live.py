@@ -15,7 +15,7 @@ from spatial_replay.monitor.run import Run
 from spatial_replay.spec.formula import Outline
 from spatial_replay.trace.sample import Sample
 
-_ROOM = 64
+ROOM = 64
 """Recent samples that there is room for at first: few, so that they stay in the processor's cache."""
 
 
@@ -37,7 +37,7 @@ class LiveRuns:
         """Start before the first sample; those before `start_ns` are only there to be looked back at."""
         ends = accumulate((len(program.leaves) for program in programs), initial=0)
         self._runs = [
-            (Run(program, room=_ROOM, tile=1), slice(*ends))
+            (Run(program, room=ROOM, tile=1), slice(*ends))
             for program, ends in zip(programs, pairwise(ends), strict=True)
         ]
         self._leaves = SampleLeaves([program.leaves for program in programs], regions)

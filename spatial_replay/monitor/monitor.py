@@ -11,6 +11,7 @@ from typing import NamedTuple
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.evaluation import no_such_node, require_specification
+from spatial_replay.monitor.live import ROOM
 from spatial_replay.monitor.semantics import checked_semantics, live_evaluation
 from spatial_replay.monitor.verdict import Verdict, online_verdict, worst_verdict
 from spatial_replay.spec.formula import NamedSpec, Specification, iter_nodes
@@ -123,6 +124,9 @@ class Monitor:
         self._specs = specification.results
         self._names = tuple(tuple(node.name for _, _, node in iter_nodes(s.formula)) for s in self._specs)
         self._places = _places_of_names(self._names)
+        trial = live_evaluation(specification, checked, 0)  # loads what samples would wait for otherwise
+        for time_ns in range(2 * ROOM):
+            trial.take(Sample(time_ns))
         self._live = live_evaluation(specification, checked, start_ns or 0)
         self._last_ns: int | None = None
 
