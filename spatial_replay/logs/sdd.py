@@ -29,6 +29,10 @@ _LARGEST = 10**18 - 1
 """Any integer of so many digits fits 64 bits."""
 
 
+_BLOCK_BOXES = 2**16
+"""A block is closed when it holds this many, however few its frames are."""
+
+
 class _NoBoxError(Exception):
     """A line that is no box; its text says why and what to give instead."""
 
@@ -63,8 +67,12 @@ def iter_annotations(
     frames, starts = np.unique(boxes.frame, return_index=True)
     sound = ~np.isin(frames, np.fromiter(broken, np.int64))
     frames, starts, ends = frames[sound], starts[sound], np.append(starts[1:], len(boxes.frame))[sound]
-    for first in range(0, len(frames), BLOCK_SAMPLES):
-        block = slice(first, first + BLOCK_SAMPLES)
+    after = 0
+    while after < len(frames):
+        first = after
+        filled = int(np.searchsorted(ends, starts[first] + _BLOCK_BOXES, side="right"))
+        after = min(first + BLOCK_SAMPLES, max(filled, first + 1))
+        block = slice(first, after)
         seen = _observations(boxes, frames[block], starts[block], ends[block], rate, lost)
         trace, left_out = trace_from_observations(seen, concave=concave)
         for index, what in sorted(left_out.items()):
