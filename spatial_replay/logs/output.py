@@ -93,7 +93,7 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
     """That an output may be written.
 
     Raises:
-        UsageError: it is one of the inputs, a folder, or in none.
+        UsageError: it is one of the inputs or in one, a folder, or in none.
     """
     if output.is_dir():
         raise UsageError(f"{output} is a folder; give the name of a file in it")
@@ -102,6 +102,8 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
     for each in inputs:
         if output.exists() and each.exists() and output.samefile(each):
             raise UsageError(f"{output} is an input too and would be lost; give the output another name")
+        if each.is_dir() and output.resolve().is_relative_to(each.resolve()):
+            raise UsageError(f"{output} lies in the folder {each}, which is an input; write it elsewhere")
 
 
 def output_error(output: Path, error: OSError) -> OutputError:

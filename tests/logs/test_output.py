@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from spatial_replay.errors import OutputError
-from spatial_replay.logs.output import open_output, replacing
+from spatial_replay.errors import OutputError, UsageError
+from spatial_replay.logs.output import open_output, refuse_inputs, replacing
 
 
 def test_an_output_appears_when_it_is_whole(tmp_path: Path) -> None:
@@ -45,3 +45,16 @@ def test_a_full_disk_is_the_output_s_error(opened: type, size: int) -> None:
 def test_what_cannot_be_opened_is_the_output_s_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="absent/out could not be written: "):
         open_output(tmp_path / "absent" / "out")
+
+
+def test_nothing_is_written_into_a_log_that_is_a_folder(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    (bag / "inner").mkdir(parents=True)
+    for output in (
+        bag / "out.mcap",
+        bag / "inner" / "out.mcap",
+        tmp_path / "bag" / ".." / "bag" / "out.mcap",
+    ):
+        with pytest.raises(UsageError, match="is an input; write it elsewhere"):
+            refuse_inputs(output, [bag])
+    refuse_inputs(tmp_path / "bag.mcap", [bag])
