@@ -12,6 +12,7 @@ import click
 COMMANDS: dict[str, str] = {
     "check": "Check a specification and show its tree.",
     "completion": "Print the script that completes commands in a shell.",
+    "explain": "Say why a verdict is what it is.",
     "export": "Write an annotated log's numbers as a table.",
     "info": "Say what a log holds.",
     "record": "Record a run as a log.",

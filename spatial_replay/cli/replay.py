@@ -7,49 +7,34 @@ from typing import TYPE_CHECKING
 
 import click
 
+from spatial_replay.cli.evaluating import Request, evaluation_options, prepared, report_reading
 from spatial_replay.cli.exit_codes import exit_code_from_verdicts
-from spatial_replay.cli.failures import say
-from spatial_replay.cli.options import Reading, output_option, profile_option, reading_options
+from spatial_replay.cli.options import output_option
 from spatial_replay.cli.progress import progress
-from spatial_replay.cli.times import time_point_from_text
+from spatial_replay.cli.times import duration_ns_from_text
 from spatial_replay.cli.verdicts import print_verdicts, write_document
 from spatial_replay.errors import UsageError
 
 if TYPE_CHECKING:
-    from spatial_replay.logs.source import Source
     from spatial_replay.monitor.semantics import Semantics
-    from spatial_replay.replay import Window
 
 
 @click.command()
-@click.argument("log", type=click.Path(path_type=Path))
-@click.option(
-    "--spec",
-    "specs",
-    metavar="SPEC",
-    multiple=True,
-    type=click.Path(path_type=Path),
-    help="A specification file; repeat it for several.  [default: those in the log]",
-)
+@evaluation_options
 @output_option("Write the annotated log (MCAP) here.")
 @click.option("--layer", is_flag=True, help="Leave the log's own messages out of the annotated one.")
 @click.option("--json", "json_file", metavar="FILE|-", help="Write what was found as one JSON object.")
 @click.option("--series", is_flag=True, help="With --json: also the numbers of every node at every sample.")
-@click.option("--from", "start", metavar="T", help="From the first sample at or after this time …")
-@click.option("--to", "end", metavar="T", help="… to the last one before this time.")
 @click.option(
-    "--every",
-    metavar="N",
-    type=click.IntRange(min=1),
-    default=1,
-    help="Keep every Nth sample, counted from the log's first; bounds in samples count those kept.",
+    "--signal",
+    is_flag=True,
+    help="With --json: the series, and each node's robustness from each sample to the end.",
 )
 @click.option(
-    "--each",
-    "choices",
-    multiple=True,
-    metavar="VAR=class:C",
-    help="The objects that a template's parameter stands for; VAR=all for every one.",
+    "--window",
+    "width",
+    metavar="DURATION",
+    help="Also evaluate the samples of the last so many seconds, at every sample: 10s.",
 )
 @click.option(
     "--semantics",
@@ -58,22 +43,15 @@ if TYPE_CHECKING:
     show_default=True,
     help="What a formula means: robustness over finite traces, or the paper's Def. 16 to the letter.",
 )
-@profile_option
-@reading_options
 def replay(
-    log: Path,
-    specs: tuple[Path, ...],
+    request: Request,
     output: Path | None,
     layer: bool,
     json_file: str | None,
     series: bool,
-    start: str | None,
-    end: str | None,
-    every: int,
-    choices: tuple[str, ...],
+    signal: bool,
+    width: str | None,
     semantics: Semantics,
-    profile: str | None,
-    reading: Reading,
 ) -> int:
     """Evaluate specifications over a recorded log.
 
@@ -86,47 +64,51 @@ def replay(
     Examples:
       spatial-replay replay run.mcap --spec blocks.spatial -o annotated.mcap
       spatial-replay replay run.mcap --spec edited.spatial --json -
+      spatial-replay replay run.mcap --spec blocks.spatial --window 10s
       spatial-replay replay people.jsonl --spec social.spatial --each ego=class:pedestrian --from 10s
       spatial-replay replay drive.bag --mapping drive.yaml --spec social.spatial -o annotated.mcap
     """
     # the numerical libraries load when there is work for them
-    from spatial_replay.logs.source import open_source
-    from spatial_replay.replay import load_files, run_replay
+    from spatial_replay.replay import run_replay
 
-    if series and json_file is None:
-        raise UsageError("--series goes into the JSON object; add --json FILE or --json -")
+    if (series or signal) and json_file is None:
+        option = "--series" if series else "--signal"
+        raise UsageError(f"{option} goes into the JSON object; add --json FILE or --json -")
     if layer and output is None:
         raise UsageError("--layer is about the annotated log; add -o FILE")
-    mapping = reading["mapping"]
-    inputs = (log, *specs, *([] if mapping is None else [mapping]))
-    _check_outputs(output, json_file, inputs)
-    source = open_source(log, **reading)
-    files = load_files(specs, source, profile=profile)
-    for warning in (warning for file in files for warning in file.warnings):
-        click.echo(warning, err=True)
+    window_ns = None if width is None else _width_ns(width)
+    if semantics != "ltlf" and (signal or window_ns is not None):
+        option = "--signal" if signal else "--window"
+        raise UsageError(f"{option} is not defined under --semantics {semantics}; leave one of them out")
+    _check_outputs(output, json_file, request.inputs)
+    task = prepared(request)
     with progress("samples") as advance:
         replayed = run_replay(
-            source,
-            files,
-            window=_window(source, start, end, every),
-            each=_each(choices),
+            task.source,
+            task.files,
+            window=task.window,
+            each=task.each,
             semantics=semantics,
-            keep_series=series,
+            keep_series=json_file is not None and (series or signal or window_ns is not None),
+            keep_leaves=True,
             output=output,
-            inputs=inputs,
+            inputs=request.inputs,
             layer=layer,
             advance=advance,
         )
-    for fault in replayed.faults:
-        say("warning", fault, colour="yellow")
-    if replayed.unreadable:
-        remark = f"{replayed.unreadable} observations hold a number that is not finite: unknown there"
-        say("warning", remark, colour="yellow")
+    report_reading(replayed)
     if json_file is not None:
-        write_document(replayed, json_file, inputs)
+        write_document(replayed, json_file, request.inputs, signal=signal, window_ns=window_ns)
     if json_file != "-":
-        print_verdicts(replayed, output)
+        print_verdicts(replayed, output, window_ns)
     return exit_code_from_verdicts((result.verdict for result in replayed.results), bool(replayed.faults))
+
+
+def _width_ns(text: str) -> int:
+    width_ns = duration_ns_from_text(text)
+    if width_ns == 0:
+        raise UsageError(f"--window {text} holds no sample; give it a width, as in --window 10s")
+    return width_ns
 
 
 def _check_outputs(output: Path | None, json_file: str | None, inputs: tuple[Path, ...]) -> None:
@@ -139,34 +121,3 @@ def _check_outputs(output: Path | None, json_file: str | None, inputs: tuple[Pat
         refuse_inputs(Path(json_file), inputs)
         if output is not None and output.resolve() == Path(json_file).resolve():
             raise UsageError(f"-o and --json both name {json_file}; give them two names")
-
-
-def _each(choices: tuple[str, ...]) -> dict[str, str]:
-    each: dict[str, str] = {}
-    for choice in choices:
-        parameter, equals, objects = choice.partition("=")
-        if not equals or not parameter:
-            raise UsageError(
-                f"--each {choice!r} chooses nothing; write --each VAR=class:NAME or --each VAR=all"
-            )
-        if parameter in each:
-            raise UsageError(f"--each gives {parameter!r} twice: {each[parameter]!r} and {objects!r}")
-        each[parameter] = objects
-    return each
-
-
-def _window(source: Source, start: str | None, end: str | None, every: int) -> Window:
-    from spatial_replay.replay import Window, first_sample_ns
-
-    if start is None and end is None:
-        return Window(every=every)
-    start_point = None if start is None else time_point_from_text(start)
-    end_point = None if end is None else time_point_from_text(end)
-    first_ns = first_sample_ns(source)
-    whole = Window()
-    start_ns = whole.start_ns if start_point is None else start_point.absolute_ns(first_ns)
-    end_ns = whole.end_ns if end_point is None else end_point.absolute_ns(first_ns)
-    if end_ns <= start_ns:
-        window = " ".join(f"{name} {text}" for name, text in (("--from", start), ("--to", end)) if text)
-        raise UsageError(f"the window {window} is empty; --to is the time after its last sample")
-    return Window(start_ns, end_ns, every)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, partial
 from reprlib import repr as shortened
 
@@ -11,13 +11,13 @@ import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
-from spatial_replay.monitor.finished import checked_width, full_signal, window_signal
+from spatial_replay.monitor.inquiry import Inquiry
 from spatial_replay.monitor.instances import find_instances
-from spatial_replay.monitor.semantics import Semantics, checked_semantics, instance_evaluation, require_ltlf
+from spatial_replay.monitor.semantics import Semantics, checked_semantics, instance_evaluation
 from spatial_replay.monitor.stream import EvaluationStream, InstanceEvaluation, Stretch
 from spatial_replay.monitor.verdict import Verdict, final_verdict, worst_verdict
 from spatial_replay.monitor.witness.evidence import Evidence
-from spatial_replay.monitor.witness.witness import Witness, find_witness
+from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.spec.faults import nearest_hint
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Diagnostic, Formula, Specification, iter_nodes, operator_of
@@ -75,7 +75,7 @@ class SpecResult:
         times_ns: (T,) int64, the samples evaluated.
         series: (N, 4, T): value, now, lower, upper of each node (see `NodeResult`).
         final: (N, 2): lower and upper end of each node for the finished log.
-        semantics: what the formula meant.
+        inquiry: answers what the numbers leave open.
     """
 
     name: str
@@ -84,9 +84,7 @@ class SpecResult:
     times_ns: Integers
     series: Floats
     final: Floats
-    semantics: Semantics
-    _leaves: Floats = field(repr=False)
-    _evidence: Evidence = field(repr=False)
+    inquiry: Inquiry
 
     @cached_property
     def nodes(self) -> tuple[NodeResult, ...]:
@@ -142,40 +140,20 @@ class SpecResult:
         return int(self.times_ns[satisfied[0]]) if len(satisfied) else None
 
     def full_signal(self) -> Floats:
-        """(N, T): each node's robustness at each sample, from there to the end of the log.
-
-        This is the usual offline robustness; NaN where it is not determined.
-
-        Raises:
-            UsageError: under the paper's semantics.
-        """
-        require_ltlf(self.semantics, "the signal of a whole log")
-        return full_signal(self.formula, self._evidence.instance.program.leaves, self._leaves, self.times_ns)
+        """(N, T): each node's robustness at each sample, from there to the end; see `Inquiry.full_signal`."""
+        return self.inquiry.full_signal()
 
     def window_signal(self, width_ns: int) -> Floats:
-        """(N, T): each node's robustness over the samples in (t - width, t], for the sample at each t.
+        """(N, T): each node's robustness over a sliding window; see `Inquiry.window_signal`."""
+        return self.inquiry.window_signal(width_ns)
 
-        Past operators start where the window does; `a[-3]` may look before it. NaN where not determined.
-
-        Raises:
-            UsageError: a width below 1 ns, or under the paper's semantics.
-        """
-        require_ltlf(self.semantics, "a sliding window")
-        order = self._evidence.instance.program.leaves
-        return window_signal(self.formula, order, self._leaves, self.times_ns, checked_width(width_ns))
-
-    def witness(self, node: int | str | None = None) -> Witness:
-        """What decides a node's verdict over the whole log, given its id or its name; by default the root's.
+    def witness(self, node: str | None = None) -> Witness:
+        """What decides the verdict of a named node or, by default, of the root.
 
         Raises:
             UsageError: no such node, or under the paper's semantics.
         """
-        require_ltlf(self.semantics, "a witness")
-        if isinstance(node, str):
-            node = self.node(node).id
-        if node is not None and not 0 <= node < len(self.series):
-            raise UsageError(f"no node has the id {node}; {self.name!r} has {len(self.series)}, from 0")
-        return find_witness(self._evidence, self._leaves, self.times_ns, node or 0)
+        return self.inquiry.witness(0 if node is None else self.node(node).id)
 
     def __repr__(self) -> str:
         instance = f" for {self.object}" if self.object is not None else ""
@@ -321,11 +299,11 @@ def evaluate(
         partial(instance_evaluation, semantics=semantics),
     )
     stretches = stream.extend(trace)
-    results = tuple(
-        _result(own, stretch, semantics, Evidence(own.instance, specification.regions, lambda: [trace]))
-        for own, stretch in zip(stream.streams, stretches, strict=True)
-    )
-    return Evaluation(results, semantics, specification, trace.names, tuple(trace.signals))
+    results = []
+    for own, stretch in zip(stream.streams, stretches, strict=True):
+        evidence = Evidence(own.instance, specification.regions, lambda: [trace])
+        results.append(_result(own, stretch, Inquiry(evidence, stretch.times_ns, stretch.leaves, semantics)))
+    return Evaluation(tuple(results), semantics, specification, trace.names, tuple(trace.signals))
 
 
 def require_specification(value: object) -> None:
@@ -344,9 +322,7 @@ def _require_trace(value: object) -> None:
         raise UsageError(f"trace is {shortened(value)}; {remedy}")
 
 
-def _result(
-    stream: InstanceEvaluation, stretch: Stretch, semantics: Semantics, evidence: Evidence
-) -> SpecResult:
+def _result(stream: InstanceEvaluation, stretch: Stretch, inquiry: Inquiry) -> SpecResult:
     return SpecResult(
         stream.instance.name,
         stream.instance.object,
@@ -354,9 +330,7 @@ def _result(
         read_only_integers(stretch.times_ns),
         read_only_floats(stretch.series),
         read_only_floats(stream.final),
-        semantics,
-        read_only_floats(stretch.leaves),
-        evidence,
+        inquiry,
     )
 
 

@@ -71,7 +71,12 @@ def window_signal(
 
     It is that at the first of these samples, on these samples alone: past operators start there. NaN where it
     is not determined. Takes time in proportion to the samples in a window.
+
+    Raises:
+        UsageError: a width that is no positive number of ns.
     """
+    if isinstance(width_ns, bool) or not isinstance(width_ns, int) or not 0 < width_ns <= LATEST_NS:
+        raise UsageError(f"a window of {width_ns!r} ns; give its width as an integer of at least 1 ns")
     table, rows = _compiled(formula, order)
     leaves = np.ascontiguousarray(leaves[:2])
     starts = np.searchsorted(times_ns, times_ns - width_ns, side="right").astype(np.int64)
@@ -79,16 +84,6 @@ def window_signal(
     result = np.empty((len(leaves), len(rows), len(times_ns)))
     run_windows(table, rows, leaves, times_ns, starts, columns, np.empty(len(times_ns)), result)
     return _determined(result)
-
-
-def checked_width(width_ns: int) -> int:
-    """
-    Raises:
-        UsageError: a width of a window that is no positive number of ns.
-    """
-    if isinstance(width_ns, bool) or not isinstance(width_ns, int) or not 0 < width_ns <= LATEST_NS:
-        raise UsageError(f"a window of {width_ns!r} ns; give its width as an integer of at least 1 ns")
-    return width_ns
 
 
 def new_leaves(formula: Formula, order: Sequence[Atom | Quantified]) -> list[Atom | Quantified]:

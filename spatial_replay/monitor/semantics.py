@@ -33,15 +33,6 @@ def checked_semantics(name: str, specifications: Iterable[Specification] = ()) -
     return cast(Semantics, name)
 
 
-def require_ltlf(semantics: Semantics, what: str) -> None:
-    """
-    Raises:
-        UsageError: for other semantics, which do not have what was asked for.
-    """
-    if semantics != "ltlf":
-        raise UsageError(f"{what} is not defined under the semantics {semantics!r}; evaluate with 'ltlf'")
-
-
 def instance_evaluation(instance: Instance, semantics: Semantics = "ltlf") -> InstanceEvaluation:
     """An instance before its first sample, to be evaluated in stretches."""
     return PaperStream(instance) if semantics == "paper" else InstanceStream(instance)

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from spatial_replay.replay.annotated import load_files, run_replay
 from spatial_replay.replay.document import document
+from spatial_replay.replay.explanation import Explanation, explanations
 from spatial_replay.replay.replay import Replay, Replayed, ReplayedSpec
 from spatial_replay.replay.window import Window, first_sample_ns
 
 __all__ = [
+    "Explanation",
     "Replay",
     "Replayed",
     "ReplayedSpec",
     "Window",
     "document",
+    "explanations",
     "first_sample_ns",
     "load_files",
     "run_replay",

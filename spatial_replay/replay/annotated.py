@@ -33,6 +33,7 @@ def run_replay(
     each: Mapping[str, str] | None = None,
     semantics: Semantics = "ltlf",
     keep_series: bool = False,
+    keep_leaves: bool = False,
     output: Path | None = None,
     inputs: Sequence[Path] = (),
     layer: bool = False,
@@ -47,6 +48,7 @@ def run_replay(
         each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
         semantics: "ltlf", or "paper": Def. 16 of the paper to the letter.
         keep_series: keep every sample's numbers in memory.
+        keep_leaves: keep every sample's atoms in memory, so that results can be inquired into.
         output: the annotated log; it replaces a file of that name only when it is whole.
         inputs: files that the output must not be.
         layer: leave the source's own messages, metadata and attachments out of the output.
@@ -59,7 +61,15 @@ def run_replay(
         OutputError: the output cannot be written.
     """
     check_parameters(files, each or {})
-    replay = Replay(source, files, window=window, each=each, semantics=semantics, keep_series=keep_series)
+    replay = Replay(
+        source,
+        files,
+        window=window,
+        each=each,
+        semantics=semantics,
+        keep_series=keep_series,
+        keep_leaves=keep_leaves,
+    )
     with ExitStack() as stack:
         sink: LogWriter | None = None
         if output is not None:

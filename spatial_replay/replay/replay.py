@@ -11,7 +11,6 @@ from spatial_replay.errors import LogError, SpecificationError, UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.inspection.annotation import AnnotatedEvaluation, kept_files, messages_of
 from spatial_replay.inspection.certificate import MessageHash, ResultHash, SampleHash, certificate
-from spatial_replay.inspection.specification import ReportedTree
 from spatial_replay.logs.block import Block, Messages
 from spatial_replay.logs.merging import merge, select
 from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates
@@ -20,10 +19,12 @@ from spatial_replay.logs.reading import read_blocks
 from spatial_replay.logs.sink import Attachment
 from spatial_replay.logs.source import Source, within
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
+from spatial_replay.monitor.inquiry import Inquiry
 from spatial_replay.monitor.instances import Choice, Instance, find_instances
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
-from spatial_replay.monitor.stream import InstanceEvaluation, Stretch, join_stretches, look_back
+from spatial_replay.monitor.stream import Stretch, join_stretches, look_back
 from spatial_replay.monitor.verdict import Verdict, final_verdict, worst_verdict
+from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.replay.window import Window, first_sample_ns
 from spatial_replay.spec import check_names
 from spatial_replay.spec.formula import Diagnostic, Formula, Specification
@@ -41,6 +42,7 @@ class ReplayedSpec:
         final: (N, 2), lower and upper end of each node for the finished log.
         first_satisfied_ns: the first sample with a value of at least 0, or None.
         times_ns, series: every sample's numbers, (T,) and (N, 4, T), if they were asked for.
+        inquiry: answers what the numbers leave open, if that was asked for.
     """
 
     name: str
@@ -51,6 +53,7 @@ class ReplayedSpec:
     first_satisfied_ns: int | None
     times_ns: Integers | None = None
     series: Floats | None = None
+    inquiry: Inquiry | None = None
 
     @property
     def verdict(self) -> Verdict:
@@ -106,8 +109,13 @@ class Replay:
         each: Mapping[str, str] | None = None,
         semantics: Semantics = "ltlf",
         keep_series: bool = False,
+        keep_leaves: bool = False,
     ) -> None:
         """Prepare; templates read the source once for the objects that they stand for.
+
+        Args:
+            keep_series: keep every sample's numbers in memory.
+            keep_leaves: keep every sample's atoms in memory, so that results can be inquired into.
 
         Raises:
             UsageError: a template without its objects, or objects for a parameter that no template has; an
@@ -118,10 +126,10 @@ class Replay:
         self._files = files
         self._window = window or Window()
         self.files = kept_files(files)
-        instances = [self._instances(file, each or {}) for file in self.files]
-        self._evaluation = AnnotatedEvaluation(self.files, instances, self._semantics)
+        self._instances = [self._find_instances(file, each or {}) for file in self.files]
+        self._evaluation = AnnotatedEvaluation(self.files, self._instances, self._semantics)
         self.trees = self._evaluation.trees
-        self._keep_series = keep_series
+        self._keep_series, self._keep_leaves = keep_series, keep_leaves
         self._kept: list[list[Stretch]] = [[] for _ in self.trees]
         self._sample_hash, self._message_hash = SampleHash(), MessageHash()
         self._result_hash = ResultHash([(tree.name, tree.object) for tree in self.trees])
@@ -166,7 +174,7 @@ class Replay:
             end_ns=self._times[-1],
             faults=tuple(self._faults),
             unreadable=self._unreadable,
-            results=tuple(map(_replayed, self.trees, self._evaluation.streams, self._stretches())),
+            results=tuple(self._results()),
             certificate=self.certificate(),
             semantics=self._semantics,
         )
@@ -179,21 +187,26 @@ class Replay:
         """The certificate over what was taken in so far."""
         return certificate(self._sample_hash, self._message_hash, self._files, self._result_hash)
 
-    def _instances(self, file: Specification, each: Mapping[str, str]) -> list[Instance]:
+    def _find_instances(self, file: Specification, each: Mapping[str, str]) -> list[Instance]:
         parameters = {spec.parameter for spec in file.results}
         own = {parameter: choice for parameter, choice in each.items() if parameter in parameters}
         choices = [Choice.parse(parameter, choice) for parameter, choice in own.items()]
         classes: set[str | None] = set()
-        traces = self._iter_traces(classes)
+        traces = self._iter_with_classes(classes)
         instances = find_instances(file, own, traces, self._window.start_ns, self._window.end_ns)
         for choice in choices:
             self._check_class(choice, classes)
         return instances
 
-    def _iter_traces(self, classes: set[str | None]) -> Iterator[Trace]:
+    def _iter_with_classes(self, classes: set[str | None]) -> Iterator[Trace]:
         """The samples that count; the classes of their objects go to `classes`."""
         for block, trace in self._iter_blocks():
             classes.update(block.trace.classes)
+            yield trace
+
+    def _iter_traces(self) -> Iterator[Trace]:
+        """The samples that count."""
+        for _, trace in self._iter_blocks():
             yield trace
 
     def _check_class(self, choice: Choice, classes: set[str | None]) -> None:
@@ -247,12 +260,35 @@ class Replay:
         self._message_hash.add(own)
         for index, stretch in enumerate(stretches):
             self._result_hash.add(index, stretch.series)
-            if self._keep_series:
-                self._kept[index].append(stretch)
+            if self._keep_series or self._keep_leaves:
+                self._kept[index].append(self._worth_keeping(stretch))
 
-    def _stretches(self) -> Iterator[Stretch | None]:
-        for stretches in self._kept:
-            yield join_stretches(stretches) if self._keep_series else None
+    def _worth_keeping(self, stretch: Stretch) -> Stretch:
+        series = stretch.series if self._keep_series else np.empty((len(stretch.series), 4, 0))
+        leaves = stretch.leaves if self._keep_leaves else np.empty((1, stretch.leaves.shape[1], 0))
+        return Stretch(stretch.times_ns, series, leaves)
+
+    def _results(self) -> Iterator[ReplayedSpec]:
+        regions = [file.regions for file, own in zip(self.files, self._instances, strict=True) for _ in own]
+        for tree, stream, kept, own in zip(
+            self.trees, self._evaluation.streams, self._kept, regions, strict=True
+        ):
+            stretch = join_stretches(kept) if kept else None
+            inquiry = None
+            if self._keep_leaves and stretch is not None:
+                evidence = Evidence(stream.instance, own, self._iter_traces)
+                inquiry = Inquiry(evidence, stretch.times_ns, stretch.leaves, self._semantics)
+            yield ReplayedSpec(
+                tree.name,
+                tree.object,
+                tree.formula,
+                stream.robustness,
+                stream.final,
+                stream.first_satisfied_ns,
+                None if stretch is None else stretch.times_ns,
+                stretch.series if stretch is not None and self._keep_series else None,
+                inquiry,
+            )
 
     def _check_names(self) -> None:
         """That the log has every object and signal that a specification names."""
@@ -284,19 +320,6 @@ class Replay:
             f"{name} has no sample in the window asked for; its samples are from {first_ns} to {last_ns} ns, "
             f"{(last_ns - first_ns) / 1e9:.3f} s"
         )
-
-
-def _replayed(tree: ReportedTree, stream: InstanceEvaluation, stretch: Stretch | None) -> ReplayedSpec:
-    return ReplayedSpec(
-        tree.name,
-        tree.object,
-        tree.formula,
-        stream.robustness,
-        stream.final,
-        stream.first_satisfied_ns,
-        None if stretch is None else stretch.times_ns,
-        None if stretch is None else stretch.series,
-    )
 
 
 _OBJECTS = protobuf_channel(OBJECTS, ObjectStates)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import permutations, product
 from typing import Any
 
@@ -79,14 +79,25 @@ class DecidingAtom:
         unknown: why it is unknown, in words.
     """
 
-    atom: Atom
+    atom: Atom = field(repr=False)
     end: End
     value: float
     lower: float
     upper: float
-    branch: tuple[tuple[int, Expression], ...]
+    branch: tuple[tuple[int, Expression], ...] = field(repr=False)
     measured: tuple[Measured, ...]
     unknown: tuple[str, ...]
+
+    @property
+    def text(self) -> str:
+        """The atom as it is written, its variables replaced."""
+        return self.atom.text
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Names of the objects, regions and groups that the atom is about, in the order written."""
+        bases = (base_of(term) for term in self.atom.terms)
+        return tuple(dict.fromkeys(base.name or format_term(base) for base in bases))
 
 
 def deciding_atom(scene: Scene, leaf: Formula, end: End) -> DecidingAtom | None:

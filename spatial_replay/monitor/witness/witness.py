@@ -12,7 +12,8 @@ from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.monitor.witness.extremum import End
 from spatial_replay.monitor.witness.path import deciding_path
 from spatial_replay.monitor.witness.threshold import Threshold, threshold_of
-from spatial_replay.spec.formula import Atom, Formula, Quantified, iter_nodes
+from spatial_replay.spec.format import format_formula
+from spatial_replay.spec.formula import Atom, Formula, Quantified, iter_nodes, operator_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,11 +22,16 @@ class WitnessStep:
 
     Attributes:
         node: its id.
+        operator: "and", "F", a relation's name, …
+        name: the name of the spec that it is the root of, or None.
+        text: its canonical text.
         time_ns: of the sample.
     """
 
     node: int
-    formula: Formula
+    operator: str
+    name: str | None
+    text: str
     time_ns: int
 
 
@@ -83,15 +89,16 @@ def find_witness(evidence: Evidence, leaves: Floats, times_ns: Integers, node: i
     verdict = final_verdict(lower, upper)
     end = {Verdict.SATISFIED: End.LOW, Verdict.VIOLATED: End.HIGH}.get(verdict, End.OPEN)
     found = deciding_path(instance.formula, done, times_ns, node, end)
-    nodes = [formula for _, _, formula in iter_nodes(instance.formula)]
-    path = tuple(
-        WitnessStep(step.node, evidence.bound(nodes[step.node]), int(times_ns[step.sample]))
-        for step in found.steps
-    )
+    nodes = [evidence.bound(formula) for _, _, formula in iter_nodes(instance.formula)]
+    path = tuple(_step(step.node, nodes[step.node], int(times_ns[step.sample])) for step in found.steps)
     deciding = threshold = None
-    last = path[-1]
-    if isinstance(last.formula, Atom | Quantified):
-        deciding = deciding_atom(evidence.scene(last.time_ns), last.formula, found.end)
+    leaf = nodes[path[-1].node]
+    if isinstance(leaf, Atom | Quantified):
+        deciding = deciding_atom(evidence.scene(path[-1].time_ns), leaf, found.end)
     if deciding is not None:
         threshold = threshold_of(evidence, leaves, times_ns, node, verdict, deciding)
     return Witness(instance.name, instance.object, verdict, lower, upper, path, deciding, threshold)
+
+
+def _step(node: int, formula: Formula, time_ns: int) -> WitnessStep:
+    return WitnessStep(node, operator_of(formula), formula.name, format_formula(formula), time_ns)

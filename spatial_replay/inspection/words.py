@@ -1,0 +1,170 @@
+"""Witnesses in plain sentences."""
+
+from __future__ import annotations
+
+import math
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
+
+from spatial_replay.monitor.verdict import Verdict
+from spatial_replay.monitor.witness.atom import DecidingAtom, Measured
+from spatial_replay.monitor.witness.threshold import Threshold
+from spatial_replay.monitor.witness.witness import Witness, WitnessStep
+
+_DIGITS = 6
+_LONGEST = 60
+"""Characters of a formula that is only mentioned."""
+_EDGES = {"min_x": "left", "max_x": "right", "min_y": "lower", "max_y": "upper"}
+
+
+def sentences_of(
+    witness: Witness, *, first_ns: int, since_ns: int | None = None, is_open: bool = False
+) -> tuple[str, ...]:
+    """Why a node has its verdict: what decided it, and what would flip it.
+
+    Args:
+        first_ns: the time that others are told from.
+        since_ns: since when it has had its verdict, if that is known.
+        is_open: whether samples after those evaluated may change it.
+    """
+    sentences = [_verdict(witness, first_ns, since_ns, is_open)]
+    if witness.deciding is None:
+        sentences.append(_dead_end(witness.path[-1], first_ns))
+    elif witness.deciding.unknown:
+        sentences.append(_unknown(witness, witness.deciding, first_ns))
+    elif witness.verdict is Verdict.UNKNOWN:
+        sentences.append(_uncertain(witness, witness.deciding, first_ns))
+    else:
+        sentences.append(_decision(witness, witness.deciding, first_ns))
+        sentences.append(_flip(witness, witness.deciding, witness.threshold))
+    return tuple(sentences)
+
+
+def number_text(number: float) -> str:
+    """A number as people read it: six digits."""
+    return f"{number:.{_DIGITS}g}"
+
+
+def time_text(time_ns: int, first_ns: int) -> str:
+    """A time as seconds since another."""
+    return f"{(time_ns - first_ns) / 1e9:.3f} s"
+
+
+def _verdict(witness: Witness, first_ns: int, since_ns: int | None, is_open: bool) -> str:
+    title = witness.path[0].name or witness.path[0].text
+    instance = f" for {witness.object}" if witness.object is not None else ""
+    low, high = number_text(witness.lower), number_text(witness.upper)
+    numbers = (
+        f"robustness {low}" if witness.lower == witness.upper else f"robustness between {low} and {high}"
+    )
+    since = f", since {time_text(since_ns, first_ns)}" if since_ns is not None else ""
+    so_far, later = (" so far", "; later samples may change that") if is_open else ("", "")
+    return f"`{title}`{instance} is {witness.verdict}{so_far}: {numbers}{since}{later}."
+
+
+def _decision(witness: Witness, deciding: DecidingAtom, first_ns: int) -> str:
+    amount = deciding.value if deciding.lower == deciding.upper else _end(witness, deciding)
+    how = f"holds by {number_text(amount)}" if amount >= 0.0 else f"fails by {number_text(-amount)}"
+    if amount == 0.0:
+        how = "just holds"
+    what = " and ".join(map(_measured, deciding.measured))
+    when = time_text(witness.time_ns, first_ns)
+    return f"What decides is `{deciding.text}`, which {how} at {when}{_in_time(witness)}: {what}."
+
+
+def _end(witness: Witness, deciding: DecidingAtom) -> float:
+    return deciding.lower if deciding.end.value == "low" else deciding.upper
+
+
+def _in_time(witness: Witness) -> str:
+    """Which sample that is of those that the innermost temporal operator looks at."""
+    superlatives = {"F": "greatest", "O": "greatest", "G": "least", "H": "least"}
+    for step in reversed(witness.path[:-1]):
+        if step.operator in superlatives:
+            return f" (its {superlatives[step.operator]} within `{_shortened(step)}`)"
+        if step.operator in ("X", "WX", "Y", "U", "R", "W", "S"):
+            return f" (within `{_shortened(step)}`)"
+    return ""
+
+
+def _shortened(step: WitnessStep) -> str:
+    text = step.name or step.text
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1].rstrip()}…"
+
+
+def _measured(measured: Measured) -> str:
+    names, value = measured.names, measured.value
+    size = number_text(abs(value))
+    match measured.quantity:
+        case "signed_distance" if math.isinf(value):
+            return f"{names[0]} and {names[1]} are infinitely far apart, since a group is empty"
+        case "signed_distance":
+            if value == 0.0:
+                return f"{names[0]} and {names[1]} touch"
+            return f"{names[0]} and {names[1]} " + (
+                f"are {size} apart" if value > 0 else f"overlap by {size}"
+            )
+        case "protrusion":
+            if value > 0.0:
+                return f"{names[0]} sticks out of {names[1]} by {size}"
+            return f"{names[0]} lies {size} inside {names[1]}"
+        case "misalignment":
+            degrees = math.degrees(math.acos(max(-1.0, min(1.0, 1.0 - value))))
+            return f"{names[0]} is turned by {number_text(degrees)}° from {names[1]}"
+        case "signal":
+            return f"{names[0]} is {number_text(value)}"
+    axis = measured.quantity[-1]
+    if measured.quantity.startswith("centroid"):
+        return f"the centroid of {names[0]} is at {axis} = {number_text(value)}"
+    edge = _EDGES.get(measured.quantity, "bottom" if measured.quantity == "min_z" else "top")
+    return f"the {edge} edge of {names[0]} is at {axis} = {number_text(value)}"
+
+
+def _flip(witness: Witness, deciding: DecidingAtom, threshold: Threshold | None) -> str:
+    if threshold is None:
+        opposite = "violated" if witness.verdict is Verdict.SATISFIED else "satisfied"
+        return f"No number of this atom alone makes it {opposite}: other atoms decide it, too."
+    rises = threshold.flips_at > threshold.value
+    rounded = _rounded(threshold.flips_at, up=rises)
+    more = "more" if rises else "less"
+    if threshold.is_written:
+        limit = f"{rounded} or {more} in place of {number_text(threshold.value)}"
+        return f"It would be {threshold.verdict} with {limit} in `{deciding.text}`."
+    margin = rounded.lstrip("-")
+    if threshold.flips_at < 0.0:
+        return f"It would be {threshold.verdict} if `{deciding.text}` were allowed to fail by {margin}."
+    return f"It would be {threshold.verdict} if `{deciding.text}` had to hold by {margin}."
+
+
+def _rounded(number: float, *, up: bool) -> str:
+    """Six digits, rounded so that the change is no smaller."""
+    rounding = ROUND_CEILING if up else ROUND_FLOOR
+    rounded = Context(prec=_DIGITS, rounding=rounding).create_decimal(Decimal(number))
+    return f"{rounded.normalize():f}" if abs(rounded.adjusted()) < 2 * _DIGITS else str(rounded.normalize())
+
+
+def _unknown(witness: Witness, deciding: DecidingAtom, first_ns: int) -> str:
+    reasons = " and ".join(deciding.unknown)
+    when = time_text(witness.time_ns, first_ns)
+    return f"`{deciding.text}` is unknown at {when}, where it could decide{_in_time(witness)}: {reasons}."
+
+
+def _uncertain(witness: Witness, deciding: DecidingAtom, first_ns: int) -> str:
+    low, high = number_text(deciding.lower), number_text(deciding.upper)
+    return (
+        f"`{deciding.text}` lies between {low} and {high} at {time_text(witness.time_ns, first_ns)}"
+        f"{_in_time(witness)}: the uncertainty of the objects leaves open whether it holds."
+    )
+
+
+def _dead_end(step: WitnessStep, first_ns: int) -> str:
+    when = time_text(step.time_ns, first_ns)
+    match step.operator:
+        case "true" | "false":
+            return f"What decides is the constant `{step.text}`."
+        case "X" | "WX":
+            return f"What decides is `{step.text}` at {when}: the log has no next sample."
+        case "Y":
+            return f"What decides is `{step.text}` at {when}: there is no sample before."
+        case "forall" | "exists":
+            return f"What decides is `{step.text}` at {when}: nobody is in its group."
+    return f"What decides is `{step.text}` at {when}: no sample lies in its window."
