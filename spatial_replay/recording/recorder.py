@@ -25,6 +25,10 @@ from spatial_replay.trace.trace import Trace
 FLUSH_S = 0.4
 """A sample is handed to the operating system at most about this long after it was written."""
 
+_GATHER_S = 0.2
+"""How long samples are gathered before they are encoded: a few together cost hardly more than one, and while
+none are encoded, the caller has the interpreter to itself."""
+
 _TOGETHER = 1024
 """At most this many samples are encoded at once."""
 
@@ -81,7 +85,9 @@ class Recorder:
         refuse_inputs(self._path, ())
         # an interruption can leave this kind of queue locked in no way, unlike one with a limit of its own
         self._queue: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
+        self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._waiting = waiting
+        self._enough = max(1, min(waiting, _TOGETHER) // 2)
         self._blocks = block
         self._dropped = 0
         self._last_ns = -1
@@ -130,6 +136,8 @@ class Recorder:
                 return
             time.sleep(_PAUSE_S)
         self._queue.put(sample)
+        if self._queue.qsize() >= self._enough:
+            self._ring()
 
     def close(self, *, interrupted: bool = False) -> None:
         """Write what waits and finish the log; closing twice does nothing.
@@ -142,6 +150,7 @@ class Recorder:
                 return
             self._closed = True
             self._queue.put(None)
+            self._ring()
             self._thread.join()
             self._finish(interrupted=interrupted)
         self._raise_failure()
@@ -188,19 +197,26 @@ class Recorder:
                 # whatever it is, it is the caller's to know: nobody sees what a thread dies of
                 self._failure = error
 
+    def _ring(self) -> None:
+        """Let the writing thread begin with what waits."""
+        if self._bell.empty():
+            self._bell.put(None)
+
     def _waiting_samples(self) -> tuple[list[Sample], bool]:
-        """What waits now, or comes soon; and whether that is the end."""
+        """What has been gathered; and whether that is the end."""
+        if self._queue.qsize() < self._enough:
+            with suppress(queue.Empty):
+                self._bell.get(timeout=_GATHER_S)
         samples: list[Sample] = []
         try:
-            sample = self._queue.get(timeout=FLUSH_S / 2)
-            while sample is not None:
-                samples.append(sample)
-                if len(samples) == _TOGETHER:
-                    return samples, False
+            while len(samples) < _TOGETHER:
                 sample = self._queue.get_nowait()
+                if sample is None:
+                    return samples, True
+                samples.append(sample)
         except queue.Empty:
-            return samples, False
-        return samples, True
+            pass
+        return samples, False
 
     def _raise_failure(self) -> None:
         if self._failure is not None:
