@@ -3,15 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal, TypeAlias
+from typing import Final
 
+import numpy as np
+
+from spatial_replay.errors import LogError
+from spatial_replay.geometry.arrays import Integers
 from spatial_replay.geometry.footprint import Concave
+from spatial_replay.logs.faults import FaultList
 from spatial_replay.logs.foreign.messages import Decoder, Message
-from spatial_replay.logs.mapping.plan import Plan
+from spatial_replay.logs.mapping.channel import MISFITS, Channel
+from spatial_replay.logs.mapping.frames import HISTORY_NS, FrameTree
+from spatial_replay.logs.mapping.instants import Instants
+from spatial_replay.logs.mapping.naming import Codes
+from spatial_replay.logs.mapping.plan import DISORDER_NS, Plan
+from spatial_replay.logs.mapping.remarks import Remarks
+from spatial_replay.logs.mapping.scene import Scene
+from spatial_replay.logs.mapping.transforms import add_transforms
+from spatial_replay.logs.options import OnTimeJump
+from spatial_replay.trace.times import FOREVER, LATEST_NS
 from spatial_replay.trace.trace import Trace
 
-OnTimeJump: TypeAlias = Literal["error", "split"]
-"""What becomes of a log whose time jumps back by more than a second: it is refused, or it ends there."""
+_FIRST_STEP: Final = 256
+_LONGEST_STEP: Final = 8_192
+"""After how many messages samples come out: soon at first, for those who want to see the first one only."""
 
 
 class Assembler:
@@ -25,6 +40,7 @@ class Assembler:
         decoder: how the messages of a topic are decoded.
         start_ns, end_ns: only samples from `start_ns` up to, not including, `end_ns` come out; messages
             before and after may be fed, and count for them.
+        on_time_jump: whether a log whose time jumps back by more than a second is refused, or ends there.
     """
 
     def __init__(
@@ -38,12 +54,42 @@ class Assembler:
         on_time_jump: OnTimeJump = "error",
         concave: Concave = "decompose",
     ) -> None:
-        raise NotImplementedError
+        self._plan = plan
+        self._name = name
+        self._start_ns, self._end_ns = start_ns or 0, FOREVER if end_ns is None else end_ns
+        self._on_time_jump = on_time_jump
+        self._faults = FaultList()
+        self._remarks = Remarks(name, plan.mapping)
+        self._tree = FrameTree()
+        names, classes = Codes(), Codes()
+        self._channels = {
+            topic.name: Channel(
+                topic,
+                decoder,
+                names,
+                classes,
+                mapping_name=plan.mapping.name,
+                needs_frame=plan.mapping.fixed_frame is not None,
+                fault=self._add_fault,
+            )
+            for topic in plan.planned
+        }
+        self._scene = Scene(
+            plan, self._channels, names, classes, self._tree, self._remarks, self._add_fault, concave
+        )
+        self._instants = Instants(plan, name)
+        self._newest_ns = -1
+        self._settled_ns = -1
+        self._newest_place = ""
+        self._count = 0
+        self._next_step = _FIRST_STEP
+        self._step = _FIRST_STEP
+        self._has_split = False
 
     @property
     def is_finished(self) -> bool:
         """Whether no further message can change anything: after a jump that splits, or past the end."""
-        raise NotImplementedError
+        return self._has_split or self._settled_ns >= self._end_ns - 1
 
     def add(self, messages: Sequence[Message]) -> Trace:
         """Take messages in the order of the log; the samples that are final now, maybe none.
@@ -52,16 +98,167 @@ class Assembler:
             LogError: time jumps back by more than a second, and `on_time_jump` is "error".
             UsageError: the mapping does not fit what the messages hold.
         """
-        raise NotImplementedError
+        traces: list[Trace] = []
+        begin = 0
+        while begin < len(messages) and not self.is_finished:
+            part = messages[begin : begin + self._next_step - self._count]
+            begin += len(part)
+            self._accept(part)
+            self._count += len(part)
+            if self._count == self._next_step:
+                self._step = min(2 * self._step, _LONGEST_STEP)
+                self._next_step += self._step
+                traces.append(self._settle(self._newest_ns - self._plan.margin_ns))
+        return traces[0] if len(traces) == 1 else Trace.concatenate(traces)
 
     def finish(self) -> Trace:
         """The samples that are left when the log has ended."""
-        raise NotImplementedError
+        trace = self._settle(self._newest_ns)
+        self._settled_ns = LATEST_NS
+        return trace
 
     def take_faults(self) -> tuple[str, ...]:
         """What was lost since the last call, each with its place."""
-        raise NotImplementedError
+        return self._faults.take(last=self._settled_ns == LATEST_NS)
 
     def take_remarks(self) -> tuple[str, ...]:
-        """What is not as one would wish, without a loss: counts of stale objects, missing transforms."""
-        raise NotImplementedError
+        """What is not as one would wish, without a loss: counts of stale objects, missing transforms.
+
+        They are complete when `finish` has been called, and come then.
+        """
+        return self._remarks.take() if self._settled_ns == LATEST_NS else ()
+
+    def _accept(self, messages: Sequence[Message]) -> None:
+        """Decode messages, put transforms into the tree and the others where they wait."""
+        if self._plan.by_log_time:
+            messages = self._without_jump(messages)
+        by_topic = _by_topic(messages)
+        if not self._plan.by_log_time:
+            self._accept_in_order(messages, by_topic)
+            return
+        for topic, listed in by_topic.items():
+            channel = self._channels.get(topic)
+            if channel is not None:
+                contents, kept = channel.decoded(listed)
+                self._take_in(
+                    channel, [listed[i] for i in kept] if len(kept) < len(listed) else listed, contents
+                )
+
+    def _accept_in_order(self, messages: Sequence[Message], by_topic: dict[str, list[Message]]) -> None:
+        """Accept messages whose times are only known once they are decoded."""
+        timed: dict[str, tuple[list[int], Sequence[Message], list[object]]] = {}
+        for topic, listed in by_topic.items():
+            channel = self._channels.get(topic)
+            if channel is not None:
+                contents, kept = channel.decoded(listed)
+                timed[topic] = channel.times([listed[i] for i in kept], contents)
+        place = {id(message): number for number, message in enumerate(messages)}
+        moving = [
+            (place[id(message)], time, message)
+            for topic, (times, listed, _) in timed.items()
+            if self._is_moving(topic)
+            for time, message in zip(times, listed, strict=True)
+        ]
+        moving.sort(key=lambda entry: entry[0])
+        upto = self._jump([time for _, time, _ in moving], [message for _, _, message in moving])
+        last = moving[upto][0] if upto is not None else len(messages)
+        for topic, (times, listed, contents) in timed.items():
+            kept = [i for i, message in enumerate(listed) if place[id(message)] < last]
+            self._put(
+                self._channels[topic],
+                np.array([times[i] for i in kept], np.int64),
+                [listed[i] for i in kept],
+                [contents[i] for i in kept],
+            )
+
+    def _without_jump(self, messages: Sequence[Message]) -> Sequence[Message]:
+        moving = [message for message in messages if self._is_moving(message[0])]
+        upto = self._jump([message[1] for message in moving], moving)
+        if upto is None:
+            return messages
+        jumped = moving[upto]
+        return messages[: next(i for i, message in enumerate(messages) if message is jumped)]
+
+    def _is_moving(self, topic: str) -> bool:
+        """Whether a topic's times tell how far the log has come: not those of transforms and lasting things,
+        whose stamps may lie in the past or the future."""
+        channel = self._channels.get(topic)
+        return channel is not None and not (
+            channel.planned.is_lasting or (channel.planned.is_transforms and channel.extractor is None)
+        )
+
+    def _jump(self, times_ns: list[int], messages: Sequence[Message]) -> int | None:
+        """Take note of times, in the order of the log; the first that is a jump back, where that splits.
+
+        Raises:
+            LogError: there is one, and it does not split.
+        """
+        if not times_ns:
+            return None
+        times = np.array(times_ns, np.int64)
+        newest = np.maximum.accumulate(np.concatenate([[self._newest_ns], times]))
+        late = np.flatnonzero(times < newest[:-1] - DISORDER_NS)
+        if not len(late):
+            self._newest_ns = int(newest[-1])
+            return None
+        at = int(late[0])
+        self._newest_ns = int(newest[at])
+        back = (int(newest[at]) - times_ns[at]) / 1e9
+        where = (
+            f"time jumps back by {back:.3f} s, from {newest[at]} ns to {times_ns[at]} ns, at a message of"
+            f" {messages[at].topic} logged at {messages[at].log_time_ns} ns"
+        )
+        if self._on_time_jump == "error":
+            raise LogError(
+                f"{self._name}: {where}; on_time_jump='split' (--on-time-jump split) ends the log there, and"
+                " another clock in the mapping may not jump"
+            )
+        self._has_split = True
+        self._remarks.add(f"{where}: the log is taken to end there; cut it to evaluate what comes after")
+        return at
+
+    def _take_in(self, channel: Channel, messages: Sequence[Message], contents: list[object]) -> None:
+        times = np.array([message[1] for message in messages], np.int64)
+        self._put(channel, times, messages, contents)
+
+    def _put(
+        self, channel: Channel, times_ns: Integers, messages: Sequence[Message], contents: list[object]
+    ) -> None:
+        planned = channel.planned
+        if planned.is_transforms:
+            for time_ns, message, content in zip(times_ns.tolist(), messages, contents, strict=True):
+                try:
+                    add_transforms(self._tree, content, time_ns, is_static=planned.is_static)
+                except MISFITS as error:
+                    self._add_fault(
+                        channel.name, message.log_time_ns, f"its transforms cannot be read: {error}"
+                    )
+        if planned.mapping is None and channel.name != self._plan.sampled_topic:
+            return
+        log_times = np.array([message[1] for message in messages], np.int64)
+        sequences = np.array([message[3] for message in messages], np.int64)
+        # what is stamped before what is settled came too late for it, and counts from now on
+        channel.pending.add(np.maximum(times_ns, self._settled_ns + 1), sequences, log_times, contents)
+
+    def _settle(self, upto_ns: int) -> Trace:
+        """The samples up to a time, all of whose messages are there."""
+        if upto_ns <= self._settled_ns:
+            return Trace.from_samples(())
+        with np.errstate(all="ignore"):
+            trace = self._scene.settle(upto_ns, self._instants, self._start_ns, self._end_ns)
+        self._settled_ns = upto_ns
+        self._tree.forget_before(upto_ns - HISTORY_NS)
+        return trace
+
+    def _add_fault(self, topic: str, log_time_ns: int, what: str) -> None:
+        self._faults.add(f"{self._name}: {topic} at {log_time_ns} ns: {what}")
+
+
+def _by_topic(messages: Sequence[Message]) -> dict[str, list[Message]]:
+    found: dict[str, list[Message]] = {}
+    for message in messages:
+        listed = found.get(message[0])
+        if listed is None:
+            listed = found[message[0]] = []
+        listed.append(message)
+    return found

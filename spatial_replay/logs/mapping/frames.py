@@ -1,7 +1,7 @@
 """Frames: transforms as a log reports them, and between any two frames at any time.
 
 A transform places a child frame in its parent. Between two transforms of a child, translation is interpolated
-linearly and rotation along the shorter arc, as tf2 does; there is no extrapolation. A static transform holds at
+linearly and rotation along the shorter arc, as tf2 does; there is no extrapolation. A static one holds at
 all times.
 """
 

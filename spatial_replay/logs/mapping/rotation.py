@@ -19,7 +19,7 @@ def matrices_from_quaternions(quaternions: Floats) -> tuple[Floats, Floats]:
         quaternions: (N, 4) x, y, z, w.
 
     Returns:
-        (N, 3, 3) a_from_b matrices whose columns are the axes of b; (N,) yaw, the angle of the projected x axis,
+        (N, 3, 3) a_from_b matrices, whose columns are the axes of b; (N,) the angle of the projected x axis,
         NaN for quaternions of zeros.
     """
     norm = np.sqrt(np.einsum("ij,ij->i", quaternions, quaternions))

@@ -1,0 +1,323 @@
+"""Decoded messages of one topic to columns: objects, their poses and bodies, who left."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import chain, compress
+from typing import Any
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.logs.mapping.binding import Binding, TimeGetter, bind, bind_time
+from spatial_replay.logs.mapping.bodies import (
+    DELETE_ALL_ENTITIES,
+    MARKER_ADD,
+    MARKER_DELETE,
+    MARKER_DELETE_ALL,
+    reader_of,
+)
+from spatial_replay.logs.mapping.fields import style_of
+from spatial_replay.logs.mapping.naming import Codes, Namer, class_codes
+from spatial_replay.logs.mapping.paths import Get, Path, iter_elements, list_getter
+from spatial_replay.logs.mapping.poses import Poses, poses_of
+from spatial_replay.logs.mapping.readings import Reading
+from spatial_replay.logs.mapping.solids import Solids
+from spatial_replay.logs.mapping.substance import substance_of
+from spatial_replay.logs.mapping.templates import Template
+
+EVERYONE = -1
+"""Instead of a name: everything that the topic has told of."""
+
+
+@dataclass(slots=True)
+class Seen:
+    """R objects that M messages of a topic tell of.
+
+    Attributes:
+        message: (R,) int64, increasing: the message of each object.
+        name, class_code: (R,) int64.
+        frames: the name of the frame of each, or None where all are in the fixed frame.
+        stamp_ns: (R,) int64 of each, or None where messages have no stamps.
+        poses: where they are.
+        solids: what they consist of.
+        height: (R, 2) above the origin of each; None for the heights of the solids.
+        uncertainty: (R,) radius.
+        covariance: (R, 3, 3) of the position with the number of deviations applied, or None.
+        lifetime_ns: (R,) 0 for ever; None for all of them.
+        gone: (message, name's code or `EVERYONE`) of those that were deleted.
+        skipped: how many objects had nothing that is a body.
+    """
+
+    message: Integers
+    name: Integers
+    class_code: Integers
+    frames: list[str] | None
+    stamp_ns: Integers | None
+    poses: Poses
+    solids: Solids
+    height: Floats | None
+    uncertainty: Floats
+    covariance: Floats | None
+    lifetime_ns: Integers | None
+    gone: list[tuple[int, int]] = field(default_factory=list)
+    skipped: int = 0
+
+
+class Extractor:
+    """Reads the objects of one topic.
+
+    Args:
+        names, classes: codes that all topics share.
+        needs_frame: whether frames matter: whether there is a fixed one.
+        needs_stamp: whether the objects' stamps matter.
+    """
+
+    def __init__(
+        self,
+        reading: Reading,
+        topic: str,
+        names: Codes,
+        classes: Codes,
+        *,
+        only: Sequence[str] = (),
+        without: Sequence[str] = (),
+        needs_frame: bool = False,
+    ) -> None:
+        self.reading = reading
+        self._names, self._classes = names, classes
+        self._namer = Namer(Template.of(reading.name), topic, names, only, without)
+        self._needs_frame = needs_frame
+        self._path = Path.of(reading.objects) if reading.objects else None
+        self._list: Get | None = None
+        self._binding: Binding | None = None
+        self._time: TimeGetter | None = None
+        self._has_time = False
+
+    @property
+    def is_bound(self) -> bool:
+        """Whether an object has been seen, so that every path is known to lead somewhere."""
+        return self._binding is not None
+
+    def message_times(self, messages: Sequence[object]) -> list[int | None]:
+        """The stamp of each message: its own, or that of its first object; None where it has none.
+
+        Raises:
+            FieldError: there is no stamp where the reading says.
+        """
+        times: list[int | None] = []
+        for message in messages:
+            first = next(iter(self._elements(message)), None)
+            own = first if first is not None else message
+            if not self._has_time:
+                if first is None:
+                    times.append(None)
+                    continue
+                self._bind_time(own, message)
+            if self._time is None:
+                times.append(None)
+            elif self._time.path.from_message:
+                times.append(self._time.nanoseconds([message])[0])
+            else:
+                times.append(None if first is None else self._time.nanoseconds([first])[0])
+        return times
+
+    def extract(self, messages: Sequence[object]) -> Seen:
+        """
+        Raises:
+            FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError: a message that is
+                not as the others; the first says what is wrong.
+        """
+        objects, index, places = self._objects(messages)
+        gone: list[tuple[int, int]] = []
+        if self.reading.solids == "scene":
+            gone = self._deleted_entities(messages)
+        style = style_of(messages[0]) if messages else "attributes"
+        names = self._namer.codes(objects, places, style)
+        if self.reading.solids == "marker":
+            objects, index, names, gone = self._without_deleted(objects, index, names)
+        if self._namer.is_filtering():
+            texts = list(self._names)
+            keep = [self._namer.wants(code, texts[code]) for code in names]
+            objects, index, names = _kept(keep, objects, index, names)
+        if objects and self._binding is None:
+            message = messages[index[0]]
+            self._binding = bind(self.reading, objects[0], message, needs_frame=self._needs_frame)
+            self._bind_time(objects[0], message)
+        return self._columns(messages, objects, index, names, gone)
+
+    def _columns(
+        self,
+        messages: Sequence[object],
+        objects: list[Any],
+        index: list[int],
+        names: list[int],
+        gone: list[tuple[int, int]],
+    ) -> Seen:
+        if self._binding is None:
+            return _nobody(gone)
+        binding = self._binding
+        substance = substance_of(self.reading, binding, objects)
+        skipped = 0
+        if substance.bodiless is not None:
+            keep = ~substance.bodiless
+            skipped = int(substance.bodiless.sum())
+            objects, index, names = _kept(keep.tolist(), objects, index, names)
+        numbers = _numbers(binding, objects)
+        poses = substance.poses if substance.poses is not None else poses_of(self.reading, binding, numbers)
+        return Seen(
+            message=np.array(index, np.int64),
+            name=np.array(names, np.int64),
+            class_code=np.array(class_codes(self.reading, binding, objects, self._classes), np.int64),
+            frames=self._frames(messages, objects, index),
+            stamp_ns=self._stamps(messages, objects, index),
+            poses=poses,
+            solids=substance.solids(poses, numbers),
+            height=_measured(binding.height, numbers),
+            uncertainty=_uncertainty(binding, numbers, len(objects)),
+            covariance=_covariance(self.reading, binding, objects),
+            lifetime_ns=None
+            if binding.lifetime is None
+            else np.array(binding.lifetime.nanoseconds(objects), np.int64),
+            gone=gone,
+            skipped=skipped,
+        )
+
+    def _objects(self, messages: Sequence[object]) -> tuple[list[Any], list[int], list[int]]:
+        """All objects, the message of each, and its place in that."""
+        if self._path is None:
+            return list(messages), list(range(len(messages))), [0] * len(messages)
+        if self._list is None and messages:
+            # the first message is taken step by step, so that a wrong path is told well
+            list(iter_elements(self._path, messages[0]))
+            self._list = list_getter(self._path, style_of(messages[0])) or self._elements
+        lists = list(map(self._list, messages)) if self._list is not None else []
+        counts = [len(each) for each in lists]
+        index = np.repeat(np.arange(len(counts)), counts).tolist()
+        places = list(chain.from_iterable(map(range, counts)))
+        return list(chain.from_iterable(lists)), index, places
+
+    def _elements(self, message: object) -> list[object]:
+        return [message] if self._path is None else list(iter_elements(self._path, message))
+
+    def _deleted_entities(self, messages: Sequence[object]) -> list[tuple[int, int]]:
+        gone: list[tuple[int, int]] = []
+        for number, message in enumerate(messages):
+            read = reader_of(style_of(message))
+            for deletion in read(message, "deletions") or ():
+                if read(deletion, "type") == DELETE_ALL_ENTITIES:
+                    gone.append((number, EVERYONE))
+                else:
+                    (code,) = self._namer.codes([deletion], [0], style_of(deletion))
+                    gone.append((number, code))
+        return gone
+
+    def _without_deleted(
+        self, objects: list[Any], index: list[int], names: list[int]
+    ) -> tuple[list[Any], list[int], list[int], list[tuple[int, int]]]:
+        """The markers that are shown, and those that are deleted."""
+        gone: list[tuple[int, int]] = []
+        if not objects:
+            return objects, index, names, gone
+        read = reader_of(style_of(objects[0]))
+        actions = [read(each, "action") for each in objects]
+        if any(actions):
+            for action, number, name in zip(actions, index, names, strict=True):
+                if action == MARKER_DELETE_ALL:
+                    gone.append((number, EVERYONE))
+                elif action == MARKER_DELETE:
+                    gone.append((number, name))
+            keep = [action == MARKER_ADD or not action for action in actions]
+            objects, index, names = _kept(keep, objects, index, names)
+        return objects, index, names, gone
+
+    def _bind_time(self, example: object, message: object) -> None:
+        if not self._has_time:
+            self._time = bind_time(self.reading.stamp, example, message) if self.reading.stamp else None
+            self._has_time = True
+
+    def _frames(self, messages: Sequence[object], objects: list[Any], index: list[int]) -> list[str] | None:
+        if self.reading.frame_name is not None:
+            return [self.reading.frame_name] * len(objects)
+        binding = self._binding
+        if binding is None or binding.frame is None:
+            return None
+        get, from_message = binding.frame
+        if from_message:
+            of_message = [get(message) for message in messages]
+            return [str(of_message[number]).removeprefix("/") for number in index]
+        return [str(get(each)).removeprefix("/") for each in objects]
+
+    def _stamps(self, messages: Sequence[object], objects: list[Any], index: list[int]) -> Integers | None:
+        if self._time is None or not self._needs_frame:
+            return None
+        if self._time.path.from_message:
+            return np.array(self._time.nanoseconds(messages), np.int64)[index]
+        return np.array(self._time.nanoseconds(objects), np.int64)
+
+
+def _kept(
+    keep: list[bool], objects: list[Any], index: list[int], names: list[int]
+) -> tuple[list[Any], list[int], list[int]]:
+    if all(keep):
+        return objects, index, names
+    return list(compress(objects, keep)), list(compress(index, keep)), list(compress(names, keep))
+
+
+def _numbers(binding: Binding, objects: list[Any]) -> Floats:
+    """(R, width) every number that is read from the objects."""
+    if binding.numbers is None:
+        return np.empty((len(objects), 0))
+    rows = [binding.numbers(each) for each in objects]
+    return np.array(rows, np.float64).reshape(len(objects), binding.width)
+
+
+def _measured(measures: tuple[float | int, ...], numbers: Floats) -> Floats | None:
+    """(R, K) numbers of K measures."""
+    if not measures:
+        return None
+    columns = [
+        numbers[:, each] if isinstance(each, int) else np.full(len(numbers), each) for each in measures
+    ]
+    return np.stack(columns, axis=1)
+
+
+def _uncertainty(binding: Binding, numbers: Floats, count: int) -> Floats:
+    if isinstance(binding.uncertainty, int):
+        return numbers[:, binding.uncertainty]
+    return np.full(count, binding.uncertainty or 0.0)
+
+
+def _covariance(reading: Reading, binding: Binding, objects: list[Any]) -> Floats | None:
+    """(R, 3, 3) the position's part, times the square of the number of deviations."""
+    if binding.covariance is None or reading.uncertainty is None:
+        return None
+    rows = np.array([list(binding.covariance(each)) for each in objects], np.float64)
+    size = {4: 2, 9: 3, 36: 6}[rows.shape[1]]
+    used = min(size, 3)
+    found = np.zeros((len(objects), 3, 3))
+    found[:, :used, :used] = rows.reshape(-1, size, size)[:, :used, :used]
+    return found * reading.uncertainty.sigmas**2
+
+
+def _nobody(gone: list[tuple[int, int]]) -> Seen:
+    none = np.empty(0, np.int64)
+    empty = np.empty((0, 3))
+    matrices = np.empty((0, 3, 3))
+    return Seen(
+        message=none,
+        name=none,
+        class_code=none,
+        frames=None,
+        stamp_ns=None,
+        poses=Poses(empty, matrices, np.empty(0)),
+        solids=Solids(
+            none, np.empty(0, np.int8), empty, matrices, empty, np.zeros(1, np.int64), np.empty((0, 3))
+        ),
+        height=None,
+        uncertainty=np.empty(0),
+        covariance=None,
+        lifetime_ns=None,
+        gone=gone,
+    )

@@ -1,0 +1,59 @@
+"""When samples are taken."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spatial_replay.errors import LogError
+from spatial_replay.geometry.arrays import Integers
+from spatial_replay.logs.mapping.plan import Plan
+
+_MOST_STEPS = 100_000
+"""Samples between two messages; more are no log with pauses, but a clock that jumped."""
+
+
+class Instants:
+    """The times of samples, as the messages go by."""
+
+    def __init__(self, plan: Plan, name: str) -> None:
+        self._name = name
+        self._step_ns = plan.mapping.sampling.step_ns
+        self._last_ns = -1
+
+    def upto(self, times_ns: Integers, upto_ns: int) -> Integers:
+        """The times of the next samples, each once.
+
+        Args:
+            times_ns: of the messages that are new: those of the sampled topic or, for samples at
+                each multiple of a step, of all topics with objects or signals.
+            upto_ns: how far the log is known.
+
+        Raises:
+            LogError: there are far too many samples to where the log goes on.
+        """
+        if self._step_ns is None:
+            times = np.unique(times_ns)
+            times = times[times > self._last_ns]
+        else:
+            times = self._multiples(times_ns, upto_ns, self._step_ns)
+        if len(times):
+            self._last_ns = int(times[-1])
+        return times
+
+    def _multiples(self, times_ns: Integers, upto_ns: int, step_ns: int) -> Integers:
+        if self._last_ns < 0:
+            if not len(times_ns):
+                return np.empty(0, np.int64)
+            first = -(-int(times_ns.min()) // step_ns)
+        else:
+            first = self._last_ns // step_ns + 1
+        stop = upto_ns // step_ns + 1
+        marks = np.unique(np.concatenate([[first * step_ns, upto_ns], times_ns]))
+        gaps = np.diff(marks)
+        if len(gaps) and int(gaps.max()) // step_ns > _MOST_STEPS:
+            at = int(np.argmax(gaps))
+            raise LogError(
+                f"{self._name}: time jumps forward from {marks[at]} ns to {marks[at + 1]} ns, more than"
+                f" {_MOST_STEPS} samples without a message; take another clock or a longer step"
+            )
+        return np.arange(first, max(first, stop), dtype=np.int64) * step_ns

@@ -1,0 +1,169 @@
+"""Names and classes of objects, as numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from fnmatch import fnmatchcase
+from typing import Any
+
+from spatial_replay.logs.mapping.binding import Binding
+from spatial_replay.logs.mapping.fields import Style, field_names, type_name
+from spatial_replay.logs.mapping.paths import FieldError, Path, getter, walk
+from spatial_replay.logs.mapping.readings import Reading
+from spatial_replay.logs.mapping.templates import INDEX, TOPIC, Template, name_from_topic
+
+Get = Callable[[Any], Any]
+
+
+class Codes(dict[Any, int]):
+    """A number for each value, counted as they come."""
+
+    def __missing__(self, value: Any) -> int:
+        code = self[value] = len(self)
+        return code
+
+
+class Namer:
+    """Objects' names from a template, as codes that several namers share."""
+
+    def __init__(
+        self, template: Template, topic: str, codes: Codes, only: Sequence[str], without: Sequence[str]
+    ) -> None:
+        self._template = template
+        self._topic = name_from_topic(topic)
+        self._codes = codes
+        self._only, self._without = tuple(only), tuple(without)
+        self._wanted: dict[int, bool] = {}
+        self._by_values: dict[Any, int] = {}
+        self._get: Get | None = None
+
+    def codes(self, objects: Sequence[object], places: Sequence[int], style: Style) -> list[int]:
+        """The code of each object's name.
+
+        Args:
+            places: where each object stands in its list.
+
+        Raises:
+            FieldError: a field of the template is missing, or the name is empty or too long.
+        """
+        if self._template.is_constant or self._template.text == "{topic}":
+            name = "".join(str(part) for part in self._template.parts) if self._template.is_constant else ""
+            return [self._codes[_checked(name or self._topic)]] * len(objects)
+        get = self._single()
+        known = self._by_values
+        if get is None:
+            return [self._codes[self._name(each, place)] for each, place in zip(objects, places, strict=True)]
+        # most names depend on one field alone
+        found = []
+        for each in objects:
+            value = get(each) if style == "attributes" else each[self._field()]  # type: ignore[index]
+            code = known.get(value)
+            if code is None:
+                code = known[value] = self._codes[self._name(each, 0)]
+            found.append(code)
+        return found
+
+    def is_filtering(self) -> bool:
+        return bool(self._only or self._without)
+
+    def wants(self, code: int, name: str) -> bool:
+        """Whether an object of this name is to be kept."""
+        found = self._wanted.get(code)
+        if found is None:
+            kept = not self._only or any(fnmatchcase(name, pattern) for pattern in self._only)
+            found = kept and not any(fnmatchcase(name, pattern) for pattern in self._without)
+            self._wanted[code] = found
+        return found
+
+    def _single(self) -> Get | None:
+        """How the one field is read that the name depends on; None where it is not as simple as that."""
+        if self._get is None and self._field():
+            self._get = getter(Path.of(self._field()), "attributes")
+        return self._get
+
+    def _field(self) -> str:
+        fields = [part for part in self._template.parts if not isinstance(part, str)]
+        if len(fields) == 1 and len(fields[0]) == 1:
+            (path,) = fields[0]
+            if len(path.steps) == 1 and path.text not in (INDEX, TOPIC) and not path.from_message:
+                return path.text
+        return ""
+
+    def _name(self, thing: object, place: int) -> str:
+        words = [
+            part if isinstance(part, str) else self._word(part, thing, place) for part in self._template.parts
+        ]
+        return _checked("".join(words))
+
+    def _word(self, alternatives: tuple[Path, ...], thing: object, place: int) -> str:
+        for path in alternatives:
+            if path.text in (INDEX, TOPIC) and path.text not in field_names(thing):
+                return str(place) if path.text == INDEX else self._topic
+            try:
+                word = _text(walk(path, thing), path)
+            except FieldError:
+                if len(alternatives) == 1:
+                    raise
+                continue
+            if word:
+                return word
+        raise FieldError(f"{{{'|'.join(path.text for path in alternatives)}}} is empty; choose another name")
+
+
+def class_codes(reading: Reading, binding: Binding, objects: Sequence[object], codes: Codes) -> list[int]:
+    """The code of each object's class."""
+    if not binding.class_gets:
+        return [codes[reading.class_name]] * len(objects)
+    known: dict[Any, int] = {}
+    found = []
+    for each in objects:
+        value = _first_value(binding.class_gets, each)
+        code = known.get(value)
+        if code is None:
+            code = known[value] = codes[_class_name(reading, value)]
+        found.append(code)
+    return found
+
+
+def _first_value(gets: Sequence[Get], thing: object) -> Any:
+    for get in gets:
+        try:
+            value = get(thing)
+        except (AttributeError, LookupError, TypeError):
+            continue
+        # what cannot be a key cannot be a class
+        return value if isinstance(value, str | int | float | bool) else str(value)
+    return None
+
+
+def _class_name(reading: Reading, value: object) -> str | None:
+    if value is None or value == "":
+        return None
+    text = str(value)
+    if text in reading.class_table:
+        return reading.class_table[text]
+    return reading.class_other if reading.class_has_other else text
+
+
+def _text(value: object, path: Path) -> str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, float) and value.is_integer():
+        return str(int(value))
+    if isinstance(value, int | float) or (hasattr(value, "item") and not hasattr(value, "__len__")):
+        return str(value)
+    if field_names(value) == ("value",):
+        # such as osi3.Identifier
+        return str(getattr(value, "value", ""))
+    raise FieldError(f"{path.text}: {type_name(value)} where a text or a number belongs")
+
+
+_LONGEST_NAME = 500
+
+
+def _checked(name: str) -> str:
+    if not name or len(name) > _LONGEST_NAME or not name.isprintable():
+        raise FieldError(
+            f"the name {name[:40]!r} is empty, too long or not printable; give another with `name`"
+        )
+    return name
