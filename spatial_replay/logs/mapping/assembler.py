@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from spatial_replay.errors import LogError
-from spatial_replay.geometry.arrays import Integers
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.faults import FaultList
 from spatial_replay.logs.foreign.messages import Decoder, Message
@@ -136,40 +136,38 @@ class Assembler:
         if not self._plan.by_log_time:
             self._accept_in_order(messages, by_topic)
             return
-        for topic, listed in by_topic.items():
+        for topic, places in by_topic.items():
             channel = self._channels.get(topic)
             if channel is not None:
+                listed = [messages[i] for i in places]
                 contents, kept = channel.decoded(listed)
-                self._take_in(
-                    channel, [listed[i] for i in kept] if len(kept) < len(listed) else listed, contents
-                )
+                if len(kept) < len(listed):
+                    listed = [listed[i] for i in kept]
+                self._put(channel, [message[1] for message in listed], listed, contents)
 
-    def _accept_in_order(self, messages: Sequence[Message], by_topic: dict[str, list[Message]]) -> None:
+    def _accept_in_order(self, messages: Sequence[Message], by_topic: dict[str, list[int]]) -> None:
         """Accept messages whose times are only known once they are decoded."""
-        timed: dict[str, tuple[list[int], Sequence[Message], list[object]]] = {}
-        for topic, listed in by_topic.items():
+        timed: list[_Timed] = []
+        for topic, places in by_topic.items():
             channel = self._channels.get(topic)
             if channel is not None:
-                contents, kept = channel.decoded(listed)
-                timed[topic] = channel.times([listed[i] for i in kept], contents)
-        place = {id(message): number for number, message in enumerate(messages)}
-        moving = [
-            (place[id(message)], time, message)
-            for topic, (times, listed, _) in timed.items()
-            if self._is_moving(topic)
-            for time, message in zip(times, listed, strict=True)
-        ]
-        moving.sort(key=lambda entry: entry[0])
-        upto = self._jump([time for _, time, _ in moving], [message for _, _, message in moving])
+                contents, kept = channel.decoded([messages[i] for i in places])
+                places = [places[i] for i in kept]
+                times, kept = channel.times([messages[i] for i in places], contents)
+                timed.append(_Timed(channel, times, [places[i] for i in kept], [contents[i] for i in kept]))
+        moving = sorted(
+            entry
+            for each in timed
+            if self._is_moving(each.channel.name)
+            for entry in zip(each.places, each.times_ns, strict=True)
+        )
+        upto = self._jump([time for _, time in moving], [messages[place] for place, _ in moving])
         last = moving[upto][0] if upto is not None else len(messages)
-        for topic, (times, listed, contents) in timed.items():
-            kept = [i for i, message in enumerate(listed) if place[id(message)] < last]
-            self._put(
-                self._channels[topic],
-                np.array([times[i] for i in kept], np.int64),
-                [listed[i] for i in kept],
-                [contents[i] for i in kept],
-            )
+        for each in timed:
+            # places increase
+            count = bisect_left(each.places, last)
+            taken = [messages[place] for place in each.places[:count]]
+            self._put(each.channel, each.times_ns[:count], taken, each.contents[:count])
 
     def _without_jump(self, messages: Sequence[Message]) -> Sequence[Message]:
         moving = [message for message in messages if self._is_moving(message[0])]
@@ -217,16 +215,12 @@ class Assembler:
         self._remarks.add(f"{where}: the log is taken to end there; cut it to evaluate what comes after")
         return at
 
-    def _take_in(self, channel: Channel, messages: Sequence[Message], contents: list[object]) -> None:
-        times = np.array([message[1] for message in messages], np.int64)
-        self._put(channel, times, messages, contents)
-
     def _put(
-        self, channel: Channel, times_ns: Integers, messages: Sequence[Message], contents: list[object]
+        self, channel: Channel, times_ns: list[int], messages: Sequence[Message], contents: list[object]
     ) -> None:
         planned = channel.planned
         if planned.is_transforms:
-            for time_ns, message, content in zip(times_ns.tolist(), messages, contents, strict=True):
+            for time_ns, message, content in zip(times_ns, messages, contents, strict=True):
                 try:
                     add_transforms(self._tree, content, time_ns, is_static=planned.is_static)
                 except MISFITS as error:
@@ -238,7 +232,8 @@ class Assembler:
         log_times = np.array([message[1] for message in messages], np.int64)
         sequences = np.array([message[3] for message in messages], np.int64)
         # what is stamped before what is settled came too late for it, and counts from now on
-        channel.pending.add(np.maximum(times_ns, self._settled_ns + 1), sequences, log_times, contents)
+        times = np.maximum(np.array(times_ns, np.int64), self._settled_ns + 1)
+        channel.pending.add(times, sequences, log_times, contents)
 
     def _settle(self, upto_ns: int) -> Trace:
         """The samples up to a time, all of whose messages are there."""
@@ -254,11 +249,21 @@ class Assembler:
         self._faults.add(f"{self._name}: {topic} at {log_time_ns} ns: {what}")
 
 
-def _by_topic(messages: Sequence[Message]) -> dict[str, list[Message]]:
-    found: dict[str, list[Message]] = {}
-    for message in messages:
-        listed = found.get(message[0])
-        if listed is None:
-            listed = found[message[0]] = []
-        listed.append(message)
+class _Timed(NamedTuple):
+    """Decoded messages of one topic: their times, where they stand among all, what they hold."""
+
+    channel: Channel
+    times_ns: list[int]
+    places: list[int]
+    contents: list[object]
+
+
+def _by_topic(messages: Sequence[Message]) -> dict[str, list[int]]:
+    """Where the messages of each topic stand."""
+    found: dict[str, list[int]] = {}
+    for place, message in enumerate(messages):
+        places = found.get(message[0])
+        if places is None:
+            places = found[message[0]] = []
+        places.append(place)
     return found

@@ -18,6 +18,7 @@ from spatial_replay.logs.mapping.paths import FieldError, Get, Path, check, gett
 from spatial_replay.logs.mapping.plan import PlannedTopic
 from spatial_replay.logs.mapping.readings import GENERIC
 from spatial_replay.logs.mapping.transforms import stamp_of_transforms
+from spatial_replay.trace.times import LATEST_NS
 
 MISFITS = (FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError)
 """What reading fields of a message raises that is not as the mapping says."""
@@ -109,28 +110,22 @@ class Channel:
             payloads = [message[4] for message in messages]
             return self._one_by_one(payloads, decode, [message[1] for message in messages])
 
-    def times(
-        self, messages: Sequence[Message], contents: list[object]
-    ) -> tuple[list[int], Sequence[Message], list[object]]:
-        """The time of each message on its clock, and those messages and contents that have one.
+    def times(self, messages: Sequence[Message], contents: Sequence[object]) -> tuple[list[int], list[int]]:
+        """The time of each message on its clock, and which of the messages have one.
 
         Raises:
             UsageError: there are no stamps where the mapping says.
         """
-        if self.planned.clock == "log":
-            return [message[1] for message in messages], messages, contents
-        if self.planned.clock == "publish":
-            return [message[2] for message in messages], messages, contents
+        if self.planned.clock != "header":
+            by_log = self.planned.clock == "log"
+            times_ns = [message[1] if by_log else message[2] for message in messages]
+            return times_ns, list(range(len(messages)))
         found, kept = self._one_by_one(contents, self._stamp, [message[1] for message in messages])
-        times = [time for time in found if isinstance(time, int)]
-        if len(times) < len(found):
-            kept = [place for place, time in zip(kept, found, strict=True) if isinstance(time, int)]
-        late = [time for time in times if not 0 <= time < 2**63]
+        pairs = [(time, place) for time, place in zip(found, kept, strict=True) if isinstance(time, int)]
+        late = [time for time, _ in pairs if not 0 <= time <= LATEST_NS]
         if late:
-            raise UsageError(
-                f"{self.name}: its stamp {late[0]} lies outside the times of a log; take another clock"
-            )
-        return times, [messages[i] for i in kept], [contents[i] for i in kept]
+            raise self._misfit(f"its stamp {late[0]} ns lies outside the times of a log; take another clock")
+        return [time for time, _ in pairs], [place for _, place in pairs]
 
     def seen(self, log_times_ns: Integers, contents: list[object]) -> tuple[Seen, list[int]]:
         """The objects in messages, and which of the messages could be read.
