@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
-import tempfile
-import weakref
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from functools import cached_property
@@ -26,7 +23,7 @@ from spatial_replay.logs.foreign.ordering import CountedTopics, Run, merged
 from spatial_replay.logs.foreign.sqlite_bag import SqliteBag
 from spatial_replay.logs.foreign.sqlite_tables import SQLITE_MAGIC
 from spatial_replay.logs.foreign.topic_table import topics_named
-from spatial_replay.logs.foreign.unpacking import ZSTD_MAGIC, unpack_file, unpacked
+from spatial_replay.logs.foreign.unpacking import ZSTD_MAGIC, temporary_folder, unpack_file, unpacked
 from spatial_replay.logs.mcap_records import MAGIC
 
 METADATA_FILE = "metadata.yaml"
@@ -89,10 +86,8 @@ class BagFolder:
 
     @cached_property
     def _unpacked_files(self) -> Path:
-        """A folder for decompressed files that goes away with this reader."""
-        folder = tempfile.mkdtemp(prefix="spatial-replay-")
-        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        return Path(folder)
+        """A folder for decompressed files."""
+        return temporary_folder(self)
 
     @cached_property
     def _topics(self) -> tuple[Topic, ...]:

@@ -178,6 +178,8 @@ def _connection(fields: dict[str, bytes], data: bytes) -> Connection:
 
 
 def _record(stream: BinaryIO, position: int, size: int) -> _Record:
+    if position > size:
+        raise DamageError("the place lies outside the file")
     stream.seek(position)
     head_length = _word(stream)
     if head_length > min(LONGEST_HEAD, size - position):

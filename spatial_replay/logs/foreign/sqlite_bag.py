@@ -13,12 +13,13 @@ from spatial_replay.logs.foreign.messages import Decoder, Message, Topic
 from spatial_replay.logs.foreign.ordering import CountedTopics
 from spatial_replay.logs.foreign.sqlite_tables import (
     BagTables,
+    extent_of,
     iter_rows,
-    missing_bytes,
     opened,
     read_tables,
 )
 from spatial_replay.logs.foreign.topic_table import topics_named
+from spatial_replay.logs.foreign.unpacking import copy_beginning, temporary_folder
 from spatial_replay.trace.times import LATEST_NS
 
 _ROW_BYTES = 6
@@ -40,9 +41,16 @@ class SqliteBag:
         return self._path.name
 
     @cached_property
+    def _whole(self) -> Path:
+        """The file; if it was cut, a copy of its whole pages: the rest of a page would read as zeros."""
+        extent = extent_of(self._path)
+        if not extent.missing:
+            return self._path
+        self._faults.add(f"{self.name}: at least {extent.missing} bytes are missing from its end")
+        return copy_beginning(self._path, extent.whole, temporary_folder(self))
+
+    @cached_property
     def _tables(self) -> BagTables:
-        if missing := missing_bytes(self._path):
-            self._faults.add(f"{self.name}: at least {missing} bytes are missing from its end")
         for ending in ("-wal", "-journal"):
             beside = self._path.with_name(self.name + ending)
             if beside.is_file() and beside.stat().st_size:
@@ -50,7 +58,7 @@ class SqliteBag:
                     f"{self.name}: its recorder was interrupted, and what {beside.name} holds was not read;"
                     " open a copy of both with sqlite3 to bring them together"
                 )
-        with opened(self._path) as database:
+        with opened(self._whole) as database:
             return read_tables(database, self.name)
 
     @cached_property
@@ -61,7 +69,7 @@ class SqliteBag:
     def start_ns(self) -> int | None:
         """Log time of the first message."""
         try:
-            with opened(self._path) as database:
+            with opened(self._whole) as database:
                 ((start_ns,),) = database.execute("SELECT min(timestamp) FROM messages")
         except LogError:
             # the damage is told when the messages are read
@@ -104,7 +112,7 @@ class SqliteBag:
     def _messages(self, topics: Collection[str], first: int, last: int) -> Iterator[Message]:
         wanted = {number: topic.name for number, topic in self._tables.topics.items() if topic.name in topics}
         most = self._path.stat().st_size // _ROW_BYTES
-        with opened(self._path) as database:
+        with opened(self._whole) as database:
             rows = iter_rows(database, sorted(wanted), first, last, self._faults, self.name)
             for _, number, time_ns, payload in rows:
                 most -= 1

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 from spatial_replay.errors import LogError
@@ -75,18 +75,27 @@ def opened(path: Path) -> Iterator[sqlite3.Connection]:
         raise LogError(f"{path.name}: the database is damaged ({error})") from None
 
 
-def missing_bytes(path: Path) -> int:
-    """How many bytes are missing from the end of a file, as its head counts its pages."""
+class Extent(NamedTuple):
+    """How much of a file is there: bytes missing from its end, and bytes in whole pages."""
+
+    missing: int
+    whole: int
+
+
+def extent_of(path: Path) -> Extent:
+    """What is left of a file, by its head."""
+    size = path.stat().st_size
     with path.open("rb") as stream:
         head = stream.read(100)
     if len(head) < 100:
-        return 100 - len(head)
+        return Extent(100 - len(head), size)
     page = int.from_bytes(head[16:18], "big")
+    page = 65536 if page == 1 else page
     pages = int.from_bytes(head[28:32], "big")
-    if head[24:28] != head[92:96]:
-        # written by a version that does not count them
-        return 0
-    return max(0, pages * (65536 if page == 1 else page) - path.stat().st_size)
+    if page < 512 or head[24:28] != head[92:96]:
+        # damaged, or written by a version that does not count pages
+        return Extent(0, size)
+    return Extent(max(0, pages * page - size), size - size % page)
 
 
 def read_tables(database: sqlite3.Connection, name: str) -> BagTables:

@@ -1,7 +1,10 @@
-"""Files and messages that a ROS 2 recorder compressed as a whole."""
+"""Files that cannot be read in place: decompressed, or without a broken end. Messages compressed each."""
 
 from __future__ import annotations
 
+import shutil
+import tempfile
+import weakref
 from pathlib import Path
 
 import zstandard
@@ -13,6 +16,23 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _PIECE = 2**20
 _MOST_TIMES_LARGER = 1_000
 _ALWAYS_ALLOWED = 2**26
+
+
+def temporary_folder(owner: object) -> Path:
+    """A folder that goes away with its owner."""
+    folder = tempfile.mkdtemp(prefix="spatial-replay-")
+    weakref.finalize(owner, shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
+
+
+def copy_beginning(path: Path, size: int, folder: Path) -> Path:
+    """Copy the first `size` bytes of a file into a folder."""
+    target = folder / path.name
+    with path.open("rb") as source, target.open("wb") as sink:
+        while size > 0 and (piece := source.read(min(size, _PIECE))):
+            sink.write(piece)
+            size -= len(piece)
+    return target
 
 
 def unpack_file(packed: Path, folder: Path) -> Path:

@@ -1,0 +1,152 @@
+"""Damaged logs of messages: what is left is read, what is lost is told, and nothing else happens."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from logs.foreign.bag_files import drive, write_json_mcap, write_ros1, write_ros2
+from spatial_replay.errors import LogError
+from spatial_replay.logs.foreign.messages import Message
+from spatial_replay.logs.foreign.opening import open_messages
+
+SENT = drive(60)
+
+
+class Log(NamedTuple):
+    """A way to write a log of one file.
+
+    Attributes:
+        is_checked: whether its container has checksums, so that no change of its messages goes unseen.
+    """
+
+    write: Callable[[Path], Path]
+    is_checked: bool
+
+
+LOGS = {
+    "ros1": Log(lambda folder: write_ros1(folder / "drive.bag", SENT), False),
+    "ros1 bz2": Log(lambda folder: write_ros1(folder / "drive.bag", SENT, compression="bz2"), True),
+    "ros1 lz4": Log(lambda folder: write_ros1(folder / "drive.bag", SENT, compression="lz4"), False),
+    "mcap cdr": Log(lambda folder: next(write_ros2(folder / "drive", SENT).glob("*.mcap")), False),
+    "db3": Log(
+        lambda folder: next(write_ros2(folder / "drive", SENT, storage="sqlite3").glob("*.db3")), False
+    ),
+    "mcap json": Log(
+        lambda folder: write_json_mcap(
+            folder / "drive.mcap", [(each.topic, each.time_ns, {"x": 1}) for each in SENT]
+        ),
+        True,
+    ),
+}
+
+
+class Outcome(NamedTuple):
+    messages: list[Message]
+    told: tuple[str, ...]
+
+
+def read(path: Path) -> Outcome:
+    """Everything that can be read and decoded, and all that is said of the rest."""
+    reader = open_messages(path)
+    try:
+        topics = reader.topics()
+        told = [topic.unreadable for topic in topics if topic.unreadable]
+        messages = list(reader.iter_messages([topic.name for topic in topics]))
+        told += reader.take_faults()
+        decoders = {topic.name: reader.decoder(topic.name) for topic in topics if not topic.unreadable}
+    except LogError as error:
+        return Outcome([], (str(error),))
+    for message in messages:
+        try:
+            if message.topic in decoders:
+                decoders[message.topic](message.payload)
+        except LogError as error:
+            told.append(str(error))
+    return Outcome(messages, tuple(told))
+
+
+@pytest.fixture(scope="module", params=LOGS.values(), ids=LOGS)
+def sound(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Log]:
+    log: Log = request.param
+    path = log.write(tmp_path_factory.mktemp("sound"))
+    assert read(path).told == ()
+    return path, log
+
+
+def test_a_log_cut_anywhere_is_told(sound: tuple[Path, Log], tmp_path: Path) -> None:
+    path, _ = sound
+    data, whole = path.read_bytes(), read(path).messages
+    randomly = random.Random(1)
+    cut = tmp_path / path.name
+    for size in {randomly.randrange(16, len(data)) for _ in range(200)}:
+        cut.write_bytes(data[:size])
+        messages, told = read(cut)
+        assert told, f"cut after {size} bytes"
+        assert set(messages) <= set(whole), f"cut after {size} bytes"
+
+
+def test_a_flipped_bit_is_told_or_changes_no_more_than_itself(
+    sound: tuple[Path, Log], tmp_path: Path
+) -> None:
+    path, log = sound
+    data, whole = path.read_bytes(), read(path).messages
+    randomly = random.Random(2)
+    flipped = tmp_path / path.name
+    for _ in range(200):
+        position, bit = randomly.randrange(16, len(data)), randomly.randrange(8)
+        changed = bytearray(data)
+        changed[position] ^= 1 << bit
+        flipped.write_bytes(changed)
+        messages, told = read(flipped)
+        where = f"bit {bit} of byte {position}"
+        if not told:
+            assert len(messages) == len(whole), where
+            differing = len(set(messages) - set(whole))
+            assert differing == 0 if log.is_checked else differing <= 60, where
+
+
+def test_a_damaged_stretch_costs_no_more_than_itself(tmp_path: Path) -> None:
+    path = write_ros1(tmp_path / "drive.bag", SENT, compression="bz2")
+    data = bytearray(path.read_bytes())
+    middle = data.index(b"BZh9", len(data) // 2)
+    data[middle + 20] ^= 0xFF
+    path.write_bytes(data)
+    messages, told = read(path)
+    assert 150 < len(messages) < 180
+    assert "are lost" in told[0] and "at byte" in told[0]
+    assert any("declares 60 messages on '/a'" in each for each in told)
+
+
+def test_a_bag_without_its_index_is_read(tmp_path: Path) -> None:
+    path = write_ros1(tmp_path / "drive.bag", SENT)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * 0.6)])
+    messages, told = read(path)
+    assert len(messages) > 60
+    assert "no index" in told[0] and "cannot be read" in told[1]
+
+
+def test_a_database_is_read_past_its_damage(tmp_path: Path) -> None:
+    path = next(write_ros2(tmp_path / "drive", drive(600), storage="sqlite3").glob("*.db3"))
+    data = bytearray(path.read_bytes())
+    for page in range(len(data) // 3 // 4096 * 4096, len(data) // 3 // 4096 * 4096 + 2 * 4096, 4096):
+        data[page : page + 8] = b"\xff" * 8
+    path.write_bytes(data)
+    messages, told = read(path)
+    assert 1_000 < len(messages) < 1_800
+    assert len(set(messages)) == len(messages)
+    assert "the database is damaged" in told[0]
+
+
+@pytest.mark.parametrize("junk", [b"", b"\x00" * 5_000, b"\xff" * 5_000, bytes(range(256)) * 20])
+@pytest.mark.parametrize("magic", [b"#ROSBAG V2.0\n", b"SQLite format 3\x00", b"\x89MCAP0\r\n"])
+def test_junk_after_a_good_beginning_is_told(tmp_path: Path, magic: bytes, junk: bytes) -> None:
+    path = tmp_path / "junk"
+    path.write_bytes(magic + junk)
+    messages, told = read(path)
+    assert not messages and told
