@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -13,12 +14,16 @@ import click
 
 from spatial_replay.cli.exit_codes import ExitCode
 from spatial_replay.cli.failures import say
+from spatial_replay.cli.options import Reading, reading_options
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.verdicts import counted
+from spatial_replay.errors import UsageError
 
 if TYPE_CHECKING:
+    from spatial_replay.logs.foreign.messages import MessageReader
     from spatial_replay.logs.mcap_info import LogSummary
     from spatial_replay.logs.overview import Overview
+    from spatial_replay.logs.survey import Survey
 
 _EPOCH_LIKELY_NS = 10**18
 """Clocks beyond this count from 1970 (2001 or later); others count from the start of something."""
@@ -27,8 +32,12 @@ _EPOCH_LIKELY_NS = 10**18
 @click.command()
 @click.argument("log", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
-def info(log: Path, as_json: bool) -> int:
+@click.option("--suggest-mapping", is_flag=True, help="Print a mapping file to start from instead (YAML).")
+@reading_options
+def info(log: Path, as_json: bool, suggest_mapping: bool, reading: Reading) -> int:
     """Say what a log holds: samples, objects, signals, topics, attachments.
+
+    Of a log of messages by others it says what could be read as objects; with a mapping, which objects are.
 
     The whole log is read. Exits with 0, or with 3 if it is damaged; what is wrong goes to standard error.
 
@@ -36,24 +45,55 @@ def info(log: Path, as_json: bool) -> int:
     Examples:
       spatial-replay info annotated.mcap
       spatial-replay info blocks.jsonl.gz --json
+      spatial-replay info drive.bag --suggest-mapping > drive.yaml
     """
     # the numerical libraries load when there is work for them
-    from spatial_replay.logs.overview import overview_of
+    from spatial_replay.logs.overview import overview_of, overview_of_survey
     from spatial_replay.logs.source import open_source
+    from spatial_replay.logs.survey import messages_in, survey
 
-    with progress("samples") as advance:
-        overview = overview_of(open_source(log), advance)
-    for fault in overview.faults:
-        say("warning", fault, colour="yellow")
-    if as_json:
-        click.echo(json.dumps(_document(overview), indent=2, ensure_ascii=False))
+    reader = messages_in(log)
+    if suggest_mapping:
+        return _suggest(log, reader, as_json)
+    surveyed = None
+    if reader is not None:
+        with progress("messages") as advance:
+            surveyed = survey(reader, advance)
+    if surveyed is not None and reading["mapping"] is None:
+        overview = overview_of_survey(log, surveyed)
     else:
-        for line in _lines(overview):
+        with progress("samples") as advance:
+            overview = overview_of(open_source(log, **reading), advance)
+    faults = tuple(dict.fromkeys((*overview.faults, *(surveyed.faults if surveyed else ()))))
+    for warning in dict.fromkeys((*faults, *(surveyed.remarks if surveyed else ()), *overview.remarks)):
+        say("warning", warning, colour="yellow")
+    if as_json:
+        click.echo(json.dumps(_document(overview, surveyed, faults), indent=2, ensure_ascii=False))
+    else:
+        for line in _lines(overview, surveyed, bool(faults)):
             click.echo(line)
-    return ExitCode.DAMAGED if overview.faults else ExitCode.SATISFIED
+    return ExitCode.DAMAGED if faults else ExitCode.SATISFIED
 
 
-def _document(overview: Overview) -> dict[str, object]:
+def _suggest(log: Path, reader: MessageReader | None, as_json: bool) -> int:
+    """Print a mapping file for a log of messages."""
+    from spatial_replay.logs.source import open_source
+    from spatial_replay.logs.survey import survey
+
+    if as_json:
+        raise UsageError("--suggest-mapping prints YAML; leave --json out")
+    if reader is None:
+        source = open_source(log)
+        raise UsageError(f"{source.name} needs no mapping: it names its objects itself")
+    with progress("messages") as advance:
+        surveyed = survey(reader, advance, whole=False)
+    for warning in (*surveyed.faults, *surveyed.remarks):
+        say("warning", warning, colour="yellow")
+    click.echo(surveyed.mapping, nl=False)
+    return ExitCode.DAMAGED if surveyed.faults else ExitCode.SATISFIED
+
+
+def _document(overview: Overview, survey: Survey | None, faults: tuple[str, ...]) -> dict[str, object]:
     container = overview.container
     document: dict[str, object] = {
         "name": overview.name,
@@ -61,16 +101,34 @@ def _document(overview: Overview) -> dict[str, object]:
         "samples": overview.samples,
         "start_ns": overview.start_ns,
         "end_ns": overview.end_ns,
-        "damaged": bool(overview.faults),
-        "faults": overview.faults,
+        "damaged": bool(faults),
+        "faults": faults,
         "objects": [asdict(each) for each in overview.objects],
         "signals": overview.signals,
     }
-    if container is not None:
+    if survey is not None:
+        document["messages"] = {
+            "count": survey.messages,
+            "start_ns": survey.start_ns,
+            "end_ns": survey.end_ns,
+        }
+        document["topics"] = [
+            {
+                "topic": each.topic.name,
+                "schema": each.topic.type,
+                "encoding": each.topic.encoding,
+                "messages": each.messages,
+                "mapping": each.entry or None,
+                "unreadable": each.topic.unreadable,
+            }
+            for each in survey.topics
+        ]
+    elif container is not None:
         document["topics"] = [
             {"topic": topic, "schema": schema, "encoding": encoding, "messages": messages}
             for topic, schema, encoding, messages in _topics(container)
         ]
+    if container is not None:
         document["metadata"] = [{"name": name, "data": dict(data)} for name, data in container.metadata]
         document["attachments"] = [asdict(each) for each in container.attachments]
     return document
@@ -82,12 +140,16 @@ def _topics(container: LogSummary) -> Iterator[tuple[str, str, str, int]]:
         yield each.channel.topic, schema, each.channel.encoding, each.messages
 
 
-def _lines(overview: Overview) -> Iterator[str]:
-    damaged = ", damaged" if overview.faults else ""
-    yield f"{overview.name}: {overview.kind}, {counted(overview.samples, 'sample')}{damaged}"
-    if overview.start_ns is not None and overview.end_ns is not None:
-        seconds = (overview.end_ns - overview.start_ns) / 1e9
-        yield f"time     {_clock(overview.start_ns)} to {_clock(overview.end_ns)} ({seconds:.3f} s)"
+def _lines(overview: Overview, survey: Survey | None, damaged: bool) -> Iterator[str]:
+    counts = counted(overview.samples, "sample")
+    if survey is not None and not overview.samples:
+        counts = counted(survey.messages, "message")
+    yield f"{overview.name}: {overview.kind}, {counts}{', damaged' if damaged else ''}"
+    start_ns, end_ns = overview.start_ns, overview.end_ns
+    if survey is not None and start_ns is None:
+        start_ns, end_ns = survey.start_ns, survey.end_ns
+    if start_ns is not None and end_ns is not None:
+        yield f"time     {_clock(start_ns)} to {_clock(end_ns)} ({(end_ns - start_ns) / 1e9:.3f} s)"
     if overview.objects:
         yield "objects"
         yield from _table(
@@ -101,13 +163,30 @@ def _lines(overview: Overview) -> Iterator[str]:
         )
     if overview.signals:
         yield f"signals  {', '.join(overview.signals)}"
+    if survey is not None:
+        yield from _survey_lines(survey, mapped=bool(overview.samples))
     if overview.container is not None:
-        yield from _container_lines(overview.container)
+        yield from _container_lines(overview.container, topics=survey is None)
 
 
-def _container_lines(container: LogSummary) -> Iterator[str]:
-    yield "topics"
-    yield from _table((*names, counted(messages, "message")) for *names, messages in _topics(container))
+def _survey_lines(survey: Survey, *, mapped: bool) -> Iterator[str]:
+    if survey.topics:
+        yield "topics"
+        yield from _table(
+            (each.topic.name, each.topic.type, each.topic.encoding, counted(each.messages, "message"))
+            for each in survey.topics
+        )
+    objects = [(f"{each.topic.name}:", each.entry) for each in survey.topics if each.entry]
+    if objects and not mapped:
+        yield "could be read as objects"
+        yield from _table(objects)
+        yield f"a mapping to start from: spatial-replay info {shlex.quote(survey.name)} --suggest-mapping"
+
+
+def _container_lines(container: LogSummary, *, topics: bool) -> Iterator[str]:
+    if topics:
+        yield "topics"
+        yield from _table((*names, counted(messages, "message")) for *names, messages in _topics(container))
     for name, data in container.metadata:
         yield f"metadata {name}"
         yield from _table(data.items())

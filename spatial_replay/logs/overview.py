@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
+from spatial_replay.errors import UsageError
 from spatial_replay.logs.mcap_info import LogSummary, summarise_mcap
 from spatial_replay.logs.mcap_reader import McapSource
-from spatial_replay.logs.source import Source
+from spatial_replay.logs.source import Source, TrackSource
+from spatial_replay.logs.survey import Survey
 from spatial_replay.trace.trace import Trace
 
 
@@ -38,6 +41,7 @@ class Overview:
         start_ns, end_ns: times of the first and the last sample; None without samples.
         faults: what was lost or set aside, in words.
         container: channels, metadata and attachments of an MCAP log; None for other formats.
+        remarks: why there is nothing to evaluate, in words.
     """
 
     name: str
@@ -49,6 +53,7 @@ class Overview:
     signals: tuple[str, ...]
     faults: tuple[str, ...]
     container: LogSummary | None = None
+    remarks: tuple[str, ...] = ()
 
 
 def overview_of(source: Source, advance: Callable[[int], object] = lambda samples: None) -> Overview:
@@ -61,12 +66,19 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
         LogError: nothing in the log can be read as a sample.
     """
     tally = _Tally()
+    remarks: list[str] = []
     container = summarise_mcap(source.path) if isinstance(source, McapSource) else None
     # a log of something else has no samples, and yet something to tell
     if container is None or container.has_objects:
-        for block in source.iter_blocks():
-            tally.add(block.trace)
-            advance(len(block.trace))
+        try:
+            for block in source.iter_blocks():
+                tally.add(block.trace)
+                advance(len(block.trace))
+        except UsageError as error:
+            # a scenario without objects is sound; a mapping that does not fit is a mistake to be put right
+            if not isinstance(source, TrackSource):
+                raise
+            remarks.append(str(error))
     faults = [*tally.faults, *(container.faults if container is not None else ())]
     return Overview(
         name=source.name,
@@ -78,6 +90,23 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
         signals=tuple(sorted(tally.signals)),
         # reading the samples and the rest of the file comes upon the same damage
         faults=tuple(dict.fromkeys(faults)),
+        container=container,
+        remarks=tuple(remarks),
+    )
+
+
+def overview_of_survey(path: Path, survey: Survey) -> Overview:
+    """What is in a log of messages by others, of which nothing says yet what its samples are."""
+    container = summarise_mcap(path) if survey.kind == McapSource.kind else None
+    return Overview(
+        name=survey.name,
+        kind=survey.kind,
+        samples=0,
+        start_ns=None,
+        end_ns=None,
+        objects=(),
+        signals=(),
+        faults=container.faults if container is not None else (),
         container=container,
     )
 

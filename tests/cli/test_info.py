@@ -10,6 +10,7 @@ import pytest
 from replay.runs import SPECIFICATION, PiecewiseSource
 from replay.runs import run as recorded_run
 from spatial_replay.cli.application import run
+from spatial_replay.logs.mapping.load import parse_mapping
 from spatial_replay.replay import run_replay
 from spatial_replay.spec.specification import parse_specification
 
@@ -107,3 +108,84 @@ def test_a_damaged_attachment_is_told_by_info_and_replay(
         assert run(arguments) == 3
         said = capsys.readouterr().err
         assert said.count("an attachment's checksum does not fit") == 1
+
+
+def test_a_scenario_without_objects_is_sound(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    empty = tmp_path / "empty.xml"
+    empty.write_text('<?xml version="1.0"?><commonRoad timeStepSize="0.1"/>')
+    assert run(["info", str(empty)]) == 0
+    said = capsys.readouterr()
+    assert "CommonRoad scenario, 0 samples" in said.out
+    assert "without obstacles" in said.err
+
+
+def test_a_log_by_others_says_what_could_be_read(
+    data_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = data_folder / "bags" / "two_turtles_lz4.bag"
+    assert run(["info", str(bag)]) == 0
+    said = capsys.readouterr().out
+    assert "ROS 1 bag, 8,647 messages" in said
+    assert "/turtle1/pose:  {name: turtle1, position: [x, y], yaw: theta, shape: {disc: 0.5}}" in said
+    assert "spatial-replay info two_turtles_lz4.bag --suggest-mapping" in said
+
+
+def test_topics_of_a_log_by_others_as_json(data_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["info", str(data_folder / "bags" / "pose_db3"), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert (document["kind"], document["samples"], document["messages"]["count"]) == ("ROS 2 bag", 0, 4695)
+    (pose,) = (each for each in document["topics"] if each["topic"] == "/pose")
+    assert pose == {
+        "topic": "/pose",
+        "schema": "geometry_msgs/msg/PoseStamped",
+        "encoding": "cdr",
+        "messages": 1565,
+        "mapping": "{shape: {disc: 0.5}}",
+        "unreadable": None,
+    }
+
+
+def test_bags_that_others_read_as_empty_are_read(
+    data_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("talker_mcap", "talker_sqlite3"):
+        assert run(["info", str(data_folder / "bags" / name), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["messages"]["count"] == 20
+
+
+def test_a_mapping_is_suggested_and_nothing_else_is_printed(
+    data_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["info", str(data_folder / "bags" / "two_turtles.bag"), "--suggest-mapping"]) == 0
+    printed = capsys.readouterr().out
+    mapping = parse_mapping(printed)
+    assert [topic.topic for topic in mapping.topics] == ["/turtle1/pose", "/turtle2/pose"]
+    mapped = tmp_path / "turtles.yaml"
+    mapped.write_text(printed)
+    assert (
+        run(["info", str(data_folder / "bags" / "two_turtles.bag"), "--mapping", str(mapped), "--json"]) == 0
+    )
+    document = json.loads(capsys.readouterr().out)
+    assert {each["name"]: each["samples"] for each in document["objects"]} == {
+        "turtle1": 1344,
+        "turtle2": 1344,
+    }
+
+
+def test_no_mapping_is_suggested_where_none_is_needed(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["info", str(log), "--suggest-mapping"]) == 2
+    assert "run.jsonl needs no mapping" in capsys.readouterr().err
+    assert run(["info", str(log), "--suggest-mapping", "--json"]) == 2
+    log.write_bytes(b"\x89PNG\r\n\x1a\n")
+    assert run(["info", str(log), "--suggest-mapping"]) == 3
+
+
+def test_a_damaged_bag_is_told(data_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cut = tmp_path / "cut.bag"
+    cut.write_bytes((data_folder / "bags" / "two_turtles.bag").read_bytes()[:860_000])
+    assert run(["info", str(cut)]) == 3
+    said = capsys.readouterr()
+    assert "cut.bag" in said.err
+    assert "damaged" in said.out
+    assert run(["info", str(cut), "--suggest-mapping"]) == 3
+    assert parse_mapping(capsys.readouterr().out).topics

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import gzip
 import json
+import random
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from spatial_replay.errors import LogError, UsageError
+from spatial_replay.errors import LogError, SpatialReplayError, UsageError
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.logs.block import BLOCK_SAMPLES
 from spatial_replay.logs.source import open_source, read_trace
@@ -181,3 +182,22 @@ def test_published_values_over_the_dataset(data_folder: Path, name: str) -> None
     for ego, values in expected.items():
         samples = [int(frame) for frame in values]
         np.testing.assert_allclose(found[ego][samples], list(values.values()), atol=1e-6, err_msg=ego)
+
+
+def test_damage_anywhere_is_told_or_harmless(annotations: Write) -> None:
+    """Changed anywhere, a file gives the frames that can be read and says which cannot, or is refused."""
+    path = annotations(
+        *(row(number, frame, f"{frame} 0 {frame + 9} 20") for number in (1, 2) for frame in range(9))
+    )
+    content = path.read_bytes()
+    whole = read_trace(path)
+    chance = random.Random(7)
+    for _ in range(300):
+        damaged = bytearray(content)
+        damaged[chance.randrange(len(damaged))] ^= 1 << chance.randrange(8)
+        path.write_bytes(damaged)
+        try:
+            trace = read_trace(path, allow_damage=True)
+        except SpatialReplayError:
+            continue
+        assert len(trace) >= len(whole) - 1 or trace.faults

@@ -6,16 +6,21 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
+from types import MappingProxyType
 
 from spatial_replay.logs.foreign.messages import Topic
 from spatial_replay.logs.mapping.guess import Guess, frame_of, guess_from, numbers_in
 from spatial_replay.logs.mapping.readings import BUILT_IN, TRANSFORM_TYPES, short_type
 from spatial_replay.logs.mapping.templates import name_from_topic
+from spatial_replay.trace.times import FOREVER
 
 EXAMPLES = 20
 """Decoded messages of each topic that are worth a look."""
 
 _RADIUS = "0.5"
+_TOGETHER_NS = 10**9
+_NOT_KNOWN: Mapping[str, int] = MappingProxyType({})
 _MOST_SIGNALS = 8
 _PLAIN = re.compile(r"/?[A-Za-z_][\w/.-]*", re.ASCII)
 _WORDS = frozenset({"true", "false", "null", "yes", "no", "on", "off", "y", "n"})
@@ -53,19 +58,25 @@ def candidates(topics: Sequence[Topic], examples: Mapping[str, Sequence[object]]
     return tuple(_candidate(topic, examples.get(topic.name, ())) for topic in topics)
 
 
-def suggest_mapping(log: str, topics: Sequence[Topic], examples: Mapping[str, Sequence[object]]) -> str:
+def suggest_mapping(
+    log: str,
+    topics: Sequence[Topic],
+    examples: Mapping[str, Sequence[object]],
+    first_ns: Mapping[str, int] = _NOT_KNOWN,
+) -> str:
     """A mapping file with comments, as text; it can be used at once where some topic holds objects.
 
     Args:
         log: the log's name.
         examples: some decoded messages of each topic, by its name.
+        first_ns: log time of the first message of each topic, by its name.
     """
     found = candidates(topics, examples)
     mapped = [each for each in found if each.entry and not each.is_transforms]
     transforms = [each for each in found if each.is_transforms]
     active = mapped or [each for each in transforms if each.entry]
     lines = [f"# How messages of {_comment(log)} become objects: a start, made from the first of them."]
-    lines += [*_frame_lines(active, transforms, examples), *_time_lines(active), "topics:"]
+    lines += [*_frame_lines(active, transforms, examples), *_time_lines(active, first_ns), "topics:"]
     if not active:
         lines.append("  # nothing looks like an object; name the fields of a topic that is one, such as")
         lines.append("  # /robot/state: {name: robot, position: [x, y], yaw: theta, shape: {disc: 0.5}}")
@@ -188,12 +199,25 @@ class _Attributes:
         return getattr(self._message, name, None)
 
 
-def _time_lines(active: Sequence[Candidate]) -> Iterator[str]:
+def _time_lines(active: Sequence[Candidate], first_ns: Mapping[str, int]) -> Iterator[str]:
     yield "clock: log    # when a message was recorded; publish: when it was sent; header: its own stamp"
     if active:
-        first = _text(active[0].topic.name)
-        yield f"sample: {{topic: {first}}}    # a sample at each of its messages; or {{every: 100ms}}"
+        topic = _text(_sampled(active, first_ns).name)
+        yield f"sample: {{topic: {topic}}}    # a sample at each of its messages; or {{every: 100ms}}"
         yield "max_age: 1s    # after which an object that nothing is heard of is unknown"
+
+
+def _sampled(active: Sequence[Candidate], first_ns: Mapping[str, int]) -> Topic:
+    """Where to take samples: at the last of the topics that begin together, so that none is missing."""
+    topics = [each.topic for each in active]
+    begins = [first_ns.get(topic.name, FOREVER) for topic in topics]
+    often = max(topic.count or 0 for topic in topics)
+    together = [
+        (begin, topic)
+        for begin, topic in zip(begins, topics, strict=True)
+        if begin <= min(begins) + _TOGETHER_NS and 2 * (topic.count or 0) >= often
+    ]
+    return max(together, key=itemgetter(0))[1] if together else topics[0]
 
 
 def _unused(each: Candidate) -> Iterator[str]:

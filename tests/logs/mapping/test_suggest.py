@@ -150,3 +150,10 @@ def test_names_that_need_quotes_get_them() -> None:
     ]
     mapping = parse_mapping(suggest_mapping("run", topics, {}))
     assert [each.topic for each in mapping.topics] == [each.name for each in topics]
+
+
+def test_samples_are_taken_when_everything_has_begun() -> None:
+    topics = [Topic(name, "geometry_msgs/msg/PoseStamped", "cdr", 100) for name in ("/a", "/b", "/late")]
+    begins = {"/a": 10, "/b": 20, "/late": 10**10}
+    assert parse_mapping(suggest_mapping("run", topics, {}, begins)).sampling.topic == "/b"
+    assert parse_mapping(suggest_mapping("run", topics, {})).sampling.topic == "/a"

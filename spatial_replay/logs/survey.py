@@ -1,0 +1,151 @@
+"""A look through a log of messages by others: its topics, and what could be read as objects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from spatial_replay.errors import LogError, MissingFileError
+from spatial_replay.logs.foreign.mcap_log import McapLog
+from spatial_replay.logs.foreign.messages import Decoder, Message, MessageReader, Topic
+from spatial_replay.logs.foreign.opening import open_messages
+from spatial_replay.logs.mapping.suggest import EXAMPLES, candidates, suggest_mapping
+from spatial_replay.logs.topics import OBJECTS
+
+_STEP = 10_000
+"""Messages between two reports of progress."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicSurvey:
+    """A topic by others.
+
+    Attributes:
+        messages: how many were read.
+        entry: what a mapping could say of it; empty if nothing looks like an object.
+    """
+
+    topic: Topic
+    messages: int
+    entry: str
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What is in a log of messages by others.
+
+    Attributes:
+        start_ns, end_ns: log times of the first and the last message; None without messages.
+        mapping: a mapping file to start from.
+        faults: what is damaged, each with its place.
+        remarks: what was set aside without a loss.
+    """
+
+    name: str
+    kind: str
+    start_ns: int | None
+    end_ns: int | None
+    topics: tuple[TopicSurvey, ...]
+    mapping: str
+    faults: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+    @property
+    def messages(self) -> int:
+        return sum(each.messages for each in self.topics)
+
+
+def messages_in(path: Path) -> MessageReader | None:
+    """A reader of a log of messages that needs a mapping; None for logs that name their objects themselves.
+
+    Raises:
+        MissingFileError: there is no such file.
+    """
+    try:
+        reader = open_messages(path)
+        if isinstance(reader, McapLog) and any(topic.name == OBJECTS for topic in reader.topics()):
+            return None
+    except MissingFileError:
+        raise
+    except LogError:
+        return None
+    return reader
+
+
+def survey(
+    reader: MessageReader, advance: Callable[[int], object] = lambda messages: None, *, whole: bool = True
+) -> Survey:
+    """Look through a log.
+
+    Args:
+        advance: called with the number of messages read, again and again.
+        whole: read all of it, to find what is damaged; else only until enough is known of every topic.
+
+    Raises:
+        LogError: nothing can be read.
+    """
+    topics = reader.topics()
+    counter = _Counter(reader, topics)
+    for count, message in enumerate(reader.iter_messages({topic.name for topic in topics}), 1):
+        counter.add(message)
+        if count % _STEP == 0:
+            advance(_STEP)
+        if not whole and counter.knows_enough:
+            break
+    found = candidates(topics, counter.examples)
+    return Survey(
+        name=reader.name,
+        kind=reader.kind,
+        start_ns=counter.start_ns,
+        end_ns=counter.end_ns,
+        topics=tuple(TopicSurvey(each.topic, counter.counts[each.topic.name], each.entry) for each in found),
+        mapping=suggest_mapping(reader.name, topics, counter.examples, counter.first_ns),
+        faults=reader.take_faults(),
+        remarks=(*reader.take_remarks(), *counter.remarks),
+    )
+
+
+class _Counter:
+    """Counts messages, and decodes the first ones of each topic."""
+
+    def __init__(self, reader: MessageReader, topics: Sequence[Topic]) -> None:
+        self.start_ns: int | None = None
+        self.end_ns: int | None = None
+        self.first_ns: dict[str, int] = {}
+        self.counts = {topic.name: 0 for topic in topics}
+        self.examples: dict[str, list[object]] = {}
+        self.remarks: list[str] = []
+        self._decoders: dict[str, Decoder] = {}
+        self._missing = {topic.name for topic in topics if topic.count != 0}
+        for topic in topics:
+            try:
+                self._decoders[topic.name] = reader.decoder(topic.name)
+                self.examples[topic.name] = []
+            except LogError as error:
+                self.remarks.append(f"topic {topic.name!r}: {error}")
+        self._declared = {topic.name: topic.count for topic in topics}
+
+    @property
+    def knows_enough(self) -> bool:
+        return not self._missing
+
+    def add(self, message: Message) -> None:
+        time_ns, topic = message.log_time_ns, message.topic
+        self.start_ns = time_ns if self.start_ns is None else min(self.start_ns, time_ns)
+        self.end_ns = time_ns if self.end_ns is None else max(self.end_ns, time_ns)
+        self.first_ns.setdefault(topic, time_ns)
+        self.counts[topic] += 1
+        if topic in self._missing:
+            self._look(message)
+
+    def _look(self, message: Message) -> None:
+        topic, count = message.topic, self.counts[message.topic]
+        try:
+            if topic in self.examples:
+                self.examples[topic].append(self._decoders[topic](message.payload))
+        except LogError as error:
+            if count == 1:
+                self.remarks.append(f"topic {topic!r}: {error}")
+        if count >= EXAMPLES or count == self._declared[topic]:
+            self._missing.discard(topic)

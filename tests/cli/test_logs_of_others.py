@@ -1,0 +1,136 @@
+"""Logs that others recorded, from end to end: as they are, annotated, and replayed again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from spatial_replay.cli.application import run
+
+TURTLES = """\
+sample: {topic: /turtle2/pose}    # the later of the two: no sample without the other
+topics:
+  /turtle1/pose: {shape: {disc: 0.5}}
+  /turtle2/pose: {shape: {disc: 0.5}}
+"""
+SPECIFICATION = """\
+spec meet = F (turtle1 ovlp turtle2)
+spec near = G (turtle1 dist turtle2 <= 2.9)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder, with a mapping and a specification."""
+    (tmp_path / "turtles.yaml").write_text(TURTLES)
+    (tmp_path / "turtles.spatial").write_text(SPECIFICATION)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def replayed(capsys: pytest.CaptureFixture[str], log: Path, *more: str, code: int = 0) -> Any:
+    """What a replay of a log prints as JSON, with every number of every node."""
+    capsys.readouterr()
+    arguments = ["replay", str(log), "--spec", "turtles.spatial", "--json", "-", "--series", *more]
+    assert run(arguments) == code
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_bag_is_replayed_annotated_and_replayed_again(
+    data_folder: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = data_folder / "bags" / "two_turtles.bag"
+    first = replayed(capsys, bag, "--mapping", "turtles.yaml", "-o", "annotated.mcap")
+    again = replayed(capsys, folder / "annotated.mcap")
+    assert first["specifications"] == again["specifications"]
+    assert first["certificate"]["samples_sha256"] == again["certificate"]["samples_sha256"]
+    meet, near = first["specifications"]
+    # the discs touch when their centres are 1 apart
+    assert meet["robustness"] == pytest.approx(1 - 0.0721, abs=1e-4)
+    assert near["robustness"] == pytest.approx(2.9 + 1 - 3.8663, abs=1e-4)
+    assert run(["info", "annotated.mcap", "--json"]) == 0
+    topics = {each["topic"]: each for each in json.loads(capsys.readouterr().out)["topics"]}
+    assert topics["/turtle1/pose"]["messages"] == 1344
+    assert topics["/turtle1/pose"]["encoding"] == "ros1"
+    assert topics["/spatial/objects"]["messages"] == first["log"]["samples"]
+    assert "/rosout" not in topics
+
+
+def test_four_containers_of_one_recording_give_one_verdict(
+    data_folder: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    containers = ("two_turtles.bag", "two_turtles_lz4.bag", "two_turtles_mcap", "two_turtles_sqlite3")
+    found = [
+        replayed(capsys, data_folder / "bags" / each, "--mapping", "turtles.yaml") for each in containers
+    ]
+    for each in found[1:]:
+        assert each["specifications"] == found[0]["specifications"]
+        assert each["certificate"]["samples_sha256"] == found[0]["certificate"]["samples_sha256"]
+
+
+def test_a_bag_is_recorded_as_a_log(
+    data_folder: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = str(data_folder / "bags" / "two_turtles_lz4.bag")
+    assert run(["record", "tracks", bag, "--mapping", "turtles.yaml", "-o", "run.mcap"]) == 0
+    direct = replayed(capsys, Path(bag), "--mapping", "turtles.yaml")
+    assert replayed(capsys, folder / "run.mcap")["specifications"] == direct["specifications"]
+
+
+def test_names_are_compared_with_those_of_the_mapping(
+    data_folder: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = str(data_folder / "bags" / "two_turtles_lz4.bag")
+    assert run(["check", "turtles.spatial", "--log", bag, "--mapping", "turtles.yaml"]) == 0
+    (folder / "other.spatial").write_text("F (turtle1 ovlp turtle3)")
+    assert run(["check", "other.spatial", "--log", bag, "--mapping", "turtles.yaml"]) == 2
+    assert "turtle2" in capsys.readouterr().err
+    assert run(["check", "turtles.spatial", "--mapping", "turtles.yaml"]) == 2
+
+
+def test_a_mapping_is_asked_for_checked_and_never_written_to(
+    data_folder: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = str(data_folder / "bags" / "two_turtles_lz4.bag")
+    replay = ["replay", bag, "--spec", "turtles.spatial"]
+    assert run(replay) == 2
+    assert "--mapping" in capsys.readouterr().err
+    assert run([*replay, "--mapping", "absent.yaml"]) == 2
+    assert "absent.yaml: no such file" in capsys.readouterr().err
+    (folder / "wrong.yaml").write_text("topics:\n  /turtle1/pose: {shape: {disk: 0.5}}\n")
+    assert run([*replay, "--mapping", "wrong.yaml"]) == 2
+    assert "wrong.yaml:2" in capsys.readouterr().err
+    assert run([*replay, "--mapping", "turtles.yaml", "-o", "turtles.yaml"]) == 2
+    assert (folder / "turtles.yaml").read_text() == TURTLES
+
+
+def test_annotations_on_the_command_line(
+    data_folder: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = data_folder / "sdd" / "quad_video1_annotations.txt"
+    (folder / "turtles.spatial").write_text(
+        "use spatial_spec\ngroup anyone = all\nspec apart(ego) = G (ego dist (anyone except ego) >= 15)\n"
+    )
+    each = ("--each", "ego=class:biker", "--to", "2s")
+    dropped = replayed(capsys, log, *each, "--semantics", "paper")
+    kept = replayed(capsys, log, *each, "--semantics", "paper", "--lost", "keep", "--rate", "60")
+    assert dropped["log"]["samples"] == 60
+    assert kept["log"]["samples"] == 120
+    assert len(kept["specifications"]) > len(dropped["specifications"]) > 0
+    assert run(["replay", str(log), "--spec", "turtles.spatial", "--mapping", "turtles.yaml"]) == 2
+    assert "mapping 'turtles.yaml' is not needed" in capsys.readouterr().err
+
+
+def test_a_scenario_on_the_command_line(
+    data_folder: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = data_folder / "commonroad" / "ZAM_Tutorial-1_2_T-1.xml"
+    (folder / "turtles.spatial").write_text(
+        'spec ahead = G ("42" leftof "44")\nspec clear = G not ("42" ovlp "43")\n'
+    )
+    first = replayed(capsys, log, "-o", "annotated.mcap")
+    assert first["log"]["samples"] == 41
+    assert replayed(capsys, folder / "annotated.mcap")["specifications"] == first["specifications"]
