@@ -57,14 +57,13 @@ class Dial:
         is_exact = "==" in atom.parameters
         for sign, part in deciding.branch:
             if isinstance(part, Number) and part.value in atom.parameters:
-                slopes = _slopes(atom.expression, "number", part.value)
+                slopes = _slopes(atom.expression, part.value)
                 return cls("number", part.value, sign, slopes == {sign}, is_exact)
         for sign, part in deciding.branch:
             for radius in _radii(part):
-                slopes = _slopes(part, "radius", radius)
-                slope = sign * min(slopes)
-                whole = _slopes(atom.expression, "radius", radius)
-                return cls("radius", radius, slope, whole == {slope}, is_exact)
+                # of prisms, how high they are may decide instead
+                slope = sign * _slope_of_radius(part, radius)
+                return cls("radius", radius, slope, False, is_exact)
         return cls("margin", 0.0, -1, True, is_exact)
 
     def turned(self, expression: Expression, value: float) -> Expression:
@@ -88,21 +87,19 @@ def rewritten(formula: Formula, is_meant: Callable[[Atom], bool], change: Callab
             return replace(formula, operands=operands)
 
 
-def _slopes(expression: Expression, kind: str, value: float) -> set[int]:
+def _slopes(expression: Expression, number: float) -> set[int]:
     """What adding 1 to every such number adds to the expression, over the branches that may decide it."""
     match expression:
         case Number():
-            return {int(kind == "number" and expression.value == value)}
+            return {int(expression.value == number)}
         case Sum():
-            first, second = (_slopes(each, kind, value) for each in (expression.first, expression.second))
+            first, second = _slopes(expression.first, number), _slopes(expression.second, number)
             return {a + b for a in first for b in second}
         case Negative():
-            return {-slope for slope in _slopes(expression.operand, kind, value)}
+            return {-slope for slope in _slopes(expression.operand, number)}
         case Minimum() | Maximum():
-            return {slope for each in expression.operands for slope in _slopes(each, kind, value)}
-        case _ if kind == "number":
-            return {0}
-    return {_slope_of_radius(expression, value)}
+            return {slope for each in expression.operands for slope in _slopes(each, number)}
+    return {0}
 
 
 def _slope_of_radius(expression: Expression, radius: float) -> int:

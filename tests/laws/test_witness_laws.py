@@ -1,0 +1,189 @@
+"""A witness is true: its atom has the value it claims, and the change it tells flips the verdict."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from laws.strategies_monitor import formulas_of_leaves, leaf_runs, recordings, specifications
+from laws.strategies_spec import Vocabulary
+from laws.test_monitor_laws import observed_in
+from spatial_replay.inspection.words import sentences_of
+from spatial_replay.monitor.evaluation import evaluate
+from spatial_replay.monitor.finished import finished
+from spatial_replay.monitor.program import compile_formula
+from spatial_replay.monitor.verdict import Verdict
+from spatial_replay.monitor.witness.extremum import End
+from spatial_replay.monitor.witness.path import deciding_path
+from spatial_replay.spec.formula import Number, iter_nodes
+from spatial_replay.spec.specification import parse_specification
+from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Trace
+
+SIGNALS = Vocabulary(objects=(), signals=("p", "q"), max_depth=4, delays=False)
+NUMBER = re.compile(r"(?<![\w.])-?\d+(\.\d+)?(?![\w.])")
+
+
+@st.composite
+def signal_runs(draw) -> Trace:
+    size = draw(st.integers(1, 8))
+    values = st.sampled_from([-3.0, -1.5, 0.0, 0.25, 1.0, 2.5, 4.75, 9.0])
+    known = draw(st.booleans())
+    samples = []
+    for t in range(size):
+        signals = {name: draw(values) for name in ("p", "q") if known or draw(st.integers(0, 5)) > 0}
+        samples.append(Sample(t * 10**8, {}, signals))
+    return Trace.from_samples(samples)
+
+
+@st.composite
+def comparison_texts(draw) -> str:
+    """Formulas over comparisons, each with a number of its own in the text."""
+    count = draw(st.integers(1, 5))
+    signal, comparison = st.sampled_from("pq"), st.sampled_from(["<=", ">=", "<", ">"])
+    atoms = [f"({draw(signal)} {draw(comparison)} {draw(st.integers(-2, 8))}.{n + 1})" for n in range(count)]
+    joining = st.sampled_from(["and", "or", "and", "or", "->", "U", "R", "W", "S", "U[0,2]"])
+    inner = st.sampled_from(["", "F ", "G ", "not ", "O ", "X ", "G[1,3] "])
+    outer = st.sampled_from(["F", "G", "not", "F[0,2]", "H", "WX"])
+    text = atoms[0]
+    for atom in atoms[1:]:
+        text = f"({text} {draw(joining)} {draw(inner)}{atom})"
+        if draw(st.booleans()):
+            text = f"({draw(outer)} {text})"
+    return text
+
+
+@settings(max_examples=400)
+@given(formula=formulas_of_leaves, run=leaf_runs())
+def test_the_way_down_ends_at_the_number_it_began_with(formula, run):
+    order, times = compile_formula(formula).leaves, np.array(run.times_ns)
+    done = finished(formula, order, run.values(order), times)
+    for index, _ in enumerate(iter_nodes(formula)):
+        low, high = (float(column[0]) for column in done.ends(index))
+        end = End.LOW if low >= 0.0 else End.HIGH if high < 0.0 else End.OPEN
+        path = deciding_path(formula, done, times, index, end)
+        last = path.steps[-1]
+        found = [float(column[last.sample]) for column in done.ends(last.node)]
+        if end is End.OPEN:
+            assert found[0] < found[1]
+            assert found[0] <= 0.0 <= found[1]
+        else:
+            number = found[0] if path.end is End.LOW else found[1]
+            assert abs(number) == abs(low if end is End.LOW else high)
+
+
+@settings(max_examples=150)
+@given(specification=specifications(), recording=recordings())
+def test_a_witness_has_the_value_it_claims(specification, recording):
+    trace = recording.trace()
+    observed = observed_in(recording, specification)
+    evaluation = evaluate(
+        specification, trace, each={"ego": "all"} if specification.specs[0].parameter else None
+    )
+    for result in evaluation:
+        for node in result.nodes:
+            witness = result.inquiry.witness(node.id)
+            assert witness.verdict is node.verdict
+            np.testing.assert_allclose([witness.lower, witness.upper], [node.final_lower, node.final_upper])
+            assert len(sentences_of(witness, first_ns=0)) in (2, 3)
+            deciding = witness.deciding
+            if deciding is None:
+                continue
+            at = trace.times_ns.tolist().index(witness.time_ns)
+            nominal, wide = (
+                observed.interval(deciding.atom, at, {}, uncertain) for uncertain in (False, True)
+            )
+            np.testing.assert_allclose([deciding.lower, deciding.upper], wide, atol=1e-9)
+            value = nominal.low if math.isclose(nominal.low, nominal.high, abs_tol=1e-9) else math.nan
+            np.testing.assert_allclose(deciding.value, value, atol=1e-9)
+            assert bool(deciding.unknown) == (wide == (-math.inf, math.inf) and not deciding.measured)
+            if witness.verdict is not Verdict.UNKNOWN:
+                end = deciding.lower if deciding.end is End.LOW else deciding.upper
+                assert math.isclose(
+                    abs(end), abs(witness.lower if witness.verdict == "satisfied" else witness.upper)
+                )
+            if deciding.measured and deciding.lower == deciding.upper:
+                assert math.isclose(total(deciding), deciding.value, abs_tol=1e-9)
+
+
+def total(deciding) -> float:
+    """The deciding branch added up."""
+    measured = iter(deciding.measured)
+    return sum(
+        sign * (part.value if isinstance(part, Number) else next(measured).value)
+        for sign, part in deciding.branch
+    )
+
+
+@settings(max_examples=500)
+@given(text=comparison_texts(), trace=signal_runs())
+def test_the_threshold_flips_the_verdict(text, trace):
+    result = evaluate(parse_specification(text), trace).result()
+    witness = result.witness()
+    if witness.threshold is None:
+        assert witness.verdict is Verdict.UNKNOWN or not flips_somewhere(text, trace, witness)
+        return
+    threshold = witness.threshold
+    assert threshold.is_written
+    assert verdict_with(text, trace, threshold.value, threshold.flips_at) is threshold.verdict
+    assert threshold.verdict is not witness.verdict
+    nearer = threshold.value + 0.999 * (threshold.flips_at - threshold.value)
+    assert verdict_with(text, trace, threshold.value, nearer) is witness.verdict
+
+
+def verdict_with(text: str, trace: Trace, old: float, new: float) -> Verdict:
+    """The verdict of a text with another number in it."""
+    changed = NUMBER.sub(lambda match: repr(new) if float(match[0]) == old else match[0], text)
+    assert changed != text
+    return evaluate(parse_specification(changed), trace).verdict
+
+
+def flips_somewhere(text: str, trace: Trace, witness) -> bool:
+    """Whether the deciding atom alone can make another verdict."""
+    if witness.deciding is None or not math.isfinite(witness.deciding.value):
+        return False
+    (number,) = (each for each in witness.deciding.atom.parameters if isinstance(each, float))
+    candidates = (-1000.0, 1000.0)
+    return any(verdict_with(text, trace, number, new) is not witness.verdict for new in candidates)
+
+
+DISTANCES = [
+    "G (a dist b >= {})",
+    "F (a closeto[{}] b)",
+    "G (a farfrom[{}] goal)",
+    "F (a touch[{}] b)",
+    "G not (a moved[{}] a[-1])",
+    "F (1 <= a dist b <= {})",
+    "F (a dist b == {})",
+    "G (forall x in people: x dist goal >= {})",
+    "F (exists x, y in everyone: x closeto[{}] y)",
+    "(G a dist b >= {}) and F (a ovlp goal)",
+    "forall r in pair: F (r closeto[{}] goal)",
+    "G (a oriented[{}] b)",
+    "F (a enclosedin enlarge(goal, {}))",
+]
+HEADER = """\
+region goal = box(-2, -2, 3, 2)
+group pair = a, b
+group people = class "person"
+group everyone = all
+"""
+
+
+@settings(max_examples=150)
+@given(text=st.sampled_from(DISTANCES), number=st.sampled_from([0.5, 2.25, 7.125]), recording=recordings())
+def test_the_threshold_of_a_relation_flips_the_verdict(text, number, recording):
+    trace = recording.trace()
+
+    def evaluated(value: float):
+        return evaluate(parse_specification(f"{HEADER}spec s = {text.format(repr(value))}\n"), trace)
+
+    evaluation = evaluated(number)
+    threshold = evaluation.witness().threshold
+    if threshold is not None and threshold.is_written and threshold.value == number:
+        assert evaluated(threshold.flips_at).verdict is threshold.verdict
+        assert threshold.verdict is not evaluation.verdict
