@@ -1,0 +1,188 @@
+"""A monitor and a recorder in a loop, as the loop sees them, and other online monitors beside ours."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import random
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import spatial_replay as sr
+
+MILLION = 1_000_000
+SHORT = 100_000
+STRETCH = 10_000
+"""How many samples a median or a quantile is of."""
+
+
+def _blocks() -> tuple[sr.Specification, list[sr.Sample]] | None:
+    """The block-pushing specification, 27 nodes, and its camera recording of six objects."""
+    data = Path(os.environ.get("SPATIAL_REPLAY_DATA", "")) / "paper"
+    if not data.is_dir():
+        return None
+    text = json.loads((data / "expected.json").read_text())["blocks_moving_passage"]["spec"]
+    samples = list(sr.read_trace(data / "blocks_moving_passage.jsonl.gz").samples())
+    return sr.parse_specification(text), samples
+
+
+def _resident_bytes() -> int:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def bench_monitor(bench: Any) -> None:
+    """`Monitor.update` from the first samples to the last of a long run."""
+    blocks = _blocks()
+    if blocks is None:
+        return
+    specification, samples = blocks
+    count = MILLION if bench.full else SHORT
+    monitor = sr.Monitor(specification)
+    times = [0.0] * count
+    resident = 0
+    for k in range(count):
+        sample = sr.Sample(k * 33_333_333, samples[k % len(samples)].objects)
+        if k == 10:
+            resident = _resident_bytes()
+        start = time.perf_counter()
+        monitor.update(sample)
+        times[k] = time.perf_counter() - start
+    grown = _resident_bytes() - resident
+    starts = {10, SHORT - STRETCH, count - STRETCH}
+    for start_at in sorted(starts):
+        stretch = times[start_at : start_at + STRETCH]
+        bench.quantile(f"from sample {start_at:,}: median", stretch, 0.5, limit_s=50e-6)
+        bench.quantile(f"from sample {start_at:,}: 99.9 %", stretch, 0.999, limit_s=1e-3)
+    bench.quantile("doing nothing: 99.9 %", _nothing_for(bench.figures[0].median_s), 0.999)
+    # the list of times holds a number of its own for each sample, which is no part of the monitor's memory
+    bench.size(f"grown over {count:,} samples", grown - 24 * count, 5_000_000)
+
+    def read_all(update: Any) -> object:
+        return [
+            (node.value, node.now, node.lower, node.upper, node.verdict) for node in update.specs[0].nodes
+        ]
+
+    after = iter(range(count, count + 100))
+    bench.measure(
+        "reading 27 nodes one by one",
+        read_all,
+        prepare=lambda: monitor.update(sr.Sample(next(after) * 33_333_333, samples[0].objects)),
+        unit="sample",
+        runs=51,
+    )
+
+
+def _nothing_for(duration_s: float) -> list[float]:
+    """Times of turns that only wait so long: what the machine adds to any."""
+    times = []
+    for _ in range(STRETCH):
+        start = now = time.perf_counter()
+        while now < start + duration_s:
+            now = time.perf_counter()
+        times.append(now - start)
+    return times
+
+
+def bench_recorder(bench: Any) -> None:
+    """`Recorder.write` in a loop: samples, scene and robustness are written by another thread."""
+    blocks = _blocks()
+    if blocks is None:
+        return
+    specification, samples = blocks
+    monitor = sr.Monitor(specification)
+    seconds = 10 if bench.full else 3
+    for name, hertz, count, live in (
+        ("30 Hz", 30, 30 * seconds, None),
+        ("1 kHz", 1000, 1000 * seconds, None),
+        ("1 kHz, with a monitor", 1000, 1000 * seconds, monitor),
+        ("flat out", None, 10_000, None),
+    ):
+        given = [sr.Sample(k * 1_000_000, samples[k % len(samples)].objects) for k in range(count)]
+        with tempfile.TemporaryDirectory() as folder:
+            times, delays = _recorded(Path(folder) / "run.mcap", specification, given, hertz, live)
+        bench.quantile(f"{name}: median", times, 0.5, limit_s=100e-6)
+        bench.quantile(f"{name}: 99.9 %", times, 0.999)
+        if delays:
+            bench.quantile(f"{name}: loop late, 99 %", delays, 0.99)
+
+
+def _recorded(
+    path: Path,
+    specification: sr.Specification,
+    samples: list[sr.Sample],
+    hertz: float | None,
+    monitor: sr.Monitor | None,
+) -> tuple[list[float], list[float]]:
+    """What each sample cost the loop, and how much later than planned each turn of the loop began."""
+    times, delays = [], []
+    with sr.Recorder(path, specifications=specification) as recorder:
+        begun = time.perf_counter()
+        for k, sample in enumerate(samples):
+            if hertz is not None:
+                due = begun + k / hertz
+                time.sleep(max(0.0, due - time.perf_counter()))
+                delays.append(time.perf_counter() - due)
+            start = time.perf_counter()
+            if monitor is not None:
+                monitor.update(sample)
+            recorder.write(sample)
+            times.append(time.perf_counter() - start)
+    return times, delays
+
+
+def bench_online_peers(bench: Any) -> None:
+    """The least of a signal over the last samples, by our monitor and by others, value for value the same."""
+    values = random.Random(0)
+    signal = [values.uniform(-1, 5) for _ in range(5000)]
+    for window in (10, 1000):
+        specification = sr.parse_specification(f"H[0,{window}] p >= 0")
+        samples = [sr.Sample(k, signals={"p": value}) for k, value in enumerate(signal)]
+
+        def run(monitor: sr.Monitor, samples: list[sr.Sample] = samples) -> list[float]:
+            return [float(monitor.update(sample).specs[0].numbers[0, 1]) for sample in samples]
+
+        def prepare(specification: sr.Specification = specification) -> sr.Monitor:
+            return sr.Monitor(specification)
+
+        ours = run(prepare())
+        options = {"per": len(signal), "unit": "sample", "runs": 3, "warmups": 0}
+        bench.measure(f"H over {window}: spatial-replay", run, prepare=prepare, **options)
+        for name, monitor_of in (("rtamt", _rtamt), ("reelay", _reelay)):
+            if importlib.util.find_spec(name) is None:
+                continue
+            step = monitor_of(window)
+            if [step(k, value) for k, value in enumerate(signal)] != ours:
+                raise RuntimeError(f"{name} does not give the same values for a window of {window}")
+            bench.measure(
+                f"H over {window}: {name}",
+                lambda step: [step(k, value) for k, value in enumerate(signal)],
+                prepare=lambda monitor_of=monitor_of, window=window: monitor_of(window),
+                **options,
+            )
+    for name in ("rtamt", "reelay"):
+        if importlib.util.find_spec(name) is None:
+            bench.remark(f"{name} is not installed, and not measured")
+
+
+def _rtamt(window: int) -> Callable[[int, float], float]:
+    import rtamt
+
+    monitor = rtamt.StlDiscreteTimeSpecification()
+    monitor.declare_var("p", "float")
+    monitor.spec = f"historically[0:{window}](p >= 0)"
+    monitor.parse()
+    return lambda k, value: monitor.update(k, [("p", value)])
+
+
+def _reelay(window: int) -> Callable[[int, float], float]:
+    import reelay
+
+    monitor = reelay.discrete_timed_monitor(
+        pattern=f"historically[0:{window}]{{p >= 0}}", semantics="robustness", condense=False
+    )
+    return lambda k, value: monitor.update({"p": value})["value"]
