@@ -127,9 +127,9 @@ def scan_until_by_pairs(
     first: int, last: int, into: Floats, into_lost: Flags,
 ) -> None:  # fmt: skip
     """Until, from each sample to `last`, given the least left operand for each beginning and end."""
-    for t in range(first, last + 1):
-        into[t], into_lost[t] = np.nan, 0
-        for end in range(t, last + 1):
+    into[first : last + 1], into_lost[first : last + 1] = np.nan, 0
+    for end in range(first, last + 1):
+        for t in range(first, end + 1):
             at = starts[end] + t
             into[t] = most(into[t], least(right[end], still[at]))
             into_lost[t] |= right_lost[end] | still_lost[at]

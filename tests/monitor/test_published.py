@@ -17,10 +17,15 @@ from spatial_replay.trace.trace import Trace
 TOLERANCE = 1e-6
 
 
-@pytest.mark.parametrize(
-    "scene",
-    ["blocks_moving_passage", "blocks_move_violation", "table_scene5_parked", "table_scene5_parked_modified"],
+SCENES = (
+    "blocks_moving_passage",
+    "blocks_move_violation",
+    "table_scene5_parked",
+    "table_scene5_parked_modified",
 )
+
+
+@pytest.mark.parametrize("scene", SCENES)
 def test_scenes_of_the_paper_at_every_sample(data_folder, scene):
     expected = json.loads((data_folder / "paper" / "expected.json").read_text())[scene]
     trace = read_trace(data_folder / "paper" / f"{scene.removesuffix('_modified')}.jsonl.gz")
@@ -46,7 +51,7 @@ def test_vectors_of_another_implementation(data_folder):
     chosen = [case for case in cases if case["semantics"] == "ltlf"]
     assert len(chosen) > 100
     for case in chosen:
-        trace = Trace.from_samples(map(_sample, case["frames"]))
+        trace = Trace.from_samples(map(sample_from_frame, case["frames"]))
         start_ns = int(trace.times_ns[case["start_sample"]])
         result = evaluate(parse_specification(case["spec"]), trace, start_ns=start_ns).result()
         for name in ("value", "now", "lower", "upper"):
@@ -58,7 +63,7 @@ def test_vectors_of_another_implementation(data_folder):
         assert result.verdict == case["verdict"], case["spec"]
 
 
-def _sample(frame):
+def sample_from_frame(frame):
     return Sample(
         frame["time_ns"],
         {
