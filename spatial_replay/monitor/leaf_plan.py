@@ -21,7 +21,7 @@ from spatial_replay.geometry.measure import QUANTITY_CODES
 from spatial_replay.monitor.leaf_code import LeafCode, Membership
 from spatial_replay.monitor.measurements import quantity_of, terms_of
 from spatial_replay.monitor.operands import footprint_from_outline, left_out_of, open_group
-from spatial_replay.monitor.plan_kernel import ABSENT, ANY, PlanArrays, leaves_of_sample
+from spatial_replay.monitor.plan_kernel import ABSENT, ANY, PlanArrays, leaves_of_sample, packed
 from spatial_replay.monitor.recent import NO_DELAY, Delay
 from spatial_replay.spec.formula import (
     ANY_CLASS,
@@ -150,7 +150,7 @@ class LeafPlan:
         rows = _Rows(frame, members)
         code = LeafCode(rows)
         outputs = [number for leaves in frame.leaves for number in code.add_leaves(leaves, {})]
-        self._arrays = _arrays(frame, rows, code, outputs)
+        self._arrays = packed(_arrays(frame, rows, code, outputs))
         self._places = tuple(rows.places)
         self._signals = tuple(code.signals)
 

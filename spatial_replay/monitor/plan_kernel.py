@@ -69,6 +69,63 @@ class PlanArrays(NamedTuple):
     outputs: Integers
 
 
+class PackedPlan(NamedTuple):
+    """A plan's arrays in two, since each array costs a call something.
+
+    Attributes:
+        whole, numbers: the arrays of integers and of floats, flat, one after the other.
+        starts: where each array begins and ends in one of these, in the order of `PlanArrays`.
+    """
+
+    whole: Integers
+    numbers: Floats
+    starts: Integers
+
+
+def packed(plan: PlanArrays) -> PackedPlan:
+    """Pack arrays, for `_unpacked` to find."""
+    ends = {"i": 0, "f": 0}
+    starts = []
+    for array in plan:
+        starts += [ends[array.dtype.kind], ends[array.dtype.kind] + array.size]
+        ends[array.dtype.kind] += array.size
+    whole, numbers = (
+        np.concatenate([np.ravel(array) for array in plan if array.dtype.kind == kind]) for kind in ends
+    )
+    return PackedPlan(whole, numbers, np.array(starts, np.int64))
+
+
+@piece
+def _unpacked(plan: PackedPlan) -> PlanArrays:
+    at, whole, numbers = plan.starts, plan.whole, plan.numbers
+    return PlanArrays(
+        whole[at[0] : at[1]],
+        whole[at[2] : at[3]],
+        whole[at[4] : at[5]],
+        numbers[at[6] : at[7]],
+        numbers[at[8] : at[9]].reshape((-1, 2)),
+        numbers[at[10] : at[11]].reshape((-1, 2)),
+        whole[at[12] : at[13]],
+        whole[at[14] : at[15]],
+        whole[at[16] : at[17]],
+        numbers[at[18] : at[19]],
+        whole[at[20] : at[21]],
+        whole[at[22] : at[23]],
+        whole[at[24] : at[25]],
+        whole[at[26] : at[27]],
+        whole[at[28] : at[29]].reshape((-1, 3)),
+        whole[at[30] : at[31]],
+        whole[at[32] : at[33]],
+        whole[at[34] : at[35]],
+        whole[at[36] : at[37]],
+        whole[at[38] : at[39]],
+        whole[at[40] : at[41]],
+        whole[at[42] : at[43]].reshape((-1, 4)),
+        numbers[at[44] : at[45]],
+        whole[at[46] : at[47]],
+    )
+
+
 @piece
 def _is_there(classes: Integers, row: int, wanted: int) -> bool:
     return classes[row] != ABSENT and wanted in (ANY, classes[row])
@@ -161,7 +218,7 @@ def _members(plan: PlanArrays, classes: Integers, members: Flags) -> None:
 
 
 @kernel
-def leaves_of_sample(plan: PlanArrays, whole: Integers, numbers: Floats, vertices: Floats) -> Floats:
+def leaves_of_sample(packed_plan: PackedPlan, whole: Integers, numbers: Floats, vertices: Floats) -> Floats:
     """(C, A, 1), as `leaf_values` gives them.
 
     Args:
@@ -169,6 +226,7 @@ def leaves_of_sample(plan: PlanArrays, whole: Integers, numbers: Floats, vertice
         numbers: `NUMBERS_OF_PLACE` of each place, radius of each part, value of each signal.
         vertices: (V, 2), of all parts.
     """
+    plan = _unpacked(packed_plan)
     samples, regions, places, signals = plan.extent
     counts = whole[samples + places : samples + 2 * places]
     sizes = whole[samples + 2 * places :]
