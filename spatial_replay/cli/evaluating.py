@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from spatial_replay.logs.source import Source
+    from spatial_replay.recording.tracks import Recorded
     from spatial_replay.replay import Replayed, Window
     from spatial_replay.spec import Specification
 
@@ -112,14 +113,16 @@ def prepared(request: Request) -> Task:
     return Task(source, files, _window(source, request), _each(request.choices))
 
 
-def report_reading(replayed: Replayed) -> None:
-    """Say what was lost or unreadable of a log."""
+def report_reading(found: Replayed | Recorded) -> None:
+    """Say what was lost, odd or unreadable in a log."""
     from spatial_replay.cli.failures import say
 
-    for fault in replayed.faults:
-        say("warning", fault, colour="yellow")
-    if replayed.unreadable:
-        remark = f"{replayed.unreadable} observations hold a number that is not finite: unknown there"
+    for warning in (*found.faults, *found.remarks):
+        say("warning", warning, colour="yellow")
+    if found.unreadable:
+        remark = f"{found.unreadable} observations hold a number that is not finite: unknown there"
+        if found.remarks:
+            remark = f"{found.unreadable} observations are unknown: see above, or not finite"
         say("warning", remark, colour="yellow")
 
 

@@ -205,7 +205,7 @@ def _clock(time_ns: int) -> str:
 
 
 def _unreadable(count: int) -> str:
-    return f"{count:,} not finite" if count else ""
+    return f"{count:,} unknown" if count else ""
 
 
 def _table(rows: Iterable[tuple[str, ...]]) -> Iterator[str]:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import click
 
+from spatial_replay.cli.evaluating import report_reading
 from spatial_replay.cli.exit_codes import ExitCode
-from spatial_replay.cli.failures import say
 from spatial_replay.cli.options import Reading, output_option, profile_option, reading_options
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.verdicts import counted
@@ -59,11 +59,7 @@ def tracks(file: Path, output: Path, specs: tuple[Path, ...], profile: str | Non
     files = [load_specification(spec, profile=profile) for spec in specs]
     with progress("samples") as advance:
         recorded = record_source(source, output, files, inputs=inputs, advance=advance)
-    for fault in recorded.faults:
-        say("warning", fault, colour="yellow")
-    if recorded.unreadable:
-        remark = f"{recorded.unreadable} observations hold a number that is not finite: unknown there"
-        say("warning", remark, colour="yellow")
+    report_reading(recorded)
     for name in recorded.missing:
         click.echo(replace(name, severity="warning"), err=True)
     seconds = (recorded.end_ns - recorded.start_ns) / 1e9

@@ -75,8 +75,11 @@ class Block:
     Attributes:
         trace: its samples; `trace.faults` tells what was lost since the block before.
         messages: what a copy of the log has to contain beside what is derived from the samples; empty for
-            sources that are no log of messages.
+            sources that are no log of messages. A copy gets a topic for the samples where they have none.
+        remarks: what whoever evaluates it should know, without anything being lost: how many observations are
+            out of date, which transforms are missing.
     """
 
     trace: Trace
     messages: Messages = field(default_factory=Messages)
+    remarks: tuple[str, ...] = ()

@@ -41,7 +41,7 @@ class Overview:
         start_ns, end_ns: times of the first and the last sample; None without samples.
         faults: what was lost or set aside, in words.
         container: channels, metadata and attachments of an MCAP log; None for other formats.
-        remarks: why there is nothing to evaluate, in words.
+        remarks: what else there is to know, without anything being lost.
     """
 
     name: str
@@ -73,6 +73,7 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
         try:
             for block in source.iter_blocks():
                 tally.add(block.trace)
+                remarks += block.remarks
                 advance(len(block.trace))
         except UsageError as error:
             # a scenario without objects is sound; a mapping that does not fit is a mistake to be put right

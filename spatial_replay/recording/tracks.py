@@ -32,6 +32,7 @@ class Recorded:
         faults: what was lost while reading, each with its place.
         unreadable: how many observations held a number that is not finite.
         missing: names in the specifications that no sample had.
+        remarks: what else there is to know about the source, without anything being lost.
     """
 
     samples: int
@@ -41,6 +42,7 @@ class Recorded:
     faults: tuple[str, ...]
     unreadable: int
     missing: tuple[Diagnostic, ...]
+    remarks: tuple[str, ...] = ()
 
 
 def record_source(
@@ -86,6 +88,7 @@ def _traces(source: Source, tally: _Tally) -> Iterator[Trace]:
     any_sample = False
     for block in read_blocks(source):
         tally.add(block.trace)
+        tally.remarks += block.remarks
         if len(block.trace):
             any_sample = True
             yield block.trace
@@ -128,6 +131,7 @@ class _Tally:
         self._names: set[str] = set()
         self._signals: set[str] = set()
         self.faults: list[str] = []
+        self.remarks: list[str] = []
         self._samples = self._unreadable = 0
 
     def add(self, trace: Trace) -> None:
@@ -150,4 +154,5 @@ class _Tally:
             tuple(self.faults),
             self._unreadable,
             tuple(remark for remark in remarks if remark.severity == "error"),
+            tuple(self.remarks),
         )

@@ -34,6 +34,7 @@ def document(replayed: Replayed, *, signal: bool = False, window_ns: int | None 
             "end_ns": replayed.end_ns,
             "damaged": bool(replayed.faults),
             "faults": list(replayed.faults),
+            "remarks": list(replayed.remarks),
             "unreadable_observations": replayed.unreadable,
         },
         "semantics": replayed.semantics,

@@ -70,7 +70,8 @@ class Replayed:
         first_ns: time of the log's first sample, evaluated or not.
         start_ns, end_ns: times of the first and the last of those evaluated.
         faults: what was lost while reading, each with its place.
-        unreadable: how many observations held a number that is not finite.
+        remarks: what else the source says of its samples, where nothing was lost.
+        unreadable: how many observations are there and say nothing: a number is not finite, or too old.
         results: one per spec and object.
         certificate: hashes of what went in and came out.
         semantics: what the formulas meant.
@@ -82,6 +83,7 @@ class Replayed:
     start_ns: int
     end_ns: int
     faults: tuple[str, ...]
+    remarks: tuple[str, ...]
     unreadable: int
     results: tuple[ReplayedSpec, ...]
     certificate: Mapping[str, str]
@@ -134,6 +136,7 @@ class Replay:
         self._sample_hash, self._message_hash = SampleHash(), MessageHash()
         self._result_hash = ResultHash([(tree.name, tree.object) for tree in self.trees])
         self._faults: list[str] = []
+        self._remarks: list[str] = []
         self._names: set[str] = set()
         self._signals: set[str] = set()
         self._samples = self._unreadable = self._encoded = 0
@@ -150,6 +153,7 @@ class Replay:
             stretches = self._evaluation.extend(trace)
             inside = within(trace, self._window.start_ns, self._window.end_ns)
             own = self._own_messages(block)
+            self._remarks += block.remarks
             self._count(inside, own, stretches)
             derived = self._evaluation.messages(inside, stretches) if annotate else []
             written = [*derived, *([] if layer else [own])]
@@ -173,6 +177,7 @@ class Replay:
             start_ns=self._times[0],
             end_ns=self._times[-1],
             faults=tuple(self._faults),
+            remarks=tuple(self._remarks),
             unreadable=self._unreadable,
             results=tuple(self._results()),
             certificate=self.certificate(),
@@ -236,17 +241,17 @@ class Replay:
             yield block, trace
 
     def _own_messages(self, block: Block) -> Messages:
-        """The source's messages in the window; of a source that is no log of messages, its samples."""
+        """The source's messages in the window, and its samples where those are not among its messages."""
         messages = block.messages
-        if not len(messages):
-            trace = within(block.trace, self._window.start_ns, self._window.end_ns)
-            self._encoded += len(trace)
-            first = self._encoded - len(trace)
-            return messages_of(_OBJECTS, trace.times_ns, encode_objects(trace), first)
         begin, end = window_of(messages.log_time_ns, self._window.start_ns, self._window.end_ns)
         inside = messages if end - begin == len(messages) else select(messages, np.arange(begin, end))
-        # in the source, messages of one time come in the order of its numbers of channels
-        return merge([inside])
+        if any(channel.topic == OBJECTS for channel in messages.channels.values()):
+            # in the source, messages of one time come in the order of its numbers of channels
+            return merge([inside])
+        trace = within(block.trace, self._window.start_ns, self._window.end_ns)
+        self._encoded += len(trace)
+        first = self._encoded - len(trace)
+        return merge([inside, messages_of(_OBJECTS, trace.times_ns, encode_objects(trace), first)])
 
     def _count(self, trace: Trace, own: Messages, stretches: Sequence[Stretch]) -> None:
         self._faults += trace.faults
