@@ -1,4 +1,4 @@
-"""Messages of other logs as a copy of the log keeps them: raw, with their definitions, beside our samples."""
+"""Messages of other logs as a copy of the log keeps them: raw, with their definitions."""
 
 from __future__ import annotations
 
@@ -12,17 +12,14 @@ from spatial_replay.errors import LogError
 from spatial_replay.logs.block import Channel, Messages
 from spatial_replay.logs.foreign.messages import Message, Topic
 from spatial_replay.logs.foreign.ros_types import standard_schema
-from spatial_replay.logs.merging import merge
-from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.objects import encode_objects
-from spatial_replay.logs.topics import DERIVED, OBJECTS, protobuf_channel
+from spatial_replay.logs.topics import DERIVED, OBJECTS
 from spatial_replay.trace.trace import Trace
 
 _LOG_TIME = attrgetter("log_time_ns")
 
 
 class CopiedMessages:
-    """Collects raw messages until the samples made of them are there, and gives both in the order of time."""
+    """Collects raw messages until the samples made of them are there, and gives them in the order of time."""
 
     def __init__(self, topics: Sequence[Topic], most_bytes: int) -> None:
         self._channels: dict[str, Channel] = {
@@ -34,7 +31,6 @@ class CopiedMessages:
         self._most_bytes = most_bytes
         self._waiting: list[Message] = []
         self._waiting_bytes = 0
-        self._samples = 0
 
     def add(self, messages: Sequence[Message]) -> None:
         """Take messages that a copy of the log contains."""
@@ -43,13 +39,10 @@ class CopiedMessages:
         self._waiting_bytes += sum(len(message.payload) for message in kept)
 
     def take(self, trace: Trace, *, last: bool = False) -> Messages:
-        """The samples as messages, with the messages up to the last of them; with `last`, all that wait.
+        """The messages up to the last of some new samples; with `last`, all that wait.
 
         Messages whose clock has nothing to do with that of the samples do not wait for ever.
         """
-        return merge([self._objects(trace), self._raw(trace, last=last)])
-
-    def _raw(self, trace: Trace, *, last: bool) -> Messages:
         self._waiting.sort(key=_LOG_TIME)
         if last or self._waiting_bytes > self._most_bytes:
             ready = len(self._waiting)
@@ -61,17 +54,6 @@ class CopiedMessages:
         taken, self._waiting = self._waiting[:ready], self._waiting[ready:]
         self._waiting_bytes -= sum(len(message.payload) for message in taken)
         return _columns(taken, self._channels)
-
-    def _objects(self, trace: Trace) -> Messages:
-        first, self._samples = self._samples, self._samples + len(trace)
-        return Messages(
-            channels=MappingProxyType({0: protobuf_channel(OBJECTS, ObjectStates)}),
-            channel=np.zeros(len(trace), np.int64),
-            sequence=np.arange(first, self._samples, dtype=np.int64),
-            log_time_ns=trace.times_ns,
-            publish_time_ns=trace.times_ns,
-            payloads=encode_objects(trace),
-        )
 
 
 def _columns(messages: Sequence[Message], channels: Mapping[str, Channel]) -> Messages:

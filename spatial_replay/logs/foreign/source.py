@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
 
-from spatial_replay.errors import LogError
+from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.block import Block
 from spatial_replay.logs.faults import FaultList
@@ -50,12 +50,12 @@ class ForeignSource:
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         """See `Source.iter_blocks`; of an indexed log, only what the window needs is read.
 
-        Blocks hold the messages of mapped topics, raw, and the samples as messages of /spatial/objects.
+        Blocks hold the messages of mapped topics, raw.
         """
         reader = open_messages(self.path)
         topics = reader.topics()
-        plan = Plan.of(self.mapping, topics)
-        read = _readable([topic for topic in topics if topic.name in plan.topics], self.name)
+        plan = self._plan(reader, topics)
+        read = [topic for topic in topics if topic.name in plan.topics]
         assembler = Assembler(
             plan,
             reader.decoder,
@@ -75,6 +75,25 @@ class ForeignSource:
         if not blocks.any_sample and start_ns is None and end_ns is None:
             reason = blocks.first_fault or "its messages make none with this mapping"
             raise LogError(f"{self.name} holds no sample: {reason}")
+
+    def _plan(self, reader: MessageReader, topics: Sequence[Topic]) -> Plan:
+        """What has to be read, and how.
+
+        Raises:
+            LogError: a topic that is mapped cannot be decoded, or is missing from a damaged log.
+            UsageError: the mapping does not fit the log.
+        """
+        mapped = {*(each.topic for each in self.mapping.topics), self.mapping.sampling.topic}
+        reasons = [topic.unreadable for topic in topics if topic.name in mapped and topic.unreadable]
+        if reasons:
+            raise LogError("\n".join(f"{self.name}: {reason}" for reason in reasons))
+        try:
+            return Plan.of(self.mapping, topics)
+        except UsageError as error:
+            faults = reader.take_faults()
+            if faults:
+                raise LogError("\n".join([str(error), *faults])) from None
+            raise
 
     def attachments(self) -> tuple[Attachment, ...]:
         """See `Source.attachments`; a log of others keeps nothing that a replay needs."""
@@ -119,21 +138,10 @@ class _Blocks:
         faults = self._faults.take(last=last)
         self.any_sample = self.any_sample or len(trace) > 0
         self.first_fault = self.first_fault or next(iter(faults), None)
+        remarks = (*self._reader.take_remarks(), *self._assembler.take_remarks())
         copied = self._copied.take(trace, last=last)
-        if len(trace) or len(copied) or faults:
-            yield Block(replace(trace, faults=faults), copied)
-
-
-def _readable(topics: Sequence[Topic], name: str) -> Sequence[Topic]:
-    """The topics, all of which can be decoded.
-
-    Raises:
-        LogError: one cannot.
-    """
-    reasons = [topic.unreadable for topic in topics if topic.unreadable]
-    if reasons:
-        raise LogError("\n".join(f"{name}: {reason}" for reason in reasons))
-    return topics
+        if len(trace) or len(copied) or faults or remarks:
+            yield Block(replace(trace, faults=faults), copied, remarks)
 
 
 def _messages(

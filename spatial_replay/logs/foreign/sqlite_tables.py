@@ -71,7 +71,8 @@ def opened(path: Path) -> Iterator[sqlite3.Connection]:
             # a damaged tree of pages may lead in circles
             database.set_progress_handler(lambda: next(taken) > most, _STEPS)
             yield database
-    except sqlite3.Error as error:
+    # names of columns come as text, whatever bytes they are
+    except (sqlite3.Error, UnicodeDecodeError) as error:
         raise LogError(f"{path.name}: the database is damaged ({error})") from None
 
 
