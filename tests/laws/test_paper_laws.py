@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from laws.strategies_monitor import LEAVES, bounds, cuts
-from spatial_replay.monitor.paper_run import PaperRun
+from laws.strategies_monitor import LEAVES, WORDS, bounds, cuts, recordings, specifications
+from spatial_replay.errors import UsageError
+from spatial_replay.monitor.evaluation import evaluate
+from spatial_replay.monitor.monitor import Monitor
+from spatial_replay.monitor.paper.run import PaperRun
 from spatial_replay.spec.formula import Atom, Boolean, Formula, Temporal, Truth, iter_nodes
 
 LOST, LEFT_OUT = "lost", "left out"
 """What a leaf is where an object is not seen, and where it looks back to before the log."""
 
 
-class Undetermined(Exception):
+class UndeterminedError(Exception):
     """Something that is not known is needed."""
 
 
@@ -33,7 +36,7 @@ class Definition:
         """NaN where it is undetermined."""
         try:
             found = self.rho(formula, t, end)
-        except Undetermined:
+        except UndeterminedError:
             return math.nan
         return math.nan if found is None else found
 
@@ -44,7 +47,7 @@ class Definition:
             case Atom():
                 cell = self.cells[formula.text][t]
                 if cell == LOST:
-                    raise Undetermined
+                    raise UndeterminedError
                 return None if isinstance(cell, str) else cell
             case Boolean():
                 return boolean(formula.operator, [self.rho(each, t, end) for each in formula.operands])
@@ -168,3 +171,19 @@ def test_how_the_samples_are_cut_changes_no_bit(formula, run, data):
     whole = series_of(formula, run, (0, size))
     for ends in (data.draw(cuts(size)), range(size + 1)):
         assert series_of(formula, run, ends).tobytes() == whole.tobytes()
+
+
+@settings(max_examples=50)
+@given(specifications(words=replace(WORDS, past=False), templates=False), recordings(), st.data())
+def test_a_monitor_says_sample_by_sample_what_an_evaluation_says(specification, recording, data):
+    assume(not recording.unreadable)
+    trace = recording.trace()
+    start_ns = int(data.draw(st.sampled_from([0, *trace.times_ns])))
+    try:
+        monitor = Monitor(specification, semantics="paper", start_ns=start_ns)
+    except UsageError:
+        assume(False)
+    numbers = [monitor.update(sample).specs[0].numbers for sample in recording.samples]
+    series = evaluate(specification, trace, semantics="paper", start_ns=start_ns).result().series
+    seen = np.stack(numbers[int(np.searchsorted(trace.times_ns, start_ns)) :], axis=2)
+    assert seen.tobytes() == series.tobytes()

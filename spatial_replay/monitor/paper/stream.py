@@ -13,8 +13,8 @@ from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.leaves import leaf_values
 from spatial_replay.monitor.operands import Scene
-from spatial_replay.monitor.paper_run import PaperRun, left_out
-from spatial_replay.monitor.paper_table import OPERATORS
+from spatial_replay.monitor.paper.run import PaperRun, left_out
+from spatial_replay.monitor.paper.table import OPERATORS
 from spatial_replay.monitor.stream import Stretch
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.faults import Source

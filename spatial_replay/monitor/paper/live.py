@@ -9,7 +9,7 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.leaf_plans import SampleLeaves
-from spatial_replay.monitor.paper_run import PaperRun, left_out
+from spatial_replay.monitor.paper.run import PaperRun, left_out
 from spatial_replay.monitor.program import Program
 from spatial_replay.spec.formula import Formula, Outline, iter_nodes
 from spatial_replay.trace.sample import Sample

@@ -13,7 +13,7 @@ import numpy as np
 
 from spatial_replay.compiled import kernel, piece
 from spatial_replay.geometry.arrays import Flags, Floats, Integers
-from spatial_replay.monitor.paper_scans import (
+from spatial_replay.monitor.paper.scans import (
     combine,
     least,
     most,
@@ -24,7 +24,7 @@ from spatial_replay.monitor.paper_scans import (
     scan_until_by_pairs,
     total,
 )
-from spatial_replay.monitor.paper_table import (
+from spatial_replay.monitor.paper.table import (
     ALWAYS,
     CODE,
     COLUMN,

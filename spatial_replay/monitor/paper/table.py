@@ -1,4 +1,4 @@
-"""The tree of a formula as a table for `paper_kernel`, which evaluates Def. 16 on every prefix.
+"""The tree of a formula as a table for `kernel`, which evaluates Def. 16 on every prefix.
 
 A node without temporal operator below is *plain*: its number at a sample is settled once the sample is there.
 Any other node's number at a sample may change with every further sample. Most formulas need it at the first

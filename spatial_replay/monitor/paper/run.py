@@ -9,8 +9,8 @@ import numpy as np
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.channels import low_and_high
-from spatial_replay.monitor.paper_kernel import PaperMemory, step_paper
-from spatial_replay.monitor.paper_table import PaperTable, paper_table
+from spatial_replay.monitor.paper.kernel import PaperMemory, step_paper
+from spatial_replay.monitor.paper.table import PaperTable, paper_table
 from spatial_replay.monitor.recent import iter_delays
 from spatial_replay.spec.formula import Atom, Formula, Quantified
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from spatial_replay.compiled import inlined, piece
 from spatial_replay.geometry.arrays import Flags, Floats, Integers
-from spatial_replay.monitor.paper_table import AND, IFF, IMPLIES, NOT, OR, XOR
+from spatial_replay.monitor.paper.table import AND, IFF, IMPLIES, NOT, OR, XOR
 
 
 @inlined
