@@ -31,8 +31,12 @@ def test_the_examples_run_and_say_what_the_text_says(
         ["poured", "satisfied"],
     ]
     assert printed[1] == ["satisfied"]
-    assert "'cup'" in printed[3][0]
-    assert "'plate'" in printed[3][0]
-    assert printed[4] == ["satisfied"]
-    assert printed[5] == ["()"]
-    assert [line.split()[0] for line in printed[6]] == ["1", "2"]
+    assert printed[3][0].startswith("satisfied 8500000000 spoon dist plate <= 0.08 0.032")
+    assert "'spoon', 'plate'" in printed[3][1]
+    assert "value=0.08, flips_at=0.047" in printed[3][2]
+    assert printed[4][0].startswith("(34, 300) 0.0248")
+    assert "'cup'" in printed[5][0]
+    assert "'plate'" in printed[5][0]
+    assert printed[6] == ["satisfied"]
+    assert printed[7] == ["()"]
+    assert [line.split()[0] for line in printed[8]] == ["1", "2"]

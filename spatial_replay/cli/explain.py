@@ -37,7 +37,7 @@ def explain(
       spatial-replay explain run.mcap --spec blocks.spatial --node reach --at 12.3s
     """
     # the numerical libraries load when there is work for them
-    from spatial_replay.replay import explanations, run_replay
+    from spatial_replay.replay import explanations, has_samples_from, run_replay
 
     if at is not None and request.end is not None:
         raise UsageError("--at and --to both say where the samples end; give one of them")
@@ -53,7 +53,8 @@ def explain(
             advance=advance,
         )
     report_reading(replayed)
-    found = explanations(replayed, node=node, object=object_name, goes_on=at is not None)
+    goes_on = at is not None and has_samples_from(task.source, task.window.end_ns)
+    found = explanations(replayed, node=node, object=object_name, goes_on=goes_on)
     if as_json:
         click.echo(json.dumps([each.document for each in found], indent=2, ensure_ascii=False))
     else:

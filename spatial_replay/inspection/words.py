@@ -139,7 +139,8 @@ def _rounded(number: float, *, up: bool) -> str:
     """Six digits, rounded so that the change is no smaller."""
     rounding = ROUND_CEILING if up else ROUND_FLOOR
     rounded = Context(prec=_DIGITS, rounding=rounding).create_decimal(Decimal(number))
-    return f"{rounded.normalize():f}" if abs(rounded.adjusted()) < 2 * _DIGITS else str(rounded.normalize())
+    is_plain = -5 <= rounded.adjusted() < 2 * _DIGITS
+    return f"{rounded.normalize():f}" if is_plain else str(rounded.normalize()).lower()
 
 
 def _unknown(witness: Witness, deciding: DecidingAtom, first_ns: int) -> str:

@@ -6,7 +6,7 @@ from spatial_replay.replay.annotated import load_files, run_replay
 from spatial_replay.replay.document import document
 from spatial_replay.replay.explanation import Explanation, explanations
 from spatial_replay.replay.replay import Replay, Replayed, ReplayedSpec
-from spatial_replay.replay.window import Window, first_sample_ns
+from spatial_replay.replay.window import Window, first_sample_ns, has_samples_from
 
 __all__ = [
     "Explanation",
@@ -17,6 +17,7 @@ __all__ = [
     "document",
     "explanations",
     "first_sample_ns",
+    "has_samples_from",
     "load_files",
     "run_replay",
 ]

@@ -39,3 +39,8 @@ def first_sample_ns(source: Source) -> int:
         if len(block.trace):
             return int(block.trace.times_ns[0])
     raise LogError(f"{source.name} has no sample")
+
+
+def has_samples_from(source: Source, time_ns: int) -> bool:
+    """Whether a log goes on at or after a time."""
+    return any(len(block.trace) for block in read_blocks(source, time_ns))

@@ -1,0 +1,145 @@
+"""`spatial-replay explain`, and what else `replay` tells beside verdicts, from outside."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from spatial_replay.cli.application import run as run_in_process
+
+TRACKS = """\
+{"time_ns": 0, "objects": [{"name": "cube", "polygon": [[0,0],[1,0],[1,1],[0,1]]}], "signals": {"battery": 0.9}}
+{"time_ns": 500000000, "objects": [{"name": "cube", "polygon": [[4,0],[5,0],[5,1],[4,1]]}], "signals": {"battery": 0.4}}
+{"time_ns": 1000000000, "objects": [{"name": "cube", "polygon": [[6,0],[7,0],[7,1],[6,1]]}, {"name": "cup", "polygon": [[9,0],[10,0],[10,1],[9,1]]}], "signals": {"battery": 0.5}}
+{"time_ns": 1500000000, "objects": [{"name": "cube", "polygon": [[7,0],[8,0],[8,1],[7,1]]}, {"name": "cup", "polygon": [[9,0],[10,0],[10,1],[9,1]]}], "signals": {"battery": 0.5}}
+"""  # noqa: E501
+SPECIFICATION = """\
+region goal = box(6.5, -1, 9.25, 2)
+spec reach = F (cube enclosedin goal)
+spec charged = G (battery >= 0.3)
+spec done = reach and charged
+spec met = F[1s, 2s] (cube closeto[0.5] cup)
+spec apart = G (cube dist cup >= 0.5)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run.jsonl").write_text(TRACKS, encoding="utf-8")
+    (tmp_path / "run.spatial").write_text(SPECIFICATION, encoding="utf-8")
+    return tmp_path
+
+
+EXPLAIN = ("explain", "run.jsonl", "--spec", "run.spatial")
+REPLAY = ("replay", "run.jsonl", "--spec", "run.spatial")
+
+
+def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
+    code = run_in_process(list(arguments))
+    return code, capsys.readouterr().out
+
+
+def test_every_result_is_explained_in_a_few_sentences(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, text = said(capsys, *EXPLAIN)
+    done, met, apart = text.strip().split("\n\n")
+    assert code == 1
+    assert done.splitlines() == [
+        "`done` is satisfied: robustness 0.1, since 1.500 s.",
+        "What decides is `battery >= 0.3`, which holds by 0.1 at 0.500 s "
+        "(its least within `charged`): battery is 0.4.",
+        "It would be violated with 0.400001 or more in place of 0.3 in `battery >= 0.3`.",
+    ]
+    assert "`met` is violated" in met
+    assert "cube and cup are 1 apart" in met
+    assert "satisfied with 1.00001 or more in place of 0.5" in met
+    assert apart.splitlines() == [
+        "`apart` is unknown: robustness between -inf and 0.5.",
+        "`cube dist cup >= 0.5` is unknown at 0.000 s, where it could decide (its least within `apart`): "
+        "cup is not in the sample.",
+    ]
+
+
+def test_a_node_at_a_time(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, text = said(capsys, *EXPLAIN, "--node", "reach", "--at", "1.2s")
+    assert code == 1
+    assert text.startswith("`reach` is violated so far: robustness -0.5, since 0.000 s; later samples may")
+    assert "cube sticks out of goal by 0.5" in text
+    _, at_the_end = said(capsys, *EXPLAIN, "--node", "reach", "--at", "1500ms")
+    assert at_the_end.startswith("`reach` is satisfied: robustness 0.5, since 1.500 s.")
+
+
+def test_what_cannot_be_explained_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, expected in [
+        (("--node", "rech"), "did you mean 'reach'"),
+        (("--object", "7"), "no result is about object '7'"),
+        (("--at", "1s", "--to", "2s"), "give one of them"),
+        (("--at", "-3"), "is not a time"),
+        (("--from", "1s", "--at", "0.2s"), "lies before --from"),
+    ]:
+        assert run_in_process([*EXPLAIN, *arguments]) == 2
+        assert expected in capsys.readouterr().err
+
+
+def test_explanations_for_machines(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, text = said(capsys, *EXPLAIN, "--node", "charged", "--json")
+    (found,) = json.loads(text)
+    assert found["atom"]["text"] == "battery >= 0.3"
+    assert (found["atom"]["value"], found["time_ns"], found["verdict"]) == (
+        pytest.approx(0.1),
+        500_000_000,
+        "satisfied",
+    )
+    assert found["threshold"]["flips_at"] == pytest.approx(0.4)
+
+
+def specifications(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    _, text = said(capsys, *REPLAY, "--json", "-", *arguments)
+    return {each["name"]: each for each in json.loads(text)["specifications"]}
+
+
+def test_the_worst_is_in_the_document(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = specifications(capsys)
+    assert found["met"]["worst"]["atom"]["objects"] == ["cube", "cup"]
+    assert found["met"]["worst"]["atom"]["measured"][0]["points"] == [[8.0, 0.0], [9.0, 0.0]]
+    assert found["apart"]["worst"]["atom"]["unknown"] == ["cup is not in the sample"]
+
+
+def test_signals_and_windows_are_series(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    series = specifications(capsys, "--signal", "--window", "600ms")["done"]["series"]
+    nodes = specifications(capsys)["done"]["nodes"]
+    charged = next(node["id"] for node in nodes if node["name"] == "charged")
+    assert series["signal"][charged] == pytest.approx([0.1, 0.1, 0.2, 0.2])
+    assert series["window"][charged] == pytest.approx([0.6, 0.1, 0.1, 0.2])
+    assert len(series["value"]) == len(series["signal"]) == len(nodes)
+
+
+def test_a_window_is_summed_up(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, text = said(capsys, *REPLAY, "--window", "600ms")
+    assert "over the last 0.6s violated at 3 of 4 samples, first at 0s; robustness at the end 0.2" in text
+
+
+def test_unknown_verdicts_say_what_was_unknown(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, text = said(capsys, *REPLAY)
+    assert "cup is not in the sample" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("--signal",), "add --json"),
+        (("--window", "0s"), "holds no sample"),
+        (("--window", "ten"), "is not a duration"),
+        (("--window", "1s", "--semantics", "paper"), "not defined under --semantics paper"),
+    ],
+)
+def test_what_cannot_be_asked_for(
+    folder: Path, arguments: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_in_process([*REPLAY, *arguments]) == 2
+    assert expected in capsys.readouterr().err
