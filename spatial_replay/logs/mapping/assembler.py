@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from spatial_replay.errors import LogError
+from spatial_replay.geometry.arrays import Integers
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.faults import FaultList
 from spatial_replay.logs.foreign.messages import Decoder, Message
@@ -19,7 +19,6 @@ from spatial_replay.logs.mapping.naming import Codes
 from spatial_replay.logs.mapping.plan import DISORDER_NS, Plan
 from spatial_replay.logs.mapping.remarks import Remarks
 from spatial_replay.logs.mapping.scene import Scene
-from spatial_replay.logs.mapping.transforms import add_transforms
 from spatial_replay.logs.options import OnTimeJump
 from spatial_replay.trace.times import FOREVER, LATEST_NS
 from spatial_replay.trace.trace import Trace
@@ -74,13 +73,13 @@ class Assembler:
             )
             for topic in plan.planned
         }
+        self._codes = _Others({name: number for number, name in enumerate(self._channels)})
         self._scene = Scene(
             plan, self._channels, names, classes, self._tree, self._remarks, self._add_fault, concave
         )
         self._instants = Instants(plan, name)
         self._newest_ns = -1
-        self._settled_ns = -1
-        self._newest_place = ""
+        self._latest_ns = self._settled_ns = -1
         self._count = 0
         self._next_step = _FIRST_STEP
         self._step = _FIRST_STEP
@@ -103,7 +102,8 @@ class Assembler:
         while begin < len(messages) and not self.is_finished:
             part = messages[begin : begin + self._next_step - self._count]
             begin += len(part)
-            self._accept(part)
+            if part:
+                self._accept(part)
             self._count += len(part)
             if self._count == self._next_step:
                 self._step = min(2 * self._step, _LONGEST_STEP)
@@ -113,7 +113,7 @@ class Assembler:
 
     def finish(self) -> Trace:
         """The samples that are left when the log has ended."""
-        trace = self._settle(self._newest_ns)
+        trace = self._settle(max(self._newest_ns, self._latest_ns))
         self._settled_ns = LATEST_NS
         return trace
 
@@ -129,82 +129,61 @@ class Assembler:
         return self._remarks.take() if self._settled_ns == LATEST_NS else ()
 
     def _accept(self, messages: Sequence[Message]) -> None:
-        """Decode messages, put transforms into the tree and the others where they wait."""
-        if self._plan.by_log_time:
-            messages = self._without_jump(messages)
-        by_topic = _by_topic(messages)
-        if not self._plan.by_log_time:
-            self._accept_in_order(messages, by_topic)
-            return
-        for topic, places in by_topic.items():
-            channel = self._channels.get(topic)
-            if channel is not None:
-                listed = [messages[i] for i in places]
-                contents, kept = channel.decoded(listed)
-                if len(kept) < len(listed):
-                    listed = [listed[i] for i in kept]
-                self._put(channel, [message[1] for message in listed], listed, contents)
-
-    def _accept_in_order(self, messages: Sequence[Message], by_topic: dict[str, list[int]]) -> None:
-        """Accept messages whose times are only known once they are decoded."""
-        timed: list[_Timed] = []
-        for topic, places in by_topic.items():
-            channel = self._channels.get(topic)
-            if channel is not None:
-                contents, kept = channel.decoded([messages[i] for i in places])
-                places = [places[i] for i in kept]
-                times, kept = channel.times([messages[i] for i in places], contents)
-                timed.append(_Timed(channel, times, [places[i] for i in kept], [contents[i] for i in kept]))
-        moving = sorted(
-            entry
-            for each in timed
-            if self._is_moving(each.channel.name)
-            for entry in zip(each.places, each.times_ns, strict=True)
+        """Put transforms into the tree, and the other messages where they wait."""
+        topics, log_times_ns, publish_times_ns, sequences, payloads = zip(*messages, strict=True)
+        code = np.fromiter(map(self._codes.__getitem__, topics), np.int64, len(messages))
+        arrived = _Arrived(
+            np.array(log_times_ns, np.int64),
+            np.array(publish_times_ns, np.int64),
+            np.array(sequences),
+            payloads,
         )
-        upto = self._jump([time for _, time in moving], [messages[place] for place, _ in moving])
-        last = moving[upto][0] if upto is not None else len(messages)
-        for each in timed:
-            # places increase
-            count = bisect_left(each.places, last)
-            taken = [messages[place] for place in each.places[:count]]
-            self._put(each.channel, each.times_ns[:count], taken, each.contents[:count])
+        taken: list[_Timed] = []
+        for number, channel in enumerate(self._channels.values()):
+            places = np.flatnonzero(code == number)
+            if len(places):
+                taken.append(self._timed(channel, places, arrived))
+        end = self._jump(taken, topics, arrived)
+        for timed in taken:
+            self._put(timed.before(end), arrived)
 
-    def _without_jump(self, messages: Sequence[Message]) -> Sequence[Message]:
-        moving = [message for message in messages if self._is_moving(message[0])]
-        upto = self._jump([message[1] for message in moving], moving)
-        if upto is None:
-            return messages
-        jumped = moving[upto]
-        return messages[: next(i for i, message in enumerate(messages) if message is jumped)]
+    def _timed(self, channel: Channel, places: Integers, arrived: _Arrived) -> _Timed:
+        """The messages of one topic with their times on its clock; decoded, where that is needed."""
+        contents: list[Any] = [arrived.payloads[place] for place in places.tolist()]
+        clock = channel.planned.clock
+        if channel.keeps_decoded:
+            contents, kept = channel.decoded(contents, arrived.log_times_ns[places].tolist())
+            places = places[kept]
+        if clock == "header":
+            times, kept = channel.stamps(arrived.log_times_ns[places].tolist(), contents)
+            return _Timed(channel, places[kept], np.array(times, np.int64), [contents[i] for i in kept])
+        times_ns = arrived.log_times_ns if clock == "log" else arrived.publish_times_ns
+        return _Timed(channel, places, times_ns[places], contents)
 
-    def _is_moving(self, topic: str) -> bool:
-        """Whether a topic's times tell how far the log has come: not those of transforms and lasting things,
-        whose stamps may lie in the past or the future."""
-        channel = self._channels.get(topic)
-        return channel is not None and not (
-            channel.planned.is_lasting or (channel.planned.is_transforms and channel.extractor is None)
-        )
-
-    def _jump(self, times_ns: list[int], messages: Sequence[Message]) -> int | None:
-        """Take note of times, in the order of the log; the first that is a jump back, where that splits.
+    def _jump(self, taken: list[_Timed], topics: Sequence[str], arrived: _Arrived) -> int:
+        """Take note of how far the log has come; where it ends: at a jump back that splits, or not at all.
 
         Raises:
-            LogError: there is one, and it does not split.
+            LogError: there is a jump back, and it does not split.
         """
-        if not times_ns:
-            return None
-        times = np.array(times_ns, np.int64)
-        newest = np.maximum.accumulate(np.concatenate([[self._newest_ns], times]))
-        late = np.flatnonzero(times < newest[:-1] - DISORDER_NS)
+        moving = [timed for timed in taken if timed.channel.is_moving]
+        if not moving:
+            return len(topics)
+        places = np.concatenate([timed.places for timed in moving])
+        times_ns = np.concatenate([timed.times_ns for timed in moving])
+        order = np.argsort(places, kind="stable")
+        places, times_ns = places[order], times_ns[order]
+        newest = np.maximum.accumulate(np.concatenate([[self._newest_ns], times_ns]))
+        late = np.flatnonzero(times_ns < newest[:-1] - DISORDER_NS)
         if not len(late):
             self._newest_ns = int(newest[-1])
-            return None
+            return len(topics)
         at = int(late[0])
         self._newest_ns = int(newest[at])
-        back = (int(newest[at]) - times_ns[at]) / 1e9
+        place = int(places[at])
         where = (
-            f"time jumps back by {back:.3f} s, from {newest[at]} ns to {times_ns[at]} ns, at a message of"
-            f" {messages[at].topic} logged at {messages[at].log_time_ns} ns"
+            f"time jumps back by {(int(newest[at]) - int(times_ns[at])) / 1e9:.3f} s, from {newest[at]} ns to"
+            f" {times_ns[at]} ns, at a message of {topics[place]} logged at {arrived.log_times_ns[place]} ns"
         )
         if self._on_time_jump == "error":
             raise LogError(
@@ -213,27 +192,24 @@ class Assembler:
             )
         self._has_split = True
         self._remarks.add(f"{where}: the log is taken to end there; cut it to evaluate what comes after")
-        return at
+        return place
 
-    def _put(
-        self, channel: Channel, times_ns: list[int], messages: Sequence[Message], contents: list[object]
-    ) -> None:
-        planned = channel.planned
-        if planned.is_transforms:
-            for time_ns, message, content in zip(times_ns, messages, contents, strict=True):
+    def _put(self, timed: _Timed, arrived: _Arrived) -> None:
+        channel, planned = timed.channel, timed.channel.planned
+        log_times_ns = arrived.log_times_ns[timed.places]
+        if channel.transforms is not None:
+            for time_ns, log_ns, content in zip(
+                timed.times_ns.tolist(), log_times_ns.tolist(), timed.contents, strict=True
+            ):
                 try:
-                    add_transforms(self._tree, content, time_ns, is_static=planned.is_static)
+                    channel.transforms.add(self._tree, content, time_ns, is_static=planned.is_static)
                 except MISFITS as error:
-                    self._add_fault(
-                        channel.name, message.log_time_ns, f"its transforms cannot be read: {error}"
-                    )
-        if planned.mapping is None and channel.name != self._plan.sampled_topic:
-            return
-        log_times = np.array([message[1] for message in messages], np.int64)
-        sequences = np.array([message[3] for message in messages], np.int64)
-        # what is stamped before what is settled came too late for it, and counts from now on
-        times = np.maximum(np.array(times_ns, np.int64), self._settled_ns + 1)
-        channel.pending.add(times, sequences, log_times, contents)
+                    self._add_fault(channel.name, log_ns, f"its transforms cannot be read: {error}")
+        if planned.mapping is not None or channel.name == self._plan.sampled_topic:
+            # what is stamped before what is settled came too late for that, and counts from now on
+            times_ns = np.maximum(timed.times_ns, self._settled_ns + 1)
+            self._latest_ns = max(self._latest_ns, int(times_ns.max(initial=-1)))
+            channel.pending.add(times_ns, arrived.sequences[timed.places], log_times_ns, timed.contents)
 
     def _settle(self, upto_ns: int) -> Trace:
         """The samples up to a time, all of whose messages are there."""
@@ -249,21 +225,31 @@ class Assembler:
         self._faults.add(f"{self._name}: {topic} at {log_time_ns} ns: {what}")
 
 
+class _Arrived(NamedTuple):
+    """Messages as they came, in columns."""
+
+    log_times_ns: Integers
+    publish_times_ns: Integers
+    sequences: Integers
+    payloads: Sequence[bytes]
+
+
 class _Timed(NamedTuple):
-    """Decoded messages of one topic: their times, where they stand among all, what they hold."""
+    """Messages of one topic: where they stand among all that came, their times, what they hold."""
 
     channel: Channel
-    times_ns: list[int]
-    places: list[int]
-    contents: list[object]
+    places: Integers
+    times_ns: Integers
+    contents: list[Any]
+
+    def before(self, place: int) -> _Timed:
+        """Those that stand before a place."""
+        count = int(np.searchsorted(self.places, place))
+        return _Timed(self.channel, self.places[:count], self.times_ns[:count], self.contents[:count])
 
 
-def _by_topic(messages: Sequence[Message]) -> dict[str, list[int]]:
-    """Where the messages of each topic stand."""
-    found: dict[str, list[int]] = {}
-    for place, message in enumerate(messages):
-        places = found.get(message[0])
-        if places is None:
-            places = found[message[0]] = []
-        places.append(place)
-    return found
+class _Others(dict[str, int]):
+    """Numbers of topics; those of any other topic are left out."""
+
+    def __missing__(self, topic: str) -> int:
+        return -1

@@ -3,56 +3,47 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.foreign.messages import Decoder, Message
+from spatial_replay.logs.foreign.messages import Decoder
 from spatial_replay.logs.mapping.binding import TimeGetter, bind_time
-from spatial_replay.logs.mapping.extract import Extractor, Seen
+from spatial_replay.logs.mapping.extract import Extractor, Part, Seen
 from spatial_replay.logs.mapping.fields import style_of
 from spatial_replay.logs.mapping.naming import Codes
 from spatial_replay.logs.mapping.paths import FieldError, Get, Path, check, getter, walk
+from spatial_replay.logs.mapping.pending import Pending
 from spatial_replay.logs.mapping.plan import PlannedTopic
 from spatial_replay.logs.mapping.readings import GENERIC
-from spatial_replay.logs.mapping.transforms import stamp_of_transforms
+from spatial_replay.logs.mapping.transforms import TransformReader
 from spatial_replay.trace.times import LATEST_NS
 
 MISFITS = (FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError)
 """What reading fields of a message raises that is not as the mapping says."""
 
 
-class Pending:
-    """Messages with their times: decoded, not yet turned into objects."""
+_CHUNK = 256
+_CHUNK_BYTES = 2**14
+"""Messages decoded at once: few, so that what they hold is let go of before it piles up."""
 
-    def __init__(self) -> None:
-        self.times_ns = np.empty(0, np.int64)
-        self.sequences = np.empty(0, np.int64)
-        self.log_times_ns = np.empty(0, np.int64)
-        self.contents: list[object] = []
 
-    def add(
-        self, times_ns: Integers, sequences: Integers, log_times_ns: Integers, contents: list[object]
-    ) -> None:
-        self.times_ns = np.concatenate([self.times_ns, times_ns])
-        self.sequences = np.concatenate([self.sequences, sequences])
-        self.log_times_ns = np.concatenate([self.log_times_ns, log_times_ns])
-        self.contents += contents
+@dataclass(slots=True)
+class Harvest:
+    """What messages of a topic tell of.
 
-    def take(self, upto_ns: int) -> tuple[Integers, Integers, list[object]]:
-        """Times, log times and contents of the messages up to a time, in order; they are pending no more."""
-        order = np.lexsort((self.sequences, self.times_ns))
-        count = int(np.searchsorted(self.times_ns[order], upto_ns, "right"))
-        taken, rest = order[:count], order[count:]
-        # what is left keeps the order in which it came
-        rest = np.sort(rest)
-        found = (self.times_ns[taken], self.log_times_ns[taken], [self.contents[i] for i in taken.tolist()])
-        self.times_ns, self.sequences = self.times_ns[rest], self.sequences[rest]
-        self.log_times_ns = self.log_times_ns[rest]
-        self.contents = [self.contents[i] for i in rest.tolist()]
-        return found
+    Attributes:
+        seen: the objects, or None for a topic without.
+        signals: (M,) values of each signal.
+        kept: which messages could be read; `seen` and `signals` count these only.
+    """
+
+    seen: Seen | None
+    signals: list[Floats]
+    kept: list[int]
 
 
 class Channel:
@@ -91,84 +82,129 @@ class Channel:
                 without=entry.without if entry is not None else (),
                 needs_frame=needs_frame,
             )
+        self.transforms = TransformReader() if planned.is_transforms else None
+        self.keeps_decoded = planned.is_transforms or planned.clock == "header"
         self._time: TimeGetter | None = None
         self._has_time = False
         self._signals: list[Get] | None = None
 
     @property
+    def is_moving(self) -> bool:
+        """Whether its times tell how far the log has come.
+
+        Log times do; stamps of transforms and of what was sent once may lie in the future or the past.
+        """
+        if self.planned.clock == "log":
+            return True
+        return not self.planned.is_latched and (self.transforms is None or self.extractor is not None)
+
+    @property
+    def reads(self) -> bool:
+        """Whether its messages tell of objects or signals."""
+        return self.planned.mapping is not None
+
+    @property
     def name(self) -> str:
         return self.planned.name
 
-    def decoded(self, messages: Sequence[Message]) -> tuple[list[object], list[int]]:
+    def decoded(self, payloads: Sequence[bytes], log_times_ns: Sequence[int]) -> tuple[list[Any], list[int]]:
         """What the messages hold, and which of them could be decoded."""
         if self._decode is None:
-            return [None] * len(messages), list(range(len(messages)))
-        decode = self._decode
+            return [None] * len(payloads), list(range(len(payloads)))
         try:
-            return [decode(message[4]) for message in messages], list(range(len(messages)))
+            return list(map(self._decode, payloads)), list(range(len(payloads)))
         except LogError:
-            payloads = [message[4] for message in messages]
-            return self._one_by_one(payloads, decode, [message[1] for message in messages])
+            return self._one_by_one(payloads, self._decode, log_times_ns)
 
-    def times(self, messages: Sequence[Message], contents: Sequence[object]) -> tuple[list[int], list[int]]:
-        """The time of each message on its clock, and which of the messages have one.
+    def stamps(self, log_times_ns: Sequence[int], contents: Sequence[Any]) -> tuple[list[int], list[int]]:
+        """The stamp of each message, and which of the messages have one.
 
         Raises:
             UsageError: there are no stamps where the mapping says.
         """
-        if self.planned.clock != "header":
-            by_log = self.planned.clock == "log"
-            times_ns = [message[1] if by_log else message[2] for message in messages]
-            return times_ns, list(range(len(messages)))
-        found, kept = self._one_by_one(contents, self._stamp, [message[1] for message in messages])
+        found, kept = self._one_by_one(contents, self._stamp, log_times_ns)
         pairs = [(time, place) for time, place in zip(found, kept, strict=True) if isinstance(time, int)]
         late = [time for time, _ in pairs if not 0 <= time <= LATEST_NS]
         if late:
             raise self._misfit(f"its stamp {late[0]} ns lies outside the times of a log; take another clock")
         return [time for time, _ in pairs], [place for _, place in pairs]
 
-    def seen(self, log_times_ns: Integers, contents: list[object]) -> tuple[Seen, list[int]]:
-        """The objects in messages, and which of the messages could be read.
+    def harvest(self, log_times_ns: Integers, contents: Sequence[Any]) -> Harvest:
+        """What messages tell of: payloads, or what they hold where the channel `keeps_decoded`.
 
         Raises:
             UsageError: the mapping does not fit the first message with objects.
         """
-        assert self.extractor is not None
-        extractor = self.extractor
-        everything = list(range(len(contents)))
+        parts: list[Part] = []
+        values: list[list[float]] = []
+        kept: list[int] = []
+        times = log_times_ns.tolist()
+        size = _chunk_size(contents)
+        for begin in range(0, len(contents), size):
+            chunk, at = list(contents[begin : begin + size]), times[begin : begin + size]
+            good = list(range(len(chunk)))
+            if not self.keeps_decoded:
+                chunk, good = self.decoded(chunk, at)
+                at = [at[i] for i in good] if len(good) < len(at) else at
+            chunk, read = self._read_signals(chunk, at, values)
+            good = good if read is None else [good[i] for i in read]
+            if self.extractor is not None:
+                read = self._read_objects(self.extractor, chunk, at, len(kept), parts)
+                good = good if read is None else [good[i] for i in read]
+                values = (
+                    values
+                    if read is None
+                    else values[: len(kept)] + [values[len(kept) + i] for i in read if values]
+                )
+            kept += [begin + i for i in good]
+        columns = np.array(values, np.float64).reshape(len(values), -1) if values else np.empty((0, 0))
+        return Harvest(
+            seen=None if self.extractor is None else self.extractor.seen(parts),
+            signals=[columns[:, place] for place in range(columns.shape[1])],
+            kept=kept,
+        )
+
+    def _read_objects(
+        self, extractor: Extractor, chunk: list[Any], log_times_ns: list[int], first: int, parts: list[Part]
+    ) -> list[int] | None:
+        """Add what a few messages tell of to `parts`; which of them could be read, or None for all."""
         try:
-            return extractor.extract(contents), everything
+            parts.append(extractor.harvest(chunk, first))
+            return None
         except MISFITS as error:
             if not extractor.is_bound:
-                self._bind_first(contents, error)
-        _, kept = self._one_by_one(
-            contents, lambda content: extractor.extract([content]), log_times_ns.tolist()
-        )
-        return extractor.extract([contents[i] for i in kept]), kept
+                self._bind_first(extractor, chunk, error)
+        _, kept = self._one_by_one(chunk, lambda content: extractor.harvest([content], 0), log_times_ns)
+        parts.append(extractor.harvest([chunk[i] for i in kept], first))
+        return kept
 
-    def signals(self, log_times_ns: Integers, contents: list[object]) -> tuple[list[Floats], list[int]]:
-        """(M,) values of each signal, and which of the messages could be read.
+    def _read_signals(
+        self, chunk: list[Any], log_times_ns: list[int], values: list[list[float]]
+    ) -> tuple[list[Any], list[int] | None]:
+        """Add the signals of a few messages to `values`; those that could be read, and which (None: all).
 
         Raises:
             UsageError: a signal's path leads nowhere in the first message.
         """
         entry = self.planned.mapping
-        if entry is None or not entry.signals:
-            return [], list(range(len(contents)))
-        if self._signals is None and contents:
-            self._signals = [self._bind_signal(signal.field, contents[0]) for signal in entry.signals]
-        gets = self._signals or []
-
-        def values(content: object) -> list[float]:
-            return [_number(get(content)) for get in gets]
-
-        found, kept = self._one_by_one(contents, values, log_times_ns.tolist())
-        columns = np.array(found, np.float64).reshape(len(found), len(entry.signals))
-        return [columns[:, place] for place in range(len(entry.signals))], kept
+        if entry is None or not entry.signals or not chunk:
+            return chunk, None
+        if self._signals is None:
+            self._signals = [self._bind_signal(signal.field, chunk[0]) for signal in entry.signals]
+        gets = self._signals
+        try:
+            values += [[_number(get(content)) for get in gets] for content in chunk]
+            return chunk, None
+        except MISFITS:
+            found, kept = self._one_by_one(
+                chunk, lambda content: [_number(get(content)) for get in gets], log_times_ns
+            )
+        values += found
+        return [chunk[i] for i in kept], kept
 
     def _stamp(self, content: object) -> int | None:
-        if self.planned.is_transforms and self.extractor is None:
-            return stamp_of_transforms(content)
+        if self.transforms is not None and self.extractor is None:
+            return self.transforms.stamp(content)
         try:
             if self.extractor is not None:
                 return self.extractor.message_times([content])[0] if self._checked_stamps(content) else None
@@ -189,17 +225,16 @@ class Channel:
             raise self._misfit("the clock is header, but its messages have no stamp; give one with `stamp`")
         return content is not None
 
-    def _bind_first(self, contents: list[object], error: Exception) -> None:
+    def _bind_first(self, extractor: Extractor, contents: list[Any], error: Exception) -> None:
         """Find the message that no path is known to fit yet, and say what is wrong with it."""
-        assert self.extractor is not None
         for content in contents:
             try:
-                self.extractor.extract([content])
+                extractor.harvest([content], 0)
             except FieldError as fault:
                 raise self._misfit(str(fault)) from None
             except MISFITS as fault:
                 raise self._misfit(f"its messages are not as expected: {fault}") from None
-            if self.extractor.is_bound:
+            if extractor.is_bound:
                 return
         raise self._misfit(str(error)) from None
 
@@ -218,10 +253,10 @@ class Channel:
         return UsageError(f"{self._mapping_name}: topics.{self.name}: {what}")
 
     def _one_by_one(
-        self, items: Sequence[object], read: Callable[[Any], object], log_times_ns: Sequence[int]
-    ) -> tuple[list[object], list[int]]:
+        self, items: Sequence[Any], read: Callable[[Any], Any], log_times_ns: Sequence[int]
+    ) -> tuple[list[Any], list[int]]:
         """What can be read of each, and which those are; the others are told as faults."""
-        found: list[object] = []
+        found: list[Any] = []
         kept: list[int] = []
         for place, item in enumerate(items):
             try:
@@ -241,3 +276,9 @@ def _said(error: Exception) -> str:
     if isinstance(error, FieldError | LogError):
         return str(error)
     return f"the message is not as the others: {error}"
+
+
+def _chunk_size(contents: Sequence[Any]) -> int:
+    if not contents or not isinstance(contents[0], bytes):
+        return _CHUNK
+    return max(8, min(_CHUNK, _CHUNK_BYTES * len(contents) // max(1, sum(map(len, contents)))))

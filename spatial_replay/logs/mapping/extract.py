@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, compress
 from typing import Any
@@ -16,6 +16,7 @@ from spatial_replay.logs.mapping.bodies import (
     MARKER_ADD,
     MARKER_DELETE,
     MARKER_DELETE_ALL,
+    Body,
     reader_of,
 )
 from spatial_replay.logs.mapping.fields import style_of
@@ -24,7 +25,7 @@ from spatial_replay.logs.mapping.paths import Get, Path, iter_elements, list_get
 from spatial_replay.logs.mapping.poses import Poses, poses_of
 from spatial_replay.logs.mapping.readings import Reading
 from spatial_replay.logs.mapping.solids import Solids
-from spatial_replay.logs.mapping.substance import substance_of
+from spatial_replay.logs.mapping.substance import bodies_of, points_of, polygons, shapes, solids_of_bodies
 from spatial_replay.logs.mapping.templates import Template
 
 EVERYONE = -1
@@ -61,7 +62,26 @@ class Seen:
     uncertainty: Floats
     covariance: Floats | None
     lifetime_ns: Integers | None
-    gone: list[tuple[int, int]] = field(default_factory=list)
+    gone: list[tuple[int, int]]
+    skipped: int
+
+
+@dataclass(slots=True)
+class Part:
+    """What a few messages tell of, before it is put into columns; attributes as of `Seen`."""
+
+    gone: list[tuple[int, int]]
+    message: list[int] = field(default_factory=list)
+    name: list[int] = field(default_factory=list)
+    class_code: list[int] = field(default_factory=list)
+    frames: list[str] | None = None
+    stamps: list[int] | None = None
+    numbers: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    covariance: Floats | None = None
+    lifetimes: list[int] = field(default_factory=list)
+    bodies: list[list[Body]] = field(default_factory=list)
+    corner_counts: Integers = field(default_factory=lambda: np.empty(0, np.int64))
+    corners: Floats = field(default_factory=lambda: np.empty((0, 3)))
     skipped: int = 0
 
 
@@ -123,8 +143,9 @@ class Extractor:
                 times.append(None if first is None else self._time.nanoseconds([first])[0])
         return times
 
-    def extract(self, messages: Sequence[object]) -> Seen:
-        """
+    def harvest(self, messages: Sequence[object], first: int) -> Part:
+        """What some messages tell of objects; `first` is the number of the first of them.
+
         Raises:
             FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError: a message that is
                 not as the others; the first says what is wrong.
@@ -133,53 +154,88 @@ class Extractor:
         gone: list[tuple[int, int]] = []
         if self.reading.solids == "scene":
             gone = self._deleted_entities(messages)
-        style = style_of(messages[0]) if messages else "attributes"
-        names = self._namer.codes(objects, places, style)
+        names = self._namer.codes(objects, places, style_of(messages[0]) if messages else "attributes")
         if self.reading.solids == "marker":
             objects, index, names, gone = self._without_deleted(objects, index, names)
         if self._namer.is_filtering():
             texts = list(self._names)
             keep = [self._namer.wants(code, texts[code]) for code in names]
             objects, index, names = _kept(keep, objects, index, names)
-        if objects and self._binding is None:
+        part = Part(gone=[(number + first, name) for number, name in gone])
+        if not objects:
+            return part
+        if self._binding is None:
             message = messages[index[0]]
             self._binding = bind(self.reading, objects[0], message, needs_frame=self._needs_frame)
             self._bind_time(objects[0], message)
-        return self._columns(messages, objects, index, names, gone)
+        self._fill(part, self._binding, messages, objects, index, names)
+        part.message = [number + first for number in part.message] if first else part.message
+        return part
 
-    def _columns(
+    def _fill(
         self,
+        part: Part,
+        binding: Binding,
         messages: Sequence[object],
         objects: list[Any],
         index: list[int],
         names: list[int],
-        gone: list[tuple[int, int]],
-    ) -> Seen:
-        if self._binding is None:
-            return _nobody(gone)
+    ) -> None:
+        if self.reading.solids:
+            bodies = bodies_of(self.reading, binding, objects)
+            count = len(objects)
+            keep = [bool(each) for each in bodies]
+            objects, index, names = _kept(keep, objects, index, names)
+            part.bodies = [each for each in bodies if each]
+            part.skipped = count - len(objects)
+        elif binding.polygon is not None:
+            part.corner_counts, part.corners = points_of([binding.polygon(each) for each in objects])
+        if binding.numbers is not None:
+            rows = list(map(binding.numbers, objects))
+            part.numbers = np.array(rows, np.float64).reshape(len(objects), binding.width)
+        part.covariance = _covariance(self.reading, binding, objects)
+        part.class_code = class_codes(self.reading, binding, objects, self._classes)
+        part.frames = self._frames(messages, objects, index)
+        part.stamps = self._stamps(messages, objects, index)
+        if binding.lifetime is not None:
+            part.lifetimes = binding.lifetime.nanoseconds(objects)
+        part.message, part.name = index, names
+
+    def seen(self, parts: Sequence[Part]) -> Seen:
+        """The parts of consecutive messages as columns."""
+        gone = [each for part in parts for each in part.gone]
+        skipped = sum(part.skipped for part in parts)
+        parts = [part for part in parts if part.name]
         binding = self._binding
-        substance = substance_of(self.reading, binding, objects)
-        skipped = 0
-        if substance.bodiless is not None:
-            keep = ~substance.bodiless
-            skipped = int(substance.bodiless.sum())
-            objects, index, names = _kept(keep.tolist(), objects, index, names)
-        numbers = _numbers(binding, objects)
-        poses = substance.poses if substance.poses is not None else poses_of(self.reading, binding, numbers)
+        if binding is None or not parts:
+            return _nobody(gone, skipped)
+        name = _joined(part.name for part in parts)
+        numbers = np.empty((len(name), 0))
+        if binding.numbers is not None:
+            numbers = np.concatenate([part.numbers for part in parts])
+        if self.reading.solids:
+            solids, poses = solids_of_bodies(list(chain.from_iterable(part.bodies for part in parts)))
+        else:
+            poses = poses_of(self.reading, binding, numbers)
+            if binding.polygon is not None:
+                counts = np.concatenate([part.corner_counts for part in parts])
+                solids = polygons(counts, np.concatenate([part.corners for part in parts]))
+            else:
+                solids = shapes(self.reading, binding, poses, numbers)
+        has_frames, has_stamps = parts[0].frames is not None, parts[0].stamps is not None
+        covariances = [part.covariance for part in parts if part.covariance is not None]
         return Seen(
-            message=np.array(index, np.int64),
-            name=np.array(names, np.int64),
-            class_code=np.array(class_codes(self.reading, binding, objects, self._classes), np.int64),
-            frames=self._frames(messages, objects, index),
-            stamp_ns=self._stamps(messages, objects, index),
+            message=_joined(part.message for part in parts),
+            name=name,
+            class_code=_joined(part.class_code for part in parts),
+            frames=list(chain.from_iterable(part.frames or () for part in parts)) if has_frames else None,
+            stamp_ns=_joined(part.stamps or () for part in parts) if has_stamps else None,
             poses=poses,
-            solids=substance.solids(poses, numbers),
+            solids=solids,
             height=_measured(binding.height, numbers),
-            uncertainty=_uncertainty(binding, numbers, len(objects)),
-            covariance=_covariance(self.reading, binding, objects),
-            lifetime_ns=None
-            if binding.lifetime is None
-            else np.array(binding.lifetime.nanoseconds(objects), np.int64),
+            uncertainty=_uncertainty(binding, numbers, len(name)),
+            covariance=np.concatenate(covariances) if covariances else None,
+            lifetime_ns=_joined(part.lifetimes for part in parts) if binding.lifetime is not None else None,
             gone=gone,
             skipped=skipped,
         )
@@ -249,12 +305,13 @@ class Extractor:
             return [str(of_message[number]).removeprefix("/") for number in index]
         return [str(get(each)).removeprefix("/") for each in objects]
 
-    def _stamps(self, messages: Sequence[object], objects: list[Any], index: list[int]) -> Integers | None:
+    def _stamps(self, messages: Sequence[object], objects: list[Any], index: list[int]) -> list[int] | None:
         if self._time is None or not self._needs_frame:
             return None
         if self._time.path.from_message:
-            return np.array(self._time.nanoseconds(messages), np.int64)[index]
-        return np.array(self._time.nanoseconds(objects), np.int64)
+            of_message = self._time.nanoseconds(messages)
+            return [of_message[number] for number in index]
+        return self._time.nanoseconds(objects)
 
 
 def _kept(
@@ -265,12 +322,8 @@ def _kept(
     return list(compress(objects, keep)), list(compress(index, keep)), list(compress(names, keep))
 
 
-def _numbers(binding: Binding, objects: list[Any]) -> Floats:
-    """(R, width) every number that is read from the objects."""
-    if binding.numbers is None:
-        return np.empty((len(objects), 0))
-    rows = [binding.numbers(each) for each in objects]
-    return np.array(rows, np.float64).reshape(len(objects), binding.width)
+def _joined(columns: Iterable[Sequence[int]]) -> Integers:
+    return np.fromiter(chain.from_iterable(columns), np.int64)
 
 
 def _measured(measures: tuple[float | int, ...], numbers: Floats) -> Floats | None:
@@ -301,7 +354,7 @@ def _covariance(reading: Reading, binding: Binding, objects: list[Any]) -> Float
     return found * reading.uncertainty.sigmas**2
 
 
-def _nobody(gone: list[tuple[int, int]]) -> Seen:
+def _nobody(gone: list[tuple[int, int]], skipped: int) -> Seen:
     none = np.empty(0, np.int64)
     empty = np.empty((0, 3))
     matrices = np.empty((0, 3, 3))
@@ -320,4 +373,5 @@ def _nobody(gone: list[tuple[int, int]]) -> Seen:
         covariance=None,
         lifetime_ns=None,
         gone=gone,
+        skipped=skipped,
     )

@@ -56,14 +56,11 @@ class Transforms(NamedTuple):
 
 @dataclass(slots=True)
 class _Child:
-    """Every transform of one child frame: when, in which parent, where."""
+    """Every transform of one child frame: stamp, clock, parent, pose; and the static one, if there is one."""
 
-    stamps: list[int] = field(default_factory=list)
-    clocks: list[int] = field(default_factory=list)
-    parents: list[str] = field(default_factory=list)
-    poses: list[tuple[float, ...]] = field(default_factory=list)
+    entries: list[tuple[int, int, str, tuple[float, ...]]] = field(default_factory=list)
+    parents: dict[str, None] = field(default_factory=dict)
     static: tuple[str, tuple[float, ...]] | None = None
-    sorted_upto: int = 0
 
 
 class _Series(NamedTuple):
@@ -98,29 +95,26 @@ class FrameTree:
             stamp_ns: the time inside the message.
             clock_ns: the time of the message on the clock of the samples.
         """
-        kept = self._children.setdefault(child, _Child())
+        kept = self._children.get(child)
+        if kept is None:
+            kept = self._children[child] = _Child()
         if is_static:
             kept.static = (parent, pose)
             return
-        kept.stamps.append(stamp_ns)
-        kept.clocks.append(clock_ns)
-        kept.parents.append(parent)
-        kept.poses.append(pose)
-        self._series.pop((child, True), None)
-        self._series.pop((child, False), None)
+        kept.entries.append((stamp_ns, clock_ns, parent, pose))
+        if parent not in kept.parents:
+            kept.parents[parent] = None
+        if self._series:
+            self._series.clear()
 
     def forget_before(self, clock_ns: int) -> None:
         """Drop transforms of messages before a time, but for the last one of each child."""
-        for name, child in self._children.items():
-            keep = [i for i, clock in enumerate(child.clocks) if clock >= clock_ns]
-            if len(keep) < len(child.clocks):
-                keep = keep or [int(np.argmax(child.clocks))]
-                child.stamps = [child.stamps[i] for i in keep]
-                child.clocks = [child.clocks[i] for i in keep]
-                child.parents = [child.parents[i] for i in keep]
-                child.poses = [child.poses[i] for i in keep]
-                self._series.pop((name, True), None)
-                self._series.pop((name, False), None)
+        for child in self._children.values():
+            keep = [entry for entry in child.entries if entry[1] >= clock_ns]
+            if len(keep) < len(child.entries):
+                child.entries = keep or child.entries[-1:]
+                child.parents = dict.fromkeys(entry[2] for entry in child.entries)
+        self._series.clear()
 
     @property
     def names(self) -> frozenset[str]:
@@ -153,7 +147,7 @@ class FrameTree:
         """The times in groups between which no frame changes its parent."""
         breaks: set[int] = set()
         for name, child in self._children.items():
-            if len(set(child.parents)) > 1:
+            if len(child.parents) > 1:
                 series = self._series_of(name, by_stamp)
                 breaks.update(
                     int(series.times_ns[i])
@@ -239,14 +233,14 @@ class FrameTree:
         found = self._series.get((frame, by_stamp))
         if found is None:
             child = self._children[frame]
-            times = np.array(child.stamps if by_stamp else child.clocks, np.int64)
+            times = np.array([entry[0 if by_stamp else 1] for entry in child.entries], np.int64)
             order = np.argsort(times, kind="stable")
             ordered = times[order]
             keep = order[np.append(ordered[1:] != ordered[:-1], True)[: len(ordered)]]
             found = _Series(
                 times[keep],
-                [child.parents[i] for i in keep.tolist()],
-                np.array([child.poses[i] for i in keep.tolist()], np.float64).reshape(-1, 7),
+                [child.entries[i][2] for i in keep.tolist()],
+                np.array([child.entries[i][3] for i in keep.tolist()], np.float64).reshape(-1, 7),
             )
             self._series[frame, by_stamp] = found
         return found

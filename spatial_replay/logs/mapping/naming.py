@@ -36,6 +36,7 @@ class Namer:
         self._wanted: dict[int, bool] = {}
         self._by_values: dict[Any, int] = {}
         self._get: Get | None = None
+        self._is_planned = False
 
     def codes(self, objects: Sequence[object], places: Sequence[int], style: Style) -> list[int]:
         """The code of each object's name.
@@ -49,14 +50,14 @@ class Namer:
         if self._template.is_constant or self._template.text == "{topic}":
             name = "".join(str(part) for part in self._template.parts) if self._template.is_constant else ""
             return [self._codes[_checked(name or self._topic)]] * len(objects)
-        get = self._single()
+        get = self._single(style)
         known = self._by_values
-        if get is None:
+        if get is None or not objects:
             return [self._codes[self._name(each, place)] for each, place in zip(objects, places, strict=True)]
         # most names depend on one field alone
         found = []
         for each in objects:
-            value = get(each) if style == "attributes" else each[self._field()]  # type: ignore[index]
+            value = get(each)
             code = known.get(value)
             if code is None:
                 code = known[value] = self._codes[self._name(each, 0)]
@@ -75,19 +76,16 @@ class Namer:
             self._wanted[code] = found
         return found
 
-    def _single(self) -> Get | None:
+    def _single(self, style: Style) -> Get | None:
         """How the one field is read that the name depends on; None where it is not as simple as that."""
-        if self._get is None and self._field():
-            self._get = getter(Path.of(self._field()), "attributes")
+        if not self._is_planned:
+            self._is_planned = True
+            fields = [part for part in self._template.parts if not isinstance(part, str)]
+            if len(fields) == 1 and len(fields[0]) == 1:
+                (path,) = fields[0]
+                if path.text not in (INDEX, TOPIC) and not path.from_message:
+                    self._get = getter(path, style)
         return self._get
-
-    def _field(self) -> str:
-        fields = [part for part in self._template.parts if not isinstance(part, str)]
-        if len(fields) == 1 and len(fields[0]) == 1:
-            (path,) = fields[0]
-            if len(path.steps) == 1 and path.text not in (INDEX, TOPIC) and not path.from_message:
-                return path.text
-        return ""
 
     def _name(self, thing: object, place: int) -> str:
         words = [

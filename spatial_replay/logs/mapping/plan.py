@@ -26,6 +26,7 @@ class PlannedTopic:
         max_age_ns: how long what it says stays valid.
         is_transforms: whether its transforms place frames; `is_static`: at all times.
         is_lasting: whether a message counts however long ago it came.
+        is_latched: whether it may have been sent long before it was recorded.
     """
 
     name: str
@@ -36,6 +37,7 @@ class PlannedTopic:
     is_transforms: bool
     is_static: bool
     is_lasting: bool
+    is_latched: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,5 +150,6 @@ def _planned(mapping: Mapping, entry: TopicMapping | None, topic: Topic, needs_f
         max_age_ns=max_age_ns,
         is_transforms=is_transforms,
         is_static=is_static,
+        is_latched=topic.latched,
         is_lasting=is_static or (reading is not None and max_age_ns >= FOREVER_NS),
     )

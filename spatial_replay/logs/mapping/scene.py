@@ -57,9 +57,13 @@ class Scene:
             times_ns, log_times_ns, contents = channel.pending.take(upto_ns)
             if self._plan.sampled_topic in (None, name):
                 sampled.append(times_ns)
-            if channel.extractor is not None:
-                self._take_objects(channel, times_ns, log_times_ns, contents, stored)
-            self._take_signals(channel, times_ns, log_times_ns, contents)
+            harvest = channel.harvest(log_times_ns, contents) if channel.reads else None
+            if harvest is not None and len(harvest.kept) < len(contents):
+                times_ns, log_times_ns = times_ns[harvest.kept], log_times_ns[harvest.kept]
+            if harvest is not None and harvest.seen is not None:
+                self._take_objects(channel, times_ns, log_times_ns, harvest.seen, stored)
+            for place, values in enumerate(harvest.signals if harvest is not None else ()):
+                self._take_signal((name, place), times_ns, values)
         self._rows = Rows.concatenate(stored) if len(stored) > 1 else self._rows
         times = instants.upto(np.concatenate([np.empty(0, np.int64), *sampled]), upto_ns)
         times = times[(times >= start_ns) & (times < end_ns)]
@@ -72,14 +76,11 @@ class Scene:
         channel: Channel,
         times_ns: Integers,
         log_times_ns: Integers,
-        contents: list[object],
+        seen: Seen,
         stored: list[Rows],
     ) -> None:
-        if not contents:
+        if not len(times_ns):
             return
-        seen, kept = channel.seen(log_times_ns, contents)
-        if len(kept) < len(contents):
-            times_ns, log_times_ns = times_ns[kept], log_times_ns[kept]
         if seen.skipped:
             self._remarks.count_skipped(channel.name, seen.skipped)
         self._claim(channel.name, seen.name)
@@ -172,17 +173,9 @@ class Scene:
         stored.append(blank)
         return number
 
-    def _take_signals(
-        self, channel: Channel, times_ns: Integers, log_times_ns: Integers, contents: list[object]
-    ) -> None:
-        columns, kept = channel.signals(log_times_ns, contents)
-        for place, values in enumerate(columns):
-            key = channel.name, place
-            before = self._signals.get(key, (np.empty(0, np.int64), np.empty(0)))
-            self._signals[key] = (
-                np.concatenate([before[0], times_ns[kept]]),
-                np.concatenate([before[1], values]),
-            )
+    def _take_signal(self, key: tuple[str, int], times_ns: Integers, values: Floats) -> None:
+        before = self._signals.get(key, (np.empty(0, np.int64), np.empty(0)))
+        self._signals[key] = np.concatenate([before[0], times_ns]), np.concatenate([before[1], values])
 
     def _trace(self, times_ns: Integers) -> Trace:
         if not len(times_ns):

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from itertools import chain
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.mapping.binding import Binding
@@ -26,59 +24,35 @@ from spatial_replay.logs.mapping.rotation import matrices_from_quaternions
 from spatial_replay.logs.mapping.solids import BOX, DISC, POLYGON, SPHERE, Solids
 from spatial_replay.trace.ragged import starts_from_counts
 
-
-@dataclass(frozen=True, slots=True)
-class Substance:
-    """How objects become solids.
-
-    Attributes:
-        solids: their solids, given their poses and numbers.
-        poses: where the objects are, if their bodies say so.
-        bodiless: (R,) which objects have nothing that is a body, if any; `poses` and `solids` leave them out.
-    """
-
-    solids: Callable[[Poses, Floats], Solids]
-    poses: Poses | None = None
-    bodiless: NDArray[np.bool_] | None = None
-
-
 _BODIES = {"marker": bodies_of_marker, "scene": bodies_of_entity, "primitive": bodies_of_perceived}
 
 
-def substance_of(reading: Reading, binding: Binding, objects: Sequence[Any]) -> Substance:
-    """What objects of one topic consist of."""
-    if reading.solids:
-        read = reader_of(binding.style)
-        bodies_of = _BODIES[reading.solids]
-        return _of_bodies([bodies_of(each, read) for each in objects])
-    if binding.polygon is not None:
-        get = binding.polygon
-        counts, points = _points([get(each) for each in objects])
-        return Substance(lambda poses, numbers: _polygons(poses, counts, points))
-    return Substance(lambda poses, numbers: _shapes(reading, binding, poses, numbers))
+def bodies_of(reading: Reading, binding: Binding, objects: Sequence[Any]) -> list[list[Body]]:
+    """The bodies of each object, of a type that says what they consist of; none where nothing is one."""
+    read = reader_of(binding.style)
+    take = _BODIES[reading.solids]
+    return [take(each, read) for each in objects]
 
 
-def _of_bodies(listed: list[list[Body]]) -> Substance:
+def solids_of_bodies(listed: list[list[Body]]) -> tuple[Solids, Poses]:
+    """The solids of objects that have at least one body each, and the pose of each one's first."""
     counts = np.array([len(bodies) for bodies in listed], np.int64)
-    present = counts > 0
     bodies = list(chain.from_iterable(listed))
-    owner = np.repeat(np.arange(int(present.sum())), counts[present])
+    owner = np.repeat(np.arange(len(counts)), counts)
     position = _array([body.position for body in bodies], 3)
     rotation, yaw = matrices_from_quaternions(_array([body.quaternion for body in bodies], 4))
-    first = np.flatnonzero(np.diff(owner, prepend=-1))
+    first = np.cumsum(counts) - counts
     kind = np.array([body.kind for body in bodies], np.int8)
     poses = Poses(position[first], rotation[first], yaw[first])
-    point_counts = [len(body.points) for body in bodies]
     points = _array(list(chain.from_iterable(body.points for body in bodies)), 3)
-    start = starts_from_counts(np.array(point_counts, np.int64))
+    start = starts_from_counts(np.array([len(body.points) for body in bodies], np.int64))
     shifted = np.flatnonzero((np.diff(start) == 1) & ((kind == BOX) | (kind == SPHERE)))
     position = position.copy()
     position[shifted] += np.einsum("nij,nj->ni", rotation[shifted], points[start[shifted]])
-    solids = Solids(owner, kind, position, rotation, _array([b.size for b in bodies], 3), start, points)
-    return Substance(lambda _poses, _numbers: solids, poses, None if present.all() else ~present)
+    return Solids(owner, kind, position, rotation, _array([b.size for b in bodies], 3), start, points), poses
 
 
-def _shapes(reading: Reading, binding: Binding, poses: Poses, numbers: Floats) -> Solids:
+def shapes(reading: Reading, binding: Binding, poses: Poses, numbers: Floats) -> Solids:
     """One solid each, of the shape that the mapping or the message gives; a point where nobody does."""
     count = len(poses.position)
     shape = reading.shape
@@ -114,7 +88,7 @@ def _shapes(reading: Reading, binding: Binding, poses: Poses, numbers: Floats) -
     )
 
 
-def _polygons(poses: Poses, counts: Integers, points: Floats) -> Solids:
+def polygons(counts: Integers, points: Floats) -> Solids:
     """Polygons whose corners are given in the frame of their message, not in the object's own."""
     count = len(counts)
     origin = np.zeros((count, 3))
@@ -129,7 +103,7 @@ def _polygons(poses: Poses, counts: Integers, points: Floats) -> Solids:
     )
 
 
-def _points(lists: list[Any]) -> tuple[Integers, Floats]:
+def points_of(lists: list[Any]) -> tuple[Integers, Floats]:
     """The corners of lists of points, of pairs of numbers, or of x, y, x, y … in turn."""
     example = next((each[0] for each in lists if len(each)), None)
     flat = list(chain.from_iterable(lists))

@@ -2,60 +2,74 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-from spatial_replay.logs.mapping.bodies import Read, reader_of
 from spatial_replay.logs.mapping.fields import field_names, style_of
 from spatial_replay.logs.mapping.frames import FrameTree
+from spatial_replay.logs.mapping.paths import FieldError, Get, Path, getter, leads_somewhere, tuple_getter
+
+_SECONDS = ("sec", "secs", "seconds")
+_REST = ("nanosec", "nsec", "nsecs", "nanos")
 
 
-def add_transforms(tree: FrameTree, message: object, clock_ns: int, *, is_static: bool) -> None:
-    """Put every transform of a message into a tree.
+class TransformReader:
+    """Reads the transforms in the messages of one topic, whatever they are called there."""
 
-    Raises:
-        AttributeError, LookupError, TypeError, ValueError: it is no message of transforms.
-    """
-    read = reader_of(style_of(message))
-    for transform in _each(message, read):
-        child, parent, translation, rotation, time = _parts(transform, read)
-        pose = tuple(float(read(translation, axis) or 0.0) for axis in "xyz")
-        turned = tuple(float(read(rotation, axis) or 0.0) for axis in "xyzw")
-        tree.add(
-            str(child).removeprefix("/"),
-            str(parent).removeprefix("/"),
-            pose + turned,
-            stamp_ns=_nanoseconds(time, read),
-            clock_ns=clock_ns,
-            is_static=is_static,
-        )
+    def __init__(self) -> None:
+        self._list: Get | None = None
+        self._get: Get | None = None
+
+    def add(self, tree: FrameTree, message: object, clock_ns: int, *, is_static: bool) -> None:
+        """Put every transform of a message into a tree.
+
+        Raises:
+            FieldError, AttributeError, LookupError, TypeError, ValueError: it is no message of transforms.
+        """
+        for transform in self._each(message):
+            child, parent, seconds, rest, *pose = self._values(transform)
+            tree.add(
+                str(child).removeprefix("/"),
+                str(parent).removeprefix("/"),
+                tuple(map(float, pose)),
+                stamp_ns=int(seconds) * 1_000_000_000 + int(rest),
+                clock_ns=clock_ns,
+                is_static=is_static,
+            )
+
+    def stamp(self, message: object) -> int | None:
+        """The stamp of a message's first transform; None where it has no transform."""
+        for transform in self._each(message):
+            _, _, seconds, rest, *_ = self._values(transform)
+            return int(seconds) * 1_000_000_000 + int(rest)
+        return None
+
+    def _each(self, message: object) -> Iterator[Any]:
+        if self._list is None:
+            has_list = "transforms" in field_names(message)
+            self._list = getter(Path.of("transforms"), style_of(message)) if has_list else lambda one: (one,)
+        return iter(self._list(message))
+
+    def _values(self, transform: Any) -> Sequence[Any]:
+        if self._get is None:
+            self._get = _getter(transform)
+        values: Sequence[Any] = self._get(transform)
+        return values
 
 
-def stamp_of_transforms(message: object) -> int | None:
-    """The stamp of a message's first transform; None where it has no transform."""
-    read = reader_of(style_of(message))
-    first = next(_each(message, read), None)
-    return None if first is None else _nanoseconds(_parts(first, read)[4], read)
-
-
-def _each(message: object, read: Read) -> Iterator[Any]:
-    return iter(read(message, "transforms")) if "transforms" in field_names(message) else iter((message,))
-
-
-def _parts(transform: Any, read: Read) -> tuple[Any, Any, Any, Any, Any]:
-    """Child, parent, translation, rotation, time."""
-    child = read(transform, "child_frame_id")
-    if "header" in field_names(transform):
-        header, moved = read(transform, "header"), read(transform, "transform")
-        parent, time = read(header, "frame_id"), read(header, "stamp")
-        return child, parent, read(moved, "translation"), read(moved, "rotation"), time
-    parent, time = read(transform, "parent_frame_id"), read(transform, "timestamp")
-    return child, parent, read(transform, "translation"), read(transform, "rotation"), time
-
-
-def _nanoseconds(time: Any, read: Read) -> int:
-    names = field_names(time)
-    seconds = next((name for name in ("sec", "secs", "seconds") if name in names), None)
-    rest = next((name for name in ("nanosec", "nsec", "nsecs", "nanos") if name in names), None)
-    whole = int(read(time, seconds)) if seconds else 0
-    return whole * 10**9 + (int(read(time, rest)) if rest else 0)
+def _getter(example: object) -> Get:
+    """Child, parent, seconds, nanoseconds, x, y, z, and the quaternion's x, y, z, w."""
+    names = field_names(example)
+    stamp, parent = (
+        ("header.stamp", "header.frame_id") if "header" in names else ("timestamp", "parent_frame_id")
+    )
+    place = "transform." if "transform" in names else ""
+    paths = ["child_frame_id", parent]
+    for parts in (_SECONDS, _REST):
+        found = [f"{stamp}.{part}" for part in parts if leads_somewhere(Path.of(f"{stamp}.{part}"), example)]
+        if not found:
+            raise FieldError(f"{stamp} is no time; a transform has a stamp")
+        paths.append(found[0])
+    paths += [f"{place}translation.{axis}" for axis in "xyz"]
+    paths += [f"{place}rotation.{axis}" for axis in "xyzw"]
+    return tuple_getter([Path.of(path) for path in paths], style_of(example))
