@@ -134,3 +134,26 @@ def test_a_scenario_on_the_command_line(
     first = replayed(capsys, log, "-o", "annotated.mcap")
     assert first["log"]["samples"] == 41
     assert replayed(capsys, folder / "annotated.mcap")["specifications"] == first["specifications"]
+
+
+def test_what_is_out_of_date_is_unknown_and_told_but_no_damage(
+    data_folder: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "turtles.yaml").write_text("max_age: 1ns\n" + TURTLES)
+    bag = data_folder / "bags" / "two_turtles_lz4.bag"
+    arguments = ["replay", str(bag), "--spec", "turtles.spatial", "--mapping", "turtles.yaml", "--json", "-"]
+    assert run(arguments) == 4
+    said = capsys.readouterr()
+    document = json.loads(said.out)["log"]
+    assert document["damaged"] is False
+    assert document["unreadable_observations"] == 1344
+    (remark,) = document["remarks"]
+    assert "turtle1" in remark
+    assert remark in said.err
+    record = ["record", "tracks", str(bag), "--mapping", "turtles.yaml", "-o", "run.mcap"]
+    assert run(record) == 0
+    assert remark in capsys.readouterr().err
+    assert run(["info", str(bag), "--mapping", "turtles.yaml"]) == 0
+    said = capsys.readouterr()
+    assert remark in said.err
+    assert "1,344 unknown" in said.out
