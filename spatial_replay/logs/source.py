@@ -199,7 +199,8 @@ def read_trace(
     source = open_source(
         path, concave=concave, mapping=mapping, on_time_jump=on_time_jump, rate=rate, lost=lost
     )
-    trace = Trace.concatenate([block.trace for block in source.iter_blocks()])
+    traces = [replace(block.trace, remarks=block.remarks) for block in source.iter_blocks()]
+    trace = Trace.concatenate(traces)
     if trace.faults and not allow_damage:
         more = f"\n… and {len(trace.faults) - 1} more" if len(trace.faults) > 1 else ""
         raise LogError(f"{trace.faults[0]}{more}; allow_damage=True reads the rest")

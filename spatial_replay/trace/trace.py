@@ -29,7 +29,7 @@ class Trace:
     that is not finite is kept too, so that nothing is lost, but its row number is stored as
     -2 - row: the object is unknown there (`unreadable`).
 
-    Two traces are equal when they hold the same samples; `faults`, the order of observations and names
+    Two traces are equal when they hold the same samples; `faults`, `remarks`, the order of observations and names
     that no sample uses do not count.
 
     Attributes:
@@ -43,6 +43,7 @@ class Trace:
         classes: class names; None for objects without one.
         signals: numeric signals by name, each (T,) float64, NaN where not known.
         faults: what was lost or set aside while reading, in words, each with its place.
+        remarks: what else the log says of its samples, where nothing was lost.
         memo: what has been computed from this trace.
 
     Raises:
@@ -59,6 +60,7 @@ class Trace:
     classes: tuple[str | None, ...]
     signals: Mapping[str, Floats] = field(default_factory=dict)
     faults: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
     memo: Memo = field(default_factory=Memo, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -227,6 +229,7 @@ class Trace:
                 for name in signals
             },
             faults=tuple(fault for trace in traces for fault in trace.faults),
+            remarks=tuple(remark for trace in traces for remark in trace.remarks),
         )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from spatial_replay.cli.application import run
+from spatial_replay.logs.source import read_trace
 
 TURTLES = """\
 sample: {topic: /turtle2/pose}    # the later of the two: no sample without the other
@@ -150,6 +151,7 @@ def test_what_is_out_of_date_is_unknown_and_told_but_no_damage(
     (remark,) = document["remarks"]
     assert "turtle1" in remark
     assert remark in said.err
+    assert read_trace(bag, mapping="turtles.yaml").remarks == (remark,)
     record = ["record", "tracks", str(bag), "--mapping", "turtles.yaml", "-o", "run.mcap"]
     assert run(record) == 0
     assert remark in capsys.readouterr().err
