@@ -29,6 +29,14 @@ def kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Res
     return cast(Callable[_Arguments, _Result], _compile(function))
 
 
+def long_kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Compile as `kernel`, for calls that may take milliseconds: other threads run meanwhile.
+
+    Not for short calls: the interpreter may be lost to a busy thread at each of them, for milliseconds.
+    """
+    return cast(Callable[_Arguments, _Result], _compile(nogil=True)(function))
+
+
 def piece(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """Compile a function that only kernels call: as `kernel`, without the entry from Python."""
     compiled = _compile(no_cpython_wrapper=True, no_cfunc_wrapper=True)

@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.compiled import inlined, kernel
+from spatial_replay.compiled import inlined, long_kernel
 from spatial_replay.geometry.arrays import Floats, Integers
 
 SIGNED_DISTANCE, PROTRUSION = 0, 1
@@ -328,7 +328,7 @@ def _union_extreme(
     return -greatest if quantity % 2 == 0 else greatest
 
 
-@kernel
+@long_kernel
 def measure_rows(
     part_start: Integers,
     vertex_start: Integers,

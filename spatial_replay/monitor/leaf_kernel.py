@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spatial_replay.compiled import kernel
+from spatial_replay.compiled import long_kernel
 from spatial_replay.geometry.arrays import Flags, Floats, Integers
 
 # instructions: operation, a, b, c
@@ -22,7 +22,7 @@ TILE = 128
 """How many samples are taken at a time, so that their columns stay in the processor's cache."""
 
 
-@kernel
+@long_kernel
 def run_instructions(
     code: Integers,
     constants: Floats,
