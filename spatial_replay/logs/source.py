@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -28,6 +29,7 @@ from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.times import FOREVER
 from spatial_replay.trace.trace import Trace, window_of
 
+_BAG_FILE = re.compile(r"^metadata\.yaml$|\.(db3|mcap)(\.zstd)?$")
 _HEAD = 4096
 """Bytes by which a file's format is told."""
 
@@ -160,7 +162,7 @@ def open_source(
     _require_path(path)
     options = ReadOptions(concave, mapping, on_time_jump, rate, lost)
     path = Path(path)
-    if path.is_dir():
+    if _is_bag_folder(path):
         options.refuse_except(_MESSAGES, "ROS 2 bag", path.name)
         return _open_messages(path, "ROS 2 bag", options)
     head = _head(path)
@@ -217,6 +219,14 @@ def _require_path(value: object) -> None:
     if not isinstance(value, (str, PathLike)):
         remedy = "give the path of a log; Trace.from_samples(samples) takes samples"
         raise UsageError(f"path is {shortened(value)}; {remedy}")
+
+
+def _is_bag_folder(path: Path) -> bool:
+    """Whether a folder holds what a ROS 2 bag is made of."""
+    try:
+        return path.is_dir() and any(_BAG_FILE.search(each.name) for each in path.iterdir())
+    except (OSError, ValueError):
+        return False
 
 
 def _head(path: Path) -> bytes:

@@ -29,8 +29,8 @@ class Trace:
     that is not finite is kept too, so that nothing is lost, but its row number is stored as
     -2 - row: the object is unknown there (`unreadable`).
 
-    Two traces are equal when they hold the same samples; `faults`, `remarks`, the order of observations and names
-    that no sample uses do not count.
+    Two traces are equal when they hold the same samples; `faults`, `remarks`, the order of observations and
+    names that no sample uses do not count.
 
     Attributes:
         times_ns: (T,) int64.
