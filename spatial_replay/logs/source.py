@@ -162,7 +162,7 @@ def open_source(
     _require_path(path)
     options = ReadOptions(concave, mapping, on_time_jump, rate, lost)
     path = Path(path)
-    if _is_bag_folder(path):
+    if is_bag_folder(path):
         options.refuse_except(_MESSAGES, "ROS 2 bag", path.name)
         return _open_messages(path, "ROS 2 bag", options)
     head = _head(path)
@@ -221,7 +221,7 @@ def _require_path(value: object) -> None:
         raise UsageError(f"path is {shortened(value)}; {remedy}")
 
 
-def _is_bag_folder(path: Path) -> bool:
+def is_bag_folder(path: Path) -> bool:
     """Whether a folder holds what a ROS 2 bag is made of."""
     try:
         return path.is_dir() and any(_BAG_FILE.search(each.name) for each in path.iterdir())

@@ -11,6 +11,7 @@ from spatial_replay.logs.foreign.mcap_log import McapLog
 from spatial_replay.logs.foreign.messages import Decoder, Message, MessageReader, Topic
 from spatial_replay.logs.foreign.opening import open_messages
 from spatial_replay.logs.mapping.suggest import EXAMPLES, candidates, suggest_mapping
+from spatial_replay.logs.source import is_bag_folder
 from spatial_replay.logs.topics import OBJECTS
 
 _STEP = 10_000
@@ -62,6 +63,8 @@ def messages_in(path: Path) -> MessageReader | None:
     Raises:
         MissingFileError: there is no such file.
     """
+    if path.is_dir() and not is_bag_folder(path):
+        return None
     try:
         reader = open_messages(path)
         if isinstance(reader, McapLog) and any(topic.name == OBJECTS for topic in reader.topics()):

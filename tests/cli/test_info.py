@@ -180,6 +180,12 @@ def test_no_mapping_is_suggested_where_none_is_needed(log: Path, capsys: pytest.
     assert run(["info", str(log), "--suggest-mapping"]) == 3
 
 
+def test_a_folder_that_is_no_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for more in ([], ["--suggest-mapping"]):
+        assert run(["info", str(tmp_path), *more]) == 2
+        assert "is a directory; check the path" in capsys.readouterr().err
+
+
 def test_a_damaged_bag_is_told(data_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cut = tmp_path / "cut.bag"
     cut.write_bytes((data_folder / "bags" / "two_turtles.bag").read_bytes()[:860_000])
