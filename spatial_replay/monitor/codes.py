@@ -9,7 +9,8 @@ SAMPLES, NANOSECONDS = 0, 1
 # columns of signals
 SIGNAL_CODE, SIGNAL_A, SIGNAL_B, SIGNAL_UNIT, SIGNAL_LOW, SIGNAL_HIGH, SIGNAL_WINDOW = range(7)
 SIGNAL_WIDTH = 7
-FINISHED_WIDTH = 6  # the same without windows
+FINISHED_TARGET = 6  # of finished stretches: the column that a row writes, in place of the window
+FINISHED_WIDTH = 7
 # codes of signals
 LEAF = 0  # leaf a
 CONSTANT = 1  # low times infinity

@@ -14,6 +14,7 @@ import numpy as np
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.channels import low_and_high
+from spatial_replay.monitor.codes import FINISHED_TARGET
 from spatial_replay.monitor.finished_kernel import run_finished, run_windows
 from spatial_replay.monitor.finished_table import FinishedTable
 from spatial_replay.spec.formula import Atom, Formula, Quantified, iter_nodes
@@ -25,18 +26,15 @@ class Finished:
     """Every node at every sample.
 
     Attributes:
-        columns: (C, R, T), the ends of each row's interval (see `channels`).
-        rows: (N,), the row of each node.
+        columns: (C, N, T), the ends of each node's interval (see `channels`).
     """
 
     columns: Floats
-    rows: Integers
 
     def ends(self, node: int, *, wide: bool = True) -> tuple[Floats, Floats]:
         """Low and high end (T,) of a node's robustness at each sample, with uncertainty unless not `wide`."""
         low, high = low_and_high(len(self.columns), wide=wide)
-        row = self.rows[node]
-        return self.columns[low, row], self.columns[high, row]
+        return self.columns[low, node], self.columns[high, node]
 
 
 def finished(
@@ -49,19 +47,18 @@ def finished(
         leaves: (C, A, T), their intervals (see `leaf_values`).
         times_ns: (T,), increasing.
     """
-    table, rows = _compiled(formula, order)
-    columns = np.empty((len(leaves), len(table), len(times_ns)))
+    table, nodes, width = _compiled(formula, order)
+    columns = np.empty((len(leaves), width, len(times_ns)))
     extrema = np.empty(len(times_ns))
     run_finished(table, np.ascontiguousarray(leaves), times_ns, 0, len(times_ns), columns, extrema)
-    return Finished(columns, rows)
+    return Finished(columns[:, :nodes])
 
 
 def full_signal(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
 ) -> Floats:
     """(N, T): each node's robustness at each sample, to the end of the stretch; NaN where not determined."""
-    done = finished(formula, order, leaves[:2], times_ns)
-    return _determined(done.columns[:, done.rows])
+    return _determined(finished(formula, order, leaves[:2], times_ns).columns)
 
 
 def window_signal(
@@ -77,12 +74,12 @@ def window_signal(
     """
     if isinstance(width_ns, bool) or not isinstance(width_ns, int) or not 0 < width_ns <= LATEST_NS:
         raise UsageError(f"a window of {width_ns!r} ns; give its width as an integer of at least 1 ns")
-    table, rows = _compiled(formula, order)
+    table, nodes, width = _compiled(formula, order)
     leaves = np.ascontiguousarray(leaves[:2])
     starts = np.searchsorted(times_ns, times_ns - width_ns, side="right").astype(np.int64)
-    columns = np.empty((len(leaves), len(table), len(times_ns)))
-    result = np.empty((len(leaves), len(rows), len(times_ns)))
-    run_windows(table, rows, leaves, times_ns, starts, columns, np.empty(len(times_ns)), result)
+    columns = np.empty((len(leaves), width, len(times_ns)))
+    result = np.empty((len(leaves), nodes, len(times_ns)))
+    run_windows(table, leaves, times_ns, starts, columns, np.empty(len(times_ns)), result)
     return _determined(result)
 
 
@@ -93,10 +90,12 @@ def new_leaves(formula: Formula, order: Sequence[Atom | Quantified]) -> list[Ato
     return table.leaves[len(order) :]
 
 
-def _compiled(formula: Formula, order: Sequence[Atom | Quantified]) -> tuple[Integers, Integers]:
+def _compiled(formula: Formula, order: Sequence[Atom | Quantified]) -> tuple[Integers, int, int]:
+    """The table of a formula, how many nodes it has, and how many columns it needs."""
     table = FinishedTable(order)
-    rows = np.array([table.add(node) for _, _, node in iter_nodes(formula)], np.int64)
-    return table.rows(), rows
+    nodes = [table.add(node) for _, _, node in iter_nodes(formula)]
+    instructions = table.instructions(nodes)
+    return instructions, len(nodes), int(instructions[:, FINISHED_TARGET].max()) + 1
 
 
 def _determined(ends: Floats) -> Floats:
@@ -104,7 +103,7 @@ def _determined(ends: Floats) -> Floats:
 
     Adding zero turns -0.0 into 0.0, so that equal numbers are equal bits.
     """
-    determined = ends[0]
+    determined: Floats = ends[0]
     determined += 0.0
     if len(ends) > 1:
         determined[determined != ends[1]] = np.nan

@@ -17,6 +17,7 @@ from spatial_replay.monitor.codes import (
     AND,
     CONSTANT,
     DELAY,
+    FINISHED_TARGET,
     HISTORICALLY,
     IFF,
     LEAF,
@@ -149,7 +150,7 @@ def run_finished(
         rows: (R, FINISHED_WIDTH), operands first.
         leaves: (C, A, T) in one, two or four channels.
         stamps: (T,), ns.
-        columns: (C, R, T), receives the numbers.
+        columns: (C, K, T), receives the numbers.
         extrema: (T,), room to work in.
     """
     channels = leaves.shape[0]
@@ -161,11 +162,12 @@ def run_finished(
         steps = Steps(stamps, end - 1 if is_ahead else begin, -1 if is_ahead else 1, end - begin)
         for channel in range(channels):
             mirror = channel ^ 1 if channels > 1 else channel
-            target = columns[channel, r]
-            source = columns[channel, row[1]]
+            target = columns[channel, row[FINISHED_TARGET]]
             if code == LEAF:
                 target[begin:end] = leaves[channel, row[1], begin:end]
-            elif past < ONCE:
+                continue
+            source = columns[channel, row[1]]
+            if past < ONCE:
                 _run_boolean(row, columns, channel, mirror, target, begin, end)
             elif past <= SINCE:
                 _run_past(past, source, columns[channel, row[2]], target, steps)
@@ -178,18 +180,17 @@ def run_finished(
 
 @kernel
 def run_windows(
-    rows: Integers, wanted: Integers, leaves: Floats, stamps: Integers, starts: Integers, columns: Floats,
-    extrema: Floats, result: Floats,
+    rows: Integers, leaves: Floats, stamps: Integers, starts: Integers, columns: Floats, extrema: Floats,
+    result: Floats,
 ) -> None:  # fmt: skip
-    """What rows are at the start of a window that ends at each sample, on the window's samples alone.
+    """What the first columns are at the start of a window that ends at each sample, on its samples alone.
 
     Args:
-        wanted: (N,), the rows asked for.
         starts: (T,), the first sample of each window.
         result: (C, N, T).
     """
     for t in range(len(stamps)):
         run_finished(rows, leaves, stamps, starts[t], t + 1, columns, extrema)
-        for n in range(len(wanted)):
-            for channel in range(leaves.shape[0]):
-                result[channel, n, t] = columns[channel, wanted[n], starts[t]]
+        for channel in range(leaves.shape[0]):
+            for n in range(result.shape[1]):
+                result[channel, n, t] = columns[channel, n, starts[t]]

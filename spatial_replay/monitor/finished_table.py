@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import count
 from types import MappingProxyType
 
 from spatial_replay.geometry.arrays import Integers
@@ -26,9 +28,26 @@ class FinishedTable(SignalTable):
             return self._future(formula, [self.add(each) for each in formula.operands])
         return super().add(formula)
 
-    def rows(self) -> Integers:
-        """(R, FINISHED_WIDTH), operands first."""
-        return array_of_rows(list(self._rows), codes.FINISHED_WIDTH)
+    def instructions(self, nodes: Sequence[int]) -> Integers:
+        """Rows with the columns that they read and write: that of node n is n, others come after.
+
+        Args:
+            nodes: (N,), the row of each node.
+
+        Returns:
+            (R, FINISHED_WIDTH), operands first.
+        """
+        column = {row: node for node, row in reversed(list(enumerate(nodes)))}
+        others = (row for row in range(len(self._rows)) if row not in column)
+        column |= dict(zip(others, count(len(nodes)), strict=False))
+        result = []
+        for number, (code, a, b, *rest) in enumerate(self._rows):
+            operands = (a, b) if code == codes.LEAF else (column[a], column[b])
+            result.append((code, *operands, *rest, column[number]))
+        # equal nodes share a row, but each has a column of its own
+        copies = [(codes.AND, column[row], column[row], 0, 0, 0, n) for n, row in enumerate(nodes)]
+        result += [copy for copy in copies if copy[1] != copy[-1]]
+        return array_of_rows(result, codes.FINISHED_WIDTH)
 
     def _future(self, formula: Temporal, operands: list[int]) -> int:
         match formula.operator:
