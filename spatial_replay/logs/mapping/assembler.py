@@ -27,6 +27,9 @@ _FIRST_STEP: Final = 256
 _LONGEST_STEP: Final = 8_192
 """After how many messages samples come out: soon at first, for those who want to see the first one only."""
 
+_STEP_BYTES: Final = 2**23
+"""After how many bytes of messages they come out in any case."""
+
 
 class Assembler:
     """Makes samples of the messages of one log, as they come.
@@ -80,8 +83,7 @@ class Assembler:
         self._instants = Instants(plan, name)
         self._newest_ns = -1
         self._latest_ns = self._settled_ns = -1
-        self._count = 0
-        self._next_step = _FIRST_STEP
+        self._count = self._bytes = 0
         self._step = _FIRST_STEP
         self._has_split = False
 
@@ -98,16 +100,19 @@ class Assembler:
             UsageError: the mapping does not fit what the messages hold.
         """
         traces: list[Trace] = []
+        ends = np.cumsum(np.fromiter((len(message[4]) for message in messages), np.int64, len(messages)))
         begin = 0
         while begin < len(messages) and not self.is_finished:
-            part = messages[begin : begin + self._next_step - self._count]
-            begin += len(part)
-            if part:
-                self._accept(part)
-            self._count += len(part)
-            if self._count == self._next_step:
+            read = int(ends[begin - 1]) if begin else 0
+            by_size = int(np.searchsorted(ends, read + _STEP_BYTES - self._bytes)) + 1
+            stop = min(begin + self._step - self._count, by_size, len(messages))
+            self._accept(messages[begin:stop])
+            self._count += stop - begin
+            self._bytes += int(ends[stop - 1]) - read
+            begin = stop
+            if self._count == self._step or self._bytes >= _STEP_BYTES:
+                self._count = self._bytes = 0
                 self._step = min(2 * self._step, _LONGEST_STEP)
-                self._next_step += self._step
                 traces.append(self._settle(self._newest_ns - self._plan.margin_ns))
         return traces[0] if len(traces) == 1 else Trace.concatenate(traces)
 

@@ -150,11 +150,7 @@ def bind(reading: Reading, example: object, message: object, *, needs_frame: boo
     paths = columns.paths
     return Binding(
         style=style,
-        numbers=None
-        if not paths
-        else getter(paths[0], style)
-        if len(paths) == 1
-        else tuple_getter(paths, style),
+        numbers=tuple_getter(paths, style) if paths else None,
         width=len(paths),
         position=position,
         orientation=orientation,

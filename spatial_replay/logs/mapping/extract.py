@@ -25,7 +25,14 @@ from spatial_replay.logs.mapping.paths import Get, Path, iter_elements, list_get
 from spatial_replay.logs.mapping.poses import Poses, poses_of
 from spatial_replay.logs.mapping.readings import Reading
 from spatial_replay.logs.mapping.solids import Solids
-from spatial_replay.logs.mapping.substance import bodies_of, points_of, polygons, shapes, solids_of_bodies
+from spatial_replay.logs.mapping.substance import (
+    bodies_of,
+    points_of,
+    polygons,
+    rows_of,
+    shapes,
+    solids_of_bodies,
+)
 from spatial_replay.logs.mapping.templates import Template
 
 EVERYONE = -1
@@ -191,8 +198,8 @@ class Extractor:
         elif binding.polygon is not None:
             part.corner_counts, part.corners = points_of([binding.polygon(each) for each in objects])
         if binding.numbers is not None:
-            rows = list(map(binding.numbers, objects))
-            part.numbers = np.array(rows, np.float64).reshape(len(objects), binding.width)
+            found = map(binding.numbers, objects)
+            part.numbers = rows_of(found, len(objects), binding.width, binding.style)
         part.covariance = _covariance(self.reading, binding, objects)
         part.class_code = class_codes(self.reading, binding, objects, self._classes)
         part.frames = self._frames(messages, objects, index)

@@ -191,15 +191,18 @@ class Scene:
         classes = np.concatenate([state[2] for state in states], axis=1)
         name_of = _Names(self._names)
         names = [name_of[code] for code in codes.tolist()]
-        order = sorted(range(len(names)), key=names.__getitem__)
+        seen = (rows != ABSENT).any(axis=0).tolist()
+        order = sorted((i for i in range(len(names)) if seen[i]), key=names.__getitem__)
         rows, classes = rows[:, order], classes[:, order]
         # what is stale has a blank row, by class, after the others
         kept = self._rows
         stale_rows = len(kept) + classes
         readable = np.append(kept.is_readable, False)[np.where(rows >= 0, rows, -1)]
         numbered = np.where(rows == ABSENT, ABSENT, np.where(readable, rows, -2 - rows))
-        numbered = np.where(rows == STALE, -2 - stale_rows, numbered)
-        everything = Rows.concatenate([kept, Rows.blank(np.arange(len(self._classes), dtype=np.int64))])
+        everything, is_stale = kept, rows == STALE
+        if is_stale.any():
+            numbered = np.where(is_stale, -2 - stale_rows, numbered)
+            everything = Rows.concatenate([kept, Rows.blank(np.arange(len(self._classes), dtype=np.int64))])
         by_code = sorted(self._classes, key=self._classes.__getitem__)
         ordered = sorted(range(len(by_code)), key=lambda i: (by_code[i] is not None, by_code[i] or ""))
         rank = np.zeros(len(by_code), np.int64)
@@ -214,7 +217,7 @@ class Scene:
             class_code=rank[everything.class_code] if len(rank) else everything.class_code,
             classes=tuple(by_code[i] for i in ordered),
             signals=self._signal_columns(times_ns),
-        ).compact()
+        ).take(np.arange(len(times_ns)))
 
     def _count_stale(self, topic: str, times_ns: Integers, names: Integers, rows: Integers) -> None:
         stale = rows == STALE

@@ -47,48 +47,56 @@ def footprints_from_solids(solids: Solids, count: int) -> FootprintBatch:
     Args:
         count: R.
     """
-    solids = replace(solids, kind=_boxed(solids.kind, solids.size, solids.rotation))
+    solids = _with_boxes(solids)
     kind, size = solids.kind, solids.size
-    upright = is_upright(solids.rotation)
-    vertex_counts = np.ones(len(kind), np.int64)
-    radius = np.where(kind == BOX, 0.0, size[:, 0] / 2)
-    is_box = kind == BOX
-    flat = np.isnan(size[:, 2])
-    simple, tilted = is_box & (upright | flat), is_box & ~upright & ~flat
-    vertex_counts[simple] = 4
+    boxes, polygons, hulls = (np.flatnonzero(kind == each) for each in (BOX, POLYGON, HULL))
+    tilted = boxes[~is_upright(solids.rotation[boxes]) & ~np.isnan(size[boxes, 2])]
+    flat = np.setdiff1d(boxes, tilted, assume_unique=True) if len(tilted) else boxes
+    rings = [_ring(solids, piece) for piece in hulls.tolist()]
+    vertex_counts = _VERTICES[kind]
     vertex_counts[tilted] = 6
-    shaped = np.flatnonzero((kind == POLYGON) | (kind == HULL))
-    rings = {int(piece): _ring(solids, int(piece)) for piece in shaped if kind[piece] == HULL}
-    vertex_counts[shaped] = np.diff(solids.point_start)[shaped]
-    for piece, ring in rings.items():
-        vertex_counts[piece] = len(ring)
-    radius[shaped] = 0.0
+    vertex_counts[polygons] = np.diff(solids.point_start)[polygons]
+    vertex_counts[hulls] = [len(ring) for ring in rings]
     start = starts_from_counts(vertex_counts)
     vertices = np.empty((int(start[-1]), 2))
-    rounds = np.flatnonzero((kind != BOX) & (kind != POLYGON) & (kind != HULL))
-    vertices[start[rounds]] = solids.position[rounds, :2]
-    _fill(vertices, start, np.flatnonzero(simple), _rectangles(solids, size, np.flatnonzero(simple)))
-    _fill(vertices, start, np.flatnonzero(tilted), _hexagons(solids, size, np.flatnonzero(tilted)))
-    _fill_polygons(vertices, start, solids, np.flatnonzero(kind == POLYGON))
-    for piece, ring in rings.items():
+    if len(boxes) + len(polygons) + len(hulls) < len(kind):
+        rounds = np.flatnonzero(_IS_ROUND[kind])
+        vertices[start[rounds]] = solids.position[rounds, :2]
+    for pieces, corners in ((flat, _rectangles), (tilted, _hexagons)):
+        if len(pieces):
+            _fill(vertices, start, pieces, corners(solids, size, pieces))
+    if len(polygons):
+        _fill_polygons(vertices, start, solids, polygons)
+    for piece, ring in zip(hulls.tolist(), rings, strict=True):
         vertices[start[piece] : start[piece] + len(ring)] = ring
     bottom, top = _heights(solids, size, count)
     return FootprintBatch(
         part_start=starts_from_counts(np.bincount(solids.owner, minlength=count).astype(np.int64)),
         vertex_start=start,
         vertices=vertices,
-        radius=radius,
+        radius=np.where(_IS_ROUND[kind], size[:, 0] / 2, 0.0),
         bottom=bottom,
         top=top,
     )
 
 
-def _boxed(kind: NDArray[np.int8], size: Floats, rotation: Floats) -> NDArray[np.int8]:
-    """The kinds, with BOX for the cylinders and spheres that count as the box around them."""
+_VERTICES = np.array([4, 1, 1, 1, 0, 0], np.int64)
+_IS_ROUND = np.array([False, True, True, True, False, False])
+
+
+def _with_boxes(solids: Solids) -> Solids:
+    """The solids, with boxes for the cylinders and spheres that count as the box around them."""
+    kind, size = solids.kind, solids.size
+    doubtful = np.flatnonzero((kind == CYLINDER) | (kind == SPHERE))
+    if not len(doubtful):
+        return solids
+    kind, size = kind[doubtful], size[doubtful]
     unequal = size[:, 0] != size[:, 1]
-    cylinder = (kind == CYLINDER) & (unequal | ~is_upright(rotation))
+    cylinder = (kind == CYLINDER) & (unequal | ~is_upright(solids.rotation[doubtful]))
     sphere = (kind == SPHERE) & (unequal | (size[:, 0] != size[:, 2]))
-    return np.where(cylinder | sphere, np.int8(BOX), kind)
+    kinds = solids.kind.copy()
+    kinds[doubtful[cylinder | sphere]] = BOX
+    return replace(solids, kind=kinds)
 
 
 def _fill(vertices: Floats, start: Integers, pieces: Integers, corners: Floats) -> None:
@@ -133,11 +141,11 @@ def _hexagons(solids: Solids, size: Floats, pieces: Integers) -> Floats:
 def _fill_polygons(vertices: Floats, start: Integers, solids: Solids, pieces: Integers) -> None:
     counts = np.diff(solids.point_start)[pieces]
     points = solids.points[flat_index(solids.point_start[:-1][pieces], counts)]
-    rotation = np.repeat(solids.rotation[pieces, :2, :], counts, axis=0)
-    placed = np.einsum("nij,nj->ni", rotation, points) + np.repeat(
-        solids.position[pieces, :2], counts, axis=0
-    )
-    vertices[flat_index(start[pieces], counts)] = placed
+    rotation, position = solids.rotation[pieces, :2, :], solids.position[pieces, :2]
+    if (rotation != np.eye(3)[:2]).any() or position.any():
+        points = np.einsum("nij,nj->ni", np.repeat(rotation, counts, axis=0), points)
+        points[:, :2] += np.repeat(position, counts, axis=0)
+    vertices[flat_index(start[pieces], counts)] = points[:, :2]
 
 
 def _ring(solids: Solids, piece: int) -> Floats:
@@ -152,11 +160,15 @@ def _ring(solids: Solids, piece: int) -> Floats:
 
 def _heights(solids: Solids, size: Floats, count: int) -> tuple[Floats, Floats]:
     """(R,) bottom and top, NaN where some body of an object is flat."""
+    has_height = (
+        (solids.kind != DISC) & (solids.kind != POLYGON) & ~((solids.kind == BOX) & np.isnan(size[:, 2]))
+    )
+    if not has_height.any():
+        return np.full(count, np.nan), np.full(count, np.nan)
     up = solids.rotation[:, 2, :]
     half = np.einsum("ij,ij->i", np.abs(up), np.nan_to_num(size)) / 2
     half = np.where(solids.kind == SPHERE, size[:, 0] / 2, half)
-    half = np.where(np.isnan(size[:, 2]) & (solids.kind != SPHERE), np.nan, half)
-    half = np.where((solids.kind == DISC) | (solids.kind == POLYGON), np.nan, half)
+    half = np.where(has_height, half, np.nan)
     lowest, highest = solids.position[:, 2] - half, solids.position[:, 2] + half
     for piece in np.flatnonzero(solids.kind == HULL).tolist():
         points = solids.points[solids.point_start[piece] : solids.point_start[piece + 1]]

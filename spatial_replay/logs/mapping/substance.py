@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import chain
 from typing import Any
 
@@ -17,7 +17,8 @@ from spatial_replay.logs.mapping.bodies import (
     bodies_of_perceived,
     reader_of,
 )
-from spatial_replay.logs.mapping.fields import field_names
+from spatial_replay.logs.mapping.fields import Style, field_names, style_of
+from spatial_replay.logs.mapping.paths import Path, tuple_getter
 from spatial_replay.logs.mapping.poses import Poses
 from spatial_replay.logs.mapping.readings import Reading
 from spatial_replay.logs.mapping.rotation import matrices_from_quaternions
@@ -110,16 +111,24 @@ def points_of(lists: list[Any]) -> tuple[Integers, Floats]:
     counts = np.array([len(each) for each in lists], np.int64)
     names = field_names(example)
     if "x" in names and "y" in names:
-        read = reader_of("keys" if isinstance(example, dict) else "attributes")
-        if "z" in names:
-            return counts, _array([(read(p, "x"), read(p, "y"), read(p, "z")) for p in flat], 3)
-        return counts, _with_zero([(read(p, "x"), read(p, "y")) for p in flat])
+        axes = "xyz" if "z" in names else "xy"
+        style = style_of(example)
+        get = tuple_getter([Path.of(axis) for axis in axes], style)
+        found = rows_of(map(get, flat), len(flat), len(axes), style)
+        return counts, found if len(axes) == 3 else np.column_stack([found, np.zeros(len(flat))])
     if example is None or hasattr(example, "__len__"):
         return counts, _with_zero([(p[0], p[1]) for p in flat])
     if (counts % 2).any():
         raise ValueError("a polygon has an odd number of coordinates; give x and y of each corner in turn")
     pairs = np.array(flat, np.float64).reshape(-1, 2)
     return counts // 2, np.column_stack([pairs, np.zeros(len(pairs))])
+
+
+def rows_of(tuples: Iterable[Sequence[Any]], count: int, width: int, style: Style) -> Floats:
+    """(count, width) the numbers in tuples; None, as JSON has it, is not a number."""
+    if style == "keys":
+        return np.array(list(tuples), np.float64).reshape(count, width)
+    return np.fromiter(chain.from_iterable(tuples), np.float64, count * width).reshape(count, width)
 
 
 def _with_zero(pairs: list[tuple[Any, Any]]) -> Floats:
