@@ -72,7 +72,12 @@ class SpecUpdate:
 
 @dataclass(frozen=True, eq=False)
 class Update:
-    """What a monitor says after a sample."""
+    """What a monitor says after a sample.
+
+    Attributes:
+        specs: one for each result spec, in the order of the text.
+        places: which of `specs`, and which node of it, has a name.
+    """
 
     time_ns: int
     specs: tuple[SpecUpdate, ...]
@@ -98,8 +103,9 @@ class Update:
 class Monitor:
     """Evaluates a specification as samples come.
 
-    A sample costs the same however long the run is, and gives the same bits as a replay of its log. What is
-    kept depends on the specification alone: the samples that windows and delays (`a[-3]`) span.
+    It gives the same bits as a replay of the log. A sample costs the same however long the run is, and what is
+    kept depends on the specification alone: the samples that windows and delays (`a[-3]`) span. Only under the
+    paper's semantics, temporal operators below others look at every sample again.
     """
 
     def __init__(
