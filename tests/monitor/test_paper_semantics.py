@@ -14,6 +14,8 @@ from spatial_replay.errors import UsageError
 from spatial_replay.logs.source import read_trace
 from spatial_replay.monitor.evaluation import evaluate
 from spatial_replay.monitor.monitor import Monitor
+from spatial_replay.monitor.paper.run import PaperRun
+from spatial_replay.spec.formula import Atom, Signal, Temporal
 from spatial_replay.spec.specification import parse_specification
 from spatial_replay.trace.trace import Trace
 
@@ -240,3 +242,13 @@ def test_other_operators_are_refused_with_their_place(formula):
         with pytest.raises(UsageError, match=rf"odd.spatial:2:\d+: .* has no {operator}, as odd has; write"):
             refuse()
     assert evaluate(specification, numbers(p=[1], q=[1])).result("odd").name == "odd"
+
+
+def test_too_many_pairs_of_samples_are_refused():
+    p, q = (Atom(name, "signal", Signal(name)) for name in "pq")
+    formula = Temporal("G", (Temporal("U", (Temporal("F", (p,)), Temporal("G", (q,)))),))
+    run = PaperRun(formula, (p, q), max_pairs=10)
+    leaves = np.zeros((1, 2, 5))
+    run.extend(leaves, np.arange(5))
+    with pytest.raises(UsageError, match="after 5 samples, an until of two temporal operands"):
+        run.extend(leaves, np.arange(5, 10))

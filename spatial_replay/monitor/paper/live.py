@@ -11,7 +11,7 @@ from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.leaf_plans import SampleLeaves
 from spatial_replay.monitor.paper.run import PaperRun, left_out
 from spatial_replay.monitor.program import Program
-from spatial_replay.spec.formula import Formula, Outline, iter_nodes
+from spatial_replay.spec.formula import Formula, Outline, Truth, iter_nodes
 from spatial_replay.trace.sample import Sample
 
 
@@ -42,6 +42,8 @@ class PaperRuns:
         self._start_ns = start_ns
         self._first_ns: int | None = None
         self._position = -1
+        # compiles the kernel now rather than at the first sample
+        PaperRun(Truth(True), ()).extend(np.empty((1, 0, 1)), np.zeros(1, np.int64))
 
     def take(self, sample: Sample) -> list[Floats | None]:
         """Take in the next sample; (N, 4) for each formula."""

@@ -28,12 +28,16 @@ class PaperRun:
     proportion to them.
     """
 
-    def __init__(self, formula: Formula, leaves: Sequence[Atom | Quantified]) -> None:
+    def __init__(
+        self, formula: Formula, leaves: Sequence[Atom | Quantified], *, max_pairs: int = MAX_PAIRS
+    ) -> None:
         """Start before the first sample.
 
         Args:
             leaves: the formula's atoms and open quantifiers, in the order in which `extend` is given them.
+            max_pairs: after how many pairs of samples to give up.
         """
+        self._max_pairs = max_pairs
         self._table = paper_table(formula, leaves)
         self._memory = _first_memory(self._table)
         self._position = 0
@@ -53,7 +57,7 @@ class PaperRun:
             (N, 4, T): value, now, lower and upper of each node; the last two are the first.
 
         Raises:
-            UsageError: more than `MAX_PAIRS`.
+            UsageError: more pairs of samples than allowed.
         """
         low, high = low_and_high(len(leaves), wide=False)
         numbers = np.ascontiguousarray(leaves[low])
@@ -84,7 +88,7 @@ class PaperRun:
         if pairs:
             used = int(memory.pair_end[0])
             wanted = used + pairs * samples * (samples - self._position)
-            if used > MAX_PAIRS:
+            if used > self._max_pairs:
                 raise UsageError(
                     f"after {self._position} samples, an until of two temporal operands below a temporal "
                     "operator compares too many pairs of them; bound it, evaluate fewer samples, or use "
