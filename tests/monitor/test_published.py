@@ -10,6 +10,7 @@ import pytest
 from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
 from spatial_replay.logs.source import read_trace
 from spatial_replay.monitor.evaluation import evaluate
+from spatial_replay.monitor.monitor import Monitor
 from spatial_replay.spec.specification import parse_specification
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
@@ -51,9 +52,10 @@ def test_vectors_of_another_implementation(data_folder):
     chosen = [case for case in cases if case["semantics"] == "ltlf"]
     assert len(chosen) > 100
     for case in chosen:
-        trace = Trace.from_samples(map(sample_from_frame, case["frames"]))
-        start_ns = int(trace.times_ns[case["start_sample"]])
-        result = evaluate(parse_specification(case["spec"]), trace, start_ns=start_ns).result()
+        samples = list(map(sample_from_frame, case["frames"]))
+        start_ns = samples[case["start_sample"]].time_ns
+        specification = parse_specification(case["spec"])
+        result = evaluate(specification, Trace.from_samples(samples), start_ns=start_ns).result()
         for name in ("value", "now", "lower", "upper"):
             np.testing.assert_allclose(
                 getattr(result.nodes[0], name),
@@ -61,6 +63,9 @@ def test_vectors_of_another_implementation(data_folder):
                 rtol=0, atol=TOLERANCE, err_msg=f"{name} of {case['spec']}",
             )  # fmt: skip
         assert result.verdict == case["verdict"], case["spec"]
+        monitor = Monitor(specification, start_ns=start_ns)
+        updates = [monitor.update(sample).specs[0].numbers for sample in samples][case["start_sample"] :]
+        assert np.stack(updates, axis=-1).tobytes() == result.series.tobytes(), case["spec"]
 
 
 def sample_from_frame(frame):
