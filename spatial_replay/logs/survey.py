@@ -16,6 +16,12 @@ from spatial_replay.logs.topics import OBJECTS
 
 _STEP = 10_000
 """Messages between two reports of progress."""
+_ENOUGH = 1024
+"""Messages of a topic after which nothing new is expected of it."""
+_LOOKED_AT = frozenset({*range(1, EXAMPLES + 1), *(2**n for n in range(5, 20))})
+"""Which messages of a topic are decoded: the first ones, and ever fewer of those that come later."""
+_EXAMPLE_BYTES = 2**22
+"""How much of a topic is decoded, beyond its first message: pictures and clouds of points are large."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +134,7 @@ class _Counter:
             except LogError as error:
                 self.remarks.append(f"topic {topic.name!r}: {error}")
         self._declared = {topic.name: topic.count for topic in topics}
+        self._bytes = dict.fromkeys(self._declared, 0)
 
     @property
     def knows_enough(self) -> bool:
@@ -139,16 +146,18 @@ class _Counter:
         self.end_ns = time_ns if self.end_ns is None else max(self.end_ns, time_ns)
         self.first_ns.setdefault(topic, time_ns)
         self.counts[topic] += 1
-        if topic in self._missing:
+        if self.counts[topic] in _LOOKED_AT and topic in self.examples:
             self._look(message)
+        if self.counts[topic] >= _ENOUGH or self.counts[topic] == self._declared[topic]:
+            self._missing.discard(topic)
 
     def _look(self, message: Message) -> None:
-        topic, count = message.topic, self.counts[message.topic]
+        topic = message.topic
+        self._bytes[topic] += len(message.payload)
+        if self.counts[topic] > 1 and self._bytes[topic] > _EXAMPLE_BYTES:
+            return
         try:
-            if topic in self.examples:
-                self.examples[topic].append(self._decoders[topic](message.payload))
+            self.examples[topic].append(self._decoders[topic](message.payload))
         except LogError as error:
-            if count == 1:
+            if self.counts[topic] == 1:
                 self.remarks.append(f"topic {topic!r}: {error}")
-        if count >= EXAMPLES or count == self._declared[topic]:
-            self._missing.discard(topic)
