@@ -15,7 +15,8 @@ from typing import TypeAlias, cast
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import TrackedObject
-from spatial_replay.monitor.leaf_plan import Frame, LeafPlan, Leaves, Member, class_code
+from spatial_replay.monitor.leaf_plan import LeafPlan, class_code
+from spatial_replay.monitor.plan_rows import Frame, Leaves, Member
 from spatial_replay.monitor.recent import NO_DELAY, RecentSamples, iter_delays
 from spatial_replay.spec.formula import (
     ANY_CLASS,

@@ -103,9 +103,9 @@ class Update:
 class Monitor:
     """Evaluates a specification as samples come.
 
-    It gives the same bits as a replay of the log. A sample costs the same however long the run is, and what is
-    kept depends on the specification alone: the samples that windows and delays (`a[-3]`) span. Only under the
-    paper's semantics, temporal operators below others look at every sample again.
+    It gives the same bits as a replay of the log. A sample costs the same however long the run is, and what
+    is kept depends on the specification alone: the samples that windows and delays (`a[-3]`) span. Only
+    under the paper's semantics, temporal operators below others look at every sample again.
     """
 
     def __init__(

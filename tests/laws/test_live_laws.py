@@ -72,17 +72,21 @@ def test_any_specification_over_a_crowd(specification, samples):
     assert_monitor_agrees(specification, samples)
 
 
-def test_more_sets_of_objects_than_a_monitor_remembers():
+def test_more_kinds_of_crowds_than_a_monitor_remembers():
+    kinds = [f"k{number}" for number in range(6)]
     specification = parse_specification(
-        "group others = all\n"
-        "spec far = G forall x in (others except a): x dist a >= 1\n"
-        "spec stays = F exists x in (others except a): x dist x[-1] <= 1"
+        "".join(f'spec s{kind} = G forall x in class "{kind}": x dist a >= 3\n' for kind in kinds)
     )
-    still = TrackedObject(Footprint.box(0, 0, 1, 1))
-    chosen = Random(0)
-    crowds = [chosen.sample(range(40), 6) for _ in range(300)]
+    chosen, shape = Random(0), Footprint.disc(4, 0, 0.5)
+    crowds = [[kind for kind in kinds for _ in range(chosen.randrange(4))] for _ in range(400)]
     samples = [
-        Sample(t, {"a": still, **{f"p{k}": Footprint.disc(3 + t % 7, k, 0.5) for k in crowd}})
+        Sample(
+            t,
+            {
+                "a": Footprint.box(0, t % 5, 1, 9),
+                **{f"p{t % 7}{n}": TrackedObject(shape, class_name=kind) for n, kind in enumerate(crowd)},
+            },
+        )
         for t, crowd in enumerate([*crowds, *reversed(crowds)])
     ]
     assert_monitor_agrees(specification, samples)
