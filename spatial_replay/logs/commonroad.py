@@ -34,6 +34,9 @@ _OBSTACLES = frozenset(
     ["staticObstacle", "dynamicObstacle", "obstacle", "environmentObstacle", "phantomObstacle"]
 )
 
+_BLOCK_REPORTS = 2**14
+"""A block is closed when it holds this many obstacles, however few its time steps are."""
+
 
 @dataclass(slots=True)
 class _Obstacle:
@@ -83,6 +86,7 @@ def iter_scenario(path: Path, faults: FaultList, *, concave: Concave = "decompos
     if not obstacles and not len(faults):
         raise UsageError(f"{path.name} is a scenario without obstacles; give one that has some")
     columns = ReportColumns()
+    held = 0
     for step in steps:
         time_ns = round(step * step_s * 10**9)
         if time_ns > LATEST_NS:
@@ -90,9 +94,10 @@ def iter_scenario(path: Path, faults: FaultList, *, concave: Concave = "decompos
             continue
         reports = [report for each in obstacles if (report := each.report(step)) is not None]
         columns.add(time_ns, f"{path.name}: time step {step}", reports, {})
-        if len(columns) == BLOCK_SAMPLES:
+        held += len(reports)
+        if len(columns) == BLOCK_SAMPLES or held >= _BLOCK_REPORTS:
             yield finished_block(columns, faults, concave)
-            columns = ReportColumns()
+            columns, held = ReportColumns(), 0
     if len(columns):
         yield finished_block(columns, faults, concave)
 
