@@ -33,7 +33,9 @@ class _VerdictEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._EnumTy
     VERDICT_VIOLATED: _Verdict.ValueType  # 3
     """Violated, whatever follows."""
     VERDICT_UNKNOWN: _Verdict.ValueType  # 4
-    """The log has ended, and what was not seen in it leaves the verdict open."""
+    """The log has ended, and what was not seen in it leaves the verdict open. Under the paper's semantics,
+    at any sample: the value is not determined.
+    """
 
 class Verdict(_Verdict, metaclass=_VerdictEnumTypeWrapper):
     """What is known of a node."""
@@ -46,7 +48,9 @@ VERDICT_SATISFIED: Verdict.ValueType  # 2
 VERDICT_VIOLATED: Verdict.ValueType  # 3
 """Violated, whatever follows."""
 VERDICT_UNKNOWN: Verdict.ValueType  # 4
-"""The log has ended, and what was not seen in it leaves the verdict open."""
+"""The log has ended, and what was not seen in it leaves the verdict open. Under the paper's semantics,
+at any sample: the value is not determined.
+"""
 global___Verdict = Verdict
 
 @typing.final
@@ -105,7 +109,9 @@ class NodeRobustness(google.protobuf.message.Message):
     now: builtins.float
     """Robustness at the newest sample, of the samples seen so far; NaN where it is not determined."""
     lower: builtins.float
-    """Least and greatest value over everything that may follow and everything unknown."""
+    """Least and greatest value over everything that may follow and everything unknown. Under the paper's
+    semantics both are the value.
+    """
     upper: builtins.float
     verdict: global___Verdict.ValueType
     def __init__(
