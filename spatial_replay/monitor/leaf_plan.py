@@ -43,6 +43,11 @@ class LeafPlan:
         self._places = tuple(rows.places)
         self._signals = tuple(code.signals)
 
+    @property
+    def nbytes(self) -> int:
+        """How much memory its arrays take."""
+        return sum(array.nbytes for array in self._arrays)
+
     def leaf_values(self, samples: Sequence[Sample | None], stands_for: Mapping[str, str]) -> Floats:
         """Each leaf of each formula, one after the other.
 

@@ -33,7 +33,9 @@ from spatial_replay.spec.terms import base_of, iter_formulas, terms_of
 from spatial_replay.trace.sample import Sample
 
 MOST_PLANS = 256
-"""How many plans are kept; the one used longest ago goes first."""
+MOST_BYTES = 1 << 22
+"""How many plans are kept, and how much memory they take but for the newest; first goes the one used longest
+ago."""
 
 _NOBODY = ""
 """A name that no object has."""
@@ -69,6 +71,7 @@ class SampleLeaves:
         self._own_members: frozenset[Member] = frozenset()  # grows, but no further than the specification
         self._only_plan = None if open_classes else LeafPlan(self._frame, frozenset())
         self._plans: OrderedDict[tuple[frozenset[Member], _Counts], LeafPlan] = OrderedDict()
+        self._bytes = 0
 
     def look_at(self, sample: Sample) -> list[Sample | None]:
         """Take in the next sample; it and those that it looks back at."""
@@ -137,8 +140,10 @@ class SampleLeaves:
         }
         plan = LeafPlan(self._frame, self._own_members | unnamed)
         self._plans[key] = plan
-        if len(self._plans) > MOST_PLANS:
-            self._plans.popitem(last=False)
+        self._bytes += plan.nbytes
+        while len(self._plans) > 1 and (len(self._plans) > MOST_PLANS or self._bytes > MOST_BYTES):
+            _, dropped = self._plans.popitem(last=False)
+            self._bytes -= dropped.nbytes
         return plan
 
 
