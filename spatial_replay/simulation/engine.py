@@ -1,0 +1,197 @@
+"""The physics: the only module that knows PyBullet."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import resources
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from spatial_replay.errors import UsageError
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.simulation.kinematics import JOINTS
+from spatial_replay.simulation.shapes import Box, Pose, Shape
+
+STEPS_PER_S = 240
+"""Steps of the simulation in a second."""
+
+FINGERS = (9, 10)
+"""The joints, and the links, of the two fingers."""
+
+_FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
+"""The greatest torques of the arm's joints in N m, those the maker gives."""
+_GAINS = (0.3,) * JOINTS
+_WOOD = 0.5
+"""Friction of what has no other."""
+
+
+class Engine:
+    """A table with a robot on it and bodies around it, that move by the laws of mechanics.
+
+    Raises:
+        UsageError: the simulator is not installed.
+    """
+
+    def __init__(self, *, gui: bool = False) -> None:
+        self._bullet = bullet = _load()
+        self._client: int = bullet.connect(bullet.GUI if gui else bullet.DIRECT)
+        if self._client < 0:
+            raise UsageError("the simulator cannot open a window; run without --gui")
+        self._bodies: dict[str, int] = {}
+        call = self._call
+        if gui:
+            call("configureDebugVisualizer", bullet.COV_ENABLE_GUI, 0)
+            call("resetDebugVisualizerCamera", 1.2, 90.0, -45.0, (0.45, 0.0, 0.0))
+        call("setGravity", 0.0, 0.0, -9.81)
+        call("setPhysicsEngineParameter", deterministicOverlappingPairs=1, numSolverIterations=100)
+        self._table: int = self._add(Box(1.8, 1.8, 0.1), 0.0, (0.0, 0.0, -0.05), 0.0, (0.72, 0.62, 0.5, 1.0))
+        call("changeDynamics", self._table, -1, lateralFriction=_WOOD)
+        folder = resources.files("pybullet_data")
+        self._robot: int = call("loadURDF", str(folder / "franka_panda/panda.urdf"), useFixedBase=True)
+        self.set_grip(1.0)
+
+    def close(self) -> None:
+        """Give the simulator back; closing twice does nothing."""
+        if self._client >= 0:
+            self._call("disconnect")
+            self._client = -1
+
+    def step(self) -> None:
+        """Advance by 1 / `STEPS_PER_S` seconds."""
+        self._call("stepSimulation")
+
+    def add(
+        self,
+        name: str,
+        shape: Shape,
+        *,
+        mass: float,
+        position: tuple[float, float, float],
+        yaw: float,
+        colour: tuple[float, float, float],
+    ) -> None:
+        """Put a body into the world, its axis z upwards; a mass of 0 fixes it."""
+        number = self._add(shape, mass, position, yaw, (*colour, 1.0))
+        self._call("changeDynamics", number, -1, lateralFriction=_WOOD, spinningFriction=2e-3)
+        self._bodies[name] = number
+
+    def pose(self, name: str) -> Pose:
+        """Where a body is."""
+        position, turn = self._call("getBasePositionAndOrientation", self._bodies[name])
+        return Pose(np.array(position), np.array(self._bullet.getMatrixFromQuaternion(turn)).reshape(3, 3))
+
+    # -------------------------------------------------------------------------------------- the robot
+
+    def set_joints(self, joints: Floats, width: float) -> None:
+        """Put the arm's joints (7,) and the fingers, `width` metres apart, in place at once."""
+        for number, angle in enumerate(joints.tolist()):
+            self._call("resetJointState", self._robot, number, angle)
+        for finger in FINGERS:
+            self._call("resetJointState", self._robot, finger, width / 2)
+
+    def drive(self, joints: Floats, velocities: Floats, width: float, force: float) -> None:
+        """Command the motors: joints (7,), their velocities, the fingers' distance and their force in N."""
+        bullet = self._bullet
+        self._call(
+            "setJointMotorControlArray",
+            self._robot,
+            list(range(JOINTS)),
+            bullet.POSITION_CONTROL,
+            targetPositions=joints.tolist(),
+            targetVelocities=velocities.tolist(),
+            forces=list(_FORCES),
+            positionGains=list(_GAINS),
+            velocityGains=[1.0] * JOINTS,
+        )
+        self._call(
+            "setJointMotorControlArray",
+            self._robot,
+            list(FINGERS),
+            bullet.POSITION_CONTROL,
+            targetPositions=[width / 2] * 2,
+            forces=[force] * 2,
+        )
+
+    def joints(self) -> Floats:
+        """The arm's joints (7,) as they are."""
+        states = self._call("getJointStates", self._robot, list(range(JOINTS)))
+        return np.array([state[0] for state in states])
+
+    def finger_width(self) -> float:
+        """The distance of the fingers, in metres."""
+        return float(sum(state[0] for state in self._call("getJointStates", self._robot, list(FINGERS))))
+
+    def fingers_touching(self, name: str) -> int:
+        """How many of the two fingers touch a body."""
+        touching = (
+            self._call("getContactPoints", self._robot, self._bodies[name], finger) for finger in FINGERS
+        )
+        return sum(bool(points) for points in touching)
+
+    def set_grip(self, friction: float) -> None:
+        """Set the friction of the fingers: 1 for rubber, next to 0 for oil."""
+        for finger in FINGERS:
+            self._call("changeDynamics", self._robot, finger, lateralFriction=friction)
+
+    # ---------------------------------------------------------------------------------------- private
+
+    def _add(
+        self,
+        shape: Shape,
+        mass: float,
+        position: tuple[float, float, float],
+        yaw: float,
+        colour: tuple[float, float, float, float],
+    ) -> int:
+        bullet = self._bullet
+        if isinstance(shape, Box):
+            half = [shape.length / 2, shape.width / 2, shape.height / 2]
+            collision = self._call("createCollisionShape", bullet.GEOM_BOX, halfExtents=half)
+            visual = self._call("createVisualShape", bullet.GEOM_BOX, halfExtents=half, rgbaColor=colour)
+        else:
+            kind, r, h = bullet.GEOM_CYLINDER, shape.radius, shape.height
+            collision = self._call("createCollisionShape", kind, radius=r, height=h)
+            visual = self._call("createVisualShape", kind, radius=r, length=h, rgbaColor=colour)
+        turn = bullet.getQuaternionFromEuler((0.0, 0.0, yaw))
+        number: int = self._call("createMultiBody", mass, collision, visual, position, turn)
+        return number
+
+    def _call(self, function: str, *arguments: Any, **named: Any) -> Any:
+        """Call the simulator's function for this world, of which a process may have several."""
+        return getattr(self._bullet, function)(*arguments, physicsClientId=self._client, **named)
+
+
+def _load() -> ModuleType:
+    """The simulator.
+
+    Raises:
+        UsageError: it is not installed.
+    """
+    try:
+        with _without_greeting():
+            import pybullet
+    except ImportError as error:
+        raise UsageError(
+            "simulated worlds need PyBullet, which is not installed: pip install 'spatial-replay[sim]' "
+            "(wheels exist for Python 3.11)"
+        ) from error
+    module: ModuleType = pybullet
+    return module
+
+
+@contextmanager
+def _without_greeting() -> Iterator[None]:
+    """Keep standard error free of the date that the simulator's library writes there when it loads."""
+    kept = os.dup(2)
+    try:
+        with Path(os.devnull).open("wb") as nothing:
+            os.dup2(nothing.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)

@@ -1,0 +1,83 @@
+"""Picking a body up between two fingers that hold it by friction, and placing it elsewhere."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+
+from spatial_replay.simulation.arm import ABOVE, Motion
+from spatial_replay.simulation.grasp import Grasp, Point, best_grasp, surface
+from spatial_replay.simulation.scene import Scene
+from spatial_replay.simulation.world import Execution
+
+_SLOW = 0.15
+_SETTING_DOWN = 0.002
+"""The height above its support at which a body is let go, in metres."""
+_LOST_TICKS = 6
+"""A body that no finger touches for so long is lost."""
+_NEAR = 0.02
+"""A body this near to its goal, in metres, is there."""
+
+
+def picking(scene: Scene, name: str, goal: Point, yaw: float | None) -> Generator[None, None, Execution]:
+    """Pick a body up and place it with its centre at a point, turned to `yaw` unless that is None."""
+    grasp = best_grasp(scene, name, goal, yaw)
+    if isinstance(grasp, str):
+        return Execution(False, grasp)
+    stood = scene.pose(name).stands
+    trouble = yield from _pick_up(scene, name, grasp)
+    if not trouble:
+        trouble = yield from _set_down(scene, name, grasp, goal)
+    x, y, _ = scene.arm.commanded
+    yield from scene.arm.grip(grasp.opening)
+    yield from scene.arm.move(x, y, ABOVE)
+    trouble = trouble or _missed(scene, name, goal, stood=stood)
+    return Execution(not trouble, trouble or f"placed {name}")
+
+
+def _pick_up(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str]:
+    """Grasp a body and lift it; returns what went wrong, if anything."""
+    arm, (x, y) = scene.arm, scene.place_of(name)
+    z = scene.height(name)[0] + grasp.above_bottom
+    yield from arm.travel(x, y, grasp.yaw)
+    yield from arm.grip(grasp.opening)
+    yield from arm.move(x, y, z + 0.05)
+    yield from arm.move(x, y, z, speed=_SLOW)
+    yield from arm.grip(0.0)
+    if scene.engine.fingers_touching(name) < 2:
+        return f"the fingers closed beside {name}"
+    lifted = yield from _holding(scene, name, arm.move(x, y, ABOVE, speed=2 * _SLOW))
+    return "" if lifted else f"{name} slipped out of the fingers as it was lifted"
+
+
+def _set_down(scene: Scene, name: str, grasp: Grasp, goal: Point) -> Generator[None, None, str]:
+    """Carry what is held to a point and lower it; returns what went wrong, if anything."""
+    arm = scene.arm
+    carried = yield from _holding(scene, name, arm.travel(*goal, grasp.turn))
+    if not carried:
+        return f"{name} was lost on the way"
+    # it may hang otherwise than it stood
+    hanging = arm.commanded[2] - scene.height(name)[0]
+    z = surface(scene, name, goal) + hanging + _SETTING_DOWN
+    yield from _holding(scene, name, arm.move(*goal, z + 0.03))
+    lowered = yield from _holding(scene, name, arm.move(*goal, z, speed=_SLOW / 2))
+    return "" if lowered else f"{name} slipped out of the fingers as it was set down"
+
+
+def _holding(scene: Scene, name: str, motion: Motion) -> Generator[None, None, bool]:
+    """Move while the fingers hold a body; ends at once, False, when they have lost it."""
+    lost = 0
+    for _ in motion:
+        yield
+        lost = lost + 1 if scene.engine.fingers_touching(name) == 0 else 0
+        if lost >= _LOST_TICKS:
+            return False
+    return True
+
+
+def _missed(scene: Scene, name: str, goal: Point, *, stood: bool) -> str:
+    """How a body that was let go is not as it should be, if so."""
+    if stood and not scene.pose(name).stands:
+        return f"{name} fell over"
+    missed = math.dist(scene.place_of(name), goal)
+    return "" if missed <= _NEAR else f"{name} lies {missed * 100:.1f} cm from where it was put"

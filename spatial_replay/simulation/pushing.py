@@ -1,0 +1,127 @@
+"""Pushing a body over the table with two fingers side by side, so that it does not turn away."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Sequence
+
+import numpy as np
+
+from spatial_replay.simulation.arm import FINGER_DEPTH, FINGER_WIDTH, FINGERTIP, TICKS_PER_S, turn_towards
+from spatial_replay.simulation.scene import Scene, extent, rectangle
+from spatial_replay.simulation.world import Execution
+
+Point = tuple[float, float]
+
+_LOW = FINGERTIP + 0.006
+"""The height at which the tool pushes, in metres: low enough not to tip what it pushes."""
+_AWAY = 0.01
+"""How far behind a body the fingers come down, in metres."""
+_MARGIN = 0.001
+_FAST, _SLOW = 0.1, 0.015
+_CLOSE = 0.004
+"""A body this near to its goal, in metres, is there."""
+_FAR = 0.015
+"""A body this far from its goal, in metres, is not."""
+_STRAIGHT = 0.0025
+_STROKES = 4
+"""How often a body is pushed at the same goal."""
+
+
+def pushing(scene: Scene, name: str, path: Sequence[Point]) -> Generator[None, None, Execution]:
+    """Push a body along a path, one stroke for each straight stretch, and put right what strokes miss."""
+    corners = straightened([scene.place_of(name), *path])[1:]
+    for corner in corners[:-1]:
+        trouble = yield from _push_to(scene, name, corner, strokes=1, allowed=3 * _FAR)
+        if trouble:
+            return Execution(False, trouble)
+    trouble = yield from _push_to(scene, name, corners[-1], strokes=_STROKES, allowed=_FAR)
+    return Execution(not trouble, trouble or f"pushed {name} along {len(corners)} straight stretches")
+
+
+def _push_to(
+    scene: Scene, name: str, goal: Point, *, strokes: int, allowed: float
+) -> Generator[None, None, str]:
+    """Push a body to a point in some strokes; returns what went wrong, if anything."""
+    missed = 0.0
+    for _ in range(strokes):
+        trouble = yield from _stroke(scene, name, goal)
+        if trouble:
+            return trouble
+        missed = math.dist(scene.place_of(name), goal)
+        if missed <= _CLOSE:
+            break
+    return "" if missed <= allowed else f"{name} ended {missed * 100:.1f} cm from where it was pushed to"
+
+
+def straightened(path: Sequence[Point]) -> list[Point]:
+    """The corners of a path: points that lie on the line between others are left out (Douglas, Peucker)."""
+    if len(path) < 3:
+        return list(path)
+    points = np.array(path)
+    chord = points[-1] - points[0]
+    length = float(np.hypot(*chord))
+    offsets = points - points[0]
+    if length > 0:
+        away = np.abs(offsets[:, 0] * chord[1] - offsets[:, 1] * chord[0]) / length
+    else:
+        away = np.hypot(offsets[:, 0], offsets[:, 1])
+    farthest = int(np.argmax(away))
+    if away[farthest] <= _STRAIGHT:
+        return [path[0], path[-1]]
+    return straightened(path[: farthest + 1])[:-1] + straightened(path[farthest:])
+
+
+def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, str]:
+    """Push a body straight towards a point; returns what was in the way, if anything."""
+    x, y = scene.place_of(name)
+    length = math.dist((x, y), goal)
+    if length < _CLOSE:
+        return ""
+    heading = math.atan2(goal[1] - y, goal[0] - x)
+    u, v = math.cos(heading), math.sin(heading)
+    back = u * x + v * y - extent(scene.footprint(name), heading)[0] + FINGER_DEPTH / 2
+    behind = (x - u * (back + _AWAY), y - v * (back + _AWAY))
+    gap = _gap(scene, name, behind, heading)
+    if gap is None:
+        return f"no room for the fingers behind {name}"
+    arm = scene.arm
+    yield from arm.travel(*behind, turn_towards(heading, *behind))
+    yield from arm.grip(gap)
+    yield from arm.move(*behind, 0.08)
+    yield from arm.move(*behind, _LOW, speed=0.2)
+    reached = yield from _advance(scene, name, behind, heading, length, back)
+    x, y, z = arm.commanded
+    yield from arm.move(x - 0.02 * u, y - 0.02 * v, z)
+    yield from arm.move(x - 0.02 * u, y - 0.02 * v, 0.1)
+    return "" if reached else f"the fingers lost {name}"
+
+
+def _advance(
+    scene: Scene, name: str, behind: Point, heading: float, length: float, back: float
+) -> Generator[None, None, bool]:
+    """Move the fingers forward until the body has moved by a length; False if it does not."""
+    u, v = math.cos(heading), math.sin(heading)
+    x, y = scene.place_of(name)
+    travelled = 0.0
+    while True:
+        now = scene.place_of(name)
+        remaining = length - (now[0] - x) * u - (now[1] - y) * v
+        if remaining <= _MARGIN:
+            return True
+        if travelled > length + back + _AWAY:
+            return False
+        travelled += min(_FAST, _SLOW + 2.0 * remaining) / TICKS_PER_S
+        scene.arm.aim(np.array([behind[0] + u * travelled, behind[1] + v * travelled, _LOW]), scene.arm.yaw)
+        yield
+
+
+def _gap(scene: Scene, name: str, behind: Point, heading: float) -> float | None:
+    """How far apart the fingers fit between others behind a body; None where they do not."""
+    low, high = extent(scene.footprint(name), heading + math.pi / 2)
+    widest = max(0.0, min(0.05, high - low - 2 * FINGER_WIDTH))
+    for gap in (widest, widest / 2, 0.0):
+        fingers = rectangle(*behind, FINGER_DEPTH, gap + 2 * FINGER_WIDTH, heading)
+        if scene.clearance(fingers, name) > _MARGIN:
+            return gap
+    return None

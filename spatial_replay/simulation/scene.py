@@ -1,0 +1,76 @@
+"""A robot and what lies around it, as its motions see it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import Footprint
+from spatial_replay.geometry.measure import Operand, Request, measure
+from spatial_replay.simulation.arm import Arm
+from spatial_replay.simulation.engine import Engine
+from spatial_replay.simulation.shapes import Pose, footprint, height
+from spatial_replay.simulation.world import Body
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """The physics, the arm, and the bodies by name."""
+
+    engine: Engine
+    arm: Arm
+    bodies: Mapping[str, Body]
+
+    def pose(self, name: str) -> Pose:
+        """Where a body is."""
+        return self.engine.pose(name)
+
+    def place_of(self, name: str) -> tuple[float, float]:
+        """A body's centre in the plane, in metres."""
+        x, y, _ = self.engine.pose(name).position.tolist()
+        return x, y
+
+    def footprint(self, name: str) -> Footprint:
+        """What a body covers of the plane."""
+        return footprint(self.bodies[name].shape, self.engine.pose(name))
+
+    def height(self, name: str) -> tuple[float, float]:
+        """A body's lowest and highest point."""
+        return height(self.bodies[name].shape, self.engine.pose(name))
+
+    def clearance(self, covered: Footprint, name: str, *, above: float = 0.0) -> float:
+        """How far something is from all bodies but one that reach higher than `above`, in metres."""
+        others = [
+            self.footprint(other) for other in self.bodies if other != name and self.height(other)[1] > above
+        ]
+        return _distance(covered, others) if others else math.inf
+
+    def distance(self, covered: Footprint, name: str) -> float:
+        """How far something is from a body in the plane; below 0 where they overlap."""
+        return _distance(covered, [self.footprint(name)])
+
+
+def _distance(covered: Footprint, others: Sequence[Footprint]) -> float:
+    batch = FootprintBatch.from_footprints([covered, *others])
+    operands = [Operand(np.array([[0]])), Operand(np.arange(1, len(batch))[None, :])]
+    return float(measure(batch, operands, [Request("signed_distance", 0, 1)])[0, 0])
+
+
+def extent(covered: Footprint, angle: float) -> tuple[float, float]:
+    """The least and greatest of a footprint's coordinates along a direction in the plane."""
+    along = np.array([math.cos(angle), math.sin(angle)])
+    spans = [(part.vertices @ along, part.radius) for part in covered.parts]
+    low = min(float(values.min()) - radius for values, radius in spans)
+    return low, max(float(values.max()) + radius for values, radius in spans)
+
+
+def rectangle(x: float, y: float, length: float, width: float, yaw: float) -> Footprint:
+    """A rectangle around a point, its length along `yaw`."""
+    turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
+    corners: Floats = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * np.array([length, width]) / 2
+    return Footprint.polygon(corners @ turn + np.array([x, y]))
