@@ -22,6 +22,8 @@ from spatial_replay.logs.mapping.readings import GENERIC
 from spatial_replay.logs.mapping.transforms import TransformReader
 from spatial_replay.trace.times import LATEST_NS
 
+_NO_STAMP = "the clock is header, but its messages have no stamp; give `stamp`, or `clock: log`"
+
 MISFITS = (FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError)
 """What reading fields of a message raises that is not as the mapping says."""
 
@@ -207,7 +209,10 @@ class Channel:
             return self.transforms.stamp(content)
         try:
             if self.extractor is not None:
-                return self.extractor.message_times([content])[0] if self._checked_stamps(content) else None
+                (time_ns,) = self.extractor.message_times([content])
+                if self.extractor.lacks_stamp:
+                    raise self._misfit(_NO_STAMP)
+                return time_ns
             if not self._has_time:
                 entry = self.planned.mapping
                 stamps = GENERIC.stamp if entry is None or entry.stamp is None else (entry.stamp,)
@@ -216,14 +221,8 @@ class Channel:
         except FieldError as error:
             raise self._misfit(f"the clock is header, but {error}") from None
         if self._time is None:
-            raise self._misfit("the clock is header, but its messages have no stamp; give one with `stamp`")
+            raise self._misfit(_NO_STAMP)
         return self._time.nanoseconds([content])[0]
-
-    def _checked_stamps(self, content: object) -> bool:
-        assert self.extractor is not None
-        if not self.extractor.reading.stamp:
-            raise self._misfit("the clock is header, but its messages have no stamp; give one with `stamp`")
-        return content is not None
 
     def _bind_first(self, extractor: Extractor, contents: list[Any], error: Exception) -> None:
         """Find the message that no path is known to fit yet, and say what is wrong with it."""

@@ -127,6 +127,11 @@ class Extractor:
         """Whether an object has been seen, so that every path is known to lead somewhere."""
         return self._binding is not None
 
+    @property
+    def lacks_stamp(self) -> bool:
+        """Whether a message was seen, and there was no stamp where there could be one."""
+        return self._has_time and self._time is None
+
     def message_times(self, messages: Sequence[object]) -> list[int | None]:
         """The stamp of each message: its own, or that of its first object; None where it has none.
 

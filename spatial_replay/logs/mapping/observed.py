@@ -78,7 +78,7 @@ def rows_from_seen(
 
     Args:
         transforms: fixed_from_frame of each object, or None where all are in the fixed frame.
-        fault: takes the index of an object that makes no footprint, and why.
+        fault: takes the index of an object that makes no footprint, and what comes after its name.
     """
     poses, solids, count = seen.poses, seen.solids, len(seen.name)
     unknown = np.zeros(count, np.bool_)
@@ -142,7 +142,7 @@ def _checked(
         concave=concave,
     )
     for index, what in faults.items():
-        fault(index, what.removeprefix("object ''").removeprefix(":").strip())
+        fault(index, what.removeprefix("object ''"))
     kept = trace.rows[:, 0]
     is_good = np.zeros(count, np.bool_)
     is_good[trace.times_ns] = kept > ABSENT

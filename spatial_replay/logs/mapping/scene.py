@@ -55,11 +55,11 @@ class Scene:
         stored = [self._rows]
         for name, channel in self._channels.items():
             times_ns, log_times_ns, contents = channel.pending.take(upto_ns)
-            if self._plan.sampled_topic in (None, name):
-                sampled.append(times_ns)
             harvest = channel.harvest(log_times_ns, contents) if channel.reads else None
             if harvest is not None and len(harvest.kept) < len(contents):
                 times_ns, log_times_ns = times_ns[harvest.kept], log_times_ns[harvest.kept]
+            if self._plan.sampled_topic in (None, name):
+                sampled.append(times_ns)
             if harvest is not None and harvest.seen is not None:
                 self._take_objects(channel, times_ns, log_times_ns, harvest.seen, stored)
             for place, values in enumerate(harvest.signals if harvest is not None else ()):
@@ -87,7 +87,7 @@ class Scene:
         name_of = _Names(self._names)
 
         def fault(index: int, what: str) -> None:
-            named = f"object {name_of[int(seen.name[index])]!r} {what}"
+            named = f"object {name_of[int(seen.name[index])]!r}{what}"
             self._fault(channel.name, int(log_times_ns[seen.message[index]]), named)
 
         rows = rows_from_seen(seen, self._transforms(channel, seen, times_ns), self._concave, fault)
@@ -166,7 +166,7 @@ class Scene:
         if not len(again):
             return number
         for index in again.tolist():
-            fault(index, "is there twice in one message; name each object once")
+            fault(index, " is there twice in one message; name each object once")
         blank = Rows.blank(seen.class_code[again])
         number = number.copy()
         number[again] = sum(map(len, stored)) + np.arange(len(again))

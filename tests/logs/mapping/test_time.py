@@ -1,0 +1,230 @@
+"""When samples are taken, what is still valid then, and what becomes of time that does not run as it should."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from logs.mapping.feeding import SECOND, Feed, header, make, pose_stamped, ros
+
+from spatial_replay.errors import LogError, UsageError
+
+MS = 10**6
+
+
+def seconds(times_ns: Any) -> list[float]:
+    return [time / SECOND for time in times_ns.tolist()]
+
+
+def point(x: float, **more: Any) -> dict[str, Any]:
+    return {"x": x, "y": 0.0, **more}
+
+
+def test_each_message_of_the_first_topic_with_objects_is_a_sample() -> None:
+    feed = Feed()
+    for tick in range(5):
+        feed.add("/slow", tick * SECOND, point(tick))
+        feed.add("/fast", tick * SECOND + 1, point(tick))
+        feed.add("/fast", tick * SECOND + SECOND // 2, point(tick + 0.5))
+    slow = make("topics: {/slow: {}, /fast: {}}", feed)
+    assert seconds(slow.trace.times_ns) == [0, 1, 2, 3, 4]
+    assert slow.states("fast") == "-++++"
+    assert slow.centre(2, "fast") == (1.5, 0.0)
+    fast = make("sample: {topic: /fast}\ntopics: {/slow: {}, /fast: {}}", feed)
+    assert len(fast.trace) == 10
+
+
+def test_a_topic_that_carries_nothing_else_can_be_sampled() -> None:
+    feed = (
+        Feed()
+        .add("/a", 0, point(0))
+        .add("/tick", 1, {})
+        .add("/tick", SECOND // 2, {})
+        .add("/a", SECOND, point(1))
+    )
+    assert make("sample: {topic: /tick}\ntopics: {/a: {}}", feed).trace.times_ns.tolist() == [1, SECOND // 2]
+
+
+def test_samples_at_each_multiple_of_a_step_do_not_depend_on_the_window() -> None:
+    feed = Feed()
+    for tick in range(20):
+        feed.add("/a", tick * 130 * MS + 7, point(tick))
+    text = "sample: {every: 200ms}\ntopics: {/a: {}}"
+    whole = make(text, feed)
+    assert [time % (200 * MS) for time in whole.trace.times_ns.tolist()] == [0] * len(whole.trace)
+    assert seconds(whole.trace.times_ns) == pytest.approx([0.2 * n for n in range(1, 13)])
+    part = make(text, feed, start_ns=500 * MS, end_ns=1500 * MS)
+    assert seconds(part.trace.times_ns) == pytest.approx([0.6, 0.8, 1.0, 1.2, 1.4])
+    assert part.trace == whole.trace.slice(2, 7)
+
+
+def test_what_is_too_old_is_there_but_unknown() -> None:
+    feed = Feed().add("/b", 0, point(0))
+    for tick in range(8):
+        feed.add("/a", tick * SECOND // 2, point(tick))
+    made = make("max_age: 1500ms\ntopics: {/a: {}, /b: {}}", feed)
+    assert made.states("b") == "++++????"
+    assert "/b: b are unknown in up to 4 samples, the first at 2000000000 ns" in made.remarks[0]
+    assert make("topics: {/a: {}, /b: {max_age: forever}}", feed).states("b") == "++++++++"
+    assert make("topics: {/a: {}, /b: {}}", feed).states("b") == "+++?????"
+
+
+def test_what_a_complete_list_leaves_out_has_left() -> None:
+    def listed(*numbers: int) -> dict[str, Any]:
+        return {"things": [{"id": number, "x": 0.0, "y": 0.0} for number in numbers]}
+
+    feed = Feed()
+    for tick, numbers in enumerate([(1, 2), (1,), (), (2,), (1, 2)]):
+        feed.add("/list", tick * SECOND, listed(*numbers))
+    text = "topics: {{/list: {{objects: 'things[*]', name: 't{{id}}', position: [x, y]{more}}}}}"
+    made = make(text.format(more=""), feed)
+    assert (made.states("t1"), made.states("t2")) == ("++--+", "+--++")
+    kept = make(text.format(more=", complete: false, max_age: 2s"), feed)
+    assert (kept.states("t1"), kept.states("t2")) == ("+++++", "+++++")
+
+
+def test_a_silent_list_makes_its_objects_unknown() -> None:
+    feed = Feed().add("/list", 0, {"things": [{"id": 1, "x": 0.0, "y": 0.0}]})
+    for tick in range(4):
+        feed.add("/a", tick * SECOND, point(0))
+    text = "sample: {topic: /a}\ntopics: {/list: {objects: 'things[*]', name: 't{id}', position: [x, y]}, /a: {}}"
+    assert make(text, feed).states("t1") == "++??"
+
+
+def test_messages_out_of_order_by_up_to_a_second_are_sorted() -> None:
+    def stamped(x: float, time_ns: int) -> Any:
+        return pose_stamped(x, 0.0, time_ns=time_ns)
+
+    feed = Feed()
+    for number, tick in enumerate([0, 5, 2, 9, 4, 12]):
+        feed.add("/p", number, stamped(tick, tick * 100 * MS))
+    made = make("clock: header\ntopics: {/p: {}}", feed)
+    assert seconds(made.trace.times_ns) == pytest.approx([0, 0.2, 0.4, 0.5, 0.9, 1.2])
+    assert [made.centre(n, "p")[0] for n in range(6)] == [0, 2, 4, 5, 9, 12]
+
+
+def test_of_equal_times_the_later_one_counts() -> None:
+    feed = Feed().add("/p", 5, point(1)).add("/p", 5, point(2)).add("/p", 6, point(3))
+    made = make("topics: {/p: {}}", feed)
+    assert made.trace.times_ns.tolist() == [5, 6]
+    assert made.centre(0, "p") == (2.0, 0.0)
+
+
+def restarted() -> Feed:
+    feed = Feed()
+    for tick in [*range(100, 110), *range(5)]:
+        feed.add("/p", tick * SECOND, point(tick))
+    return feed
+
+
+def test_a_longer_jump_back_is_an_error_that_says_where() -> None:
+    with pytest.raises(
+        LogError, match=r"test.bag: time jumps back by 109.000 s, from 109000000000 ns to 0 ns, at a"
+    ):
+        make("topics: {/p: {}}", restarted())
+
+
+@pytest.mark.parametrize("batch", [1, 4, 1000])
+def test_or_the_log_ends_there_if_asked(batch: int) -> None:
+    made = make("topics: {/p: {}}", restarted(), batch=batch, on_time_jump="split")
+    assert seconds(made.trace.times_ns) == list(range(100, 110))
+    assert "the log is taken to end there" in made.remarks[0]
+
+
+def test_a_clock_that_jumps_forward_does_not_make_billions_of_samples() -> None:
+    feed = Feed().add("/p", 0, point(0)).add("/p", 1_700_000_000 * SECOND, point(1))
+    with pytest.raises(
+        LogError, match=r"jumps forward from 0 ns to 1700000000000000000 ns, more than 100000 samples"
+    ):
+        make("sample: {every: 100ms}\ntopics: {/p: {}}", feed)
+
+
+def test_the_three_clocks() -> None:
+    feed = Feed().add("/p", 7 * SECOND, pose_stamped(0, 0, time_ns=3 * SECOND))
+    assert seconds(make("clock: log\ntopics: {/p: {}}", feed).trace.times_ns) == [7]
+    assert seconds(make("clock: publish\ntopics: {/p: {}}", feed).trace.times_ns) == [7]
+    assert seconds(make("clock: header\ntopics: {/p: {}}", feed).trace.times_ns) == [3]
+
+
+def test_stamps_may_be_numbers_of_any_unit() -> None:
+    feed = Feed().add("/p", 7, point(0, at=2500))
+    made = make("clock: header\ntopics: {/p: {stamp: {field: at, unit: ms}}}", feed)
+    assert seconds(made.trace.times_ns) == [2.5]
+
+
+def test_a_topic_without_stamps_needs_another_clock() -> None:
+    feed = Feed().add("/p", 7, point(0))
+    with pytest.raises(
+        UsageError, match=r"test.yaml: topics./p: the clock is header, but its messages have no stamp"
+    ):
+        make("clock: header\ntopics: {/p: {}}", feed)
+    assert len(make("clock: header\ntopics: {/p: {clock: log}}", feed).trace) == 1
+
+
+def test_signals_follow_the_same_rules() -> None:
+    feed = Feed().add("/battery", 0, ros("sensor_msgs/BatteryState", percentage=0.5))
+    feed.add("/battery", SECOND, ros("sensor_msgs/BatteryState", percentage=0.25))
+    for tick in range(6):
+        feed.add("/p", tick * SECOND // 2, point(0))
+    text = (
+        "sample: {topic: /p}\ntopics: {/p: {}, /battery: {signals: {charge: {field: percentage, unit: '1'}}}}"
+    )
+    charge = make(text, feed).trace.signals["charge"].tolist()
+    assert charge[:5] == [0.5, 0.5, 0.25, 0.25, 0.25]
+    assert charge[5] != charge[5]
+
+
+def test_a_topic_may_have_objects_and_signals() -> None:
+    content = ros(
+        "nav_msgs/Odometry",
+        header=header("odom"),
+        twist=ros(
+            "geometry_msgs/TwistWithCovariance",
+            twist=ros("geometry_msgs/Twist", linear=ros("geometry_msgs/Vector3", x=1.5)),
+        ),
+    )
+    feed = Feed().add("/odom", 0, content)
+    both = make("topics: {/odom: {name: robot, signals: {speed: twist.twist.linear.x}}}", feed)
+    assert (both.states("robot"), both.trace.signals["speed"].tolist()) == ("+", [1.5])
+    only = make("topics: {/odom: {signals: {speed: twist.twist.linear.x}}}", feed)
+    assert (only.trace.names, only.trace.signals["speed"].tolist()) == ((), [1.5])
+
+
+@pytest.mark.parametrize("batch", [1, 3, 257])
+def test_however_messages_are_handed_over_they_make_the_same_samples(batch: int) -> None:
+    feed = Feed()
+    for tick in range(3000):
+        feed.add("/p", tick * 10 * MS + (tick % 7) * MS, point(tick))
+        if tick % 5 == 0:
+            feed.add("/q", tick * 10 * MS + 3, point(-tick))
+    text = "topics: {/p: {}, /q: {max_age: 45ms}}"
+    whole = make(text, feed, batch=100_000)
+    assert len(whole.trace) == 3000
+    assert make(text, feed, batch=batch).trace == whole.trace
+
+
+def test_a_window_has_the_samples_of_the_whole_log() -> None:
+    feed = Feed()
+    for tick in range(1000):
+        feed.add("/p", tick * 10 * MS, point(tick))
+        feed.add("/q", tick * 10 * MS + 1, point(-tick))
+    text = "topics: {/p: {}, /q: {}}"
+    whole = make(text, feed).trace
+    part = make(text, feed, start_ns=2 * SECOND, end_ns=3 * SECOND)
+    assert part.trace == whole.slice(200, 300)
+
+
+def test_messages_that_are_not_as_the_others_are_told_and_left_out() -> None:
+    feed = (
+        Feed()
+        .add("/p", 0, point(0))
+        .add("/p", 1, {"x": 1.0})
+        .add("/p", 2, {"x": "?", "y": 1})
+        .add("/p", 3, point(3))
+    )
+    made = make("topics: {/p: {signals: {speed: x}, name: p}}", feed)
+    assert made.trace.times_ns.tolist() == [0, 3]
+    assert [made.centre(n, "p") for n in (0, 1)] == [(0.0, 0.0), (3.0, 0.0)]
+    assert made.trace.signals["speed"].tolist() == [0.0, 3.0]
+    assert [fault.partition(":")[0] for fault in made.faults] == ["test.bag"] * 2
+    assert {fault.split()[3] for fault in made.faults} == {"1", "2"}

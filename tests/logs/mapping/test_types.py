@@ -1,0 +1,325 @@
+"""Objects out of messages of every type that is known by name."""
+
+from __future__ import annotations
+
+from math import cos, pi, sin
+from typing import Any
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from logs.mapping.feeding import SECOND, Feed, Made, header, make, pose, pose_stamped, ros, tf, transform
+
+from spatial_replay.geometry.footprint import Footprint, TrackedObject
+
+QUARTER = (0.0, 0.0, sin(pi / 4), cos(pi / 4))
+
+
+def one(content: Any, keys: str = "") -> Made:
+    return make(f"topics: {{/thing: {{{keys}}}}}", Feed().add("/thing", SECOND, content))
+
+
+def objects(content: Any, keys: str = "") -> dict[str, TrackedObject]:
+    made = one(content, keys)
+    assert made.faults == ()
+    (sample,) = made.trace.samples()
+    return {name: tracked for name, tracked in sample.objects.items() if isinstance(tracked, TrackedObject)}
+
+
+def corners(tracked: TrackedObject) -> set[tuple[float, float]]:
+    return {
+        (round(x, 9) + 0.0, round(y, 9) + 0.0)
+        for part in tracked.footprint.parts
+        for x, y in part.vertices.tolist()
+    }
+
+
+def test_a_pose_is_an_object_named_after_its_topic() -> None:
+    found = objects(pose_stamped(1.0, 2.0, turn=QUARTER))
+    assert found["thing"].footprint == Footprint.disc(1.0, 2.0, 0.0)
+    assert found["thing"].yaw == pytest.approx(pi / 2)
+
+
+def test_a_pose_takes_the_shape_and_the_height_that_the_mapping_gives() -> None:
+    keys = "name: robot, class: agv, shape: {box: [2, 1], offset: [1, 0]}, height: [0, 0.5]"
+    found = objects(pose_stamped(1.0, 2.0, z=0.25, turn=QUARTER), keys)["robot"]
+    assert corners(found) == {(0.5, 2.0), (1.5, 2.0), (1.5, 4.0), (0.5, 4.0)}
+    assert found.class_name == "agv"
+    assert found.height == (0.25, 0.75)
+
+
+def test_odometry_has_a_covariance() -> None:
+    covariance = np.zeros((6, 6))
+    covariance[:2, :2] = [[0.04, 0.0], [0.0, 0.01]]
+    content = ros(
+        "nav_msgs/Odometry",
+        header=header("odom"),
+        pose=ros("geometry_msgs/PoseWithCovariance", pose=pose(3.0, 4.0), covariance=covariance.ravel()),
+    )
+    assert objects(content)["thing"].uncertainty == 0.0
+    assert objects(content, "uncertainty: covariance")["thing"].uncertainty == pytest.approx(0.4)
+    keys = "uncertainty: {covariance: pose.covariance, sigmas: 3}"
+    assert objects(content, keys)["thing"].uncertainty == pytest.approx(0.6)
+    assert objects(content, "uncertainty: 0.25")["thing"].uncertainty == 0.25
+
+
+def test_a_negative_variance_says_that_nothing_is_known() -> None:
+    covariance = np.zeros(36)
+    covariance[0] = -1.0
+    content = ros(
+        "nav_msgs/Odometry",
+        pose=ros("geometry_msgs/PoseWithCovariance", pose=pose(3.0, 4.0), covariance=covariance),
+    )
+    assert one(content, "uncertainty: covariance").states("thing") == "?"
+
+
+def test_poses_of_an_array_are_numbered() -> None:
+    content = ros("geometry_msgs/PoseArray", header=header("map"), poses=[pose(1.0, 0.0), pose(2.0, 0.0)])
+    found = objects(content)
+    assert list(found) == ["thing_0", "thing_1"]
+    assert found["thing_1"].footprint == Footprint.disc(2.0, 0.0, 0.0)
+
+
+def test_a_polygon_is_its_own_footprint() -> None:
+    points = [ros("geometry_msgs/Point32", x=x, y=y) for x, y in ((0, 0), (2, 0), (2, 1), (0, 1))]
+    content = ros("geometry_msgs/PolygonStamped", polygon=ros("geometry_msgs/Polygon", points=points))
+    assert objects(content)["thing"].footprint == Footprint.box(0, 0, 2, 1)
+
+
+def test_transforms_are_objects_named_after_their_frames() -> None:
+    content = tf(transform("world", "turtle1", (1, 2, 0)), transform("world", "turtle2", (3, 4, 0)))
+    found = objects(content)
+    assert found["turtle1"].footprint == Footprint.disc(1, 2, 0)
+    assert found["turtle2"].footprint == Footprint.disc(3, 4, 0)
+    assert list(objects(content, "only: ['*2']")) == ["turtle2"]
+    assert list(objects(content, "except: [turtle2]")) == ["turtle1"]
+
+
+def marker(kind: int, number: int = 0, **values: Any) -> Any:
+    defaults: dict[str, Any] = {
+        "header": header("map"),
+        "ns": "cup",
+        "id": number,
+        "type": kind,
+        "pose": pose(1.0, 2.0, 0.5),
+        "scale": ros("geometry_msgs/Vector3", x=2.0, y=1.0, z=1.0),
+    }
+    return ros("visualization_msgs/Marker", **(defaults | values))
+
+
+def test_markers_are_boxes_discs_and_unions() -> None:
+    scale = ros("geometry_msgs/Vector3", x=2.0, y=2.0, z=1.0)
+    points = [ros("geometry_msgs/Point", x=x, y=0.0) for x in (0.0, 10.0)]
+    array = ros(
+        "visualization_msgs/MarkerArray",
+        markers=[marker(1), marker(3, 1, scale=scale), marker(6, 2, points=points), marker(9, 3)],
+    )
+    made = one(array)
+    (sample,) = made.trace.samples()
+    cube, cylinder, cubes = (sample.objects[f"cup_{number}"] for number in range(3))
+    assert isinstance(cube, TrackedObject)
+    assert cube.footprint == Footprint.box(0.0, 1.5, 2.0, 2.5)
+    assert cube.height == (0.0, 1.0)
+    assert isinstance(cylinder, TrackedObject)
+    assert cylinder.footprint == Footprint.disc(1.0, 2.0, 1.0)
+    assert isinstance(cubes, TrackedObject)
+    assert cubes.footprint == Footprint.union(
+        [Footprint.box(0.0, 1.5, 2.0, 2.5), Footprint.box(10.0, 1.5, 12.0, 2.5)]
+    )
+    assert "1 things were left out" in made.remarks[0]
+
+
+def test_markers_stay_until_they_are_deleted_or_their_time_is_up() -> None:
+    def array(*markers: Any) -> Any:
+        return ros("visualization_msgs/MarkerArray", markers=list(markers))
+
+    lifetime = ros("builtin_interfaces/Duration", sec=2)
+    feed = Feed()
+    feed.add("/m", 0, array(marker(1, 0), marker(1, 1, lifetime=lifetime), marker(1, 2)))
+    feed.add("/m", 3 * SECOND, array(marker(1, 0, action=2)))
+    feed.add("/m", 20 * SECOND, array(marker(1, 0, action=3), marker(1, 5)))
+    made = make("sample: {every: 1s}\ntopics: {/m: {}}", feed)
+    assert made.states("cup_0") == "+++" + "-" * 18
+    assert made.states("cup_1") == "++" + "-" * 19
+    assert made.states("cup_2") == "+" * 20 + "-"
+    assert made.states("cup_5") == "-" * 20 + "+"
+
+
+def hypotheses(name: str) -> list[Any]:
+    inner = ros("vision_msgs/ObjectHypothesis", class_id=name, score=0.5)
+    return [ros("vision_msgs/ObjectHypothesisWithPose", hypothesis=inner)]
+
+
+def test_detections_in_an_image_are_boxes() -> None:
+    centre = ros("vision_msgs/Pose2D", position=ros("vision_msgs/Point2D", x=10.0, y=20.0), theta=pi / 2)
+    box = ros("vision_msgs/BoundingBox2D", center=centre, size_x=4.0, size_y=2.0)
+    detections = [
+        ros("vision_msgs/Detection2D", bbox=box, id="7", results=hypotheses("cup")),
+        ros("vision_msgs/Detection2D", bbox=box),
+    ]
+    found = objects(ros("vision_msgs/Detection2DArray", detections=detections))
+    assert list(found) == ["thing_1", "thing_7"]
+    assert corners(found["thing_7"]) == {(9.0, 18.0), (11.0, 18.0), (11.0, 22.0), (9.0, 22.0)}
+    assert (found["thing_7"].class_name, found["thing_1"].class_name) == ("cup", None)
+
+
+def test_detections_in_space_have_heights() -> None:
+    size = ros("geometry_msgs/Vector3", x=2.0, y=1.0, z=3.0)
+    box = ros("vision_msgs/BoundingBox3D", center=pose(1.0, 1.0, 2.0), size=size)
+    detection = ros("vision_msgs/Detection3D", bbox=box, id="car1")
+    found = objects(ros("vision_msgs/Detection3DArray", detections=[detection]), "name: '{id}'")
+    assert found["car1"].footprint == Footprint.box(0.0, 0.5, 2.0, 1.5)
+    assert found["car1"].height == (0.5, 3.5)
+
+
+def test_tags_are_polygons_of_their_corners() -> None:
+    points = [ros("apriltag_msgs/Point", x=x, y=y) for x, y in ((0, 0), (0, 1), (1, 1), (1, 0))]
+    detection = ros("apriltag_msgs/AprilTagDetection", id=4, family="36h11", corners=points)
+    found = objects(ros("apriltag_msgs/AprilTagDetectionArray", detections=[detection]))
+    assert found["tag4"].footprint == Footprint.box(0, 0, 1, 1)
+    assert found["tag4"].class_name == "36h11"
+
+
+def test_perceived_objects_are_solids_with_a_class() -> None:
+    def perceived(number: int, kind: int, sizes: list[float], classification: int) -> Any:
+        solid = ros("shape_msgs/SolidPrimitive", type=kind, dimensions=np.array(sizes))
+        return ros(
+            "derived_object_msgs/Object",
+            id=number,
+            pose=pose(0.0, 0.0, 1.0),
+            shape=solid,
+            classification=classification,
+        )
+
+    listed = [perceived(1, 1, [4.0, 2.0, 2.0], 6), perceived(2, 3, [2.0, 0.5], 4), perceived(3, 0, [], 0)]
+    found = objects(ros("derived_object_msgs/ObjectArray", objects=listed))
+    assert found["object_1"].footprint == Footprint.box(-2, -1, 2, 1)
+    assert found["object_1"].height == (0.0, 2.0)
+    assert found["object_2"].footprint == Footprint.disc(0, 0, 0.5)
+    assert found["object_3"].footprint == Footprint.disc(0, 0, 0)
+    assert [found[f"object_{n}"].class_name for n in (1, 2, 3)] == ["car", "pedestrian", "unknown"]
+
+
+def test_entities_of_a_scene_are_unions_that_stay() -> None:
+    first = SceneUpdate()
+    for name in ("table", "cup"):
+        entity = first.entities.add(id=name, frame_id="map")
+        cube = entity.cubes.add()
+        cube.pose.position.x = 1.0
+        cube.size.x, cube.size.y, cube.size.z = 2.0, 1.0, 1.0
+    sphere = first.entities[0].spheres.add()
+    sphere.size.x = sphere.size.y = sphere.size.z = 0.5
+    first.entities.add(id="label").texts.add(text="no body")
+    second = SceneUpdate()
+    second.deletions.add(id="cup")
+    third = SceneUpdate()
+    third.deletions.add(type=1)  # type: ignore[arg-type]
+    feed = Feed().add("/scene", 0, first).add("/scene", 5 * SECOND, second).add("/scene", 9 * SECOND, third)
+    made = make("topics: {/scene: {}}", feed)
+    assert (made.states("table"), made.states("cup")) == ("++-", "+--")
+    assert "label" not in made.trace.names
+    table = made.trace.observation(int(made.trace.rows[0, made.trace.names.index("table")]))
+    assert table.footprint == Footprint.union([Footprint.box(0, -0.5, 2, 0.5), Footprint.disc(0, 0, 0.25)])
+    assert table.height == (-0.5, 0.5)
+
+
+def test_foxglove_poses_and_transforms() -> None:
+    poses = PosesInFrame(frame_id="map")
+    poses.poses.add().position.x = 3.0
+    assert objects(poses)["thing_0"].footprint == Footprint.disc(3, 0, 0)
+    single = FrameTransform(parent_frame_id="map", child_frame_id="arm")
+    single.translation.y = 2.0
+    assert objects(single)["arm"].footprint == Footprint.disc(0, 2, 0)
+    assert objects(FrameTransforms(transforms=[single]))["arm"].footprint == Footprint.disc(0, 2, 0)
+
+
+def test_the_same_in_json() -> None:
+    content = {
+        "deletions": [],
+        "entities": [
+            {
+                "id": "table",
+                "frame_id": "map",
+                "timestamp": {"sec": 1, "nsec": 0},
+                "lifetime": {"sec": 0, "nsec": 0},
+                "cubes": [
+                    {
+                        "pose": {
+                            "position": {"x": 1.0, "y": 0.0, "z": 0.0},
+                            "orientation": {"x": 0, "y": 0, "z": 0, "w": 1},
+                        },
+                        "size": {"x": 2.0, "y": 1.0, "z": 1.0},
+                    }
+                ],
+            }
+        ],
+    }
+    feed = Feed(types={"/scene": "foxglove.SceneUpdate"}).add("/scene", 0, content)
+    made = make("topics: {/scene: {}}", feed)
+    assert made.trace.observation(0).footprint == Footprint.box(0, -0.5, 2, 0.5)
+
+
+def test_a_turtle_is_found_by_its_fields() -> None:
+    found = objects(ros("turtlesim/Pose", x=1.0, y=2.0, theta=0.5), "shape: {disc: 0.5}")
+    assert found["thing"].footprint == Footprint.disc(1, 2, 0.5)
+    assert found["thing"].yaw == 0.5
+
+
+def test_any_other_type_is_read_by_field_paths() -> None:
+    content = {
+        "stamp": {"sec": 1, "nanosec": 0},
+        "things": [
+            {"id": {"value": 3}, "at": [1.0, 2.0], "size": {"l": 2.0, "w": 1.0}, "angle": 90, "kind": 2},
+            {"id": {"value": 4}, "at": [5.0, None], "size": {"l": 2.0, "w": 1.0}, "angle": 0, "kind": 9},
+        ],
+    }
+    keys = (
+        "objects: 'things[*]', name: 'v{id.value}', position: at, yaw: {field: angle, unit: deg},"
+        " shape: {box: [size.l, size.w]}, class: {field: kind, names: {2: car}, else: other},"
+        " height: [0, size.w], uncertainty: size.w"
+    )
+    made = one(content, keys)
+    car = made.trace.observation(int(made.trace.rows[0, 0]))
+    assert corners(car) == {(0.5, 1.0), (1.5, 1.0), (1.5, 3.0), (0.5, 3.0)}
+    assert (car.class_name, car.height, car.uncertainty) == ("car", (0.0, 1.0), 1.0)
+    assert made.states("v4") == "?"
+
+
+@pytest.mark.parametrize("polygon", [[0, 0, 2, 0, 2, 1, 0, 1], [[0, 0], [2, 0], [2, 1], [0, 1]]])
+def test_corners_may_be_pairs_or_numbers_in_turn(polygon: list[Any]) -> None:
+    assert objects({"outline": polygon}, "polygon: outline")["thing"].footprint == Footprint.box(0, 0, 2, 1)
+
+
+def test_a_quaternion_of_zeros_is_no_rotation_and_no_orientation() -> None:
+    found = objects(pose_stamped(0.0, 0.0, turn=(0, 0, 0, 0)), "shape: {box: [2, 1]}")["thing"]
+    assert found.footprint == Footprint.box(-1, -0.5, 1, 0.5)
+    assert found.yaw is None
+
+
+def test_a_tilted_box_is_its_outline_from_above() -> None:
+    # rolled by 45 degrees about its long axis
+    roll = (sin(pi / 8), 0.0, 0.0, cos(pi / 8))
+    size = ros("geometry_msgs/Vector3", x=4.0, y=1.0, z=1.0)
+    box = ros("vision_msgs/BoundingBox3D", center=pose(0.0, 0.0, 2.0, turn=roll), size=size)
+    detection = ros("vision_msgs/Detection3D", bbox=box, id="crate")
+    found = objects(ros("vision_msgs/Detection3DArray", detections=[detection]), "name: '{id}'")["crate"]
+    half = 2**0.5 / 2
+    assert corners(found) == {(x, round(y, 9)) for x in (-2.0, 2.0) for y in (-half, half)}
+    assert found.height == pytest.approx((2 - half, 2 + half))
+
+
+def test_an_outline_that_crosses_itself_costs_its_object_only() -> None:
+    content = {"list": [{"id": 1, "p": [0, 0, 1, 1, 1, 0, 0, 1]}, {"id": 2, "p": [0, 0, 1, 0, 1, 1]}]}
+    made = one(content, "objects: 'list[*]', name: 'o{id}', polygon: p")
+    assert (made.states("o1"), made.states("o2")) == ("?", "+")
+    assert "/thing at 1000000000 ns: object 'o1': the polygon's boundary crosses" in made.faults[0]
+
+
+def test_a_name_that_is_there_twice_makes_the_object_unknown() -> None:
+    content = {"list": [{"id": 1, "x": 0, "y": 0}, {"id": 1, "x": 1, "y": 0}, {"id": 2, "x": 1, "y": 0}]}
+    made = one(content, "objects: 'list[*]', name: 'o{id}', position: [x, y]")
+    assert (made.states("o1"), made.states("o2")) == ("?", "+")
+    assert "object 'o1' is there twice in one message" in made.faults[0]
