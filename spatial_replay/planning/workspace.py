@@ -1,0 +1,133 @@
+"""Where objects can be put: a grid of positions, how they may be turned, what stands in the way."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spatial_replay.errors import UsageError
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.geometry.footprint import Footprint
+
+Booleans = NDArray[np.bool_]
+
+MOST_CELLS = 4_000_000
+"""Cells of a grid, over all angles; beyond it a cell size was mistyped."""
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Cells that are squares in the plane; a map has a value for the middle of each.
+
+    Attributes:
+        xmin, ymin: the corner from which cells are counted, in footprint units.
+        cell_size: side of a cell, in footprint units.
+        columns, rows: how many cells along x and along y.
+
+    Raises:
+        UsageError: numbers that make no grid, or more than `MOST_CELLS`.
+    """
+
+    xmin: float
+    ymin: float
+    cell_size: float
+    columns: int
+    rows: int
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.xmin) and math.isfinite(self.ymin)):
+            raise UsageError(f"a grid from ({self.xmin}, {self.ymin}); give finite numbers")
+        if not (self.cell_size > 0.0 and math.isfinite(self.cell_size)):
+            raise UsageError(f"cell_size is {self.cell_size}; give a number above 0")
+        if self.columns < 1 or self.rows < 1 or self.columns * self.rows > MOST_CELLS:
+            raise UsageError(
+                f"a grid of {self.columns} x {self.rows} cells; give at least 1 along each axis and at most "
+                f"{MOST_CELLS:,} in all"
+            )
+
+    @classmethod
+    def over(cls, xmin: float, ymin: float, xmax: float, ymax: float, cell_size: float) -> Grid:
+        """The grid over a box; its last cells may reach beyond it.
+
+        Raises:
+            UsageError: an empty box, or numbers that make no grid.
+        """
+        if not (xmin < xmax and ymin < ymax):
+            raise UsageError(
+                f"the box ({xmin}, {ymin}, {xmax}, {ymax}) is empty; give xmin, ymin, xmax, ymax"
+            )
+        if not cell_size > 0.0:
+            raise UsageError(f"cell_size is {cell_size}; give a number above 0")
+        # a box that is a whole number of cells long must not get one more for the last bit of its length
+        columns, rows = (math.ceil(length / cell_size - 1e-9) for length in (xmax - xmin, ymax - ymin))
+        return cls(xmin, ymin, cell_size, columns, rows)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns)."""
+        return self.rows, self.columns
+
+    def centres(self) -> Floats:
+        """(rows * columns, 2): the middle of each cell, row after row."""
+        x = self.xmin + (np.arange(self.columns) + 0.5) * self.cell_size
+        y = self.ymin + (np.arange(self.rows) + 0.5) * self.cell_size
+        return np.stack(np.broadcast_arrays(x[None, :], y[:, None]), axis=-1).reshape(-1, 2)
+
+    def centre(self, row: int, column: int) -> tuple[float, float]:
+        """The middle (x, y) of a cell."""
+        x = self.xmin + (column + 0.5) * self.cell_size
+        return x, self.ymin + (row + 0.5) * self.cell_size
+
+    def cell(self, x: float, y: float) -> tuple[int, int]:
+        """The cell (row, column) that a point lies in; of one outside the grid, the nearest one."""
+        column = math.floor((x - self.xmin) / self.cell_size)
+        row = math.floor((y - self.ymin) / self.cell_size)
+        return min(max(row, 0), self.rows - 1), min(max(column, 0), self.columns - 1)
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Where a robot can put the centres of objects.
+
+    Attributes:
+        grid: the positions that are considered.
+        yaws: orientations in radians that an object may be given; empty to leave objects as they are. An
+            object of unknown orientation is turned by these angles instead.
+        base: (x, y) around which the robot reaches.
+        nearest, farthest: from and up to which distance from the base it does, in footprint units.
+        obstacles: what stands in the way besides the objects of a sample.
+        supports: objects on which others may be put: to these they are no obstacles.
+        clearance: how far objects have to stay apart, in footprint units.
+
+    Raises:
+        UsageError: angles or distances that are no numbers, or empty ranges.
+    """
+
+    grid: Grid
+    yaws: tuple[float, ...] = ()
+    base: tuple[float, float] = (0.0, 0.0)
+    nearest: float = 0.0
+    farthest: float = math.inf
+    obstacles: tuple[Footprint, ...] = ()
+    supports: frozenset[str] = field(default_factory=frozenset)
+    clearance: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not all(map(math.isfinite, (*self.yaws, *self.base, self.nearest, self.clearance))):
+            raise UsageError("yaws, base, nearest and clearance of a workspace must be finite numbers")
+        if not self.nearest <= self.farthest:
+            raise UsageError(f"nothing is farther than {self.nearest} and nearer than {self.farthest}")
+
+    @cached_property
+    def within_reach(self) -> Booleans:
+        """(rows, columns): whether the robot reaches the middle of each cell."""
+        away = self.grid.centres() - np.array(self.base)
+        distance = np.hypot(away[:, 0], away[:, 1])
+        reached = (distance >= self.nearest) & (distance <= self.farthest)
+        result: Booleans = reached.reshape(self.grid.shape)
+        result.flags.writeable = False
+        return result

@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import spatial_replay as sr
+from spatial_replay.errors import UsageError
+from spatial_replay.planning.maps import (
+    CONSTRAINED,
+    FREE,
+    OCCUPIED,
+    OUT_OF_REACH,
+    gradient_map,
+    proposition_maps,
+)
+from spatial_replay.planning.workspace import Grid, Workspace
+
+CUP = sr.TrackedObject(sr.Footprint.box(0, 0, 1, 1))
+SAMPLE = sr.Sample(0, {"cup": CUP, "mat": sr.Footprint.box(4, 4, 8, 8), "jug": sr.Footprint.disc(1, 6, 1)})
+GRID = Grid.over(0, 0, 10, 10, 1.0)
+
+
+def propositions(*texts):
+    return [sr.parse_specification(text).specs[0].formula for text in texts]
+
+
+def maps(workspace, *texts, sample=SAMPLE):
+    return proposition_maps(propositions(*texts), {}, sample, "cup", workspace)
+
+
+def test_a_map_is_best_in_the_middle_of_what_the_object_is_to_be_in():
+    found = gradient_map(maps(Workspace(GRID), "cup enclosedin mat"), (((0, True),),), (), Workspace(GRID))
+    row, column = np.unravel_index(int(np.argmax(found.robustness[0])), GRID.shape)
+    assert GRID.centre(int(row), int(column)) in {(5.5, 5.5), (5.5, 6.5), (6.5, 5.5), (6.5, 6.5)}
+    assert found.robustness[0, 5, 5] == 1.0
+
+
+def test_cells_are_blocked_for_a_reason():
+    workspace = Workspace(
+        GRID,
+        base=(5.0, 5.0),
+        farthest=6.0,
+        obstacles=(sr.Footprint.disc(8.5, 1.5, 0.25),),
+        supports=frozenset({"mat"}),
+    )
+    found = gradient_map(
+        maps(workspace, "cup enclosedin mat", "0.4 <= cup dist mat <= 1.5"),
+        (((0, True),),),
+        (((1, True),),),
+        workspace,
+    )
+    blocked = found.blocked[0]
+    assert blocked[GRID.cell(0.5, 0.5)] == OUT_OF_REACH
+    assert blocked[GRID.cell(1.5, 6.5)] == OCCUPIED
+    assert blocked[GRID.cell(8.5, 1.5)] == OCCUPIED
+    assert blocked[GRID.cell(9.5, 7.5)] == CONSTRAINED
+    assert blocked[GRID.cell(5.5, 5.5)] == FREE
+    assert (np.isnan(found.values) == (found.blocked != FREE)).all()
+
+
+def test_an_object_that_is_not_a_support_is_in_the_way():
+    found = gradient_map(maps(Workspace(GRID), "cup enclosedin mat"), (((0, True),),), (), Workspace(GRID))
+    assert found.blocked[0][GRID.cell(5.5, 5.5)] == OCCUPIED
+
+
+def test_a_blocked_set_is_the_minkowski_sum_of_obstacle_and_object():
+    grid = Grid.over(0, 0, 10, 10, 0.25)
+    workspace = Workspace(grid, obstacles=(sr.Footprint.box(5, 5, 6, 7),))
+    sample = sr.Sample(0, {"cup": sr.Footprint.box(0, 0, 1, 2)})
+    found = gradient_map(maps(workspace, "true", sample=sample), ((),), (), workspace)
+    centres = grid.centres().reshape(*grid.shape, 2)
+    x, y = centres[..., 0], centres[..., 1]
+    inside = (x >= 4.5) & (x <= 6.5) & (y >= 4) & (y <= 8)
+    assert ((found.blocked[0] == OCCUPIED) == inside).all()
+
+
+def test_what_an_object_has_no_part_in_is_the_same_everywhere():
+    found = maps(Workspace(GRID), "jug leftof mat")
+    assert np.unique(found.lower).tolist() == [2.0]
+
+
+def test_an_object_that_is_not_seen_makes_no_cell_good_and_every_cell_doubtful():
+    workspace = Workspace(GRID)
+    found = maps(workspace, "cup leftof spoon", "cup below mat")
+    assert gradient_map(found, (((0, True),),), (), workspace).best() == -math.inf
+    assert (gradient_map(found, (((1, True),),), (((0, True),),), workspace).blocked == CONSTRAINED).all()
+
+
+def test_a_margin_keeps_away_from_constraints():
+    workspace = Workspace(GRID)
+    found = maps(workspace, "cup leftof mat", "cup dist jug <= 2")
+    narrow, wide = (
+        gradient_map(found, (((0, True),),), (((1, True),),), workspace, margin).blocked == CONSTRAINED
+        for margin in (0.0, 1.5)
+    )
+    assert narrow.sum() < wide.sum()
+    assert (wide | ~narrow).all()
+
+
+def test_there_is_a_map_for_each_orientation():
+    fork = sr.TrackedObject(sr.Footprint.box(0, 0, 4, 0.5), yaw=0.0)
+    knife = sr.TrackedObject(sr.Footprint.box(6, 6, 6.5, 9), yaw=math.pi / 2)
+    sample = sr.Sample(0, {"cup": fork, "knife": knife})
+    workspace = Workspace(GRID, yaws=(0.0, math.pi / 2))
+    found = maps(workspace, "cup oriented[0.1] knife", "cup below knife", sample=sample)
+    assert found.lower.shape == (2, 2, 10, 10)
+    assert (found.lower[0, 0] < 0).all()
+    assert np.allclose(found.lower[0, 1], 0.1)
+
+
+def test_propositions_over_earlier_samples_have_no_map():
+    with pytest.raises(UsageError, match="looks at earlier samples"):
+        maps(Workspace(GRID), "cup moved[1] cup[-1]")
+
+
+def test_an_object_that_is_not_there_cannot_be_moved():
+    with pytest.raises(UsageError, match=r"spoon.*the sample has: cup, mat, jug"):
+        proposition_maps([], {}, SAMPLE, "spoon", Workspace(GRID))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ((0, 0, 0, 1, 0.1), "empty"),
+        ((0, 0, 1, 1, 0.0), "cell_size"),
+        ((0, 0, 1e9, 1e9, 0.1), "cells"),
+        ((0, 0, math.inf, 1, 0.1), "finite"),
+    ],
+)
+def test_grids_that_cannot_be_are_refused(numbers, message):
+    with pytest.raises(UsageError, match=message):
+        Grid.over(*numbers)
