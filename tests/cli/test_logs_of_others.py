@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.writer import Writer
 
 from spatial_replay.cli.application import run
 from spatial_replay.logs.source import read_trace
@@ -159,3 +160,29 @@ def test_what_is_out_of_date_is_unknown_and_told_but_no_damage(
     said = capsys.readouterr()
     assert remark in said.err
     assert "1,344 unknown" in said.out
+
+
+def test_a_clock_that_jumps_back(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with (folder / "jump.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("any.Pose", "jsonschema", b'{"type": "object"}')
+        channel = writer.register_channel("/pose", "json", schema)
+        # stamps begin anew with a simulation that is started again, recording goes on
+        for number, seconds in enumerate([*range(10), *range(5)]):
+            data = json.dumps({"stamp": seconds * 10**9, "x": float(number), "y": 0.0}).encode()
+            writer.add_message(channel, number * 10**9, data, number * 10**9)
+        writer.finish()
+    (folder / "turtles.yaml").write_text(
+        "clock: header\ntopics:\n  /pose: {name: robot, stamp: stamp, shape: {disc: 0.5}}\n"
+    )
+    (folder / "turtles.spatial").write_text(
+        "region start = box(-1, -1, 1, 1)\nspec leaves = F (robot farfrom[8] start)\n"
+    )
+    arguments = ["replay", "jump.mcap", "--spec", "turtles.spatial", "--mapping", "turtles.yaml"]
+    assert run(arguments) == 3
+    assert "--on-time-jump" in capsys.readouterr().err
+    assert run([*arguments, "--on-time-jump", "split", "--json", "-"]) == 1
+    said = capsys.readouterr()
+    assert json.loads(said.out)["log"]["samples"] == 10
+    assert "the log is taken to end there" in said.err
