@@ -6,6 +6,7 @@ import re
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import TypeAlias
 
@@ -19,7 +20,7 @@ from spatial_replay.logs.foreign.bag_metadata import (
 from spatial_replay.logs.foreign.decoders import decoder_of
 from spatial_replay.logs.foreign.mcap_log import McapLog
 from spatial_replay.logs.foreign.messages import Decoder, Message, Topic
-from spatial_replay.logs.foreign.ordering import CountedTopics, Run, merged
+from spatial_replay.logs.foreign.ordering import Batches, CountedTopics, Run, merged
 from spatial_replay.logs.foreign.sqlite_bag import SqliteBag
 from spatial_replay.logs.foreign.sqlite_tables import SQLITE_MAGIC
 from spatial_replay.logs.foreign.topic_table import topics_named
@@ -130,19 +131,25 @@ class BagFolder:
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
         """See `MessageReader.iter_messages`."""
+        return chain.from_iterable(self.iter_batches(topics, start_ns, end_ns))
+
+    def iter_batches(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Batches:
+        """See `MessageReader.iter_batches`."""
         runs = [
-            Run(file.start_ns or 0, lambda file=file: file.iter_messages(topics, start_ns, end_ns))  # type: ignore[misc]
+            Run(file.start_ns or 0, lambda file=file: file.iter_batches(topics, start_ns, end_ns))  # type: ignore[misc]
             for file in self._files
         ]
-        messages = runs[0].read() if len(runs) == 1 else merged(runs)
+        batches = runs[0].read() if len(runs) == 1 else merged(runs)
         if self._metadata and self._metadata.compression == "message":
-            messages = self._unpacked_messages(messages)
+            batches = (self._unpacked_batch(batch) for batch in batches)
         if start_ns or end_ns is not None or self._metadata is None:
-            yield from messages
+            yield from batches
             return
         self._compare_types(topics)
         counted = CountedTopics({each.name: each.count for each in self._topics if each.name in topics})
-        yield from counted.counted(messages)
+        yield from counted.counted(batches)
         counted.compare(f"{self.name}/{METADATA_FILE}", self._faults)
 
     def _told(self) -> Iterable[_File]:
@@ -185,12 +192,14 @@ class BagFolder:
                     f" they are of {topic.type!r}"
                 )
 
-    def _unpacked_messages(self, messages: Iterable[Message]) -> Iterator[Message]:
+    def _unpacked_batch(self, messages: Iterable[Message]) -> list[Message]:
+        found = []
         for message in messages:
             try:
-                yield message._replace(payload=unpacked(message.payload))
+                found.append(message._replace(payload=unpacked(message.payload)))
             except LogError as error:
                 self._faults.add(f"{self.name}: on {message.topic!r} at {message.log_time_ns} ns: {error}")
+        return found
 
 
 def _rank(name: str) -> tuple[str | int, ...]:

@@ -1,20 +1,38 @@
-"""Messages in the order of time, out of stretches that overlap."""
+"""Messages in the order of time, out of stretches that overlap; handed on in lists, not one by one."""
 
 from __future__ import annotations
 
 import heapq
+from bisect import bisect_left, bisect_right
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
+from typing import TypeAlias
 
 from spatial_replay.logs.faults import FaultList
 from spatial_replay.logs.foreign.messages import Message
 
+Batches: TypeAlias = Iterator[list[Message]]
+
 _LOG_ORDER = itemgetter(1, 0, 3)
 _LOG_TIME = itemgetter(1)
+_TOPIC = itemgetter(0)
 
 
-def in_order(starts_ns: Sequence[int], stretches: Iterable[list[Message]]) -> Iterator[Message]:
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Messages of a part of a log.
+
+    Attributes:
+        is_ordered: whether the log time of each is later than that of the one before.
+    """
+
+    messages: list[Message]
+    is_ordered: bool = False
+
+
+def in_order(starts_ns: Sequence[int], stretches: Iterable[Stretch]) -> Batches:
     """The messages of several stretches by log time, topic and sequence.
 
     No more is held than stretches overlap.
@@ -24,23 +42,18 @@ def in_order(starts_ns: Sequence[int], stretches: Iterable[list[Message]]) -> It
     """
     waiting: list[Message] = []
     for number, stretch in enumerate(stretches, 1):
-        waiting += stretch
-        waiting.sort(key=_LOG_ORDER)
-        if number == len(starts_ns) or not waiting or waiting[-1].log_time_ns < starts_ns[number]:
-            yield from waiting
-            waiting = []
-        else:
-            ready = _count_before(waiting, starts_ns[number])
-            yield from waiting[:ready]
-            del waiting[:ready]
-    yield from waiting
-
-
-def _count_before(messages: Sequence[Message], time_ns: int) -> int:
-    count = len(messages)
-    while count and messages[count - 1].log_time_ns >= time_ns:
-        count -= 1
-    return count
+        needs_order = bool(waiting) or not stretch.is_ordered
+        waiting = waiting + stretch.messages if waiting else stretch.messages
+        if needs_order:
+            waiting.sort(key=_LOG_ORDER)
+        if number == len(starts_ns):
+            break
+        ready = bisect_left(waiting, starts_ns[number], key=_LOG_TIME)
+        if ready:
+            yield waiting[:ready]
+            waiting = waiting[ready:]
+    if waiting:
+        yield waiting
 
 
 @dataclass(frozen=True)
@@ -48,37 +61,36 @@ class Run:
     """Messages in order that may be read from a time on."""
 
     start_ns: int
-    read: Callable[[], Iterator[Message]]
+    read: Callable[[], Batches]
 
 
-def merged(runs: Iterable[Run]) -> Iterator[Message]:
+def merged(runs: Iterable[Run]) -> Batches:
     """The messages of several runs by log time; a run is opened when its time has come."""
     waiting = sorted(runs, key=lambda run: run.start_ns, reverse=True)
-    active: list[tuple[int, int, Message, Iterator[Message]]] = []
+    active: list[tuple[int, int, list[Message], Batches]] = []
     opened = 0
     while waiting or active:
         while waiting and (not active or waiting[-1].start_ns <= active[0][0]):
-            messages = waiting.pop().read()
-            _push(active, opened, messages)
+            _push_next(active, opened, waiting.pop().read())
             opened += 1
         if not active:
             continue
-        _, number, message, messages = heapq.heappop(active)
-        yield message
-        limit = min([run.start_ns for run in waiting[-1:]] + [each[0] for each in active[:1]], default=None)
-        for message in messages:
-            if limit is not None and message.log_time_ns >= limit:
-                heapq.heappush(active, (message.log_time_ns, number, message, messages))
-                break
-            yield message
+        _, number, batch, batches = heapq.heappop(active)
+        limits = [run.start_ns for run in waiting[-1:]] + [each[0] for each in active[:1]]
+        # equal times come in the order of the runs
+        ready = bisect_right(batch, min(limits), key=_LOG_TIME) if limits else len(batch)
+        yield batch[:ready]
+        if ready < len(batch):
+            heapq.heappush(active, (batch[ready].log_time_ns, number, batch[ready:], batches))
+        else:
+            _push_next(active, number, batches)
 
 
-def _push(
-    active: list[tuple[int, int, Message, Iterator[Message]]], number: int, messages: Iterator[Message]
-) -> None:
-    first = next(messages, None)
-    if first is not None:
-        heapq.heappush(active, (first.log_time_ns, number, first, messages))
+def _push_next(active: list[tuple[int, int, list[Message], Batches]], number: int, batches: Batches) -> None:
+    for batch in batches:
+        if batch:
+            heapq.heappush(active, (batch[0].log_time_ns, number, batch, batches))
+            return
 
 
 class CountedTopics:
@@ -86,14 +98,13 @@ class CountedTopics:
 
     def __init__(self, declared: Mapping[str, int | None]) -> None:
         self._declared = declared
-        self._read: dict[str, int] = dict.fromkeys(declared, 0)
+        self._read: Counter[str] = Counter()
 
-    def counted(self, messages: Iterable[Message]) -> Iterator[Message]:
+    def counted(self, batches: Batches) -> Batches:
         """The messages as they are."""
-        read = self._read
-        for message in messages:
-            read[message.topic] += 1
-            yield message
+        for batch in batches:
+            self._read.update(map(_TOPIC, batch))
+            yield batch
 
     def compare(self, name: str, faults: FaultList) -> None:
         """Tell the faults where a topic has more or fewer messages than declared."""

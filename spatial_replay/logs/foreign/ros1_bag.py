@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from functools import cached_property
+from itertools import chain, repeat
 from pathlib import Path
 from types import MappingProxyType
 from typing import BinaryIO
@@ -15,8 +16,8 @@ from spatial_replay.logs.block import Schema
 from spatial_replay.logs.faults import FaultList
 from spatial_replay.logs.foreign.decoders import decoder_of
 from spatial_replay.logs.foreign.definitions import full_type_name
-from spatial_replay.logs.foreign.messages import Decoder, Message, Topic
-from spatial_replay.logs.foreign.ordering import CountedTopics, in_order
+from spatial_replay.logs.foreign.messages import Decoder, Message, Topic, messages_from_columns
+from spatial_replay.logs.foreign.ordering import Batches, CountedTopics, Stretch, in_order
 from spatial_replay.logs.foreign.ros1_directory import (
     BagChunk,
     BagDirectory,
@@ -82,6 +83,12 @@ class Ros1Bag:
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
         """See `MessageReader.iter_messages`."""
+        return chain.from_iterable(self.iter_batches(topics, start_ns, end_ns))
+
+    def iter_batches(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Batches:
+        """See `MessageReader.iter_batches`."""
         first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else end_ns
         wanted = {c.number: c for c in self._directory.connections.values() if c.topic in topics}
         chunks = [
@@ -94,24 +101,24 @@ class Ros1Bag:
         chunks.sort(key=lambda chunk: (chunk.start_ns, chunk.offset))
         with self._path.open("rb") as stream:
             stretches = (self._messages(stream, chunk, wanted, first, last) for chunk in chunks)
-            messages = in_order([chunk.start_ns for chunk in chunks], stretches)
+            batches = in_order([chunk.start_ns for chunk in chunks], stretches)
             if (first, last) != (0, LATEST_NS + 1) or not self._directory.is_indexed:
-                yield from messages
+                yield from batches
                 return
             counted = CountedTopics({each.name: each.count for each in self._topics if each.name in topics})
-            yield from counted.counted(messages)
+            yield from counted.counted(batches)
             counted.compare(self.name, self._faults)
 
     def _messages(
         self, stream: BinaryIO, chunk: BagChunk, wanted: dict[int, Connection], first: int, last: int
-    ) -> list[Message]:
+    ) -> Stretch:
         """The messages of a chunk; what is lost of them goes to the faults."""
         span = f"messages between {chunk.start_ns} and {chunk.end_ns} ns"
         try:
             content = read_chunk(stream, chunk.offset)
         except DamageError as damage:
             self._fault(chunk, f"{damage}; the {span} are lost")
-            return []
+            return Stretch([])
         table, breaks_off = record_table(content)
         if breaks_off:
             self._fault(chunk, f"a record breaks off; some of the {span} are lost")
@@ -126,14 +133,18 @@ class Ros1Bag:
             self._fault(chunk, f"the {span} have other times than the index says")
         rows = is_message & np.isin(table.connection, list(wanted))
         rows &= (table.time_ns >= first) & (table.time_ns < last)
-        topics = [wanted[number].topic for number in table.connection[rows].tolist()]
-        times: Sequence[int] = table.time_ns[rows].tolist()
+        times_ns = table.time_ns[rows]
+        times: list[int] = times_ns.tolist()
         bounds = zip(table.begin[rows].tolist(), table.end[rows].tolist(), strict=True)
-        payloads = [content[begin:end] for begin, end in bounds]
-        return [
-            Message(topic, time_ns, time_ns, 0, payload)
-            for topic, time_ns, payload in zip(topics, times, payloads, strict=True)
-        ]
+        names = {number: connection.topic for number, connection in wanted.items()}
+        messages = messages_from_columns(
+            map(names.__getitem__, table.connection[rows].tolist()),
+            times,
+            times,
+            repeat(0),
+            [content[begin:end] for begin, end in bounds],
+        )
+        return Stretch(messages, bool((times_ns[1:] > times_ns[:-1]).all()))
 
     def _topic(self, connection: Connection) -> Topic:
         definition = connection.data.get("message_definition", b"")

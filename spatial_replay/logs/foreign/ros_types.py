@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 RosEncoding = Literal["ros1", "cdr"]
 
 _DISTRIBUTIONS = ("jazzy", "kilted", "lyrical", "iron", "humble", "galactic", "foxy", "eloquent", "dashing")
+_LITTLE_ENDIAN = b"\x00\x01"
+_MOST_PADDING = 3
 _KINDS: dict[int, Kind] = {3: "array", 4: "sequence"}
 
 
@@ -85,14 +87,41 @@ def _decoder(type_name: str, encoding: RosEncoding, definitions: Definitions) ->
     # what rosbags cannot make code of ends in errors of many types, none of which it declares
     except Exception as error:
         raise LogError(f"the definition of {type_name!r} cannot be used: {_reason(error)}") from None
-    deserialize = store.deserialize_cdr if encoding == "cdr" else store.deserialize_ros1
+    return _cdr_decoder(store, type_name) if encoding == "cdr" else _ros1_decoder(store, type_name)
+
+
+def _ros1_decoder(store: Typestore, type_name: str) -> Decoder:
+    definition = store.get_msgdef(type_name)
+    deserialize, message_class = definition.deserialize_ros1, definition.cls
 
     def decode(payload: bytes) -> object:
         try:
-            return deserialize(payload, type_name)
-        # bytes that do not fit end in as many
+            message, end = deserialize(payload, 0, message_class, store)
+        # bytes that do not fit end in errors of many types
         except Exception as error:
             raise LogError(f"a message is no {type_name}: {_reason(error)}") from None
+        if end != len(payload):
+            raise LogError(f"a message is no {type_name}: it has {len(payload)} bytes; {end} were expected")
+        return message
+
+    return decode
+
+
+def _cdr_decoder(store: Typestore, type_name: str) -> Decoder:
+    definition = store.get_msgdef(type_name)
+    little, big, message_class = definition.deserialize_cdr_le, definition.deserialize_cdr_be, definition.cls
+
+    def decode(payload: bytes) -> object:
+        deserialize = little if payload[:2] == _LITTLE_ENDIAN else big
+        try:
+            # alignment counts from behind the four bytes that say how the rest is encoded
+            message, end = deserialize(payload[4:], 0, message_class, store)
+        except Exception as error:
+            raise LogError(f"a message is no {type_name}: {_reason(error)}") from None
+        if not 0 <= len(payload) - 4 - end <= _MOST_PADDING or payload[0] or payload[1] > 1:
+            expected = f"it has {len(payload)} bytes, {end + 4} were expected"
+            raise LogError(f"a message is no {type_name} in plain CDR: {expected}")
+        return message
 
     return decode
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 
 from spatial_replay.errors import LogError, UsageError
@@ -14,6 +14,7 @@ from spatial_replay.logs.faults import FaultList
 from spatial_replay.logs.foreign.channels import CopiedMessages
 from spatial_replay.logs.foreign.messages import Message, MessageReader, Topic
 from spatial_replay.logs.foreign.opening import open_messages
+from spatial_replay.logs.foreign.ordering import Batches
 from spatial_replay.logs.mapping.assembler import Assembler
 from spatial_replay.logs.mapping.model import Mapping as TopicsMapping
 from spatial_replay.logs.mapping.plan import Plan
@@ -23,7 +24,6 @@ from spatial_replay.trace.trace import Trace
 
 _FIRST_BATCH, _LARGEST_BATCH = 256, 8_192
 """Messages handed over at once: few at first, for those who want the first sample only."""
-_BATCH_BYTES = 2**24
 _WAITING_BYTES = 2**26
 
 
@@ -66,8 +66,7 @@ class ForeignSource:
             concave=self.concave,
         )
         blocks = _Blocks(assembler, reader, CopiedMessages(read, _WAITING_BYTES), start_ns, end_ns)
-        messages = _messages(reader, plan, start_ns, end_ns)
-        for batch in _batches(messages):
+        for batch in _in_steps(_batches(reader, plan, start_ns, end_ns)):
             yield from blocks.of(assembler.add(batch), batch)
             if assembler.is_finished:
                 break
@@ -144,33 +143,25 @@ class _Blocks:
             yield Block(replace(trace, faults=faults), copied, remarks)
 
 
-def _messages(
-    reader: MessageReader, plan: Plan, start_ns: int | None, end_ns: int | None
-) -> Iterator[Message]:
+def _batches(reader: MessageReader, plan: Plan, start_ns: int | None, end_ns: int | None) -> Batches:
     """The messages that samples of a window depend on."""
     if not plan.by_log_time or (not start_ns and end_ns is None):
-        return reader.iter_messages(plan.topics)
+        return reader.iter_batches(plan.topics)
     last = None if end_ns is None else end_ns + plan.margin_ns
     lookback = {topic: plan.lookback_ns(topic) for topic in plan.topics}
     known = [each for each in lookback.values() if each is not None]
     first = max(0, (start_ns or 0) - max(known, default=0))
     lasting = [topic for topic, each in lookback.items() if each is None]
-    before: Iterable[Message] = reader.iter_messages(lasting, None, first) if lasting and first else ()
-    return chain(before, reader.iter_messages(plan.topics, first or None, last))
+    before: Iterable[list[Message]] = reader.iter_batches(lasting, None, first) if lasting and first else ()
+    return chain(before, reader.iter_batches(plan.topics, first or None, last))
 
 
-def _batches(messages: Iterator[Message]) -> Iterator[list[Message]]:
-    """Lists of messages of bounded size."""
+def _in_steps(batches: Batches) -> Batches:
+    """Batches of bounded size, small ones at first."""
     size = _FIRST_BATCH
-    while batch := list(_up_to_bytes(islice(messages, size))):
-        yield batch
-        size = min(2 * size, _LARGEST_BATCH)
-
-
-def _up_to_bytes(messages: Iterable[Message]) -> Iterator[Message]:
-    held = 0
-    for message in messages:
-        yield message
-        held += len(message.payload)
-        if held > _BATCH_BYTES:
-            return
+    for batch in batches:
+        begin = 0
+        while begin < len(batch):
+            yield batch[begin : begin + size]
+            begin += size
+            size = min(2 * size, _LARGEST_BATCH)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cached_property
+from itertools import chain, repeat
 from pathlib import Path
 
 from spatial_replay.errors import LogError
 from spatial_replay.logs.faults import FaultList
 from spatial_replay.logs.foreign.decoders import decoder_of
-from spatial_replay.logs.foreign.messages import Decoder, Message, Topic
-from spatial_replay.logs.foreign.ordering import CountedTopics
+from spatial_replay.logs.foreign.messages import Decoder, Message, Topic, messages_from_columns
+from spatial_replay.logs.foreign.ordering import Batches, CountedTopics
 from spatial_replay.logs.foreign.sqlite_tables import (
     BagTables,
+    Row,
     extent_of,
     iter_rows,
     opened,
@@ -99,28 +101,36 @@ class SqliteBag:
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
         """See `MessageReader.iter_messages`."""
+        return chain.from_iterable(self.iter_batches(topics, start_ns, end_ns))
+
+    def iter_batches(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Batches:
+        """See `MessageReader.iter_batches`."""
         first, last = start_ns or 0, LATEST_NS if end_ns is None else min(end_ns - 1, LATEST_NS)
         counts = {each.name: each.count for each in self._topics if each.name in topics}
-        messages = self._messages(counts, first, last)
+        batches = self._messages(counts, first, last)
         if (first, last) != (0, LATEST_NS):
-            yield from messages
+            yield from batches
             return
         counted = CountedTopics(counts)
-        yield from counted.counted(messages)
+        yield from counted.counted(batches)
         counted.compare(self.name, self._faults)
 
-    def _messages(self, topics: Collection[str], first: int, last: int) -> Iterator[Message]:
+    def _messages(self, topics: Collection[str], first: int, last: int) -> Batches:
         wanted = {number: topic.name for number, topic in self._tables.topics.items() if topic.name in topics}
         most = self._path.stat().st_size // _ROW_BYTES
         with opened(self._whole) as database:
-            rows = iter_rows(database, sorted(wanted), first, last, self._faults, self.name)
-            for _, number, time_ns, payload in rows:
-                most -= 1
+            for rows in iter_rows(database, sorted(wanted), first, last, self._faults, self.name):
+                most -= len(rows)
                 if most < 0:
                     raise LogError(f"{self.name} is damaged: it lists more messages than it has room for")
-                if type(payload) is bytes and type(time_ns) is int:
-                    yield Message(wanted[number], time_ns, time_ns, 0, payload)
-                else:
-                    self._faults.add(
-                        f"{self.name}: a message on {wanted[number]!r} has no time or no content"
-                    )
+                yield self._batch(rows, wanted)
+
+    def _batch(self, rows: Sequence[Row], wanted: Mapping[int, str]) -> list[Message]:
+        _, numbers, times, payloads = zip(*rows, strict=True)
+        if set(map(type, payloads)) != {bytes} or set(map(type, times)) != {int}:
+            good = [row for row in rows if type(row[3]) is bytes and type(row[2]) is int]
+            self._faults.add(f"{self.name}: {len(rows) - len(good)} messages have no time or no content")
+            return self._batch(good, wanted) if good else []
+        return messages_from_columns(map(wanted.__getitem__, numbers), times, times, repeat(0), payloads)

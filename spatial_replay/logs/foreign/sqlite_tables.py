@@ -28,6 +28,8 @@ _STEPS_A_BYTE = 20
 _SKIPS = 64
 """Damaged stretches are stepped over with twice the step each time: after so many no row can be left."""
 
+_MOST_ROWS, _BATCH_BYTES = 4_096, 2**21
+
 _COLUMNS = "SELECT id, topic_id, timestamp, data FROM messages"
 
 Row = tuple[int, int, Any, Any]
@@ -136,7 +138,7 @@ def iter_rows(
     last_ns: int,
     faults: FaultList,
     name: str,
-) -> Iterator[Row]:
+) -> Iterator[list[Row]]:
     """The messages of some topics with times from `first_ns` to `last_ns`, in order.
 
     Where the file is damaged, what can be reached of the rest follows in the order in which it was written.
@@ -145,9 +147,10 @@ def iter_rows(
     inside = f"{_COLUMNS} WHERE topic_id IN ({marks}) AND timestamp BETWEEN ? AND ?"
     time_ns, row_id = first_ns, -1
     try:
-        for row in database.execute(f"{inside} ORDER BY timestamp, id", (*topics, first_ns, last_ns)):
-            yield row
-            row_id, _, time_ns, _ = row
+        cursor = database.execute(f"{inside} ORDER BY timestamp, id", (*topics, first_ns, last_ns))
+        for rows in _fetched(cursor):
+            yield rows
+            row_id, _, time_ns, _ = rows[-1]
         return
     except sqlite3.Error as error:
         faults.add(f"{name}: after {time_ns} ns: the database is damaged ({error})")
@@ -157,13 +160,22 @@ def iter_rows(
     for _ in range(_SKIPS):
         try:
             for row in database.execute(rest, (*arguments, reached + step)):
-                yield row
+                yield [row]
                 reached, step = row[0], 0
             return
         except sqlite3.Error:
             step = step * 2 or 1
         except OverflowError:
             return
+
+
+def _fetched(cursor: sqlite3.Cursor) -> Iterator[list[Row]]:
+    """The rows of a query in lists of some megabytes; an error loses those that were not handed over yet."""
+    size = 64
+    while rows := cursor.fetchmany(size):
+        yield rows
+        held = sum(len(row[3]) for row in rows if isinstance(row[3], bytes))
+        size = min(2 * size, _MOST_ROWS) if held < _BATCH_BYTES else max(1, size // 2)
 
 
 def _records(database: sqlite3.Connection, table: str) -> list[dict[str, object]]:
