@@ -77,3 +77,18 @@ def test_nothing_is_kept_per_sample():
     after, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert after - before < 50_000  # 20 bytes a sample
+
+
+def test_nodes_are_read_one_by_one_or_as_numbers():
+    monitor = Monitor(
+        parse_specification("spec low = G p >= 0\nspec high = F q >= 3\nspec odd = low xor high")
+    )
+    spec = monitor.update(at(0, p=2, q=1)).specs[0]
+    assert [(node.id, node.name) for node in spec.nodes[:2]] == [(0, "odd"), (1, "low")]
+    assert [list(node[2:]) for node in spec.nodes] == spec.numbers.tolist()
+    assert spec.nodes[1].verdict == "pending"
+    assert spec.node(1) == spec.nodes[1]
+    with pytest.raises(ValueError, match="read-only"):
+        spec.numbers[0, 0] = 1
+    with pytest.raises(UsageError, match="3 is no sample"):
+        monitor.update(3)
