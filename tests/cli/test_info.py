@@ -80,6 +80,8 @@ def test_a_log_of_something_else_is_listed(layer: Path, capsys: pytest.CaptureFi
     document = json.loads(said.out)
     assert (document["samples"], document["objects"], said.err) == (0, [], "")
     assert "/spatial/robustness" in {each["topic"] for each in document["topics"]}
+    # what was drawn of a run is no record of it
+    assert {each["mapping"] for each in document["topics"]} == {None}
     assert "replayed/blocks.spatial" in {each["name"] for each in document["attachments"]}
     assert "spatial_replay_certificate" in {each["name"] for each in document["metadata"]}
 

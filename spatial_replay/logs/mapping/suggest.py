@@ -13,6 +13,7 @@ from spatial_replay.logs.foreign.messages import Topic
 from spatial_replay.logs.mapping.guess import Guess, frame_of, guess_from, numbers_in
 from spatial_replay.logs.mapping.readings import BUILT_IN, TRANSFORM_TYPES, short_type
 from spatial_replay.logs.mapping.templates import name_from_topic
+from spatial_replay.logs.topics import DERIVED
 from spatial_replay.trace.times import FOREVER
 
 EXAMPLES = 20
@@ -90,6 +91,8 @@ def suggest_mapping(
 
 
 def _candidate(topic: Topic, examples: Sequence[object]) -> Candidate:
+    if topic.name in DERIVED or topic.name.rstrip("/").split("/")[-1] in _MIDDLEWARE:
+        return Candidate(topic)
     kind = short_type(topic.type)
     frame = next((name for each in examples if (name := frame_of(each)) is not None), None)
     if topic.unreadable is not None:
@@ -101,8 +104,6 @@ def _candidate(topic: Topic, examples: Sequence[object]) -> Candidate:
         has_outline = bool(reading.polygon or reading.sizes or reading.solids)
         entry = "{}" if has_outline else f"{{shape: {{disc: {_RADIUS}}}}}"
         return Candidate(topic, entry, () if has_outline else _SIZELESS, frame=frame)
-    if topic.name.rstrip("/").split("/")[-1] in _MIDDLEWARE:
-        return Candidate(topic)
     guesses = [guess for each in examples if (guess := guess_from(each)) is not None]
     if not guesses:
         return Candidate(topic, numbers=numbers_in(examples[0]) if examples else ())
