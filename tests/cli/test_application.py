@@ -113,7 +113,7 @@ def test_a_shell_completes_commands_and_options(tmp_path: Path) -> None:
     assert "complete -o nosort -F _spatial_replay_completion spatial-replay" in script.stdout
     for words, expected in (
         ("spatial-replay ch", "plain,check"),
-        ("spatial-replay check --l", "plain,--log"),
+        ("spatial-replay check --pro", "plain,--profile"),
     ):
         completed = run_program(
             cwd=tmp_path,
