@@ -35,10 +35,11 @@ REPLAY = ("replay", "run.jsonl", "--spec", "blocks.spatial")
 def test_verdicts_go_to_standard_output_in_words(folder: Path) -> None:
     done = run_program(*REPLAY, "-o", "out.mcap", cwd=folder)
     assert (done.returncode, done.stderr) == (4, "")
-    head, reach, apart, wrote = done.stdout.splitlines()
+    head, reach, apart, reason, wrote = done.stdout.splitlines()
     assert head == "run.jsonl: 12 samples over 2.750 s"
     assert reach.split()[:2] == ["reach", "satisfied"]
     assert apart.split()[:2] == ["apart", "unknown"]
+    assert "cup 物" in reason
     assert wrote == "wrote out.mcap"
 
 
