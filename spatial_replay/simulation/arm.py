@@ -122,6 +122,11 @@ class Arm:
         for _ in range(round(seconds * TICKS_PER_S)):
             yield
 
+    def rest(self) -> Motion:
+        """Hold still for ever."""
+        while True:
+            yield from self.wait(1.0)
+
     @property
     def commanded(self) -> tuple[float, float, float]:
         """Where the tool's point is commanded to be."""

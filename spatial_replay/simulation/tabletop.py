@@ -50,7 +50,6 @@ class Tabletop:
         seed: int = 0,
         noise_m: float = 0.0,
         injections: Sequence[Injection] = (),
-        listen: Callable[[Sample], None] = lambda sample: None,
         gui: bool = False,
     ) -> None:
         """Make the world at time 0.
@@ -59,7 +58,6 @@ class Tabletop:
             seed: of where bodies lie and of noise.
             noise_m: detection is off by up to this much, in metres, and the samples' uncertainty says so.
             injections: what goes wrong, and when.
-            listen: told each sample when its time has come, the first one when time begins to advance.
             gui: show a window, and run no faster than real time.
         """
         if noise_m < 0 or not math.isfinite(noise_m):
@@ -72,7 +70,7 @@ class Tabletop:
         self._scenario = scenario
         self._noise_m = noise_m
         self._injections = tuple(injections)
-        self._listen = listen
+        self._listen: Callable[[Sample], None] = _ignore
         self._gui = gui
         self._engine: Engine | None = None
         self.reset(seed)
@@ -106,6 +104,10 @@ class Tabletop:
     def scene(self) -> Scene:
         """The robot and what lies around it."""
         return self._scene
+
+    def attach(self, listen: Callable[[Sample], None]) -> None:
+        """See `World`."""
+        self._listen = listen
 
     def reset(self, seed: int) -> None:
         """See `World`."""
@@ -165,7 +167,7 @@ class Tabletop:
         return self._scenario.script(self._scene)
 
     def run(self, motion: Generator[None, None, _Result]) -> _Result:
-        """Move the robot to a motion's end.
+        """Move the robot to a motion's end, and return what the motion does.
 
         Raises:
             UsageError: the world is closed.
@@ -177,6 +179,28 @@ class Tabletop:
                 result: _Result = end.value
                 return result
             self.tick()
+
+    def follow(self, motion: Generator[None, None, _Result], duration_ns: int | None) -> _Result | None:
+        """Move the robot for a time, and let it hold still when the motion ends before; None if it does not.
+
+        Without a duration it takes as long as the motion.
+        """
+        if duration_ns is None:
+            return self.run(motion)
+        end_ns = self.time_ns + duration_ns
+        result: _Result | None = None
+        while self.time_ns < end_ns:
+            try:
+                next(motion)
+            except StopIteration as end:
+                result = end.value
+                break
+            self.tick()
+        for _ in self._scene.arm.rest():
+            if self.time_ns >= end_ns:
+                break
+            self.tick()
+        return result
 
     def tick(self) -> None:
         """Advance by the time that one command of the arm holds."""
@@ -231,3 +255,7 @@ class Tabletop:
         movable = [body.name for body in self.bodies if body.movable]
         if name not in movable:
             raise UsageError(f"{name!r} cannot be moved in {self.name}; {', '.join(movable)} can")
+
+
+def _ignore(sample: Sample) -> None:
+    """Nobody listens."""

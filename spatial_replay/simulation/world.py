@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -70,7 +70,7 @@ class World(Protocol):
 
     The robot's base stands at (0, 0) and looks along x; the table's surface is z = 0. Everything that
     advances time (`step`, `push`, `place`) hands each sample, when its time has come, to the listener that
-    the world was made with.
+    is attached; the first one, of time 0, when time begins to advance.
     """
 
     @property
@@ -92,6 +92,9 @@ class World(Protocol):
     @property
     def time_ns(self) -> int:
         """The simulated time, 0 at the beginning."""
+
+    def attach(self, listen: Callable[[Sample], None]) -> None:
+        """Hand samples to `listen` from now on."""
 
     def reset(self, seed: int) -> None:
         """Begin anew at time 0; equal seeds give equal worlds."""

@@ -25,17 +25,18 @@ def _script(scene: Scene) -> Generator[None, None, Execution]:
     if not first.succeeded:
         return first
     _, green_y = scene.place_of("green")
-    return (yield from pushing(scene, "green", [(blue_x + 0.07, green_y)]))
+    return (yield from pushing(scene, "green", [(blue_x + 0.05, green_y)]))
 
 
-PUSH = Scenario(
+SCENARIO = Scenario(
     name="push",
     placements=(
-        _block("green", 0.38, -0.01, 0.0, (0.2, 0.65, 0.3)),
-        _block("red", 0.46, -0.08, 0.4, (0.85, 0.2, 0.2)),
-        _block("blue", 0.56, 0.1, 0.8, (0.2, 0.35, 0.85)),
+        _block("green", 0.35, -0.01, 0.0, (0.2, 0.65, 0.3)),
+        _block("red", 0.47, -0.09, 0.4, (0.85, 0.2, 0.2)),
+        _block("blue", 0.585, 0.1, 0.8, (0.2, 0.35, 0.85)),
     ),
     workspace=Workspace(0.29, -0.2, 0.69, 0.2, nearest=0.3, farthest=0.71),
     skill="push",
     script=_script,
+    scatter_m=0.008,
 )

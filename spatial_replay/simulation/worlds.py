@@ -1,0 +1,54 @@
+"""The worlds by name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib import import_module, resources
+
+from spatial_replay.errors import UsageError
+from spatial_replay.simulation.injection import Injection
+from spatial_replay.simulation.scenario import Scenario
+from spatial_replay.simulation.tabletop import Tabletop
+from spatial_replay.spec import parse_specification
+from spatial_replay.spec.formula import Specification
+
+SCENARIOS: tuple[str, ...] = ("push",)
+"""Each has a module of that name in `scenarios`, and a specification beside it."""
+
+
+def make_world(
+    name: str,
+    *,
+    seed: int = 0,
+    noise_m: float = 0.0,
+    injections: Sequence[Injection] = (),
+    gui: bool = False,
+) -> Tabletop:
+    """A scenario's world at time 0; for the arguments see `Tabletop`.
+
+    Raises:
+        UsageError: there is no such scenario, and what `Tabletop` raises.
+    """
+    scenario = _scenario(name)
+    return Tabletop(scenario, seed=seed, noise_m=noise_m, injections=injections, gui=gui)
+
+
+def default_specification(name: str) -> Specification:
+    """What a scenario's robot should do, if nobody says otherwise.
+
+    Raises:
+        UsageError: there is no such scenario.
+    """
+    filename = f"{_scenario(name).name}.spatial"
+    file = resources.files("spatial_replay.simulation.scenarios") / filename
+    return parse_specification(file.read_text(encoding="utf-8"), filename=filename)
+
+
+def _scenario(name: str) -> Scenario:
+    if name not in SCENARIOS:
+        raise UsageError(f"there is no scenario {name!r}; there are {', '.join(SCENARIOS)}")
+    module = import_module(f"spatial_replay.simulation.scenarios.{name.replace('-', '_')}")
+    scenario = module.SCENARIO
+    if not isinstance(scenario, Scenario):
+        raise TypeError(f"{module.__name__}.SCENARIO is no scenario but {scenario!r}")
+    return scenario
