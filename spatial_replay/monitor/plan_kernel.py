@@ -144,14 +144,14 @@ def _starts(before: int, first: Integers, second: Integers) -> Integers:
 
 
 @piece
-def _spread(plan: PlanArrays, members: Integers, operand: int, places: Floats, here: int) -> float:
-    """An operand's uncertainty: the largest of its members'."""
-    largest = 0.0
-    if operand >= 0:
-        for k in range(plan.operand_start[operand], plan.operand_start[operand + 1]):
+def _spreads(starts: Integers, members: Integers, places: Floats, here: int) -> Floats:
+    """Each operand's uncertainty, the largest of its members'; last that of no operand, 0."""
+    spreads = np.zeros(len(starts))
+    for operand in range(len(starts) - 1):
+        for k in range(starts[operand], starts[operand + 1]):
             if members[k] >= here:
-                largest = max(largest, places[members[k] - here, 3])
-    return largest
+                spreads[operand] = max(spreads[operand], places[members[k] - here, 3])
+    return spreads
 
 
 @piece
@@ -192,11 +192,11 @@ def _measure(
         plan.second,
         measured,
     )
+    of_operands = _spreads(plan.operand_start, members, places, here)
     for g in range(len(plan.geometric)):
         k = plan.geometric[g]
         values[k, 0] = measured[g, 0]
-        first = _spread(plan, members, plan.first[g], places, here)
-        spreads[k, 0] = first + _spread(plan, members, plan.second[g], places, here)
+        spreads[k, 0] = of_operands[plan.first[g]] + of_operands[plan.second[g]]  # the last for -1
     for y in range(len(plan.yaws)):
         k, a, b = plan.yaws[y]
         yaws = _yaw(a, classes, places, here), _yaw(b, classes, places, here)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spatial_replay.compiled import piece
+from spatial_replay.compiled import inlined, piece
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.codes import (
     ANCHORED_RELEASE,
@@ -143,7 +143,7 @@ def _close_windows(nodes: Integers, part: Integers, table: Floats, position: int
                 table[corner] = table[corner | bit] if nodes[d, NODE_WEAK] else table[corner & ~bit]
 
 
-@piece
+@inlined
 def _step_channel(
     nodes: Integers, part: Integers, table: Floats, channel: int, mirror: int, memory: Memory,
     scratch: Scratch, position: int, start_ns: int, begin: int, count: int,
