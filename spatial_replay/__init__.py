@@ -12,6 +12,7 @@ from spatial_replay.errors import (
     GeometryError,
     LogError,
     MissingFileError,
+    NoAutomatonError,
     OutputError,
     SpatialReplayError,
     SpecificationError,
@@ -20,6 +21,8 @@ from spatial_replay.errors import (
 )
 
 if TYPE_CHECKING:
+    from spatial_replay.automata.automaton import Automaton
+    from spatial_replay.automata.compiling import automaton
     from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
     from spatial_replay.logs.source import read_trace
     from spatial_replay.monitor.evaluation import Evaluation, evaluate
@@ -34,6 +37,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "Automaton",
     "ConvexPart",
     "Evaluation",
     "Footprint",
@@ -41,6 +45,7 @@ __all__ = [
     "LogError",
     "MissingFileError",
     "Monitor",
+    "NoAutomatonError",
     "OutputError",
     "Recorder",
     "Sample",
@@ -53,6 +58,7 @@ __all__ = [
     "UsageError",
     "Verdict",
     "__version__",
+    "automaton",
     "evaluate",
     "load_specification",
     "parse_specification",
@@ -60,6 +66,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "Automaton": "spatial_replay.automata.automaton",
     "ConvexPart": "spatial_replay.geometry.footprint",
     "Evaluation": "spatial_replay.monitor.evaluation",
     "Footprint": "spatial_replay.geometry.footprint",
@@ -70,6 +77,7 @@ _HOMES = {
     "Trace": "spatial_replay.trace.trace",
     "TrackedObject": "spatial_replay.geometry.footprint",
     "Verdict": "spatial_replay.monitor.verdict",
+    "automaton": "spatial_replay.automata.compiling",
     "evaluate": "spatial_replay.monitor.evaluation",
     "load_specification": "spatial_replay.spec.specification",
     "parse_specification": "spatial_replay.spec.specification",

@@ -2,7 +2,8 @@
 
     SpatialReplayError
     ├── UsageError              a call or an option that cannot work
-    │   └── MissingFileError    a named file is not there
+    │   ├── MissingFileError    a named file is not there
+    │   └── NoAutomatonError    a formula that has no automaton, or too large a one
     ├── SpecificationError      a specification with faults, all of them listed
     ├── GeometryError           coordinates that make no footprint
     ├── TraceError              samples that make no trace
@@ -38,6 +39,10 @@ class MissingFileError(UsageError):
         else:
             reason = (getattr(error, "strerror", None) or str(error) or "cannot be read").lower()
         return cls(f"{fspath(path)}: {reason}; check the path")
+
+
+class NoAutomatonError(UsageError):
+    """A formula that has no automaton, or one that is too large."""
 
 
 class Diagnosis(Protocol):

@@ -1,0 +1,163 @@
+"""Automata for people and for other tools: as text, for Graphviz, in the Hanoi format, drawn."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+
+from spatial_replay.automata.automaton import Automaton, Transition
+from spatial_replay.errors import OutputError, UsageError
+
+_DRAWING_S = 120.0
+"""How long Graphviz may take."""
+_WIDTH = 60
+"""Characters after which a label of a drawing goes on in a new line."""
+
+
+def words_text(automaton: Automaton) -> str:
+    """States, what they mean, and their moves in words."""
+    states, propositions = len(automaton.states), len(automaton.propositions)
+    lines = [
+        f"automaton of {automaton.name}: {_count(states, 'state')}, {_count(propositions, 'proposition')}"
+    ]
+    lines += [f"  {each.name} means {each.text}" for each in automaton.propositions if each.name is not None]
+    for state in automaton.states:
+        lines.append(f"  state {state}: {state_words(automaton, state)}")
+        for each in automaton.transitions:
+            if each.source == state:
+                to = "stays" if each.target == state else f"to {each.target}"
+                lines.append(f"    {to} if {automaton.guard_words(each)}")
+    return "\n".join(lines)
+
+
+def state_words(automaton: Automaton, state: int) -> str:
+    """What a run that ends in a state is, and what it can become."""
+    begins = "start, " if state == automaton.initial else ""
+    if state == automaton.initial and not automaton.has_returns:
+        return f"{begins}before the first sample"
+    now = "accepting" if state in automaton.accepting else "not accepting"
+    if state not in automaton.can_reject:
+        now = "accepting for good"
+    elif state not in automaton.can_accept:
+        now = "a trap: acceptance is lost"
+    return begins + now
+
+
+def dot_text(automaton: Automaton) -> str:
+    """The automaton in the language of Graphviz, with guards in words.
+
+    Accepting states have a double outline; those that accept for good are green, traps are red.
+    """
+    lines = [
+        f"digraph {_quoted(automaton.name)} {{",
+        "  rankdir=LR;",
+        '  node [shape=circle, style=filled, fillcolor=white, fontname="Helvetica"];',
+        '  edge [fontname="Helvetica", fontsize=10];',
+        "  start [shape=point];",
+        f"  start -> {automaton.initial};",
+    ]
+    for state in automaton.states:
+        shape = "doublecircle" if state in automaton.accepting else "circle"
+        colour = "white"
+        if state not in automaton.can_reject:
+            colour = "palegreen"
+        elif state not in automaton.can_accept:
+            colour = "lightsalmon"
+        about = _quoted(state_words(automaton, state))
+        lines.append(f"  {state} [shape={shape}, fillcolor={colour}, tooltip={about}];")
+    for each in automaton.transitions:
+        label = "\\n".join(map(_escaped, _broken(automaton.guard_words(each))))
+        lines.append(f'  {each.source} -> {each.target} [label="{label}"];')
+    return "\n".join([*lines, "}", ""])
+
+
+def hoa_text(automaton: Automaton) -> str:
+    """The automaton in the Hanoi omega-automata format, version 1.
+
+    That format is about infinite runs and has no acceptance for finite ones. So the accepting states are
+    written as the acceptance set 0 of a Büchi automaton: a finite run is accepted iff it ends in a state of
+    that set. The header `finite-runs`, which readers may ignore, says so.
+    """
+    numbers = range(len(automaton.propositions))
+    names = [_quoted(each.label) for each in automaton.propositions]
+    lines = [
+        "HOA: v1",
+        f"name: {_quoted(automaton.name)}",
+        f"States: {len(automaton.states)}",
+        f"Start: {automaton.initial}",
+        " ".join(["AP:", str(len(numbers)), *names]),
+        "acc-name: Buchi",
+        "Acceptance: 1 Inf(0)",
+        "properties: trans-labels explicit-labels state-acc complete deterministic",
+        'finite-runs: "accepted iff they end in a state of set 0"',
+        "--BODY--",
+    ]
+    for state in automaton.states:
+        lines.append(f"State: {state} {{0}}" if state in automaton.accepting else f"State: {state}")
+        lines += [
+            f"  [{_hoa_guard(each)}] {each.target}" for each in automaton.transitions if each.source == state
+        ]
+    return "\n".join([*lines, "--END--", ""])
+
+
+def svg_text(automaton: Automaton) -> str:
+    """The automaton drawn by Graphviz.
+
+    Raises:
+        UsageError: Graphviz is not installed.
+        OutputError: Graphviz fails, or takes too long.
+    """
+    executable = shutil.which("dot")
+    if executable is None:
+        raise UsageError(
+            "drawing an automaton takes Graphviz, which is not installed: apt-get install graphviz; "
+            "or write it as text to a file that ends in .dot"
+        )
+    try:
+        done = subprocess.run(
+            [executable, "-Tsvg"],
+            input=dot_text(automaton).encode(),
+            capture_output=True,
+            check=False,
+            timeout=_DRAWING_S,
+        )
+    except subprocess.TimeoutExpired:
+        raise OutputError(
+            f"Graphviz did not draw {len(automaton.states)} states and {len(automaton.transitions)} "
+            f"transitions within {_DRAWING_S:g} s; write them as text to a file that ends in .dot"
+        ) from None
+    if done.returncode != 0:
+        reason = done.stderr.decode(errors="replace").strip()[:200]
+        raise OutputError(f"Graphviz ended with code {done.returncode}: {reason}")
+    return done.stdout.decode()
+
+
+def _hoa_guard(transition: Transition) -> str:
+    cubes = [
+        "&".join(str(number) if value else f"!{number}" for number, value in cube) or "t"
+        for cube in transition.guard
+    ]
+    return " | ".join(cubes)
+
+
+def _broken(text: str) -> list[str]:
+    """A sentence in lines, broken before `and` and `or`."""
+    lines = [""]
+    for word in text.split(" "):
+        if word in ("and", "or") and len(lines[-1]) > _WIDTH:
+            lines.append("")
+        lines[-1] += f" {word}" if lines[-1] else word
+    return lines
+
+
+def _escaped(text: str) -> str:
+    printable = "".join(character if character.isprintable() else " " for character in text)
+    return printable.replace("\\", "\\\\").replace('"', '\\"')
+
+
+def _quoted(text: str) -> str:
+    return f'"{_escaped(text)}"'
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

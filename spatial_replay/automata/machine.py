@@ -1,0 +1,121 @@
+"""Automata as compilers give them, and the least one that accepts the same runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from spatial_replay.automata.diagrams import LEAF, Diagrams, copied
+
+
+@dataclass(frozen=True, eq=False)
+class Machine:
+    """A deterministic automaton with a move from every state for every symbol.
+
+    Attributes:
+        moves: for each state, the node of the diagram with the states that its moves lead to.
+        accepting: for each state.
+        start: the node with the states that the first sample of a run leads to.
+    """
+
+    diagrams: Diagrams
+    moves: tuple[int, ...]
+    accepting: tuple[bool, ...]
+    start: int
+
+
+def least(machine: Machine) -> Machine:
+    """The automaton with the fewest states, one of them, 0, for a run that has not begun.
+
+    Two machines that accept the same runs of at least one sample give equal ones: states are numbered by
+    their distance from the first one. No run is empty, so that may be any state with the same moves, and one
+    that does not accept if there is a choice.
+    """
+    machine = _renumbered(machine, _reachable(machine, machine.start))
+    classes = _classes(machine)
+    diagrams = Diagrams()
+    copy = _relabelled(machine, diagrams, classes)
+    moves = [0] * len(set(classes))
+    accepting = [False] * len(moves)
+    for state, number in enumerate(classes):
+        moves[number] = copy(machine.moves[state])
+        accepting[number] = machine.accepting[state]
+    start = copy(machine.start)
+    first = _first(moves, accepting, start)
+    joined = Machine(diagrams, tuple(moves), tuple(accepting), start)
+    others = [state for state in _reachable(joined, start) if state != first]
+    return _renumbered(joined, [first, *others])
+
+
+def _classes(machine: Machine) -> list[int]:
+    """For each state the number of its class: which runs from it on are accepted, the empty one included."""
+    classes = [int(each) for each in machine.accepting]
+    count = len(set(classes))
+    while True:
+        copy = _relabelled(machine, Diagrams(), classes)
+        numbers: dict[tuple[int, int], int] = {}
+        signatures = list(zip(classes, map(copy, machine.moves), strict=True))
+        classes = [numbers.setdefault(signature, len(numbers)) for signature in signatures]
+        if len(numbers) == count:
+            return classes
+        count = len(numbers)
+
+
+def _first(moves: list[int], accepting: list[bool], start: int) -> int:
+    """A state that moves as a run begins, one more if there is none."""
+    same = [state for state, node in enumerate(moves) if node == start]
+    if not same:
+        moves.append(start)
+        accepting.append(False)
+        return len(moves) - 1
+    return min(same, key=lambda state: accepting[state])
+
+
+def _reachable(machine: Machine, start: int) -> list[int]:
+    """The states that a node leads to in the end: the nearer ones first, then as false comes before true."""
+    order = dict.fromkeys(leaves_of(machine.diagrams, start))
+    waiting = list(order)
+    for state in waiting:
+        for target in leaves_of(machine.diagrams, machine.moves[state]):
+            if target not in order:
+                order[target] = None
+                waiting.append(target)
+    return waiting
+
+
+def _renumbered(machine: Machine, states: Sequence[int]) -> Machine:
+    """Only some states, in the order given; no move leads to another."""
+    numbers = {state: number for number, state in enumerate(states)}
+    diagrams = Diagrams()
+    copy = _relabelled(machine, diagrams, numbers)
+    return Machine(
+        diagrams,
+        tuple(copy(machine.moves[state]) for state in states),
+        tuple(machine.accepting[state] for state in states),
+        copy(machine.start),
+    )
+
+
+def _relabelled(
+    machine: Machine, diagrams: Diagrams, numbers: Mapping[int, int] | Sequence[int]
+) -> Callable[[int], int]:
+    """A function that copies nodes into other diagrams, with other numbers for the states."""
+    return copied(machine.diagrams, diagrams, LEAF, lambda node: numbers[machine.diagrams[node].low])
+
+
+def leaves_of(diagrams: Diagrams, node: int) -> list[int]:
+    """The leaves below a node, in the order of the decisions, false before true."""
+    found: dict[int, None] = {}
+    seen: set[int] = set()
+    stack = [node]
+    while stack:
+        each = stack.pop()
+        if each in seen:
+            continue
+        seen.add(each)
+        variable, low, high = diagrams[each]
+        if variable == LEAF:
+            found[low] = None
+        else:
+            stack += [high, low]
+    return list(found)

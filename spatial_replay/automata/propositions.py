@@ -1,0 +1,150 @@
+"""What an automaton reads: the subformulas without temporal operators, as propositions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from spatial_replay.spec.format import format_formula
+from spatial_replay.spec.formula import Boolean, Formula, Quantified, Temporal, Truth, operands_of
+
+
+@dataclass(frozen=True)
+class Proposition:
+    """A subformula without temporal operators; true in a sample iff its robustness there is at least 0.
+
+    Attributes:
+        text: its canonical text.
+        name: the name that the specification gives to it, or None.
+    """
+
+    formula: Formula
+    text: str
+    name: str | None = None
+
+    @property
+    def label(self) -> str:
+        """What it is called: its name or, without one, its text."""
+        return self.name or self.text
+
+    def literal(self, value: bool) -> str:
+        """In words, that it is true, or that it is not."""
+        if self.name is not None:
+            return self.name if value else f"not {self.name}"
+        if not value:
+            return f"not ({self.text})"
+        return self.text if not isinstance(self.formula, (Boolean, Quantified)) else f"({self.text})"
+
+
+def is_spatial(formula: Formula) -> bool:
+    """Whether a formula is about one sample: no operator in it looks ahead or back."""
+    return not isinstance(formula, Temporal) and all(is_spatial(each) for each in operands_of(formula))
+
+
+class Propositions:
+    """The propositions of a formula, numbered in the order of the text.
+
+    Equal ones, however they are written (`a and b`, `b and a`; `a -> b`, `not a or b`), are one. So are a
+    proposition and its negation where a formula holds both: the second is the first, negated.
+    """
+
+    def __init__(self, formula: Formula) -> None:
+        """Number those of a formula."""
+        self._shapes = _Shapes()
+        self._numbers: dict[int, int] = {}
+        self._literals: dict[int, tuple[int, bool]] = {}
+        self.all: list[Proposition] = []
+        for each in _maximal(formula):
+            self._add(each)
+
+    def literal(self, formula: Formula) -> tuple[int, bool]:
+        """Which proposition a maximal spatial subformula is, and whether it is that or its negation."""
+        return self._literals[id(formula)]
+
+    def _add(self, formula: Formula) -> None:
+        number = self._numbers.get(self._shapes.of(formula, True))
+        if number is not None:
+            self._literals[id(formula)] = number, True
+            return
+        negated = self._shapes.of(formula, False)
+        if negated in self._numbers:
+            self._literals[id(formula)] = self._numbers[negated], False
+            return
+        number = self._numbers[self._shapes.of(formula, True)] = len(self.all)
+        self._literals[id(formula)] = number, True
+        self.all.append(Proposition(formula, format_formula(formula), formula.name))
+
+
+def _maximal(formula: Formula) -> Iterator[Formula]:
+    """The largest subformulas about one sample, in the order of the text; constants are none."""
+    if isinstance(formula, Truth):
+        return
+    if is_spatial(formula):
+        yield formula
+        return
+    for operand in operands_of(formula):
+        yield from _maximal(operand)
+
+
+class _Shapes:
+    """What spatial formulas have in common but for the way they are written: equal ones have one number."""
+
+    def __init__(self) -> None:
+        self._interned: dict[tuple[object, ...], int] = {}
+        self._known: dict[tuple[int, bool], int] = {}
+        self._joined: dict[tuple[bool, int], frozenset[int]] = {}
+
+    def of(self, formula: Formula, positive: bool) -> int:
+        """The number of a formula, or of its negation, in negation normal form."""
+        key = (id(formula), positive)
+        if key not in self._known:
+            self._known[key] = self._shape(formula, positive)
+        return self._known[key]
+
+    def _shape(self, formula: Formula, positive: bool) -> int:
+        match formula:
+            case Truth():
+                return self._intern("truth", formula.value == positive)
+            case Boolean():
+                return self._boolean(formula, positive)
+            case Quantified():
+                body = self.of(formula.body, positive)
+                is_every = (formula.quantifier == "forall") == positive
+                return self._intern("members", is_every, formula.variables, formula.group, body)
+            case Temporal():
+                raise ValueError(f"{formula.operator} is no operator about one sample")
+        return self._intern("atom", formula.expression, positive)
+
+    def _boolean(self, formula: Boolean, positive: bool) -> int:
+        first, *rest = formula.operands
+        match formula.operator:
+            case "not":
+                return self.of(first, not positive)
+            case "spec":
+                return self.of(first, positive)
+            case "and" | "or":
+                is_both = (formula.operator == "and") == positive
+                return self._join(is_both, *(self.of(each, positive) for each in formula.operands))
+            case "->":
+                return self._join(not positive, self.of(first, not positive), self.of(rest[0], positive))
+        # `xor` and `<->` are conjunctions or disjunctions of these two
+        second = rest[0]
+        is_xor = (formula.operator == "xor") == positive
+        one, other = self.of(first, True), self.of(second, True)
+        not_one, not_other = self.of(first, False), self.of(second, False)
+        pairs = ((one, not_other), (not_one, other)) if is_xor else ((not_one, other), (one, not_other))
+        return self._join(not is_xor, *(self._join(is_xor, *pair) for pair in pairs))
+
+    def _join(self, is_both: bool, *operands: int) -> int:
+        """A conjunction or disjunction, whatever the order, repetition and bracketing of its operands."""
+        chosen = frozenset[int]().union(
+            *(self._joined.get((is_both, each), frozenset({each})) for each in operands)
+        )
+        if len(chosen) == 1:
+            return next(iter(chosen))
+        number = self._intern(is_both, chosen)
+        self._joined[is_both, number] = chosen
+        return number
+
+    def _intern(self, *key: object) -> int:
+        return self._interned.setdefault(key, len(self._interned))
