@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, TypeAlias, get_args
 
-from spatial_replay.automaton import mona
+from spatial_replay.automata import mona
 from spatial_replay.automata.automaton import Automaton, automaton_of
 from spatial_replay.automata.machine import Machine, least
 from spatial_replay.automata.progression import progressed
