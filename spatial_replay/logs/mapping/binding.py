@@ -162,7 +162,7 @@ def bind(reading: Reading, example: object, message: object, *, needs_frame: boo
         polygon=polygon,
         covariance=covariance,
         class_gets=tuple(getter(path, style) for path in class_paths),
-        frame=_frame(reading, example, message) if needs_frame else None,
+        frame=_frame(reading, example, message, needs_frame),
         lifetime=lifetime,
     )
 
@@ -263,11 +263,11 @@ def _uncertainty(reading: Reading, columns: _Columns, style: Style) -> tuple[flo
     return None, getter(path, style)
 
 
-def _frame(reading: Reading, example: object, message: object) -> tuple[Get, bool] | None:
+def _frame(reading: Reading, example: object, message: object, needs_frame: bool) -> tuple[Get, bool] | None:
     for text in reading.frame:
         path = Path.of(text)
         root = message if path.from_message else example
-        if len(reading.frame) > 1 and not leads_somewhere(path, root):
+        if (len(reading.frame) > 1 or not needs_frame) and not leads_somewhere(path, root):
             continue
         value = walk(path, root)
         if not isinstance(value, str):

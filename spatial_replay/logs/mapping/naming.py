@@ -50,7 +50,11 @@ class Namer:
         if self._template.is_constant or self._template.text == "{topic}":
             name = "".join(str(part) for part in self._template.parts) if self._template.is_constant else ""
             return [self._codes[_checked(name or self._topic)]] * len(objects)
-        get = self._single(style)
+        if objects and not self._is_planned:
+            # the first one is taken step by step, so that a wrong path is told well
+            self._name(objects[0], places[0])
+            self._plan(objects[0], style)
+        get = self._get
         known = self._by_values
         if get is None or not objects:
             return [self._codes[self._name(each, place)] for each, place in zip(objects, places, strict=True)]
@@ -76,16 +80,16 @@ class Namer:
             self._wanted[code] = found
         return found
 
-    def _single(self, style: Style) -> Get | None:
-        """How the one field is read that the name depends on; None where it is not as simple as that."""
-        if not self._is_planned:
-            self._is_planned = True
-            fields = [part for part in self._template.parts if not isinstance(part, str)]
-            if len(fields) == 1 and len(fields[0]) == 1:
-                (path,) = fields[0]
-                if path.text not in (INDEX, TOPIC) and not path.from_message:
-                    self._get = getter(path, style)
-        return self._get
+    def _plan(self, example: object, style: Style) -> None:
+        """Find out how the one field is read that names depend on, where it is as simple as that."""
+        self._is_planned = True
+        fields = [part for part in self._template.parts if not isinstance(part, str)]
+        if len(fields) == 1 and len(fields[0]) == 1:
+            (path,) = fields[0]
+            if path.text in (INDEX, TOPIC) and path.text not in field_names(example):
+                return
+            if not path.from_message and isinstance(walk(path, example), str | int | float):
+                self._get = getter(path, style)
 
     def _name(self, thing: object, place: int) -> str:
         words = [

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Concave
-from spatial_replay.logs.mapping.extract import Seen
 from spatial_replay.logs.mapping.frames import Transforms
+from spatial_replay.logs.mapping.seen import Seen
 from spatial_replay.logs.mapping.solids import Solids, footprints_from_solids
 from spatial_replay.trace.observations import Observations, trace_from_observations
 from spatial_replay.trace.trace import ABSENT

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from spatial_replay.logs.mapping.model import Mapping
 
 _MOST_NAMES = 8
@@ -17,7 +19,7 @@ class Remarks:
         self._missing: dict[tuple[str, str, bool], tuple[int, int]] = {}
         self._stale: dict[tuple[str, str], tuple[int, int]] = {}
         self._skipped: dict[str, int] = {}
-        self._frames: dict[str, None] = {}
+        self._frames: set[str] = set()
 
     def add(self, text: str) -> None:
         self._texts.append(text)
@@ -36,10 +38,10 @@ class Remarks:
         """Drawn things that are no bodies."""
         self._skipped[topic] = self._skipped.get(topic, 0) + count
 
-    def note_frame(self, frame: str) -> None:
-        """A frame that coordinates are taken in as they are."""
+    def note_frames(self, frames: Iterable[str]) -> None:
+        """Frames that coordinates are taken in as they are."""
         if len(self._frames) < _MOST_NAMES:
-            self._frames[frame] = None
+            self._frames.update(frame.removeprefix("/") for frame in frames if frame)
 
     def take(self) -> tuple[str, ...]:
         """Every remark, once."""
@@ -66,7 +68,7 @@ class Remarks:
                 f"{self._name}: coordinates are in the frames {listed} and taken as they are;"
                 " `fixed_frame` in the mapping brings them into one"
             )
-        self._texts, self._missing, self._stale, self._skipped, self._frames = [], {}, {}, {}, {}
+        self._texts, self._missing, self._stale, self._skipped, self._frames = [], {}, {}, {}, set()
         return tuple(texts)
 
     def _stale_texts(self) -> list[str]:

@@ -10,13 +10,13 @@ from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.mapping.channel import Channel
-from spatial_replay.logs.mapping.extract import EVERYONE, Seen
 from spatial_replay.logs.mapping.frames import FrameTree, Transforms
 from spatial_replay.logs.mapping.instants import Instants
 from spatial_replay.logs.mapping.naming import Codes
 from spatial_replay.logs.mapping.observed import Rows, rows_from_seen
 from spatial_replay.logs.mapping.plan import Plan
 from spatial_replay.logs.mapping.remarks import Remarks
+from spatial_replay.logs.mapping.seen import EVERYONE, Seen
 from spatial_replay.logs.mapping.timeline import STALE, Events, events_of
 from spatial_replay.trace.trace import ABSENT, Trace
 
@@ -58,6 +58,8 @@ class Scene:
             harvest = channel.harvest(log_times_ns, contents) if channel.reads else None
             if harvest is not None and len(harvest.kept) < len(contents):
                 times_ns, log_times_ns = times_ns[harvest.kept], log_times_ns[harvest.kept]
+            if channel.extractor is not None:
+                self._remarks.note_frames(channel.extractor.noted_frames)
             if self._plan.sampled_topic in (None, name):
                 sampled.append(times_ns)
             if harvest is not None and harvest.seen is not None:
@@ -124,11 +126,7 @@ class Scene:
     def _transforms(self, channel: Channel, seen: Seen, times_ns: Integers) -> Transforms | None:
         """fixed_from_frame of each object; None where everything is in the fixed frame."""
         fixed = self._plan.mapping.fixed_frame
-        if seen.frames is None or not seen.frames:
-            return None
-        if fixed is None:
-            for frame in set(seen.frames):
-                self._remarks.note_frame(frame)
+        if seen.frames is None or fixed is None:
             return None
         codes = Codes()
         of_frame = np.array([codes[frame] for frame in seen.frames], np.int64)

@@ -49,7 +49,7 @@ def _told(error: Any) -> Iterator[tuple[Place, str]]:
     elif keyword == "required":
         missing = [key for key in error.validator_value if key not in error.instance]
         yield place, f"the key {missing[0]!r} is missing"
-    elif keyword == "propertyNames" or _is_of_a_key(error):
+    elif "propertyNames" in error.absolute_schema_path:
         yield place, "a name is empty; give it a name"
     else:
         wanted = error.schema.get("description", _around(error))
@@ -63,10 +63,6 @@ def _around(error: Any) -> str:
         parent = parent.parent
     fallback = f"something that fits {error.validator} {error.validator_value}"
     return fallback if parent is None else str(parent.schema["description"])
-
-
-def _is_of_a_key(error: Any) -> bool:
-    return error.parent is not None and error.parent.validator == "propertyNames"
 
 
 def _branches(error: Any) -> Iterable[list[Any]]:

@@ -1,12 +1,12 @@
-"""When samples are taken, what is still valid then, and what becomes of time that does not run as it should."""
+"""When samples are taken, what is valid then, and what becomes of time that does not run as it should."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import pytest
-from logs.mapping.feeding import SECOND, Feed, header, make, pose_stamped, ros
 
+from logs.mapping.feeding import SECOND, Feed, header, make, pose_stamped, ros
 from spatial_replay.errors import LogError, UsageError
 
 MS = 10**6
@@ -87,7 +87,8 @@ def test_a_silent_list_makes_its_objects_unknown() -> None:
     feed = Feed().add("/list", 0, {"things": [{"id": 1, "x": 0.0, "y": 0.0}]})
     for tick in range(4):
         feed.add("/a", tick * SECOND, point(0))
-    text = "sample: {topic: /a}\ntopics: {/list: {objects: 'things[*]', name: 't{id}', position: [x, y]}, /a: {}}"
+    listed = "{objects: 'things[*]', name: 't{id}', position: [x, y]}"
+    text = f"sample: {{topic: /a}}\ntopics: {{/list: {listed}, /a: {{}}}}"
     assert make(text, feed).states("t1") == "++??"
 
 

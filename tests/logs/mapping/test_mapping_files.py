@@ -1,0 +1,207 @@
+"""Mapping files: what they say, and everything that can be wrong with them, all at once."""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+from jsonschema import Draft202012Validator
+
+from logs.mapping.feeding import Feed, make, pose_stamped
+from spatial_replay.errors import MissingFileError, UsageError
+from spatial_replay.logs.foreign.messages import Topic
+from spatial_replay.logs.mapping import schema
+from spatial_replay.logs.mapping.load import load_mapping, parse_mapping
+from spatial_replay.logs.mapping.model import FOREVER_NS, Sampling, Shape, Signal, Uncertainty
+from spatial_replay.logs.mapping.plan import Plan
+
+EXAMPLE = """
+fixed_frame: world
+clock: header
+sample: {every: 100ms}
+max_age: 1.5s
+topics:
+  /turtle1/pose: {name: turtle1, shape: {disc: 0.5}}
+  /tags: {objects: "detections[*]", name: "tag{id}", polygon: corners, class: tag}
+  /odom: {shape: robot, uncertainty: covariance, height: [0, 0.4], max_age: forever}
+  /battery: {signals: {battery: {field: percentage, unit: "1"}}}
+  /plain:
+shapes:
+  robot: {box: [0.6, 0.4], offset: [0.1, 0]}
+"""
+
+
+def test_a_mapping_says_what_is_read_and_how() -> None:
+    mapping = parse_mapping(EXAMPLE)
+    turtle, tags, odom, battery, plain = mapping.topics
+    assert (mapping.fixed_frame, mapping.clock, mapping.max_age_ns) == ("world", "header", 1_500_000_000)
+    assert mapping.sampling == Sampling(None, 100_000_000)
+    assert (turtle.name, turtle.shape) == ("turtle1", Shape("disc", (0.5,)))
+    assert (tags.objects, tags.name, tags.polygon, tags.class_name) == (
+        "detections[*]",
+        "tag{id}",
+        "corners",
+        "tag",
+    )
+    assert odom.shape == Shape("box", (0.6, 0.4), offset=(0.1, 0.0))
+    assert (odom.uncertainty, odom.height) == (Uncertainty("", True), (0.0, 0.4))
+    assert odom.max_age_ns == FOREVER_NS
+    assert (battery.signals, battery.reads_objects) == ((Signal("battery", "percentage", "1"),), False)
+    assert plain.reads_objects
+
+
+def test_its_hash_is_of_what_it_says_not_how_it_is_laid_out() -> None:
+    one = parse_mapping("topics:\n  /a:\n    name: x  # a comment\n", "one.yaml")
+    other = parse_mapping('{"topics": {"/a": {"name": "x"}}}', "other.yaml")
+    different = parse_mapping("topics: {/a: {name: y}}")
+    assert one.sha256 == other.sha256 != different.sha256
+
+
+@pytest.mark.parametrize("word", ["no", "on", "12:30", "2020-01-01", "0x10", "1_000"])
+def test_words_stay_words(word: str) -> None:
+    (topic,) = parse_mapping(f"topics: {{/a: {{name: {word}}}}}").topics
+    assert topic.name == word
+
+
+def test_every_fault_is_told_with_its_line_and_what_belongs_there() -> None:
+    text = """
+fixed_fram: world
+clock: logs
+sample: {every: 0ms}
+max_age: 5
+topics:
+  /a: {shape: {dics: 0.5}, nam: x}
+  /b: {objects: "detections[*", name: "tag{id", class: {fild: x}}
+  /c: {shape: robt, uncertainty: -1, position: [x]}
+  /d: {signals: {battery: {field: percentage, unit: 1}}, yaw: a, orientation: b, polygon: a..b}
+shapes:
+  robot: {box: [0.6, -0.4], offset: [0.1]}
+"""
+    with pytest.raises(UsageError) as caught:
+        parse_mapping(text, "drive.yaml")
+    told = str(caught.value).splitlines()
+    for line in (
+        "drive.yaml:2: fixed_fram: unknown key; did you mean 'fixed_frame'?",
+        'drive.yaml:3: clock: "logs" where this belongs: one of log, publish, header',
+        "drive.yaml:4: sample.every: '0ms' is no time; give a duration above 0",
+        "drive.yaml:5: max_age: 5 where this belongs: a duration above 0 such as 500ms, or forever",
+        "drive.yaml:7: topics./a.nam: unknown key; did you mean 'name'?",
+        "drive.yaml:7: topics./a.shape.dics: unknown key; did you mean 'disc'?",
+        "drive.yaml:8: topics./b.class.fild: unknown key; did you mean 'field'?",
+        "drive.yaml:9: topics./c.shape: there is no shape 'robt'; did you mean 'robot'?",
+        'drive.yaml:10: topics./d.polygon: "a..b" where this belongs: a field path such as pose.position.x',
+        "drive.yaml:10: topics./d.yaw: there is 'orientation' already; give one of the two",
+        "drive.yaml:10: topics./d.signals.battery.unit: 1 where this belongs: a unit as text, such as"
+        ' "m/s" or "1"',
+        "drive.yaml:12: shapes.robot.offset: [0.1] where this belongs: two numbers [x, y]",
+    ):
+        assert line in told
+    assert any("topics./b.objects" in line for line in told)
+    assert any("topics./b.name" in line for line in told)
+    assert any("topics./c.uncertainty" in line for line in told)
+    assert any("topics./c.position" in line for line in told)
+    assert any("shapes.robot.box[1]" in line for line in told)
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("topics: {/a: {}, /a: {}}", "the key '/a' is there twice; the first is in line 1"),
+        ("a: &x [1]\nb: *x", "m.yaml:2: \\*x repeats another part"),
+        (
+            "topics: !!python/object:os.system {}",
+            "the tag tag:yaml.org,2002:python/object:os.sys",
+        ),
+        ("topics: !own {}", "the tag !own means nothing"),
+        ("[" * 5000, "nested more than 20 deep"),
+        ("topics: [1", "this is no YAML"),
+        ("a: \x00", "this is no YAML"),
+        ("", "null where this belongs"),
+        ("topics: {}", "topics"),
+        ("topics: {'': {}}", "a name is empty"),
+        ("? [a, b]\n: c", "a key is a list or a mapping"),
+        ("topics: {/a: {name: '{a b}'}}", "is no name"),
+        ("x" * 300_000, "larger than 256 KiB"),
+        ("a: 1\n---\nb: 2", "this is no YAML"),
+    ],
+)
+def test_what_is_no_mapping_is_refused(text: str, what: str) -> None:
+    with pytest.raises(UsageError, match=what):
+        parse_mapping(text, "m.yaml")
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(MissingFileError, match="no such file"):
+        load_mapping(tmp_path / "missing.yaml")
+    (tmp_path / "latin.yaml").write_bytes(b"topics:\n  /\xe4: {}\n")
+    with pytest.raises(UsageError, match=r"latin.yaml:2: a byte is not UTF-8"):
+        load_mapping(tmp_path / "latin.yaml")
+    (tmp_path / "good.yaml").write_text("\ufefftopics: {/a: }\n", encoding="utf-8")
+    assert load_mapping(tmp_path / "good.yaml").topics[0].topic == "/a"
+
+
+def test_the_published_schema_is_the_one_that_is_used() -> None:
+    used = files("spatial_replay.logs.mapping").joinpath(schema.SCHEMA_FILE).read_text(encoding="utf-8")
+    Draft202012Validator.check_schema(json.loads(used))
+    published = Path(__file__).parents[3] / "schemas" / schema.SCHEMA_FILE
+    assert published.read_text(encoding="utf-8") == used
+
+
+def test_topics_that_the_log_does_not_have() -> None:
+    mapping = parse_mapping("sample: {topic: /tick}\ntopics: {/pse: {}, /other: {type: foo/Bar}}", "m.yaml")
+    with pytest.raises(UsageError) as caught:
+        Plan.of(mapping, [Topic("/pose", "geometry_msgs/msg/PoseStamped", "cdr"), Topic("/other", "", "cdr")])
+    assert str(caught.value).splitlines() == [
+        "m.yaml: topics./pse: the log has no topic '/pse'; did you mean '/pose'?",
+        "m.yaml: sample.topic: the log has no topic '/tick'; its topics are /other, /pose",
+        *[line for line in str(caught.value).splitlines() if "'foo/Bar' is no type that is known" in line],
+    ]
+
+
+def test_topics_that_cannot_be_decoded() -> None:
+    broken = Topic("/pose", "geometry_msgs/msg/PoseStamped", "cdr", unreadable="its definition is missing")
+    with pytest.raises(UsageError, match="its messages cannot be decoded: its definition is miss"):
+        Plan.of(parse_mapping("topics: {/pose: {}}"), [broken])
+
+
+@pytest.mark.parametrize(
+    ("keys", "what"),
+    [
+        (
+            "position: pose.positon",
+            "has no field 'positon'; did you mean 'position'[?]; its fields are posi",
+        ),
+        ("position: header.stamp", "has no x and y; its fields are sec, nanosec"),
+        ("yaw: pose", "geometry_msgs/msg/Pose where a number belongs"),
+        ("orientation: pose.position", "has no x and y|no quaternion"),
+        ("polygon: pose", "where a list of corners belongs"),
+        ("objects: 'poses[*]'", "has no field 'poses'"),
+        ("objects: 'header[*]'", r"\[\*\] follows std_msgs/msg/Header, which is no list"),
+        ("name: 'x{id}'", "has no field 'id'"),
+        ("class: {field: kind}", "has no field 'kind'"),
+        ("shape: {disc: size}", "has no field 'size'"),
+        ("uncertainty: {covariance: pose}", "is no covariance"),
+        ("name: p, signals: {speed: speed}", "has no field 'speed'"),
+        ("name: p, signals: {speed: header.frame_id}", "its value is no number"),
+        ("yaw: $.header.stamp.sec", "give a field of the object"),
+    ],
+)
+def test_paths_that_lead_nowhere_are_told_with_the_fields_that_are_there(keys: str, what: str) -> None:
+    feed = Feed().add("/p", 0, pose_stamped(0, 0))
+    with pytest.raises(UsageError, match=rf"test.yaml: topics./p: .*({what})"):
+        make(f"topics: {{/p: {{{keys}}}}}", feed)
+
+
+def test_one_name_for_objects_of_two_topics_is_refused() -> None:
+    feed = Feed().add("/a", 0, pose_stamped(0, 0)).add("/b", 0, pose_stamped(0, 0))
+    with pytest.raises(UsageError, match="both /a and /b have an object 'cup'; give one of them"):
+        make("topics: {/a: {name: cup}, /b: {name: cup}}", feed)
+
+
+def test_a_topic_can_be_read_as_a_type_that_is_known() -> None:
+    feed = Feed().add("/p", 0, {"pose": {"position": {"x": 1.0, "y": 2.0, "z": 0.0}}, "header": {}})
+    with pytest.raises(UsageError, match="has no field 'orientation'"):
+        make("topics: {/p: {type: geometry_msgs/PoseStamped}}", feed)
+    assert make("topics: {/p: {}}", feed).centre(0, "p") == (1.0, 2.0)
