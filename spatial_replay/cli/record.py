@@ -11,6 +11,7 @@ from spatial_replay.cli.evaluating import report_reading
 from spatial_replay.cli.exit_codes import ExitCode
 from spatial_replay.cli.options import Reading, output_option, profile_option, reading_options
 from spatial_replay.cli.progress import progress
+from spatial_replay.cli.simulated import SCENARIOS, recording_command
 from spatial_replay.cli.verdicts import counted
 
 
@@ -19,9 +20,14 @@ def record() -> None:
     """Record a run as an MCAP log.
 
     \b
-    Example:
+    Examples:
       spatial-replay record tracks blocks.jsonl.gz -o run.mcap
+      spatial-replay record push -o run.mcap
     """
+
+
+for _scenario in SCENARIOS:
+    record.add_command(recording_command(_scenario))
 
 
 @record.command()

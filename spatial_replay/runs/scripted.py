@@ -8,6 +8,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
+from spatial_replay.errors import UsageError
 from spatial_replay.runs.run_log import run_log
 from spatial_replay.simulation.injection import Injection
 from spatial_replay.simulation.worlds import default_specification, make_world
@@ -54,9 +55,11 @@ def record_script(
         advance: told how many more samples are done.
 
     Raises:
-        UsageError: no such scenario, no simulator, a specification that cannot be recorded.
+        UsageError: no such scenario, no simulator, a duration of 0, a specification that cannot be recorded.
         OutputError: the output cannot be written.
     """
+    if duration_ns is not None and duration_ns <= 0:
+        raise UsageError("a run of 0 s has no sample; give a longer duration")
     files = [default_specification(scenario)] if files is None else list(files)
     options = run_options(seed=seed, noise_m=noise_m, injections=injections)
     about = {"source": scenario, "seed": str(seed), "options": options}
