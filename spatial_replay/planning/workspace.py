@@ -56,10 +56,11 @@ class Grid:
         Raises:
             UsageError: an empty box, or numbers that make no grid.
         """
+        box = f"the box ({xmin}, {ymin}, {xmax}, {ymax})"
+        if not all(map(math.isfinite, (xmin, ymin, xmax, ymax))):
+            raise UsageError(f"{box} is not finite; give four numbers")
         if not (xmin < xmax and ymin < ymax):
-            raise UsageError(
-                f"the box ({xmin}, {ymin}, {xmax}, {ymax}) is empty; give xmin, ymin, xmax, ymax"
-            )
+            raise UsageError(f"{box} is empty; give xmin, ymin, xmax, ymax")
         if not cell_size > 0.0:
             raise UsageError(f"cell_size is {cell_size}; give a number above 0")
         # a box that is a whole number of cells long must not get one more for the last bit of its length

@@ -1,0 +1,267 @@
+"""Algorithm 1 of the paper: an edge of the automaton at a time, by moving one object at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from spatial_replay.automata.automaton import Automaton, Transition
+from spatial_replay.automata.compiling import automaton as automaton_of
+from spatial_replay.errors import TraceError, UsageError
+from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.planning.maps import (
+    PropositionMaps,
+    concerns,
+    gradient_map,
+    proposition_maps,
+    refuse_delays,
+)
+from spatial_replay.planning.observing import Observer, Symbol
+from spatial_replay.planning.settings import Settings
+from spatial_replay.planning.step import Candidate, Consideration, Edge, Guards, Kind, Outcome, Step
+from spatial_replay.planning.targets import find_target
+from spatial_replay.spec.formula import Specification
+from spatial_replay.trace.sample import Sample
+
+
+class Planner:
+    """Plans towards a specification, step by step, from what is observed (section 5.2 of the paper).
+
+    Use as:
+
+        planner = Planner(specification, settings)
+        planner.observe(sample)
+        while (step := planner.next_step()).kind == "execute":
+            outcome = executor.execute(step)
+            planner.observe(sample)
+            planner.conclude(outcome)
+
+    It observes every sample, during an execution too: each one moves the automaton. It comes to an end: each
+    step uses up one of the attempts that every edge of the automaton has. Equal samples and outcomes give
+    equal steps.
+
+    Attributes:
+        automaton: of the specification.
+        settings: as given.
+    """
+
+    def __init__(self, specification: Specification, settings: Settings, *, name: str | None = None) -> None:
+        """Begin before the first sample.
+
+        Args:
+            name: which spec of the file to plan for; without it, its only result.
+
+        Raises:
+            NoAutomatonError: past operators, bounds in seconds, or too large a formula.
+            UsageError: no such spec, several to choose from, or propositions about earlier samples.
+        """
+        self.automaton: Automaton = automaton_of(specification, name)
+        self.settings = settings
+        self._regions = specification.regions
+        self._formulas = [each.formula for each in self.automaton.propositions]
+        refuse_delays(self._formulas)
+        self._states: frozenset[int] = frozenset({self.automaton.initial})
+        self._sample: Sample | None = None
+        self._observer = Observer(self._formulas, specification.regions)
+        self._symbol: Symbol = ()
+        self._maps: dict[str, PropositionMaps] = {}
+        self._pruned: dict[Edge, str] = {}
+        self._tried: dict[Edge, int] = {}
+        self._failed: dict[tuple[Edge, str], tuple[tuple[float, float], ...]] = {}
+        self._running: Step | None = None
+        self._steps = 0
+
+    @property
+    def states(self) -> tuple[int, ...]:
+        """Where the automaton can be after the samples observed; one state where everything is known."""
+        return tuple(sorted(self._states))
+
+    @property
+    def is_accepting(self) -> bool:
+        """Whether the samples observed satisfy the specification, as far as propositions tell."""
+        return self._sample is not None and self._states <= self.automaton.accepting
+
+    def observe(self, sample: Sample) -> None:
+        """Take in the next sample.
+
+        Raises:
+            TraceError: a time that does not come after the last one's.
+        """
+        if self._sample is not None and sample.time_ns <= self._sample.time_ns:
+            raise TraceError(
+                f"a sample at {sample.time_ns} ns follows one at {self._sample.time_ns} ns; give times that "
+                "increase"
+            )
+        self._sample = sample
+        self._maps = {}
+        self._symbol = self._observer.symbol(sample)
+        self._states = self.automaton.step_set(self._states, self._symbol)
+
+    def next_step(self) -> Step:
+        """Decide on what the samples observed so far say (Algorithm 1).
+
+        Edges that no movable object can take now are pruned, and the next shortest path is tried, until one
+        can be taken or none is left.
+
+        Raises:
+            UsageError: nothing was observed yet, or a step is being executed and was not concluded.
+        """
+        if self._sample is None:
+            raise UsageError("there is nothing to plan on; observe a sample first")
+        if self._running is not None:
+            raise UsageError(
+                f"step {self._running.number} is being executed; conclude it with its outcome first"
+            )
+        if self._states <= self.automaton.accepting:
+            return self._decided("hold", (), "the specification is satisfied: hold")
+        if len(self._states) > 1 and None in self._symbol:
+            return self._decided("wait", (), f"not enough is seen: {self._unknown()} unknown")
+        state = self._worst_state()
+        if state is None:
+            reason = "no path left: the specification cannot be satisfied any more"
+            return self._decided("no path", (), reason)
+        if state in self.automaton.accepting:
+            return self._decided("hold", (), "satisfied, unless it was violated while not enough was seen")
+        considered: list[Consideration] = []
+        while (way := next(self.automaton.paths(state, self._pruned), None)) is not None:
+            considered.append(self._considered(way, self._sample))
+            if not considered[-1].pruned:
+                return self._running_step(considered)
+            self._pruned[considered[-1].edge] = considered[-1].pruned
+        return self._decided("no path", considered, self._why_no_path(state))
+
+    def conclude(self, outcome: Outcome) -> None:
+        """Say how the execution of the last step went, once its samples were observed.
+
+        A place where an object could not be brought is avoided when the same edge is tried again.
+
+        Raises:
+            UsageError: no step is being executed.
+        """
+        step = self._running
+        if step is None or step.target is None or step.aim is None:
+            raise UsageError("no step is being executed; call next_step() first")
+        self._running = None
+        if not outcome.succeeded:
+            key = (step.aim.edge, step.target.name)
+            self._failed[key] = (*self._failed.get(key, ()), (step.target.x, step.target.y))
+
+    def _considered(self, way: tuple[Transition, ...], sample: Sample) -> Consideration:
+        """Look into the first edge of a path: what it takes, and which objects could do it."""
+        first = way[0]
+        edge = (first.source, first.target)
+        progress = self._guards([first])
+        constraints = self._guards(
+            each
+            for each in self.automaton.transitions
+            if each.source == first.source
+            and each.target not in edge
+            and (each.source, each.target) not in self._pruned
+        )
+        consideration = Consideration(
+            (first.source, *(each.target for each in way)), edge, progress, constraints, ()
+        )
+        tried = self._tried.get(edge, 0)
+        if tried >= self.settings.attempts:
+            return replace(consideration, pruned=f"tried {tried} times in vain")
+        candidates = [
+            self._candidate(name, consideration, sample) for name in self._movable(progress, sample)
+        ]
+        targets = [
+            (self._cost(candidate), number) for number, candidate in enumerate(candidates) if candidate.target
+        ]
+        if not targets:
+            reasons = "; ".join(f"{each.name}: {each.rejected}" for each in candidates)
+            reason = (
+                f"no object can do it ({reasons})" if reasons else "no object that can be moved matters to it"
+            )
+            return replace(consideration, candidates=tuple(candidates), pruned=reason)
+        chosen = min(targets)[1]
+        candidates[chosen] = replace(candidates[chosen], is_chosen=True)
+        return replace(consideration, candidates=tuple(candidates))
+
+    def _cost(self, candidate: Candidate) -> float:
+        """What the candidate with the least of is chosen."""
+        if candidate.target is None:
+            raise UsageError(f"{candidate.name} has no target")
+        pushes = self.settings.skill == "push"
+        return candidate.target.length if pushes else -candidate.target.robustness
+
+    def _candidate(self, name: str, consideration: Consideration, sample: Sample) -> Candidate:
+        tracked = sample.objects[name]
+        if not isinstance(tracked, TrackedObject):
+            raise TraceError(f"object {name!r} is {tracked!r}; give a TrackedObject")
+        if name not in self._maps:
+            self._maps[name] = proposition_maps(
+                self._formulas, self._regions, sample, name, self.settings.workspace
+            )
+        found = gradient_map(
+            self._maps[name],
+            consideration.progress.cubes,
+            consideration.constraints.cubes,
+            self.settings.workspace,
+            self.settings.constraint_margin,
+        )
+        failed = self._failed.get((consideration.edge, name), ())
+        target = find_target(found, tracked, self.settings, failed)
+        if isinstance(target, str):
+            return Candidate(name, found, None, target)
+        return Candidate(name, found, target)
+
+    def _movable(self, progress: Guards, sample: Sample) -> list[str]:
+        """The objects that a progress set is about and that can be moved, in the order of the settings."""
+        about = {number for cube in progress.cubes for number, _ in cube}
+        names = self.settings.movable if self.settings.movable is not None else tuple(sample.objects)
+        return [
+            name
+            for name in names
+            if name in sample.objects and any(concerns(self._formulas[number], name) for number in about)
+        ]
+
+    def _guards(self, transitions: Iterable[Transition]) -> Guards:
+        cubes = tuple(cube for each in transitions for cube in each.guard)
+        propositions = self.automaton.propositions
+        texts = tuple(
+            " and ".join(propositions[number].literal(value) for number, value in cube) or "true"
+            for cube in cubes
+        )
+        return Guards(cubes, texts)
+
+    def _running_step(self, considered: list[Consideration]) -> Step:
+        aim = considered[-1]
+        (target,) = [each.target for each in aim.candidates if each.is_chosen]
+        if target is None:
+            raise UsageError("the chosen object has no target")
+        self._tried[aim.edge] = self._tried.get(aim.edge, 0) + 1
+        verb = "push" if self.settings.skill == "push" else "place"
+        reason = (
+            f"{verb} {target.name} at ({target.x:.4g}, {target.y:.4g}) for the edge {aim.edge[0]} -> "
+            f"{aim.edge[1]}: {aim.progress}"
+        )
+        self._running = replace(self._decided("execute", considered, reason), target=target)
+        return self._running
+
+    def _decided(self, kind: Kind, considered: Iterable[Consideration], reason: str) -> Step:
+        if self._sample is None:
+            raise UsageError("there is nothing to plan on; observe a sample first")
+        number, self._steps = self._steps, self._steps + 1
+        pruned = tuple(sorted(self._pruned.items()))
+        return Step(number, self._sample.time_ns, kind, self.states, tuple(considered), None, pruned, reason)
+
+    def _worst_state(self) -> int | None:
+        """Of the states it can be in, the one farthest from acceptance; None if that is lost from all."""
+        ways = {state: next(self.automaton.paths(state), None) for state in self.states}
+        distances = {state: len(way) for state, way in ways.items() if way is not None}
+        return max(distances, key=lambda state: (distances[state], -state), default=None)
+
+    def _unknown(self) -> str:
+        """The propositions that the newest sample says nothing about."""
+        propositions = self.automaton.propositions
+        labels = zip(propositions, self._symbol, strict=True)
+        return ", ".join(each.label for each, value in labels if value is None)
+
+    def _why_no_path(self, state: int) -> str:
+        edges = "; ".join(
+            f"{source} -> {target}: {reason}" for (source, target), reason in sorted(self._pruned.items())
+        )
+        return f"no path left: every way from state {state} was given up ({edges})"

@@ -1,0 +1,163 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+
+import spatial_replay as sr
+from planning.kinematics import BLOCKS, PUSHING, block, run
+from spatial_replay.errors import TraceError, UsageError
+from spatial_replay.planning.planner import Planner
+from spatial_replay.planning.settings import Settings
+from spatial_replay.planning.step import Outcome
+from spatial_replay.planning.workspace import Grid, Workspace
+
+PUSH = Settings(
+    Workspace(Grid.over(0.3, -0.225, 0.75, 0.225, 0.005)), "push", margin=0.01, constraint_margin=0.005
+)
+TABLE = Settings(Workspace(Grid.over(0, 0, 10, 10, 0.5), supports=frozenset({"plate"})))
+THINGS = {
+    "cup": block(1, 1, size=1),
+    "fork": block(9, 9, size=1),
+    "plate": block(5, 5, size=3),
+}
+
+
+def planner(text, settings=TABLE, **options):
+    return Planner(sr.parse_specification(text), settings, **options)
+
+
+def test_three_blocks_are_pushed_as_in_the_paper():
+    steps, table = run(planner(PUSHING, PUSH), BLOCKS)
+    assert [step.kind for step in steps] == ["execute", "execute", "hold"]
+    assert len(steps[0].pruned) == 1
+    assert steps[0].considered[0].pruned.startswith("no object can do it")
+    assert steps[0].considered[0].path[-1] == steps[1].considered[-1].path[-1]
+    result = sr.evaluate(sr.parse_specification(PUSHING), sr.Trace.from_samples(table.samples))
+    assert result.verdict == "satisfied"
+
+
+def test_a_way_keeps_clear_of_what_must_not_be():
+    _, table = run(planner(PUSHING, PUSH), BLOCKS)
+    always = sr.parse_specification(
+        "G (green dist red >= 0.03 and green dist blue >= 0.03 and red dist blue >= 0.03)"
+    )
+    assert sr.evaluate(always, sr.Trace.from_samples(table.samples)).verdict == "satisfied"
+
+
+def test_things_are_put_one_after_the_other():
+    text = "(F (cup enclosedin plate)) and (F (fork leftof plate and fork dist plate <= 1))"
+    steps, table = run(planner(text), THINGS)
+    assert sorted(step.target.name for step in steps[:-1]) == ["cup", "fork"]
+    assert steps[-1].kind == "hold"
+    result = sr.evaluate(sr.parse_specification(text), sr.Trace.from_samples(table.samples))
+    assert result.verdict == "satisfied"
+
+
+def test_only_what_can_be_moved_is_moved():
+    settings = Settings(TABLE.workspace, movable=("cup",))
+    steps, _ = run(planner("F (cup enclosedin plate)", settings), THINGS)
+    assert [candidate.name for candidate in steps[0].candidates] == ["cup"]
+
+
+def test_an_object_is_turned_where_that_is_asked_for():
+    yaws = tuple(k * math.pi / 4 for k in range(8))
+    settings = Settings(Workspace(Grid.over(0, 0, 10, 10, 0.5), yaws))
+    fork = block(1, 1, 0.3, size=1)
+    steps, table = run(planner("F (fork oriented[0.01] plate)", settings), {**THINGS, "fork": fork})
+    assert steps[-1].kind == "hold"
+    assert math.isclose(math.cos(table.objects["fork"].yaw - table.objects["plate"].yaw), 1.0)
+
+
+def test_a_step_that_fails_is_tried_elsewhere():
+    steps, _ = run(planner("F (cup enclosedin plate)"), THINGS, slips=1)
+    assert [step.kind for step in steps] == ["execute", "execute", "hold"]
+    first, second = (step.target for step in steps[:2])
+    assert math.dist((first.x, first.y), (second.x, second.y)) > TABLE.workspace.grid.cell_size
+
+
+def test_what_cannot_be_moved_is_given_up_with_a_reason():
+    steps, _ = run(planner("F (cup enclosedin plate)"), THINGS, stuck={"cup", "plate"})
+    assert steps[-1].kind == "no path"
+    assert steps[-1].pruned == (((0, 1), "tried 3 times in vain"),)
+    assert "no path left" in steps[-1].reason
+    assert len(steps) == 1 + TABLE.attempts
+
+
+def test_what_is_impossible_ends_with_the_edges_given_up():
+    steps, _ = run(planner("F (cup leftof plate and cup rightof plate and cup enclosedin plate)"), THINGS)
+    assert [step.kind for step in steps] == ["no path"]
+    assert steps[0].reason.startswith("no path left")
+    ((edge, reason),) = steps[0].pruned
+    assert edge == (0, 1)
+    assert "cup: nowhere would it hold" in reason
+
+
+def test_what_is_violated_for_good_has_no_path():
+    steps, _ = run(
+        planner("(G (cup leftof plate)) and F (fork leftof plate)"), {**THINGS, "cup": block(8, 1)}
+    )
+    assert [step.kind for step in steps] == ["no path"]
+    assert "cannot be satisfied any more" in steps[0].reason
+    assert not steps[0].pruned
+
+
+def test_nothing_is_done_for_what_is_satisfied():
+    steps, _ = run(planner("G (cup leftof plate)"), THINGS)
+    assert [step.kind for step in steps] == ["hold"]
+    assert steps[0].target is None
+    assert steps[0].candidates == ()
+
+
+def test_it_waits_for_what_is_not_seen():
+    one = planner("(G (cup leftof plate)) and F (fork leftof plate)")
+    one.observe(sr.Sample(0, {"plate": THINGS["plate"], "fork": THINGS["fork"]}))
+    step = one.next_step()
+    assert step.kind == "wait"
+    assert "cup leftof plate" in step.reason
+    one.observe(sr.Sample(1, THINGS))
+    assert one.next_step().kind == "execute"
+
+
+def test_equal_samples_give_equal_steps():
+    first, second = (run(planner(PUSHING, PUSH), BLOCKS)[0] for _ in range(2))
+    assert [step.target for step in first] == [step.target for step in second]
+    assert [step.reason for step in first] == [step.reason for step in second]
+
+
+def test_steps_come_in_their_order():
+    one = planner("F (cup enclosedin plate)")
+    with pytest.raises(UsageError, match="observe a sample first"):
+        one.next_step()
+    with pytest.raises(UsageError, match="no step is being executed"):
+        one.conclude(Outcome(True))
+    one.observe(sr.Sample(5, THINGS))
+    with pytest.raises(TraceError, match="5 ns follows one at 5 ns"):
+        one.observe(sr.Sample(5, THINGS))
+    one.next_step()
+    with pytest.raises(UsageError, match="conclude it"):
+        one.next_step()
+
+
+def test_formulas_that_cannot_be_planned_are_refused():
+    with pytest.raises(UsageError, match="looks at earlier samples"):
+        planner("F (cup moved[1] cup[-3])")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"skill": "throw"}, "skill is 'throw'"),
+        ({"margin": -1.0}, "margin is -1.0"),
+        ({"constraint_margin": math.nan}, "constraint_margin is nan"),
+        ({"attempts": 0}, "attempts is 0"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(options, message):
+    with pytest.raises(UsageError, match=message):
+        Settings(TABLE.workspace, **options)
+
+
+def test_what_is_pushed_is_not_turned():
+    with pytest.raises(UsageError, match="yaws"):
+        Settings(Workspace(TABLE.workspace.grid, yaws=(0.0,)), "push")
