@@ -6,9 +6,10 @@ import re
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from functools import cached_property
-from itertools import chain
 from pathlib import Path
 from typing import TypeAlias
+
+import numpy as np
 
 from spatial_replay.errors import LogError, MissingFileError
 from spatial_replay.logs.faults import FaultList
@@ -17,10 +18,11 @@ from spatial_replay.logs.foreign.bag_metadata import (
     BagMetadata,
     bag_metadata_from_text,
 )
+from spatial_replay.logs.foreign.columns import Columns, MessageColumns, one_by_one
 from spatial_replay.logs.foreign.decoders import decoder_of
 from spatial_replay.logs.foreign.mcap_log import McapLog
 from spatial_replay.logs.foreign.messages import Decoder, Message, Topic
-from spatial_replay.logs.foreign.ordering import Batches, CountedTopics, Run, merged
+from spatial_replay.logs.foreign.ordering import CountedTopics, Run, merged
 from spatial_replay.logs.foreign.sqlite_bag import SqliteBag
 from spatial_replay.logs.foreign.sqlite_tables import SQLITE_MAGIC
 from spatial_replay.logs.foreign.topic_table import topics_named
@@ -131,25 +133,25 @@ class BagFolder:
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
         """See `MessageReader.iter_messages`."""
-        return chain.from_iterable(self.iter_batches(topics, start_ns, end_ns))
+        return one_by_one(self.iter_columns(topics, start_ns, end_ns))
 
-    def iter_batches(
+    def iter_columns(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
-    ) -> Batches:
-        """See `MessageReader.iter_batches`."""
+    ) -> Columns:
+        """What `iter_messages` gives, as columns."""
         runs = [
-            Run(file.start_ns or 0, lambda file=file: file.iter_batches(topics, start_ns, end_ns))  # type: ignore[misc]
+            Run(file.start_ns or 0, lambda file=file: file.iter_columns(topics, start_ns, end_ns))  # type: ignore[misc]
             for file in self._files
         ]
-        batches = runs[0].read() if len(runs) == 1 else merged(runs)
+        columns = runs[0].read() if len(runs) == 1 else merged(runs)
         if self._metadata and self._metadata.compression == "message":
-            batches = (self._unpacked_batch(batch) for batch in batches)
+            columns = map(self._unpacked, columns)
         if start_ns or end_ns is not None or self._metadata is None:
-            yield from batches
+            yield from columns
             return
         self._compare_types(topics)
         counted = CountedTopics({each.name: each.count for each in self._topics if each.name in topics})
-        yield from counted.counted(batches)
+        yield from counted.counted(columns)
         counted.compare(f"{self.name}/{METADATA_FILE}", self._faults)
 
     def _told(self) -> Iterable[_File]:
@@ -192,14 +194,17 @@ class BagFolder:
                     f" they are of {topic.type!r}"
                 )
 
-    def _unpacked_batch(self, messages: Iterable[Message]) -> list[Message]:
-        found = []
-        for message in messages:
+    def _unpacked(self, packed: MessageColumns) -> MessageColumns:
+        payloads: list[bytes] = []
+        kept: list[int] = []
+        for place, payload in enumerate(packed.payloads):
             try:
-                found.append(message._replace(payload=unpacked(message.payload)))
+                payloads.append(unpacked(payload))
+                kept.append(place)
             except LogError as error:
-                self._faults.add(f"{self.name}: on {message.topic!r} at {message.log_time_ns} ns: {error}")
-        return found
+                where = f"on {packed.topics[place]!r} at {packed.log_time_ns[place]} ns"
+                self._faults.add(f"{self.name}: {where}: {error}")
+        return replace(packed.take(np.array(kept, np.int64)), payloads=payloads)
 
 
 def _rank(name: str) -> tuple[str | int, ...]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from functools import cached_property
-from itertools import chain
 from pathlib import Path
 from typing import BinaryIO
 
@@ -14,10 +13,11 @@ from mcap.opcode import Opcode
 from spatial_replay.errors import LogError
 from spatial_replay.logs.block import Channel
 from spatial_replay.logs.faults import FaultList
+from spatial_replay.logs.foreign.columns import Columns, MessageColumns, one_by_one
 from spatial_replay.logs.foreign.decoders import decoder_of
 from spatial_replay.logs.foreign.definitions import full_type_name
-from spatial_replay.logs.foreign.messages import Decoder, Message, Topic, messages_from_columns
-from spatial_replay.logs.foreign.ordering import Batches, CountedTopics, Stretch, in_order
+from spatial_replay.logs.foreign.messages import Decoder, Message, Topic
+from spatial_replay.logs.foreign.ordering import CountedTopics, in_order
 from spatial_replay.logs.foreign.topic_table import is_latched, topics_named
 from spatial_replay.logs.mcap_chunks import ChunkPlace, read_records
 from spatial_replay.logs.mcap_directory import Directory, read_directory
@@ -90,12 +90,12 @@ class McapLog:
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
         """See `MessageReader.iter_messages`."""
-        return chain.from_iterable(self.iter_batches(topics, start_ns, end_ns))
+        return one_by_one(self.iter_columns(topics, start_ns, end_ns))
 
-    def iter_batches(
+    def iter_columns(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
-    ) -> Batches:
-        """See `MessageReader.iter_batches`."""
+    ) -> Columns:
+        """What `iter_messages` gives, as columns."""
         first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else end_ns
         directory, channels = self._contents
         wanted = {number: channel.topic for number, channel in channels.items() if channel.topic in topics}
@@ -109,24 +109,24 @@ class McapLog:
         places.sort(key=lambda place: (place.start_ns, place.offset))
         with self._path.open("rb") as stream:
             stretches = (self._messages(stream, place, wanted, first, last) for place in places)
-            batches = in_order([place.start_ns for place in places], stretches)
+            columns = in_order([place.start_ns for place in places], stretches)
             if (first, last) != (0, LATEST_NS + 1):
-                yield from batches
+                yield from columns
                 return
             counted = CountedTopics({each.name: each.count for each in self._topics if each.name in topics})
-            yield from counted.counted(batches)
+            yield from counted.counted(columns)
             counted.compare(self.name, self._faults)
 
     def _messages(
         self, stream: BinaryIO, place: ChunkPlace, wanted: dict[int, str], first: int, last: int
-    ) -> Stretch:
+    ) -> MessageColumns:
         """The messages in a place; what is lost of them goes to the faults."""
         span = f"messages between {place.start_ns} and {place.end_ns} ns"
         try:
             content = read_records(stream, place)
         except DamageError as damage:
             self._fault(place, f"{damage}; the {span} are lost")
-            return Stretch([])
+            return MessageColumns()
         heads, breaks_off = walk_records(content)
         is_message = (heads.opcode == Opcode.MESSAGE) & (heads.end - heads.begin >= _MESSAGE_FIELDS)
         if breaks_off:
@@ -139,15 +139,13 @@ class McapLog:
         rows = is_message & np.isin(heads.channel, np.array(list(wanted), np.uint64))
         rows &= (heads.log_time >= first) & (heads.log_time < last)
         bounds = zip((heads.begin[rows] + _MESSAGE_FIELDS).tolist(), heads.end[rows].tolist(), strict=True)
-        times_ns = heads.log_time[rows]
-        messages = messages_from_columns(
-            map(wanted.__getitem__, heads.channel[rows].tolist()),
-            times_ns.tolist(),
-            heads.publish_time[rows].view(np.int64).tolist(),
-            heads.sequence[rows].tolist(),
+        return MessageColumns(
+            [wanted[number] for number in heads.channel[rows].tolist()],
+            heads.log_time[rows].view(np.int64),
+            heads.publish_time[rows].view(np.int64),
+            heads.sequence[rows].view(np.int64),
             [content[begin:end] for begin, end in bounds],
         )
-        return Stretch(messages, bool((times_ns[1:] > times_ns[:-1]).all()))
 
     def _fault(self, place: ChunkPlace, what: str) -> None:
         self._faults.add(f"{self.name}: at byte {place.offset}: {what}")

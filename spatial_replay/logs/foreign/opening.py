@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
+from typing import Protocol
 
 from spatial_replay.errors import LogError, MissingFileError
 from spatial_replay.logs.foreign.bag_folder import BagFolder
+from spatial_replay.logs.foreign.columns import Columns
 from spatial_replay.logs.foreign.mcap_log import McapLog
 from spatial_replay.logs.foreign.messages import MessageReader
 from spatial_replay.logs.foreign.ros1_bag import Ros1Bag
@@ -15,7 +18,16 @@ from spatial_replay.logs.foreign.sqlite_tables import SQLITE_MAGIC
 from spatial_replay.logs.mcap_records import MAGIC
 
 
-def open_messages(path: Path) -> MessageReader:
+class ColumnReader(MessageReader, Protocol):
+    """A reader that hands on many messages at once."""
+
+    def iter_columns(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Columns:
+        """What `iter_messages` gives, as columns."""
+
+
+def open_messages(path: Path) -> ColumnReader:
     """A reader of the log in a file or a folder; the content decides, not the name.
 
     Raises:

@@ -1,38 +1,17 @@
-"""Messages in the order of time, out of stretches that overlap; handed on in lists, not one by one."""
+"""Messages in the order of time, out of stretches and files that overlap."""
 
 from __future__ import annotations
 
 import heapq
-from bisect import bisect_left, bisect_right
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from operator import itemgetter
-from typing import TypeAlias
 
 from spatial_replay.logs.faults import FaultList
-from spatial_replay.logs.foreign.messages import Message
-
-Batches: TypeAlias = Iterator[list[Message]]
-
-_LOG_ORDER = itemgetter(1, 0, 3)
-_LOG_TIME = itemgetter(1)
-_TOPIC = itemgetter(0)
+from spatial_replay.logs.foreign.columns import Columns, MessageColumns, joined
 
 
-@dataclass(frozen=True, slots=True)
-class Stretch:
-    """Messages of a part of a log.
-
-    Attributes:
-        is_ordered: whether the log time of each is later than that of the one before.
-    """
-
-    messages: list[Message]
-    is_ordered: bool = False
-
-
-def in_order(starts_ns: Sequence[int], stretches: Iterable[Stretch]) -> Batches:
+def in_order(starts_ns: Sequence[int], stretches: Iterable[MessageColumns]) -> Columns:
     """The messages of several stretches by log time, topic and sequence.
 
     No more is held than stretches overlap.
@@ -40,19 +19,16 @@ def in_order(starts_ns: Sequence[int], stretches: Iterable[Stretch]) -> Batches:
     Args:
         starts_ns: when each stretch begins, in order; a message before that comes late.
     """
-    waiting: list[Message] = []
+    waiting = MessageColumns()
     for number, stretch in enumerate(stretches, 1):
-        needs_order = bool(waiting) or not stretch.is_ordered
-        waiting = waiting + stretch.messages if waiting else stretch.messages
-        if needs_order:
-            waiting.sort(key=_LOG_ORDER)
+        waiting = joined([waiting, stretch] if len(waiting) else [stretch]).ordered()
         if number == len(starts_ns):
             break
-        ready = bisect_left(waiting, starts_ns[number], key=_LOG_TIME)
+        ready = waiting.count_before(starts_ns[number])
         if ready:
-            yield waiting[:ready]
-            waiting = waiting[ready:]
-    if waiting:
+            yield waiting.slice(0, ready)
+            waiting = waiting.slice(ready, len(waiting))
+    if len(waiting):
         yield waiting
 
 
@@ -61,13 +37,17 @@ class Run:
     """Messages in order that may be read from a time on."""
 
     start_ns: int
-    read: Callable[[], Batches]
+    read: Callable[[], Columns]
 
 
-def merged(runs: Iterable[Run]) -> Batches:
+_Active = list[tuple[int, int, MessageColumns, Columns]]
+"""A heap: time of the first message, number of the run, messages, and those that come after them."""
+
+
+def merged(runs: Iterable[Run]) -> Columns:
     """The messages of several runs by log time; a run is opened when its time has come."""
     waiting = sorted(runs, key=lambda run: run.start_ns, reverse=True)
-    active: list[tuple[int, int, list[Message], Batches]] = []
+    active: _Active = []
     opened = 0
     while waiting or active:
         while waiting and (not active or waiting[-1].start_ns <= active[0][0]):
@@ -75,21 +55,22 @@ def merged(runs: Iterable[Run]) -> Batches:
             opened += 1
         if not active:
             continue
-        _, number, batch, batches = heapq.heappop(active)
+        _, number, columns, following = heapq.heappop(active)
         limits = [run.start_ns for run in waiting[-1:]] + [each[0] for each in active[:1]]
         # equal times come in the order of the runs
-        ready = bisect_right(batch, min(limits), key=_LOG_TIME) if limits else len(batch)
-        yield batch[:ready]
-        if ready < len(batch):
-            heapq.heappush(active, (batch[ready].log_time_ns, number, batch[ready:], batches))
+        ready = columns.count_before(min(limits) + 1) if limits else len(columns)
+        yield columns.slice(0, ready)
+        if ready < len(columns):
+            rest = columns.slice(ready, len(columns))
+            heapq.heappush(active, (int(rest.log_time_ns[0]), number, rest, following))
         else:
-            _push_next(active, number, batches)
+            _push_next(active, number, following)
 
 
-def _push_next(active: list[tuple[int, int, list[Message], Batches]], number: int, batches: Batches) -> None:
-    for batch in batches:
-        if batch:
-            heapq.heappush(active, (batch[0].log_time_ns, number, batch, batches))
+def _push_next(active: _Active, number: int, following: Columns) -> None:
+    for columns in following:
+        if len(columns):
+            heapq.heappush(active, (int(columns.log_time_ns[0]), number, columns, following))
             return
 
 
@@ -100,11 +81,11 @@ class CountedTopics:
         self._declared = declared
         self._read: Counter[str] = Counter()
 
-    def counted(self, batches: Batches) -> Batches:
+    def counted(self, columns: Columns) -> Columns:
         """The messages as they are."""
-        for batch in batches:
-            self._read.update(map(_TOPIC, batch))
-            yield batch
+        for each in columns:
+            self._read.update(each.topics)
+            yield each
 
     def compare(self, name: str, faults: FaultList) -> None:
         """Tell the faults where a topic has more or fewer messages than declared."""

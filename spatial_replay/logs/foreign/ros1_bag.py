@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from functools import cached_property
-from itertools import chain, repeat
 from pathlib import Path
 from types import MappingProxyType
 from typing import BinaryIO
@@ -14,10 +13,11 @@ import numpy as np
 from spatial_replay.errors import LogError
 from spatial_replay.logs.block import Schema
 from spatial_replay.logs.faults import FaultList
+from spatial_replay.logs.foreign.columns import Columns, MessageColumns, one_by_one, unnumbered
 from spatial_replay.logs.foreign.decoders import decoder_of
 from spatial_replay.logs.foreign.definitions import full_type_name
-from spatial_replay.logs.foreign.messages import Decoder, Message, Topic, messages_from_columns
-from spatial_replay.logs.foreign.ordering import Batches, CountedTopics, Stretch, in_order
+from spatial_replay.logs.foreign.messages import Decoder, Message, Topic
+from spatial_replay.logs.foreign.ordering import CountedTopics, in_order
 from spatial_replay.logs.foreign.ros1_directory import (
     BagChunk,
     BagDirectory,
@@ -83,12 +83,12 @@ class Ros1Bag:
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
         """See `MessageReader.iter_messages`."""
-        return chain.from_iterable(self.iter_batches(topics, start_ns, end_ns))
+        return one_by_one(self.iter_columns(topics, start_ns, end_ns))
 
-    def iter_batches(
+    def iter_columns(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
-    ) -> Batches:
-        """See `MessageReader.iter_batches`."""
+    ) -> Columns:
+        """What `iter_messages` gives, as columns."""
         first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else end_ns
         wanted = {c.number: c for c in self._directory.connections.values() if c.topic in topics}
         chunks = [
@@ -101,24 +101,24 @@ class Ros1Bag:
         chunks.sort(key=lambda chunk: (chunk.start_ns, chunk.offset))
         with self._path.open("rb") as stream:
             stretches = (self._messages(stream, chunk, wanted, first, last) for chunk in chunks)
-            batches = in_order([chunk.start_ns for chunk in chunks], stretches)
+            columns = in_order([chunk.start_ns for chunk in chunks], stretches)
             if (first, last) != (0, LATEST_NS + 1) or not self._directory.is_indexed:
-                yield from batches
+                yield from columns
                 return
             counted = CountedTopics({each.name: each.count for each in self._topics if each.name in topics})
-            yield from counted.counted(batches)
+            yield from counted.counted(columns)
             counted.compare(self.name, self._faults)
 
     def _messages(
         self, stream: BinaryIO, chunk: BagChunk, wanted: dict[int, Connection], first: int, last: int
-    ) -> Stretch:
+    ) -> MessageColumns:
         """The messages of a chunk; what is lost of them goes to the faults."""
         span = f"messages between {chunk.start_ns} and {chunk.end_ns} ns"
         try:
             content = read_chunk(stream, chunk.offset)
         except DamageError as damage:
             self._fault(chunk, f"{damage}; the {span} are lost")
-            return Stretch([])
+            return MessageColumns()
         table, breaks_off = record_table(content)
         if breaks_off:
             self._fault(chunk, f"a record breaks off; some of the {span} are lost")
@@ -133,18 +133,13 @@ class Ros1Bag:
             self._fault(chunk, f"the {span} have other times than the index says")
         rows = is_message & np.isin(table.connection, list(wanted))
         rows &= (table.time_ns >= first) & (table.time_ns < last)
-        times_ns = table.time_ns[rows]
-        times: list[int] = times_ns.tolist()
-        bounds = zip(table.begin[rows].tolist(), table.end[rows].tolist(), strict=True)
         names = {number: connection.topic for number, connection in wanted.items()}
-        messages = messages_from_columns(
-            map(names.__getitem__, table.connection[rows].tolist()),
-            times,
-            times,
-            repeat(0),
+        bounds = zip(table.begin[rows].tolist(), table.end[rows].tolist(), strict=True)
+        return unnumbered(
+            [names[number] for number in table.connection[rows].tolist()],
+            table.time_ns[rows],
             [content[begin:end] for begin, end in bounds],
         )
-        return Stretch(messages, bool((times_ns[1:] > times_ns[:-1]).all()))
 
     def _topic(self, connection: Connection) -> Topic:
         definition = connection.data.get("message_definition", b"")

@@ -7,14 +7,16 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
+import numpy as np
+
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.block import Block
 from spatial_replay.logs.faults import FaultList
 from spatial_replay.logs.foreign.channels import CopiedMessages
-from spatial_replay.logs.foreign.messages import Message, MessageReader, Topic
-from spatial_replay.logs.foreign.opening import open_messages
-from spatial_replay.logs.foreign.ordering import Batches
+from spatial_replay.logs.foreign.columns import Columns, MessageColumns, in_pieces
+from spatial_replay.logs.foreign.messages import MessageReader, Topic
+from spatial_replay.logs.foreign.opening import ColumnReader, open_messages
 from spatial_replay.logs.mapping.assembler import Assembler
 from spatial_replay.logs.mapping.model import Mapping as TopicsMapping
 from spatial_replay.logs.mapping.plan import Plan
@@ -22,8 +24,6 @@ from spatial_replay.logs.options import OnTimeJump
 from spatial_replay.logs.sink import Attachment
 from spatial_replay.trace.trace import Trace
 
-_FIRST_BATCH, _LARGEST_BATCH = 256, 8_192
-"""Messages handed over at once: few at first, for those who want the first sample only."""
 _WAITING_BYTES = 2**26
 
 
@@ -66,11 +66,11 @@ class ForeignSource:
             concave=self.concave,
         )
         blocks = _Blocks(assembler, reader, CopiedMessages(read, _WAITING_BYTES), start_ns, end_ns)
-        for batch in _in_steps(_batches(reader, plan, start_ns, end_ns)):
-            yield from blocks.of(assembler.add(batch), batch)
+        for columns in in_pieces(_columns(reader, plan, start_ns, end_ns)):
+            yield from blocks.of(assembler.add(columns.messages()), columns)
             if assembler.is_finished:
                 break
-        yield from blocks.of(assembler.finish(), (), last=True)
+        yield from blocks.of(assembler.finish(), MessageColumns(), last=True)
         if not blocks.any_sample and start_ns is None and end_ns is None:
             reason = blocks.first_fault or "its messages make none with this mapping"
             raise LogError(f"{self.name} holds no sample: {reason}")
@@ -122,15 +122,14 @@ class _Blocks:
         self.any_sample = False
         self.first_fault: str | None = None
 
-    def of(self, trace: Trace, messages: Sequence[Message], *, last: bool = False) -> Iterator[Block]:
+    def of(self, trace: Trace, messages: MessageColumns, *, last: bool = False) -> Iterator[Block]:
         """A block, or none while there is nothing to say."""
         start_ns, end_ns = self._window
         if start_ns or end_ns is not None:
-            messages = [
-                message
-                for message in messages
-                if start_ns <= message.log_time_ns and (end_ns is None or message.log_time_ns < end_ns)
-            ]
+            inside = messages.log_time_ns >= start_ns
+            if end_ns is not None:
+                inside &= messages.log_time_ns < end_ns
+            messages = messages.take(np.flatnonzero(inside))
         self._copied.add(messages)
         for fault in chain(trace.faults, self._reader.take_faults(), self._assembler.take_faults()):
             self._faults.add(fault)
@@ -143,25 +142,14 @@ class _Blocks:
             yield Block(replace(trace, faults=faults), copied, remarks)
 
 
-def _batches(reader: MessageReader, plan: Plan, start_ns: int | None, end_ns: int | None) -> Batches:
+def _columns(reader: ColumnReader, plan: Plan, start_ns: int | None, end_ns: int | None) -> Columns:
     """The messages that samples of a window depend on."""
     if not plan.by_log_time or (not start_ns and end_ns is None):
-        return reader.iter_batches(plan.topics)
+        return reader.iter_columns(plan.topics)
     last = None if end_ns is None else end_ns + plan.margin_ns
     lookback = {topic: plan.lookback_ns(topic) for topic in plan.topics}
     known = [each for each in lookback.values() if each is not None]
     first = max(0, (start_ns or 0) - max(known, default=0))
     lasting = [topic for topic, each in lookback.items() if each is None]
-    before: Iterable[list[Message]] = reader.iter_batches(lasting, None, first) if lasting and first else ()
-    return chain(before, reader.iter_batches(plan.topics, first or None, last))
-
-
-def _in_steps(batches: Batches) -> Batches:
-    """Batches of bounded size, small ones at first."""
-    size = _FIRST_BATCH
-    for batch in batches:
-        begin = 0
-        while begin < len(batch):
-            yield batch[begin : begin + size]
-            begin += size
-            size = min(2 * size, _LARGEST_BATCH)
+    before: Iterable[MessageColumns] = reader.iter_columns(lasting, None, first) if lasting and first else ()
+    return chain(before, reader.iter_columns(plan.topics, first or None, last))

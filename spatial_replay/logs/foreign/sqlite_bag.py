@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cached_property
-from itertools import chain, repeat
 from pathlib import Path
+
+import numpy as np
 
 from spatial_replay.errors import LogError
 from spatial_replay.logs.faults import FaultList
+from spatial_replay.logs.foreign.columns import Columns, MessageColumns, one_by_one, unnumbered
 from spatial_replay.logs.foreign.decoders import decoder_of
-from spatial_replay.logs.foreign.messages import Decoder, Message, Topic, messages_from_columns
-from spatial_replay.logs.foreign.ordering import Batches, CountedTopics
+from spatial_replay.logs.foreign.messages import Decoder, Message, Topic
+from spatial_replay.logs.foreign.ordering import CountedTopics
 from spatial_replay.logs.foreign.sqlite_tables import (
     BagTables,
     Row,
@@ -101,23 +103,23 @@ class SqliteBag:
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
         """See `MessageReader.iter_messages`."""
-        return chain.from_iterable(self.iter_batches(topics, start_ns, end_ns))
+        return one_by_one(self.iter_columns(topics, start_ns, end_ns))
 
-    def iter_batches(
+    def iter_columns(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
-    ) -> Batches:
-        """See `MessageReader.iter_batches`."""
+    ) -> Columns:
+        """What `iter_messages` gives, as columns."""
         first, last = start_ns or 0, LATEST_NS if end_ns is None else min(end_ns - 1, LATEST_NS)
         counts = {each.name: each.count for each in self._topics if each.name in topics}
-        batches = self._messages(counts, first, last)
+        columns = self._messages(counts, first, last)
         if (first, last) != (0, LATEST_NS):
-            yield from batches
+            yield from columns
             return
         counted = CountedTopics(counts)
-        yield from counted.counted(batches)
+        yield from counted.counted(columns)
         counted.compare(self.name, self._faults)
 
-    def _messages(self, topics: Collection[str], first: int, last: int) -> Batches:
+    def _messages(self, topics: Collection[str], first: int, last: int) -> Columns:
         wanted = {number: topic.name for number, topic in self._tables.topics.items() if topic.name in topics}
         most = self._path.stat().st_size // _ROW_BYTES
         with opened(self._whole) as database:
@@ -125,12 +127,12 @@ class SqliteBag:
                 most -= len(rows)
                 if most < 0:
                     raise LogError(f"{self.name} is damaged: it lists more messages than it has room for")
-                yield self._batch(rows, wanted)
+                yield self._columns(rows, wanted)
 
-    def _batch(self, rows: Sequence[Row], wanted: Mapping[int, str]) -> list[Message]:
+    def _columns(self, rows: Sequence[Row], wanted: Mapping[int, str]) -> MessageColumns:
         _, numbers, times, payloads = zip(*rows, strict=True)
         if set(map(type, payloads)) != {bytes} or set(map(type, times)) != {int}:
             good = [row for row in rows if type(row[3]) is bytes and type(row[2]) is int]
             self._faults.add(f"{self.name}: {len(rows) - len(good)} messages have no time or no content")
-            return self._batch(good, wanted) if good else []
-        return messages_from_columns(map(wanted.__getitem__, numbers), times, times, repeat(0), payloads)
+            return self._columns(good, wanted) if good else MessageColumns()
+        return unnumbered([wanted[number] for number in numbers], np.array(times, np.int64), payloads)

@@ -28,7 +28,7 @@ _STEPS_A_BYTE = 20
 _SKIPS = 64
 """Damaged stretches are stepped over with twice the step each time: after so many no row can be left."""
 
-_MOST_ROWS, _BATCH_BYTES = 4_096, 2**21
+_MOST_ROWS, _BATCH_BYTES = 2_048, 2**21
 
 _COLUMNS = "SELECT id, topic_id, timestamp, data FROM messages"
 
