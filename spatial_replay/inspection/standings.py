@@ -1,0 +1,179 @@
+"""How a node stands from sample to sample, and the changes of it that are worth telling.
+
+A verdict that no continuation can change counts at once; the sign of a value that is still pending counts
+once it lasts `LASTING` samples in a row. What is carried from one stretch of samples to the next is a few
+numbers for each node, and into how many stretches a run is cut changes nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from spatial_replay.compiled import kernel
+from spatial_replay.geometry.arrays import Floats, Integers
+
+LASTING: Final = 3
+"""How many samples in a row a sign must last."""
+
+START, HOLDING, FAILING, SATISFIED, VIOLATED = 0, 1, 2, 3, 4
+"""Nothing known yet; pending, with a value of at least 0; pending, below 0; and the final ones."""
+
+OF_STANDING, OF_CANDIDATE = -1, -2
+"""In place of a sample of the stretch: one before it, that at which what was carried was worst."""
+
+_CODE, _SINCE, _UNTIL, _NEXT, _COUNT, _NEXT_SINCE = range(6)
+
+
+class Period(NamedTuple):
+    """A time during which a node stood in one way.
+
+    Attributes:
+        code: how.
+        start_ns, end_ns: its first and its last sample.
+        worst: the least number: of the value; of a final verdict, the end of the interval that decides.
+        place: the first sample of the stretch that has it, or where it was carried.
+    """
+
+    code: int
+    start_ns: int
+    end_ns: int
+    worst: float
+    place: int
+
+
+class Change(NamedTuple):
+    """A node stands in another way than before.
+
+    Attributes:
+        node: index among the nodes watched.
+        sample: index in the stretch, where it is confirmed.
+        before: None where nothing was known before.
+        after: what has begun, up to the sample that confirms it.
+    """
+
+    node: int
+    sample: int
+    before: Period | None
+    after: Period
+
+
+@dataclass(frozen=True, eq=False)
+class Standings:
+    """How some nodes stand.
+
+    Attributes:
+        integers: (K, 6) int64: of each node, how it stands, since when, at which sample the last time; how it
+            would stand next, for how many samples in a row, since when.
+        worst: (K, 2): the least number of the one and of the other.
+    """
+
+    integers: Integers
+    worst: Floats
+
+    @classmethod
+    def begin(cls, nodes: int) -> Standings:
+        """Before the first sample."""
+        return cls(np.zeros((nodes, 6), np.int64), np.full((nodes, 2), np.inf))
+
+    @property
+    def are_final(self) -> bool:
+        """Whether no node can change any more."""
+        return bool((self.integers[:, _CODE] >= SATISFIED).all())
+
+
+class Followed(NamedTuple):
+    """What a stretch did to some nodes.
+
+    Attributes:
+        changes: by node, then in the order of time.
+        places: (K, 2) int64, where each of `standings.worst` is: a sample of the stretch, or where it was
+            carried.
+    """
+
+    standings: Standings
+    changes: list[Change]
+    places: Integers
+
+
+def follow(before: Standings, times_ns: Integers, series: Floats, nodes: Integers) -> Followed:
+    """Take in the next samples.
+
+    Args:
+        times_ns: (T,).
+        series: (N, 4, T): value, now, lower, upper.
+        nodes: (K,) int64, ids of the nodes that are watched.
+    """
+    integers, worst = before.integers.copy(), before.worst.copy()
+    places = np.tile(np.array([OF_STANDING, OF_CANDIDATE], np.int64), (len(nodes), 1))
+    room = len(nodes) * (len(times_ns) // LASTING + 2)
+    found, numbers = np.empty((room, 10), np.int64), np.empty((room, 2))
+    count = _follow(times_ns, series, nodes, integers, worst, places, found, numbers)
+    changes = []
+    for row, (worst_before, worst_after) in zip(
+        found[:count].tolist(), numbers[:count].tolist(), strict=True
+    ):
+        node, sample, code, start, end, place, next_code, next_start, next_end, next_place = row
+        period = Period(code, start, end, worst_before, place) if code != START else None
+        after = Period(next_code, next_start, next_end, worst_after, next_place)
+        changes.append(Change(node, sample, period, after))
+    return Followed(Standings(integers, worst), changes, places)
+
+
+@kernel
+def _follow(
+    times_ns: Integers,
+    series: Floats,
+    nodes: Integers,
+    integers: Integers,
+    worst: Floats,
+    places: Integers,
+    found: Integers,
+    numbers: Floats,
+) -> int:
+    """Take samples into the state (see `Standings`, `Followed`); how many rows of `found` are filled."""
+    count = 0
+    for k in range(nodes.shape[0]):
+        value, lower, upper = series[nodes[k], 0], series[nodes[k], 2], series[nodes[k], 3]
+        state = integers[k]
+        for t in range(times_ns.shape[0]):
+            if state[_CODE] >= SATISFIED:
+                break
+            code, number = START, value[t]
+            if lower[t] >= 0.0:
+                code, number = SATISFIED, lower[t]
+            elif upper[t] < 0.0:
+                code, number = VIOLATED, upper[t]
+            elif value[t] >= 0.0:
+                code = HOLDING
+            elif value[t] < 0.0:
+                code = FAILING
+            if code == state[_CODE] or code == START:
+                state[_COUNT] = 0
+                if code != START:
+                    state[_UNTIL] = times_ns[t]
+                    if number < worst[k, 0]:
+                        worst[k, 0], places[k, 0] = number, t
+                continue
+            if state[_COUNT] == 0 or state[_NEXT] != code:
+                state[_NEXT], state[_COUNT], state[_NEXT_SINCE] = code, 0, times_ns[t]
+                worst[k, 1], places[k, 1] = number, t
+            elif number < worst[k, 1]:
+                worst[k, 1], places[k, 1] = number, t
+            state[_COUNT] += 1
+            is_first = state[_CODE] == START and code < SATISFIED
+            if not is_first and code < SATISFIED and state[_COUNT] < LASTING:
+                continue
+            if not is_first:
+                row = found[count]
+                row[0], row[1] = k, t
+                row[2], row[3], row[4], row[5] = state[_CODE], state[_SINCE], state[_UNTIL], places[k, 0]
+                row[6], row[7], row[8], row[9] = code, state[_NEXT_SINCE], times_ns[t], places[k, 1]
+                numbers[count, 0], numbers[count, 1] = worst[k, 0], worst[k, 1]
+                count += 1
+            state[_CODE], state[_SINCE], state[_UNTIL] = code, state[_NEXT_SINCE], times_ns[t]
+            worst[k, 0], places[k, 0] = worst[k, 1], places[k, 1]
+            state[_COUNT] = 0
+    return count
