@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 SCENARIOS: Mapping[str, str] = MappingProxyType(
     {
         "push": "three blocks on a table, and a robot that pushes them",
+        "pick-place": "nine things on a table, and a robot that picks and places them",
     }
 )
 """The simulated worlds, and what there is in each."""

@@ -53,6 +53,7 @@ class Engine:
         call("changeDynamics", self._table, -1, lateralFriction=_WOOD)
         folder = resources.files("pybullet_data")
         self._robot: int = call("loadURDF", str(folder / "franka_panda/panda.urdf"), useFixedBase=True)
+        self._couple_fingers()
         self.set_grip(1.0)
 
     def close(self) -> None:
@@ -139,6 +140,15 @@ class Engine:
             self._call("changeDynamics", self._robot, finger, lateralFriction=friction)
 
     # ---------------------------------------------------------------------------------------- private
+
+    def _couple_fingers(self) -> None:
+        """Let one motor drive both fingers, as in the real hand: what they hold stays in their middle."""
+        left, right = FINGERS
+        kind, axis, centre = self._bullet.JOINT_GEAR, (1, 0, 0), (0, 0, 0)
+        gear = self._call(
+            "createConstraint", self._robot, left, self._robot, right, kind, axis, centre, centre
+        )
+        self._call("changeConstraint", gear, gearRatio=-1, erp=0.1, maxForce=50)
 
     def _add(
         self,

@@ -57,19 +57,18 @@ def best_grasp(scene: Scene, name: str, goal: Point, yaw: float | None) -> Grasp
     bottom, top = scene.height(name)
     above_bottom = max(FINGERTIP + 0.003, top - bottom - _BELOW_TOP)
     start = scene.place_of(name)
-    best, best_room = None, _ROOM
+    best, best_room, can_pick = None, _ROOM, False
     for thickness, angle in sorted(across):
         opening = min(WIDEST, thickness + _OPENING)
         for grasp_yaw, turn in _turns(scene, name, angle, goal, yaw):
             grasp = Grasp(grasp_yaw, turn, above_bottom, opening)
-            room = min(
-                _room(scene, name, start, grasp.yaw, grasp, bottom),
-                _room(scene, name, goal, grasp.turn, grasp, surface(scene, name, goal)),
-                _AMPLE,
-            )
+            here = _room(scene, name, start, grasp.yaw, grasp, bottom)
+            there = _room(scene, name, goal, grasp.turn, grasp, surface(scene, name, goal))
+            can_pick = can_pick or here > _ROOM
+            room = min(here, there, _AMPLE)
             if room > best_room:
                 best, best_room = grasp, room
-    return best or f"no room for the fingers around {name} or where it should go"
+    return best or f"no room for the fingers around {name} where it {'should go' if can_pick else 'lies'}"
 
 
 def surface(scene: Scene, name: str, goal: Point) -> float:

@@ -53,15 +53,25 @@ def _pick_up(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str
 def _set_down(scene: Scene, name: str, grasp: Grasp, goal: Point) -> Generator[None, None, str]:
     """Carry what is held to a point and lower it; returns what went wrong, if anything."""
     arm = scene.arm
-    carried = yield from _holding(scene, name, arm.travel(*goal, grasp.turn))
+    x, y = _tool_for(scene, name, goal, grasp.turn)
+    carried = yield from _holding(scene, name, arm.travel(x, y, grasp.turn))
     if not carried:
         return f"{name} was lost on the way"
     # it may hang otherwise than it stood
     hanging = arm.commanded[2] - scene.height(name)[0]
     z = surface(scene, name, goal) + hanging + _SETTING_DOWN
-    yield from _holding(scene, name, arm.move(*goal, z + 0.03))
-    lowered = yield from _holding(scene, name, arm.move(*goal, z, speed=_SLOW / 2))
+    yield from _holding(scene, name, arm.move(x, y, z + 0.03))
+    lowered = yield from _holding(scene, name, arm.move(x, y, z, speed=_SLOW / 2))
     return "" if lowered else f"{name} slipped out of the fingers as it was set down"
+
+
+def _tool_for(scene: Scene, name: str, goal: Point, turn: float) -> Point:
+    """Where the tool must be for what it holds, hardly ever in its very middle, to be at a point."""
+    x, y = scene.place_of(name)
+    tool_x, tool_y, _ = scene.arm.commanded
+    dx, dy, turned = x - tool_x, y - tool_y, turn - scene.arm.yaw
+    cosine, sine = math.cos(turned), math.sin(turned)
+    return goal[0] - dx * cosine + dy * sine, goal[1] - dx * sine - dy * cosine
 
 
 def _holding(scene: Scene, name: str, motion: Motion) -> Generator[None, None, bool]:

@@ -21,7 +21,7 @@ from spatial_replay.simulation.pushing import pushing
 from spatial_replay.simulation.scenario import Scenario
 from spatial_replay.simulation.scene import Scene
 from spatial_replay.simulation.shapes import Box, Pose, footprint, height
-from spatial_replay.simulation.world import Body, Execution, Workspace
+from spatial_replay.simulation.world import Body, Execution, Skill, Workspace
 from spatial_replay.trace.sample import Sample
 
 SAMPLES_PER_S = 30
@@ -79,6 +79,11 @@ class Tabletop:
     def name(self) -> str:
         """See `World`."""
         return self._scenario.name
+
+    @property
+    def skill(self) -> Skill:
+        """See `World`."""
+        return self._scenario.skill
 
     @property
     def bodies(self) -> tuple[Body, ...]:
@@ -244,7 +249,7 @@ class Tabletop:
             footprint(body.shape, seen),
             class_name=body.class_name,
             yaw=yaw,
-            height=height(body.shape, seen),
+            height=None if body.support else height(body.shape, seen),
             uncertainty=self._noise_m,
         )
 

@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.simulation.shapes import Shape
 from spatial_replay.trace.sample import Sample
+
+
+Skill = Literal["push", "place"]
+"""What a robot does with an object: push it along a path, or pick it up and place it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +24,8 @@ class Body:
         name, class_name: as in the samples.
         shape: its form and size, in metres.
         movable: whether the robot can push it, or pick and place it.
-        support: whether other objects may be placed on it, as on a plate; it is then no obstacle to them.
+        support: whether other objects may be placed on it, as on a plate. It is then no obstacle to them, and
+            its samples have no height: what lies on it lies in it.
     """
 
     name: str
@@ -76,6 +81,10 @@ class World(Protocol):
     @property
     def name(self) -> str:
         """The scenario's name."""
+
+    @property
+    def skill(self) -> Skill:
+        """What the robot does with objects."""
 
     @property
     def bodies(self) -> tuple[Body, ...]:

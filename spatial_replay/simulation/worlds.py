@@ -12,7 +12,7 @@ from spatial_replay.simulation.tabletop import Tabletop
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.formula import Specification
 
-SCENARIOS: tuple[str, ...] = ("push",)
+SCENARIOS: tuple[str, ...] = ("push", "pick-place")
 """Each has a module of that name in `scenarios`, and a specification beside it."""
 
 
@@ -39,7 +39,7 @@ def default_specification(name: str) -> Specification:
     Raises:
         UsageError: there is no such scenario.
     """
-    filename = f"{_scenario(name).name}.spatial"
+    filename = f"{_scenario(name).name.replace('-', '_')}.spatial"
     file = resources.files("spatial_replay.simulation.scenarios") / filename
     return parse_specification(file.read_text(encoding="utf-8"), filename=filename)
 
