@@ -68,7 +68,7 @@ class LeafPlan:
             self._arrays,
             np.array([ABSENT if sample is None else 0 for sample in samples] + whole, np.int64),
             np.array(numbers + [newest.get(name, nan) for name in self._signals], np.float64),
-            np.concatenate(vertices),
+            np.concatenate(vertices).ravel(),
         )
 
     def _flattened(self, seen: list[TrackedObject | None]) -> tuple[list[int], list[float], list[Floats]]:
@@ -131,7 +131,7 @@ def _arrays(frame: Frame, rows: Rows, code: LeafCode, outputs: Sequence[int]) ->
         region_parts=np.diff(regions.part_start),
         region_sizes=np.diff(regions.vertex_start),
         region_radius=regions.radius.copy(),
-        region_vertices=regions.vertices.copy(),
+        region_vertices=regions.vertices.ravel(),
         region_heights=np.stack((regions.bottom, regions.top), axis=1),
         operand_start=_starts(operand_rows),
         operand_rows=_whole(each.row for among in operand_rows for each in among),

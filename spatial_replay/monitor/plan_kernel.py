@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spatial_replay.compiled import kernel, piece
+from spatial_replay.compiled import inlined, kernel, piece
 from spatial_replay.geometry.arrays import Flags, Floats, Integers
 from spatial_replay.geometry.kernels import measure_rows
 from spatial_replay.geometry.orientation import misalignment_of
@@ -31,7 +31,8 @@ class PlanArrays(NamedTuple):
     Attributes:
         extent: (4,), how many samples, regions, places and signals there are.
         region_parts, region_sizes, region_radius, region_vertices, region_heights: the regions' footprints:
-            parts of each, vertices of each part, radius of each part, all vertices, (bottom, top) of each.
+            parts of each, vertices of each part, radius of each part, x and y of all vertices,
+            (bottom, top) of each.
         operand_start, operand_rows, operand_classes: rows of each operand, and the class that each must have.
         enlargement: of each operand.
         geometric: numbers of the measurements between footprints, with their `quantity` and operands
@@ -103,7 +104,7 @@ def _unpacked(plan: PackedPlan) -> PlanArrays:
         whole[at[2] : at[3]],
         whole[at[4] : at[5]],
         numbers[at[6] : at[7]],
-        numbers[at[8] : at[9]].reshape((-1, 2)),
+        numbers[at[8] : at[9]],
         numbers[at[10] : at[11]].reshape((-1, 2)),
         whole[at[12] : at[13]],
         whole[at[14] : at[15]],
@@ -126,7 +127,7 @@ def _unpacked(plan: PackedPlan) -> PlanArrays:
     )
 
 
-@piece
+@inlined
 def _is_there(classes: Integers, row: int, wanted: int) -> bool:
     return classes[row] != ABSENT and wanted in (ANY, classes[row])
 
@@ -144,6 +145,24 @@ def _starts(before: int, first: Integers, second: Integers) -> Integers:
 
 
 @piece
+def _joined(first: Floats, second: Floats) -> Floats:
+    joined = np.empty(len(first) + len(second))
+    for k in range(len(first)):
+        joined[k] = first[k]
+    for k in range(len(second)):
+        joined[len(first) + k] = second[k]
+    return joined
+
+
+@piece
+def _lengths(starts: Integers) -> Integers:
+    lengths = np.empty(len(starts) - 1, np.int64)
+    for k in range(len(lengths)):
+        lengths[k] = starts[k + 1] - starts[k]
+    return lengths
+
+
+@piece
 def _spreads(starts: Integers, members: Integers, places: Floats, here: int) -> Floats:
     """Each operand's uncertainty, the largest of its members'; last that of no operand, 0."""
     spreads = np.zeros(len(starts))
@@ -154,7 +173,7 @@ def _spreads(starts: Integers, members: Integers, places: Floats, here: int) -> 
     return spreads
 
 
-@piece
+@inlined
 def _yaw(row: int, classes: Integers, places: Floats, here: int) -> float:
     return places[row - here, 2] if row >= here and classes[row] != ABSENT else np.nan
 
@@ -165,12 +184,15 @@ def _measure(
     vertices: Floats, values: Floats, spreads: Floats,
 ) -> None:  # fmt: skip
     """Fill `values` and `spreads` (K, 1), as `measurements.measured` gives them."""
-    here = len(classes) - len(places)
-    bottom, top = np.full(len(classes), np.nan), np.full(len(classes), np.nan)
-    for k in range(len(plan.region_heights)):
-        row = plan.extent[0] + k
-        bottom[row], top[row] = plan.region_heights[k, 0], plan.region_heights[k, 1]
-    bottom[here:], top[here:] = places[:, 0], places[:, 1]
+    here, regions = len(classes) - len(places), plan.extent[1]
+    bottom, top = np.empty(len(classes)), np.empty(len(classes))
+    for row in range(len(classes)):
+        bottom[row] = top[row] = np.nan
+        if row >= here:
+            bottom[row], top[row] = places[row - here, 0], places[row - here, 1]
+        elif row >= here - regions:
+            heights = plan.region_heights[row - here + regions]
+            bottom[row], top[row] = heights[0], heights[1]
     members = np.empty(len(plan.operand_rows), np.int64)
     for k in range(len(members)):
         is_there = _is_there(classes, plan.operand_rows[k], plan.operand_classes[k])
@@ -179,13 +201,13 @@ def _measure(
     measure_rows(
         _starts(plan.extent[0], plan.region_parts, counts),
         _starts(0, plan.region_sizes, sizes),
-        np.concatenate((plan.region_vertices, vertices)),
-        np.concatenate((plan.region_radius, radius)),
+        _joined(plan.region_vertices, vertices).reshape((-1, 2)),
+        _joined(plan.region_radius, radius),
         bottom,
         top,
         members,
         plan.operand_start,
-        plan.operand_start[1:] - plan.operand_start[:-1],
+        _lengths(plan.operand_start),
         plan.enlargement,
         plan.quantity,
         plan.first,
@@ -207,7 +229,7 @@ def _measure(
                 values[k, 0] = np.nan
 
 
-@piece
+@inlined
 def _members(plan: PlanArrays, classes: Integers, members: Flags) -> None:
     """Fill `members` (M, 1): whether each binding is one (1, 0), or that is not known (-1)."""
     for m in range(len(members)):
@@ -217,6 +239,24 @@ def _members(plan: PlanArrays, classes: Integers, members: Flags) -> None:
                 members[m, 0] = -1 if plan.is_group[m] else 0
 
 
+@inlined
+def _channels_of(values: Floats, spreads: Floats, signals: Floats, members: Flags) -> int:
+    """How many channels hold what is known: 4 with uncertainty, 2 with anything unknown, else 1."""
+    channels = 1
+    for k in range(len(values)):
+        if spreads[k, 0] != 0.0:
+            return 4
+        if not np.isfinite(values[k, 0]):
+            channels = 2
+    for k in range(len(signals)):
+        if not np.isfinite(signals[k, 0]):
+            channels = 2
+    for k in range(len(members)):
+        if members[k, 0] < 0:
+            channels = 2
+    return channels
+
+
 @kernel
 def leaves_of_sample(packed_plan: PackedPlan, whole: Integers, numbers: Floats, vertices: Floats) -> Floats:
     """(C, A, 1), as `leaf_values` gives them.
@@ -224,15 +264,17 @@ def leaves_of_sample(packed_plan: PackedPlan, whole: Integers, numbers: Floats, 
     Args:
         whole: class codes of the samples and of the places, parts of each place, vertices of each part.
         numbers: `NUMBERS_OF_PLACE` of each place, radius of each part, value of each signal.
-        vertices: (V, 2), of all parts.
+        vertices: x and y of each vertex of all parts.
     """
     plan = _unpacked(packed_plan)
     samples, regions, places, signals = plan.extent
     counts = whole[samples + places : samples + 2 * places]
     sizes = whole[samples + 2 * places :]
     classes = np.zeros(samples + regions + places, np.int64)
-    classes[:samples] = whole[:samples]
-    classes[samples + regions :] = whole[samples : samples + places]
+    for k in range(samples):
+        classes[k] = whole[k]
+    for k in range(places):
+        classes[samples + regions + k] = whole[samples + k]
     of_places = numbers[: NUMBERS_OF_PLACE * places].reshape((places, NUMBERS_OF_PLACE))
     radius = numbers[NUMBERS_OF_PLACE * places : len(numbers) - signals]
     of_signals = numbers[len(numbers) - signals :].reshape((signals, 1))
@@ -241,8 +283,7 @@ def leaves_of_sample(packed_plan: PackedPlan, whole: Integers, numbers: Floats, 
     _measure(plan, classes, counts, sizes, radius, of_places, vertices, values, spreads)
     members = np.empty((len(plan.is_group), 1), np.int8)
     _members(plan, classes, members)
-    is_known = np.isfinite(values).all() and np.isfinite(of_signals).all() and not (members < 0).any()
-    channels = 4 if spreads.any() else 1 if is_known else 2
+    channels = _channels_of(values, spreads, of_signals, members)
     leaves = np.empty((channels, len(plan.outputs), 1))
     run_instructions(plan.code, plan.constants, values, spreads, of_signals, members, plan.outputs, leaves)
     return leaves

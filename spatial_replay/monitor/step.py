@@ -44,7 +44,8 @@ def step(
         final: (N, 2), receives the ends of each node's value if the run ends with the last of them.
     """  # fmt: skip
     channels, begin = leaves.shape[0], position - offset
-    memory.stamps[begin : begin + count] = times_ns[t : t + count]
+    for k in range(count):
+        memory.stamps[begin + k] = times_ns[t + k]
     step_signals(tables.signals, leaves, t, count, position, offset, memory)
     step_tables(tables.nodes, tables.parts, memory, scratch, channels, position, start_ns, begin, count)
     report(tables.reports, tables.operands, memory, scratch, channels, begin, count, t, series, final)
@@ -57,7 +58,8 @@ def step_with_windows(
 ) -> None:  # fmt: skip
     """`step` for any program; apart from it because it is much more to compile and to load."""
     channels, begin = leaves.shape[0], position - offset
-    memory.stamps[begin : begin + count] = times_ns[t : t + count]
+    for k in range(count):
+        memory.stamps[begin + k] = times_ns[t + k]
     step_signals(tables.signals, leaves, t, count, position, offset, memory)
     step_tables(tables.nodes, tables.parts, memory, scratch, channels, position, start_ns, begin, count)
     for p in range(len(tables.parts)):
