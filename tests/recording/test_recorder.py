@@ -79,6 +79,15 @@ def test_a_closed_recorder_takes_no_more_and_closes_once(tmp_path: Path) -> None
         recorder.write(sample(0))
 
 
+@pytest.mark.parametrize("waiting", [1, 2, 3000])
+def test_a_loop_that_may_wait_loses_nothing(tmp_path: Path, waiting: int) -> None:
+    path = tmp_path / "run.mcap"
+    with Recorder(path, specifications=[SPEC], waiting=waiting) as recorder:
+        for index in range(60):
+            recorder.write(sample(index))
+    assert (read_trace(path), recorder.dropped) == (run(60), 0)
+
+
 def test_a_loop_that_may_not_wait_drops_and_counts(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with Recorder(path, specifications=[SPEC], waiting=1, block=False) as recorder:
