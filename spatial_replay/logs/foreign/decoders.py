@@ -43,13 +43,16 @@ def decoder_of(topic: Topic, distribution: str | None = None) -> Decoder:
 def why_unreadable(topic: Topic, distribution: str | None = None) -> str | None:
     """Why the messages of a topic cannot be decoded, or None."""
     try:
-        match topic.encoding:
-            case "ros1" | "cdr":
-                ros_definitions(topic.type, topic.encoding, topic.schema, distribution)
-            case _:
-                decoder_of(topic)
+        if topic.encoding not in ("ros1", "cdr"):
+            decoder_of(topic)
+            return None
     except LogError as error:
         return str(error)
+    try:
+        # a decoder takes longer to make than its definition to check
+        ros_definitions(topic.type, topic.encoding, topic.schema, distribution)
+    except LogError as error:
+        return f"topic {topic.name!r}: {error}"
     return None
 
 

@@ -1,0 +1,186 @@
+"""MCAP logs of others in every encoding."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import build_file_descriptor_set
+
+from logs.foreign.bag_files import (
+    POINT,
+    ROS1,
+    ROS2,
+    SECOND,
+    START_NS,
+    point,
+    write_json_mcap,
+    write_mcap,
+)
+from spatial_replay.errors import LogError
+from spatial_replay.logs.foreign.opening import open_messages
+
+POSES = build_file_descriptor_set(PosesInFrame).SerializeToString()
+
+
+def poses_log(path: Path, schema: bytes = POSES, **options: Any) -> Path:
+    messages = []
+    for index in range(20):
+        poses = PosesInFrame(frame_id="map")
+        poses.poses.add().position.x = 0.5 * index
+        messages.append(("/poses", START_NS + index * SECOND, poses.SerializeToString()))
+    channels = [("/poses", "protobuf", "foxglove.PosesInFrame", "protobuf", schema)]
+    return write_mcap(path, channels, messages, **options)
+
+
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD])
+def test_protobuf_is_decoded_by_the_descriptors_in_the_log(
+    tmp_path: Path, compression: CompressionType
+) -> None:
+    reader = open_messages(poses_log(tmp_path / "poses.mcap", compression=compression))
+    (topic,) = reader.topics()
+    assert (topic.type, topic.encoding, topic.count) == ("foxglove.PosesInFrame", "protobuf", 20)
+    decode: Callable[[bytes], Any] = reader.decoder("/poses")
+    found = [decode(message.payload).poses[0].position.x for message in reader.iter_messages(["/poses"])]
+    assert found == [0.5 * index for index in range(20)]
+    with pytest.raises(LogError, match=r"a message is no foxglove\.PosesInFrame"):
+        decode(b"\xff\xff\xff")
+
+
+def test_files_of_descriptors_may_come_in_any_order(tmp_path: Path) -> None:
+    described = FileDescriptorSet.FromString(POSES)
+    turned = FileDescriptorSet(file=list(reversed(described.file)))
+    (topic,) = open_messages(poses_log(tmp_path / "poses.mcap", turned.SerializeToString())).topics()
+    assert topic.unreadable is None
+
+
+@pytest.mark.parametrize(
+    ("schema", "told"),
+    [
+        (b"", "cannot be used"),
+        (b"\xff\xff", "cannot be used"),
+        (POSES.replace(b"PosesInFrame", b"PosesInCrate"), "cannot be used"),
+        (POSES[: len(POSES) // 2], "cannot be used"),
+    ],
+)
+def test_descriptors_that_do_not_describe_the_type_are_told(tmp_path: Path, schema: bytes, told: str) -> None:
+    (topic,) = open_messages(poses_log(tmp_path / "poses.mcap", schema)).topics()
+    assert topic.unreadable is not None and told in topic.unreadable
+
+
+def test_json_needs_no_schema(tmp_path: Path) -> None:
+    log = write_json_mcap(tmp_path / "a.mcap", [("/a", START_NS, {"x": 1.5}), ("/a", START_NS + 1, [1])])
+    reader = open_messages(log)
+    (topic,) = reader.topics()
+    assert (topic.type, topic.encoding, topic.unreadable) == ("", "json", None)
+    decode = reader.decoder("/a")
+    assert [decode(message.payload) for message in reader.iter_messages(["/a"])] == [{"x": 1.5}, [1]]
+    for bad in (b"{", b"\xff", b"[" * 100_000):
+        with pytest.raises(LogError, match="a message is no JSON"):
+            decode(bad)
+
+
+def test_ros1_messages_may_stand_in_mcap(tmp_path: Path) -> None:
+    text, _ = ROS1.generate_msgdef(POINT)
+    payload = bytes(ROS1.serialize_ros1(point(1.0, 2.0), POINT))
+    log = write_mcap(
+        tmp_path / "a.mcap",
+        [("/a", "ros1", "geometry_msgs/Point", "ros1msg", text.encode())],
+        [("/a", START_NS, payload)],
+        profile="ros1",
+    )
+    reader = open_messages(log)
+    decode: Callable[[bytes], Any] = reader.decoder("/a")
+    (message,) = reader.iter_messages(["/a"])
+    decoded = decode(message.payload)
+    assert (decoded.x, decoded.y) == (1.0, 2.0)
+    assert reader.topics()[0].type == POINT
+    assert (message.log_time_ns, message.publish_time_ns) == (START_NS, START_NS - 1_000)
+
+
+def test_events_of_services_do_not_keep_a_log_from_being_read(tmp_path: Path) -> None:
+    """Nor does a profile that is not that of ROS 2."""
+    text, _ = ROS2.generate_msgdef(POINT, ros_version=2)
+    payload = bytes(ROS2.serialize_cdr(point(1.0, 2.0), POINT))
+    event = b"own_msgs/Request[<=1] request\n" + b"=" * 80 + b"\nMSG: own_msgs/Request\nint32 x\n"
+    log = write_mcap(
+        tmp_path / "a.mcap",
+        [
+            ("/a", "cdr", POINT, "ros2msg", text.encode()),
+            ("/ask/_service_event", "cdr", "own_msgs/srv/Ask_Event", "ros2msg", event),
+        ],
+        [("/a", START_NS, payload), ("/ask/_service_event", START_NS, bytes(8))],
+    )
+    reader = open_messages(log)
+    assert [topic.type for topic in reader.topics()] == [POINT, "own_msgs/srv/Ask_Event"]
+    assert len(list(reader.iter_messages(["/a"]))) == 1
+    assert reader.take_faults() == ()
+
+
+def test_what_cannot_be_decoded_says_why_and_hides_nothing_else(tmp_path: Path) -> None:
+    log = write_mcap(
+        tmp_path / "a.mcap",
+        [
+            ("/cbor", "cbor", "", "", b""),
+            ("/flat", "flatbuffer", "foxglove.Grid", "flatbuffer", b""),
+            ("/json", "json", "", "", b""),
+            ("/nothing", "cdr", "", "", b""),
+            ("/protobuf", "protobuf", "", "", b""),
+        ],
+        [("/json", START_NS, b"{}"), ("/cbor", START_NS, b"\x00")],
+    )
+    reader = open_messages(log)
+    reasons = {topic.name: topic.unreadable for topic in reader.topics()}
+    assert reasons.pop("/json") is None
+    told = [str(reason).split(";")[0] for reason in reasons.values()]
+    assert told == [
+        "topic '/cbor': the encoding 'cbor' is not known",
+        "topic '/flat': the encoding 'flatbuffer' is not known",
+        "topic '/nothing': '' is no name of a message type, such as geometry_msgs/msg/Pose",
+        "topic '/protobuf': the definition of '' is missing",
+    ]
+    assert [message.payload for message in reader.iter_messages(["/json"])] == [b"{}"]
+
+
+def test_a_topic_of_two_types_is_not_guessed_at(tmp_path: Path) -> None:
+    text, _ = ROS2.generate_msgdef(POINT, ros_version=2)
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for name in (POINT, "own_msgs/msg/Point"):
+            schema = writer.register_schema(name, "ros2msg", text.encode())
+            writer.add_message(writer.register_channel("/a", "cdr", schema), START_NS, b"", START_NS)
+        writer.finish()
+    (topic,) = open_messages(path).topics()
+    assert topic.unreadable is not None and "more than one type" in topic.unreadable
+
+
+def test_a_log_without_summary_is_read(tmp_path: Path) -> None:
+    path = poses_log(tmp_path / "poses.mcap", chunk_bytes=200)
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    path.write_bytes(path.read_bytes()[: summary.chunk_indexes[4].chunk_start_offset + 10])
+    reader = open_messages(path)
+    messages = list(reader.iter_messages(["/poses"]))
+    assert [message.sequence for message in messages] == list(range(len(messages)))
+    assert 4 <= len(messages) < 20
+    assert "breaks off" in reader.take_faults()[0]
+
+
+def test_a_log_by_others_is_read_whole(data_folder: Path) -> None:
+    reader = open_messages(data_folder / "osi" / "osi_centerline_example.mcap")
+    (topic,) = reader.topics()
+    assert (topic.type, topic.count) == ("osi3.GroundTruth", 91)
+    decode: Callable[[bytes], Any] = reader.decoder(topic.name)
+    vehicles: set[int] = set()
+    for message in reader.iter_messages([topic.name]):
+        vehicles.update(each.id.value for each in decode(message.payload).moving_object)
+    assert len(vehicles) == 14
