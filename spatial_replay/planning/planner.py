@@ -211,7 +211,7 @@ class Planner:
     def _movable(self, progress: Guards, sample: Sample) -> list[str]:
         """The objects that a progress set is about and that can be moved, in the order of the settings."""
         about = {number for cube in progress.cubes for number, _ in cube}
-        names = self.settings.movable if self.settings.movable is not None else tuple(sample.objects)
+        names = self.settings.movable if self.settings.movable is not None else tuple(sorted(sample.objects))
         return [
             name
             for name in names

@@ -1,0 +1,128 @@
+"""The planner's messages in a log: what it decided, on which maps, and how that went."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from foxglove_schemas_protobuf.Grid_pb2 import Grid as GridMessage
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.message import Message
+
+from spatial_replay.errors import UsageError
+from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.logs.block import Channel, Messages
+from spatial_replay.logs.merging import merge
+from spatial_replay.logs.messages.PlanDecision_pb2 import PlanDecision
+from spatial_replay.logs.topics import protobuf_channel
+from spatial_replay.planning.messages import decision_message, map_message, outcome_message, path_message
+from spatial_replay.planning.planner import Planner
+from spatial_replay.planning.poses import centre_of
+from spatial_replay.planning.step import Outcome, Step
+from spatial_replay.trace.sample import Sample
+
+DECISION: Final = "/plan/decision"
+GRADIENT_MAP: Final = "/plan/gradient_map"
+PATH: Final = "/plan/path"
+
+PLAN_METADATA: Final = "spatial_replay_plan"
+"""The metadata record with what decisions depend on besides samples: settings, and which specification."""
+
+_CHANNELS: Final = (
+    protobuf_channel(DECISION, PlanDecision),
+    protobuf_channel(GRADIENT_MAP, GridMessage),
+    protobuf_channel(PATH, SceneUpdate),
+)
+
+
+class BlackBox:
+    """A planner and a record of everything it decides.
+
+    Samples, `decide` and `conclude` go through it in the order in which they happen; equal ones give equal
+    bytes.
+    """
+
+    def __init__(self, planner: Planner) -> None:
+        """Begin before the first sample."""
+        self.planner = planner
+        self._written = dict.fromkeys(_CHANNELS, 0)
+        self._sample: Sample | None = None
+        self._step: Step | None = None
+        self._tracked: TrackedObject | None = None
+        self._travelled: list[tuple[float, float]] = []
+
+    def observe(self, sample: Sample) -> None:
+        """Take in the next sample.
+
+        Raises:
+            TraceError: it does not come after the one before.
+        """
+        self.planner.observe(sample)
+        self._sample = sample
+        tracked = self._object_moved()
+        if tracked is not None:
+            self._travelled.append(centre_of(tracked.footprint))
+
+    def decide(self) -> tuple[Step, Messages]:
+        """The planner's next step, and the messages that tell of it.
+
+        Raises:
+            UsageError: nothing was observed yet, or the last step was not concluded.
+        """
+        self._step = step = self.planner.next_step()
+        self._tracked = self._object_moved()
+        self._travelled = [] if self._tracked is None else [centre_of(self._tracked.footprint)]
+        decision = decision_message(step, self.planner.automaton.name)
+        # the one that is drawn last is what a viewer shows
+        candidates = sorted(step.candidates, key=lambda candidate: candidate.is_chosen)
+        grid = self.planner.settings.workspace.grid
+        maps = [map_message(candidate.map, grid, step.time_ns) for candidate in candidates]
+        path = path_message(step.target, self._tracked, step.time_ns)
+        return step, self._messages(step.time_ns, [decision], maps, [path])
+
+    def conclude(self, outcome: Outcome) -> Messages:
+        """Say how the last step went; the messages that tell of it.
+
+        Raises:
+            UsageError: no step is being executed.
+        """
+        self.planner.conclude(outcome)
+        if self._step is None or self._sample is None:
+            raise UsageError("no step is being executed; decide on one first")
+        step, end_ns = self._step, self._sample.time_ns
+        decision = decision_message(step, self.planner.automaton.name)
+        told = outcome_message(outcome, end_ns, self.planner.states, self._travelled)
+        decision.outcome.CopyFrom(told)
+        path = path_message(step.target, self._tracked, end_ns, self._travelled)
+        self._step = None
+        return self._messages(end_ns, [decision], [], [path])
+
+    def _object_moved(self) -> TrackedObject | None:
+        """The object that the last step moves, as it is now."""
+        if self._step is None or self._step.target is None or self._sample is None:
+            return None
+        tracked = self._sample.objects.get(self._step.target.name)
+        return tracked if isinstance(tracked, TrackedObject) else None
+
+    def _messages(self, time_ns: int, *of_channels: Sequence[Message]) -> Messages:
+        """Messages of each channel, as the log numbers them."""
+        streams = []
+        for channel, messages in zip(_CHANNELS, of_channels, strict=True):
+            first = self._written[channel]
+            self._written[channel] += len(messages)
+            payloads = [message.SerializeToString(deterministic=True) for message in messages]
+            streams.append(_stream(channel, time_ns, payloads, first))
+        return merge(streams)
+
+
+def _stream(channel: Channel, time_ns: int, payloads: list[bytes], first: int) -> Messages:
+    times = np.full(len(payloads), time_ns, np.int64)
+    return Messages(
+        channels={0: channel},
+        channel=np.zeros(len(payloads), np.int64),
+        sequence=np.arange(first, first + len(payloads), dtype=np.int64),
+        log_time_ns=times,
+        publish_time_ns=times,
+        payloads=payloads,
+    )
