@@ -20,6 +20,7 @@ from spatial_replay.inspection.certificate import (
     certificate,
     described,
 )
+from spatial_replay.logs.block import Messages
 from spatial_replay.logs.merging import merge
 from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.objects import encode_objects
@@ -63,14 +64,20 @@ class Recording:
         """How many samples were taken in."""
         return self._samples
 
-    def add(self, trace: Trace) -> None:
+    def add(self, trace: Trace, beside: Messages | None = None) -> None:
         """Take in the next samples.
+
+        Args:
+            beside: messages of other topics that are not derived from samples, none before the first of these
+                samples; a replay keeps them.
 
         Raises:
             TraceError: samples that do not come after those before.
         """
         stretches = self._evaluation.extend(trace)
         own = messages_of(_OBJECTS, trace.times_ns, encode_objects(trace), self._samples)
+        if beside is not None and len(beside):
+            own = merge([own, beside])
         derived = self._evaluation.messages(trace, stretches)
         self._sink.write_messages(merge([own, *derived]))
         self._samples += len(trace)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from spatial_replay.logs.block import Messages
 from spatial_replay.logs.mcap_writer import LogWriter
+from spatial_replay.logs.merging import merge
 from spatial_replay.logs.output import open_output, refuse_inputs
 from spatial_replay.recording import Recording
 from spatial_replay.recording.interruption import terminable, uninterrupted
@@ -31,6 +32,7 @@ class RunLog:
         self._writer = writer
         self._recording = recording
         self._waiting: list[Sample] = []
+        self._beside: list[Messages] = []
         self._first_ns = self._last_ns = 0
         self._samples = 0
 
@@ -55,19 +57,24 @@ class RunLog:
             self._first_ns = sample.time_ns
         self._last_ns = sample.time_ns
         self._samples += 1
-        self._waiting.append(sample)
         if len(self._waiting) >= _STRETCH:
+            # what is told of the newest sample has its time, and no later sample comes before that
             self.flush()
+        self._waiting.append(sample)
 
     def write_messages(self, messages: Messages) -> None:
-        """Write messages of another channel, after the samples taken in so far.
+        """Write messages of other channels, at the time of the newest sample."""
+        self._beside.append(messages)
+
+    def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
+        """Add a metadata record.
 
         Raises:
             OutputError: the log cannot be written.
         """
         with uninterrupted():
             self._write_waiting()
-            self._writer.write_messages(messages)
+            self._writer.add_metadata(name, data)
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         """Keep a file in the log.
@@ -93,8 +100,9 @@ class RunLog:
 
     def _write_waiting(self) -> None:
         waiting, self._waiting = self._waiting, []
+        beside, self._beside = self._beside, []
         if waiting:
-            self._recording.add(Trace.from_samples(waiting))
+            self._recording.add(Trace.from_samples(waiting), merge(beside))
 
 
 @contextmanager

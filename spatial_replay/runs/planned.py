@@ -1,0 +1,215 @@
+"""A simulated world whose robot does what a planner decides, recorded with every decision."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+from spatial_replay.errors import UsageError
+from spatial_replay.inspection.annotation import kept_files
+from spatial_replay.planning.black_box import PLAN_METADATA, BlackBox
+from spatial_replay.planning.planner import Planner
+from spatial_replay.planning.settings import Settings, Skill
+from spatial_replay.planning.settings_text import text_from_settings
+from spatial_replay.planning.step import Kind, Outcome, Step
+from spatial_replay.planning.workspace import Grid, Workspace
+from spatial_replay.runs.run_log import RunLog, run_log
+from spatial_replay.runs.scripted import run_options
+from spatial_replay.simulation.injection import Injection
+from spatial_replay.simulation.world import World
+from spatial_replay.simulation.worlds import default_specification, make_world
+from spatial_replay.spec.formula import Specification
+from spatial_replay.trace.sample import Sample
+
+HOLDING_SAMPLES = 30
+"""How long it has to stay satisfied before a run ends."""
+MOST_WAITING_SAMPLES = 150
+"""How long it waits for what it does not see."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedRun:
+    """What was planned and recorded.
+
+    Attributes:
+        samples: how many samples.
+        seconds: from the first to the last.
+        ended: the kind of the last decision: "hold" where the specification is satisfied.
+        reason: the last decision in words.
+        steps: how many motions were executed.
+        pruned: how many edges of the automaton were given up.
+        planning_s: how long the planner thought, in seconds of real time.
+    """
+
+    samples: int
+    seconds: float
+    ended: Kind
+    reason: str
+    steps: int
+    pruned: int
+    planning_s: float
+
+    @property
+    def satisfied(self) -> bool:
+        """Whether the run ended with the specification satisfied."""
+        return self.ended == "hold"
+
+
+def record_plan(
+    scenario: str,
+    output: Path,
+    file: Specification | None = None,
+    *,
+    seed: int = 0,
+    noise_m: float = 0.0,
+    injections: Sequence[Injection] = (),
+    gui: bool = False,
+    inputs: Sequence[Path] = (),
+    advance: Callable[[int], None] = lambda samples: None,
+) -> PlannedRun:
+    """Let a planner satisfy a specification in a scenario's world; equal arguments give equal bytes.
+
+    Args:
+        file: what to plan for, with one result; None takes the scenario's own.
+        inputs: files that the output must not be.
+        advance: told how many more samples are done.
+
+    Raises:
+        NoAutomatonError: a specification without an automaton.
+        UsageError: no such scenario, no simulator, a specification that cannot be planned for.
+        OutputError: the output cannot be written.
+    """
+    (kept,) = kept_files([default_specification(scenario) if file is None else file])
+    options = run_options(seed=seed, noise_m=noise_m, injections=injections)
+    about = {"source": scenario, "seed": str(seed), "options": options, "planned": "true"}
+    # a world or a planner that cannot be made leaves the output alone
+    with closing(make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, gui=gui)) as world:
+        planner = Planner(kept, settings_for(world))
+        with run_log(output, [kept], about, inputs) as log:
+            plan = {
+                "settings": text_from_settings(planner.settings),
+                "file": kept.filename,
+                "specification": planner.automaton.name,
+            }
+            log.add_metadata(PLAN_METADATA, plan)
+            return _Loop(world, BlackBox(planner), log, advance).run()
+
+
+class WorldExecutor:
+    """The robot of a simulated world as an `Executor`."""
+
+    def __init__(self, world: World, skill: Skill) -> None:
+        self._world = world
+        self._skill = skill
+
+    def execute(self, step: Step) -> Outcome:
+        """See `Executor`.
+
+        Raises:
+            UsageError: the step moves nothing.
+        """
+        target = step.target
+        if target is None:
+            raise UsageError(f"step {step.number} ({step.kind}) moves nothing")
+        if self._skill == "push":
+            done = self._world.push(target.name, target.waypoints[1:] or target.waypoints)
+        else:
+            done = self._world.place(target.name, target.x, target.y, target.yaw)
+        return Outcome(done.succeeded, done.reason)
+
+
+class _Loop:
+    """A run from its first sample to its end."""
+
+    def __init__(self, world: World, box: BlackBox, log: RunLog, advance: Callable[[int], None]) -> None:
+        self._world, self._box, self._log, self._advance = world, box, log, advance
+        self._executor = WorldExecutor(world, box.planner.settings.skill)
+        self._thought_s = 0.0
+        world.attach(self._hear)
+
+    def run(self) -> PlannedRun:
+        self._world.step()
+        executed = waited = 0
+        while True:
+            step = self._decide()
+            if step.kind == "execute":
+                executed, waited = executed + 1, 0
+                outcome = self._executor.execute(step)
+                self._log.write_messages(self._box.conclude(outcome))
+            elif step.kind == "wait" and waited < MOST_WAITING_SAMPLES:
+                waited += 1
+                self._world.step()
+            elif step.kind != "hold" or self._holds():
+                return self._ended(step, executed)
+
+    def _decide(self) -> Step:
+        began = time.perf_counter()
+        step, messages = self._box.decide()
+        self._thought_s += time.perf_counter() - began
+        self._log.write_messages(messages)
+        return step
+
+    def _holds(self) -> bool:
+        """Whether it stays satisfied while the robot holds still."""
+        for _ in range(HOLDING_SAMPLES):
+            self._world.step()
+        return self._box.planner.is_accepting
+
+    def _hear(self, sample: Sample) -> None:
+        self._log.write(sample)
+        began = time.perf_counter()
+        self._box.observe(sample)
+        self._thought_s += time.perf_counter() - began
+        self._advance(1)
+
+    def _ended(self, step: Step, executed: int) -> PlannedRun:
+        samples, seconds = self._log.samples, self._log.seconds
+        return PlannedRun(
+            samples, seconds, step.kind, step.reason, executed, len(step.pruned), self._thought_s
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Care:
+    """How finely and carefully is planned for a skill, in metres."""
+
+    cell_size: float
+    margin: float
+    constraint_margin: float
+    clearance: float
+
+
+_CARE: MappingProxyType[Skill, _Care] = MappingProxyType(
+    {
+        # a block that is pushed ends up within a centimetre of where it should
+        "push": _Care(cell_size=0.005, margin=0.012, constraint_margin=0.008, clearance=0.0),
+        # fingers need room beside what they hold
+        "place": _Care(cell_size=0.01, margin=0.01, constraint_margin=0.01, clearance=0.02),
+    }
+)
+
+
+def settings_for(world: World) -> Settings:
+    """How to plan in a world."""
+    bodies, space = world.bodies, world.workspace
+    skill: Skill = world.skill
+    care = _CARE[skill]
+    workspace = Workspace(
+        Grid.over(space.xmin, space.ymin, space.xmax, space.ymax, care.cell_size),
+        nearest=space.nearest,
+        farthest=space.farthest,
+        obstacles=tuple(world.obstacles),
+        supports=frozenset(body.name for body in bodies if body.support),
+        clearance=care.clearance,
+    )
+    return Settings(
+        workspace,
+        skill,
+        movable=tuple(body.name for body in bodies if body.movable),
+        margin=care.margin,
+        constraint_margin=care.constraint_margin,
+    )
