@@ -110,7 +110,7 @@ class EventTeller:
         sentence = _sentence(watched.title, after, witness)
         facts = self._facts(watched) | _facts(after, witness, "")
         if before is not None:
-            witness = self._words(self._attained(change.node, before, stretch))
+            witness = self._words(self._attained(change.node, before, stretch), past=True)
             sentence += _before(before, after.start_ns, witness)
             facts |= _facts(before, witness, "_before")
             facts |= {"start_ns_before": str(before.start_ns), "end_ns_before": str(before.end_ns)}
@@ -128,19 +128,20 @@ class EventTeller:
         )
         return Told(time_ns, *(each.SerializeToString(deterministic=True) for each in (event, log)))
 
-    def _words(self, found: Attained | None) -> str:
+    def _words(self, found: Attained | None, *, past: bool = False) -> str:
         """A leaf and its number, as in "`a closeto[1] b` fails by 3.2"; "" for none."""
         if found is None:
             return ""
         leaf: Formula = substitute(self._leaves[found.leaf], self._bindings)
         text = format_formula(leaf, relations=self._relations)
         if found.number == 0.0:
-            return f"`{text}` just holds"
-        return f"`{text}` {'holds' if found.number > 0.0 else 'fails'} by {number_text(abs(found.number))}"
+            return f"`{text}` just {'held' if past else 'holds'}"
+        holds, fails = ("held", "failed") if past else ("holds", "fails")
+        return f"`{text}` {holds if found.number > 0.0 else fails} by {number_text(abs(found.number))}"
 
     def _facts(self, watched: Watched) -> dict[str, str]:
-        facts = {"specification": self._tree.name, "object": self._tree.object or ""}
-        return facts | {"node": str(watched.node), "name": watched.name}
+        of = {} if self._tree.object is None else {"object": self._tree.object}
+        return {"specification": self._tree.name, **of, "node": str(watched.node), "name": watched.name}
 
 
 def _watched(tree: ReportedTree, instance: Instance, file: Specification) -> list[Watched]:
@@ -189,20 +190,22 @@ _VERDICTS: Final[Mapping[int, tuple[str, str]]] = {
 
 
 def _sentence(title: str, after: Period, witness: str) -> str:
-    amount = f", by {number_text(abs(after.worst))}" if math.isfinite(after.worst) else ""
-    because = f": {witness}" if witness else ""
-    return f"{title} {_NOW[after.code]}{amount}{because}."
+    because = f", by {number_text(abs(after.worst))}" if math.isfinite(after.worst) else ""
+    if witness:
+        because = f": {witness}"
+    return f"{title} {_NOW[after.code]}{because}."
 
 
 def _before(before: Period, until_ns: int, witness: str) -> str:
     did = "held" if before.code == HOLDING else "failed"
     seconds = f"{(until_ns - before.start_ns) / 1e9:.3f} s"
-    amount = ""
-    if math.isfinite(before.worst):
+    worst = ""
+    if witness:
+        worst = f"; its worst was that {witness}"
+    elif math.isfinite(before.worst):
         number = number_text(abs(before.worst))
-        amount = f", by {number} or more" if before.code == HOLDING else f", by up to {number}"
-    because = f" ({witness})" if witness else ""
-    return f" Before, it {did} for {seconds}{amount}{because}."
+        worst = f", by {number} or more" if before.code == HOLDING else f", by up to {number}"
+    return f" Before, it {did} for {seconds}{worst}."
 
 
 def _facts(period: Period, witness: str, suffix: str) -> dict[str, str]:
