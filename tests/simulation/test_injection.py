@@ -1,0 +1,56 @@
+"""What is made to go wrong goes wrong."""
+
+from __future__ import annotations
+
+import pytest
+
+from simulation.worlds import world
+from spatial_replay.errors import UsageError
+from spatial_replay.simulation.injection import Injection
+
+GOAL = (0.36, -0.2)
+
+
+def test_a_drop_makes_the_robot_lose_what_it_carries() -> None:
+    with world("pick-place", inject=("drop@5s",)) as (made, seen):
+        done = made.place("mug", *GOAL)
+        assert not done.succeeded
+        assert done.reason.startswith("mug slipped out of the fingers")
+        wide = [sample.time_ns for sample in seen if sample.signals["finger_width"] > 0.07]
+        assert any(5 * 10**9 < time_ns < 6 * 10**9 for time_ns in wide)
+
+
+def test_slippery_fingers_hold_nothing_heavy() -> None:
+    with world("pick-place", inject=("slip",)) as (made, _):
+        done = made.place("crackerbox", 0.45, -0.3)
+        assert not done.succeeded
+        assert "crackerbox" in done.reason
+
+
+def test_a_mishap_that_is_over_does_no_harm() -> None:
+    with world("pick-place", inject=("drop@0s",)) as (made, _):
+        assert made.place("mug", *GOAL).succeeded
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("drop@7s", Injection("drop", 7 * 10**9)),
+        ("slip@2500ms", Injection("slip", 2500 * 10**6)),
+        ("slip", Injection("slip")),
+    ],
+)
+def test_mishaps_are_read(text: str, expected: Injection) -> None:
+    assert Injection.parse(text) == expected
+    assert Injection.parse(str(expected)) == expected
+
+
+@pytest.mark.parametrize("text", ["", "drop", "drop@", "drop@7", "fall@7s", "slip@-1s", "drop@7s "])
+def test_other_mishaps_are_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="write drop@7s"):
+        Injection.parse(text)
+
+
+def test_nothing_can_be_dropped_where_nothing_is_held() -> None:
+    with pytest.raises(UsageError, match="nothing is held in push"), world("push", inject=("drop@1s",)):
+        pass

@@ -1,0 +1,142 @@
+"""Worlds: what is seen of them, and what the robot does in them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from simulation.worlds import centre, off, world
+from spatial_replay.errors import UsageError
+from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.simulation.shapes import Box, footprint, height
+from spatial_replay.simulation.worlds import SCENARIOS, default_specification, make_world
+from spatial_replay.spec import object_names
+from spatial_replay.trace.sample import Sample
+
+
+def tracked(sample: Sample, name: str) -> TrackedObject:
+    each = sample.objects[name]
+    assert isinstance(each, TrackedObject)
+    return each
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_samples_show_the_bodies_where_they_are(name: str) -> None:
+    with world(name) as (made, _):
+        sample = made.sample()
+        assert list(sample.objects) == [body.name for body in made.bodies]
+        for body in made.bodies:
+            seen, pose = tracked(sample, body.name), made.scene.pose(body.name)
+            assert seen.footprint == footprint(body.shape, pose)
+            assert seen.height == (None if body.support else height(body.shape, pose))
+            assert seen.yaw == (pose.yaw if isinstance(body.shape, Box) else None)
+            assert (seen.class_name, seen.uncertainty) == (body.class_name, 0.0)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_its_specification_is_about_its_objects(name: str) -> None:
+    with world(name) as (made, _):
+        names = set(object_names(default_specification(name)))
+        assert names
+        assert names <= {body.name for body in made.bodies}
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_everything_lies_in_reach_and_at_rest(name: str) -> None:
+    with world(name, seed=3) as (made, _):
+        before = {body.name: centre(made, body.name) for body in made.bodies}
+        for body in made.bodies:
+            assert made.workspace.contains(*before[body.name])
+        for _ in range(6):
+            made.step()
+        assert all(off(made, name, place) < 1e-3 for name, place in before.items())
+
+
+def test_samples_come_thirty_times_a_second_from_time_0() -> None:
+    with world("push") as (made, seen):
+        for _ in range(3):
+            made.step()
+        assert [sample.time_ns for sample in seen] == [0, 33333333, 66666666, 100000000]
+        assert made.time_ns == 10**8
+
+
+def test_a_reset_begins_anew() -> None:
+    with world("push", seed=4) as (made, _):
+        first = made.sample()
+        made.push("red", [(0.4, 0.0)])
+        made.reset(5)
+        assert made.time_ns == 0
+        assert made.sample() != first
+        made.reset(4)
+        assert made.sample() == first
+
+
+def test_noise_stays_within_the_uncertainty_that_samples_state() -> None:
+    with world("push", noise_m=0.004) as (made, seen), world("push") as (exact, _):
+        for _ in range(20):
+            made.step()
+        assert made.sample() == made.sample() == seen[-1]
+        offsets = []
+        for sample in seen:
+            for body in made.bodies:
+                each = tracked(sample, body.name)
+                assert each.uncertainty == 0.004
+                middle = each.footprint.parts[0].vertices.mean(axis=0)
+                offsets.append(math.dist(middle, centre(exact, body.name)))
+        assert np.mean(offsets) > 0.002
+        assert max(offsets) <= 0.0041
+
+
+def test_the_robot_pushes_a_block_along_a_path() -> None:
+    with world("push") as (made, seen):
+        blue = centre(made, "blue")
+        done = made.push("green", [(0.38, -0.01), (0.42, -0.01), (0.42, 0.06)])
+        assert done.succeeded, done.reason
+        assert off(made, "green", (0.42, 0.06)) < 0.01
+        assert off(made, "blue", blue) < 1e-4
+        assert made.scene.pose("green").stands
+        widest = max(tracked(sample, "green").footprint.parts[0].vertices[:, 0].max() for sample in seen)
+        assert widest < 0.47
+
+
+def test_the_robot_places_things_where_they_should_go() -> None:
+    with world("pick-place") as (made, _):
+        for name, goal, yaw in [("mug", (0.36, -0.2), None), ("banana", (0.42, 0.2), 1.2)]:
+            done = made.place(name, *goal, yaw)
+            assert done.succeeded, done.reason
+            assert off(made, name, goal) < 0.01
+            assert made.scene.pose(name).stands
+        assert made.scene.pose("banana").yaw == pytest.approx(1.2, abs=0.05)
+
+
+def test_what_lies_on_a_plate_lies_higher() -> None:
+    with world("pick-place") as (made, _):
+        assert made.place("kanelbulle", *centre(made, "plate")).succeeded
+        top = made.scene.height("plate")[1]
+        assert made.scene.height("kanelbulle")[0] == pytest.approx(top, abs=2e-3)
+
+
+def test_what_cannot_be_done_is_said() -> None:
+    with world("pick-place") as (made, _):
+        can = centre(made, "can")
+        done = made.place("banana", *can)
+        assert not done.succeeded
+        assert done.reason == "no room for the fingers around banana where it should go"
+        assert made.time_ns == 0
+
+
+def test_wrong_uses_are_refused() -> None:
+    with world("push") as (made, _):
+        with pytest.raises(UsageError, match="'purple' cannot be moved in push; green, red, blue can"):
+            made.push("purple", [(0.4, 0.0)])
+        with pytest.raises(UsageError, match="does not place objects; it can push them"):
+            made.place("red", 0.4, 0.0)
+        made.close()
+        with pytest.raises(UsageError, match="the world push is closed"):
+            made.step()
+    with pytest.raises(UsageError, match="no scenario 'chess'; there are push"):
+        make_world("chess")
+    with pytest.raises(UsageError, match="the noise is -1"):
+        make_world("push", noise_m=-1)
