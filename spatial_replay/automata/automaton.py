@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from spatial_replay.automata.diagrams import LEAF, Diagrams, copied
-from spatial_replay.automata.guards import Guard, cubes_of, guard_words
+from spatial_replay.automata.guards import Covers, Guard, guard_words
 from spatial_replay.automata.machine import Machine, leaves_of
 from spatial_replay.automata.propositions import Proposition
 from spatial_replay.errors import UsageError
@@ -58,14 +58,19 @@ class Automaton:
 
     @cached_property
     def transitions(self) -> tuple[Transition, ...]:
-        """All moves, by source and target; the guards of one source exclude each other."""
+        """All moves, by source and target; the guards of one source exclude each other.
+
+        Raises:
+            NoAutomatonError: their guards take too many cubes; never of what `automaton` gives.
+        """
         diagrams, moves = self._diagrams()
-        found = []
-        for source, node in enumerate(moves):
-            for target in sorted(leaves_of(diagrams, node)):
-                boolean = _whether_to(diagrams, target)
-                found.append(Transition(source, cubes_of(diagrams, boolean(node)), target))
-        return tuple(found)
+        covers = Covers(diagrams)
+        whether_to = [_whether_to(diagrams, target) for target in self.states]
+        return tuple(
+            Transition(source, covers.guard(whether_to[target](node)), target)
+            for source, node in enumerate(moves)
+            for target in self.successors[source]
+        )
 
     @cached_property
     def successors(self) -> tuple[tuple[int, ...], ...]:

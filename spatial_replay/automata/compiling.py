@@ -51,11 +51,14 @@ def automaton(
         )
     machine = _compiled(spec.name, skeleton, count, compiler)
     try:
-        return automaton_of(least(machine), spec.name, propositions.all)
+        result = automaton_of(least(machine), spec.name, propositions.all)
+        # once here, so that what is handed out has guards
+        result.transitions  # noqa: B018
     except RecursionError:
-        raise NoAutomatonError(
-            f"{spec.name}: the automaton takes decisions that are nested too deeply"
-        ) from None
+        raise NoAutomatonError(f"{spec.name}: the automaton's decisions are nested too deeply") from None
+    except NoAutomatonError as error:
+        raise NoAutomatonError(f"{spec.name}: {error}; split it into several specs") from error
+    return result
 
 
 def _compiled(name: str, skeleton: Skeleton, propositions: int, compiler: Compiler | None) -> Machine:

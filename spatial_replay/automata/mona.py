@@ -17,7 +17,7 @@ from spatial_replay.errors import NoAutomatonError
 
 INSTALL = "apt-get install mona"
 
-_TIMEOUT_S = 30.0
+_TIMEOUT_S = 10.0
 _MAX_MEMORY = 4 * 2**30
 """Bytes that MONA may use."""
 _MAX_OUTPUT = 32 * 2**20

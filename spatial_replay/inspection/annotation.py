@@ -2,26 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import PurePath
 
 import numpy as np
+from foxglove_schemas_protobuf.Event_pb2 import Event
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from spatial_replay.errors import SpecificationError
 from spatial_replay.geometry.arrays import Integers
+from spatial_replay.inspection.automata import (
+    KeptAutomaton,
+    automata_attachments,
+    automata_metadata,
+    automata_of,
+)
+from spatial_replay.inspection.automaton import AutomatonRun
+from spatial_replay.inspection.events import EventTeller
 from spatial_replay.inspection.involvement import Evaluated, concerns_of
 from spatial_replay.inspection.robustness import encode_robustness
 from spatial_replay.inspection.scene import SceneEncoder, SceneState
 from spatial_replay.inspection.specification import encode_specification, reported_trees
 from spatial_replay.inspection.viewer import Extent, layout_attachment
 from spatial_replay.logs.block import Channel, Messages
+from spatial_replay.logs.messages.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.messages.Robustness_pb2 import Robustness
 from spatial_replay.logs.messages.Specification_pb2 import Specification as SpecificationMessage
 from spatial_replay.logs.sink import Attachment
-from spatial_replay.logs.topics import ROBUSTNESS, SCENE, SPECIFICATION, protobuf_channel
+from spatial_replay.logs.topics import (
+    AUTOMATON,
+    DERIVED,
+    EVENT_LOG,
+    EVENTS,
+    ROBUSTNESS,
+    SCENE,
+    SPECIFICATION,
+    protobuf_channel,
+)
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.semantics import Semantics, instance_evaluation
 from spatial_replay.monitor.stream import EvaluationStream, Stretch
@@ -45,13 +65,17 @@ class AnnotatedEvaluation:
         files: Sequence[Specification],
         instances: Sequence[Sequence[Instance]],
         semantics: Semantics = "ltlf",
+        compiled_before: Callable[[], Sequence[Attachment]] = list,
     ) -> None:
         """Start before the first sample.
 
         Args:
             instances: what to evaluate of each file.
+            compiled_before: gives the attachments of a log; automata among them are not compiled again.
         """
         self._files = files
+        self._semantics = semantics
+        self._compiled_before = compiled_before
         begin = partial(instance_evaluation, semantics=semantics)
         self._evaluations = [
             EvaluationStream(own, file.regions, begin) for own, file in zip(instances, files, strict=True)
@@ -60,10 +84,14 @@ class AnnotatedEvaluation:
         self.trees = reported_trees(files, instances)
         self._concerns = [concerns_of(tree.formula, tree.object) for tree in self.trees]
         self._names = [[node.name for _, _, node in iter_nodes(tree.formula)] for tree in self.trees]
+        self._tellers = [
+            EventTeller(tree, stream.instance, files[tree.file])
+            for tree, stream in zip(self.trees, self.streams, strict=True)
+        ]
         self._encoder = SceneEncoder(shown_regions(files))
         self._state = SceneState()
         self._extent: Extent | None = None
-        self._written = {SPECIFICATION: 0, ROBUSTNESS: 0, SCENE: 0}
+        self._written = dict.fromkeys(DERIVED, 0)
 
     def extend(self, trace: Trace) -> list[Stretch]:
         """Take in the next samples; one stretch for each of `trees`."""
@@ -76,9 +104,12 @@ class AnnotatedEvaluation:
         self._extent = Extent.of(trace, self._extent)
         messages = []
         if self.trees and not self._written[SPECIFICATION]:
-            payload = encode_specification(self._files, self.trees)
+            propositions = [() if run is None else run.propositions for run in self._runs]
+            payload = encode_specification(self._files, self.trees, propositions=propositions)
             messages.append(self._messages(_SPECIFICATION, trace.times_ns[:1], [payload]))
         messages.append(self._robustness(stretches))
+        messages.append(self._automaton_states(stretches))
+        messages += self._events(stretches)
         evaluated = [
             Evaluated(concerns, stretch.times_ns, stretch.series)
             for concerns, stretch in zip(self._concerns, stretches, strict=True)
@@ -88,20 +119,72 @@ class AnnotatedEvaluation:
         messages.append(self._messages(_SCENE, scene.times_ns, scene.payloads))
         return messages
 
+    def automata_metadata(self) -> Mapping[str, str]:
+        """For each spec, how large its automaton is, or why there is none."""
+        return automata_metadata(self._automata)
+
+    def automata_attachments(self, prefix: str) -> list[Attachment]:
+        """The automata, to be kept beside the specifications of `specification_attachments`."""
+        return automata_attachments(self._automata, prefix)
+
     def layout(self) -> Attachment:
         """How to open the log in a viewer, once all samples are written."""
         return layout_attachment(self.trees, self._extent)
 
     def _robustness(self, stretches: Sequence[Stretch]) -> Messages:
-        """One message per sample and result, numbered in this order however the samples are cut."""
-        times = [np.empty(0, np.int64)]
-        payloads: list[bytes] = []
-        for tree, names, stretch in zip(self.trees, self._names, stretches, strict=True):
-            times.append(stretch.times_ns)
-            payloads += encode_robustness(tree.name, tree.object, names, stretch.times_ns, stretch.series)
-        times_ns = np.concatenate(times)
+        """One message per sample and result."""
+        encoded = [
+            encode_robustness(tree.name, tree.object, names, stretch.times_ns, stretch.series)
+            for tree, names, stretch in zip(self.trees, self._names, stretches, strict=True)
+        ]
+        return self._in_order(_ROBUSTNESS, stretches, encoded)
+
+    def _events(self, stretches: Sequence[Stretch]) -> list[Messages]:
+        """What changed, by time, then in the order of results and of their nodes."""
+        told = [
+            each
+            for teller, stretch in zip(self._tellers, stretches, strict=True)
+            for each in teller.tell(stretch)
+        ]
+        told.sort(key=lambda each: each.time_ns)
+        times_ns = np.array([each.time_ns for each in told], np.int64)
+        return [
+            self._messages(_EVENTS, times_ns, [each.event for each in told]),
+            self._messages(_EVENT_LOG, times_ns, [each.log for each in told]),
+        ]
+
+    def _automaton_states(self, stretches: Sequence[Stretch]) -> Messages:
+        """One message per sample and result that has an automaton."""
+        running = [
+            (run, stretch) for run, stretch in zip(self._runs, stretches, strict=True) if run is not None
+        ]
+        encoded = [run.encode(stretch) for run, stretch in running]
+        return self._in_order(_AUTOMATON, [stretch for _, stretch in running], encoded)
+
+    @cached_property
+    def _automata(self) -> Sequence[KeptAutomaton]:
+        """Of each tree; compiled when first asked for, since not every evaluation is written down."""
+        return automata_of(self._files, self.trees, self._semantics, self._compiled_before())
+
+    @cached_property
+    def _runs(self) -> Sequence[AutomatonRun | None]:
+        return [
+            None
+            if kept.automaton is None
+            else AutomatonRun(
+                tree.name, tree.object, kept.automaton, tree.formula, stream.instance.program.leaves
+            )
+            for tree, stream, kept in zip(self.trees, self.streams, self._automata, strict=True)
+        ]
+
+    def _in_order(
+        self, channel: Channel, stretches: Sequence[Stretch], encoded: Sequence[Sequence[bytes]]
+    ) -> Messages:
+        """Messages of stretches by time, numbered in the order of results however the samples are cut."""
+        times_ns = np.concatenate([np.empty(0, np.int64), *(stretch.times_ns for stretch in stretches)])
+        payloads = [payload for own in encoded for payload in own]
         order = np.argsort(times_ns, kind="stable")
-        return self._messages(_ROBUSTNESS, times_ns[order], [payloads[index] for index in order.tolist()])
+        return self._messages(channel, times_ns[order], [payloads[index] for index in order.tolist()])
 
     def _messages(self, channel: Channel, times_ns: Integers, payloads: Sequence[bytes]) -> Messages:
         first = self._written[channel.topic]
@@ -170,4 +253,7 @@ def shown_regions(files: Sequence[Specification]) -> Mapping[str, Outline]:
 
 _SPECIFICATION = protobuf_channel(SPECIFICATION, SpecificationMessage)
 _ROBUSTNESS = protobuf_channel(ROBUSTNESS, Robustness)
+_AUTOMATON = protobuf_channel(AUTOMATON, AutomatonState)
 _SCENE = protobuf_channel(SCENE, SceneUpdate)
+_EVENTS = protobuf_channel(EVENTS, Event)
+_EVENT_LOG = protobuf_channel(EVENT_LOG, Log)

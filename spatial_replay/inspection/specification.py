@@ -70,11 +70,13 @@ def encode_specification(
     files: Sequence[Specification],
     trees: Sequence[ReportedTree],
     signal_units: Mapping[str, str] | None = None,
+    propositions: Sequence[Sequence[int]] | None = None,
 ) -> bytes:
     """The message that says what a log was evaluated against; equal arguments give equal bytes.
 
     Args:
         signal_units: units of the log's signals, where known.
+        propositions: of each tree, the nodes that are propositions of its automaton.
     """
     message = SpecificationMessage()
     for file in files:
@@ -84,8 +86,9 @@ def encode_specification(
             canonical=format_specification(file),
             profile=file.profile,
         )
-    for tree in trees:
+    for index, tree in enumerate(trees):
         result = message.results.add(name=tree.name, object=tree.object or "", file=tree.file)
+        result.propositions.extend(propositions[index] if propositions is not None else ())
         _add_nodes(result, tree.formula, RELATION_NAMES | files[tree.file].relations, signal_units or {})
     return message.SerializeToString(deterministic=True)
 

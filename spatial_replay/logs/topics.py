@@ -11,10 +11,11 @@ OBJECTS = "/spatial/objects"
 SCENE = "/spatial/scene"
 SPECIFICATION = "/spatial/specification"
 ROBUSTNESS = "/spatial/robustness"
+AUTOMATON = "/spatial/automaton"
+EVENTS = "/spatial/events"
+EVENT_LOG = "/spatial/log"
 
-DERIVED = frozenset(
-    {SCENE, SPECIFICATION, ROBUSTNESS, "/spatial/automaton", "/spatial/events", "/spatial/log"}
-)
+DERIVED = frozenset({SCENE, SPECIFICATION, ROBUSTNESS, AUTOMATON, EVENTS, EVENT_LOG})
 """Topics computed from the samples and a specification: a replay replaces them."""
 
 METADATA = "spatial_replay"
@@ -22,6 +23,12 @@ METADATA = "spatial_replay"
 
 CERTIFICATE = "spatial_replay_certificate"
 """The metadata record that comes last: hashes of what went in and what came out."""
+
+AUTOMATA = "spatial_replay_automata"
+"""The metadata record with the sizes of automata, and why a specification has none."""
+
+AUTOMATA_PREFIX = "automata/"
+"""Attachments with automata; the prefix of the specification that they are of comes next."""
 
 RECORDED_PREFIX = "recorded/"
 """Attachments that a recording was made with; they stay in every copy."""

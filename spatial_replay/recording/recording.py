@@ -25,7 +25,14 @@ from spatial_replay.logs.merging import merge
 from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.objects import encode_objects
 from spatial_replay.logs.sink import Sink
-from spatial_replay.logs.topics import CERTIFICATE, METADATA, OBJECTS, RECORDED_PREFIX, protobuf_channel
+from spatial_replay.logs.topics import (
+    AUTOMATA,
+    CERTIFICATE,
+    METADATA,
+    OBJECTS,
+    RECORDED_PREFIX,
+    protobuf_channel,
+)
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.times import FOREVER
@@ -57,7 +64,10 @@ class Recording:
         self._sample_hash, self._message_hash = SampleHash(), MessageHash()
         self._result_hash = ResultHash([(tree.name, tree.object) for tree in self._evaluation.trees])
         sink.add_metadata(METADATA, _metadata(files, about or {}))
-        for attachment in specification_attachments(files, RECORDED_PREFIX):
+        if self._evaluation.trees:
+            sink.add_metadata(AUTOMATA, self._evaluation.automata_metadata())
+        kept = self._evaluation.automata_attachments(RECORDED_PREFIX)
+        for attachment in [*specification_attachments(files, RECORDED_PREFIX), *kept]:
             sink.add_attachment(attachment.name, attachment.media_type, attachment.data)
 
     def __len__(self) -> int:

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from spatial_replay import __version__
 from spatial_replay.errors import UsageError
-from spatial_replay.inspection.annotation import specification_attachments
 from spatial_replay.inspection.certificate import described
 from spatial_replay.inspection.viewer import LAYOUT
 from spatial_replay.logs.mcap_writer import LogWriter
@@ -17,12 +16,22 @@ from spatial_replay.logs.output import replacing
 from spatial_replay.logs.reading import reading_options
 from spatial_replay.logs.sink import Sink
 from spatial_replay.logs.source import Source
-from spatial_replay.logs.topics import CERTIFICATE, METADATA, RECORDED_PREFIX, REPLAYED_PREFIX
+from spatial_replay.logs.topics import (
+    AUTOMATA,
+    AUTOMATA_PREFIX,
+    CERTIFICATE,
+    METADATA,
+    RECORDED_PREFIX,
+    REPLAYED_PREFIX,
+)
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.replay.replay import Replay, Replayed
 from spatial_replay.replay.window import Window
 from spatial_replay.spec import load_specification, parse_specification
 from spatial_replay.spec.formula import Specification
+
+_REPLACED = (REPLAYED_PREFIX, AUTOMATA_PREFIX + REPLAYED_PREFIX)
+"""What the names of attachments begin with that a replay writes anew."""
 
 
 def run_replay(
@@ -74,7 +83,7 @@ def run_replay(
         sink: LogWriter | None = None
         if output is not None:
             sink = stack.enter_context(LogWriter(stack.enter_context(replacing(output, inputs))))
-            _begin(sink, source, replay.files, window or Window(), each or {}, semantics, layer=layer)
+            _begin(sink, source, replay, window or Window(), each or {}, semantics, layer=layer)
         for messages, samples in replay.iter_messages(annotate=sink is not None, layer=layer):
             if sink is not None:
                 sink.write_messages(messages)
@@ -90,7 +99,7 @@ def run_replay(
 def _begin(
     sink: Sink,
     source: Source,
-    files: Sequence[Specification],
+    replay: Replay,
     window: Window,
     each: Mapping[str, str],
     semantics: Semantics,
@@ -105,26 +114,27 @@ def _begin(
         "written_by": "replay",
         "semantics": semantics,
         "source": before.get("source", source.name) if is_replayed else source.name,
-        "specifications": described(files),
+        "specifications": described(replay.files),
         "options": json.dumps(_options(source, window, each, layer=layer)),
     }
     recorded = {key: value for key, value in before.items() if key not in about and key != "source"}
     if not is_replayed and "options" in before:
         recorded["recorded_options"] = before["options"]
     sink.add_metadata(METADATA, {**about, **recorded})
+    sink.add_metadata(AUTOMATA, replay.automata_metadata())
     if not layer:
         _copy_kept(sink, source)
-    for attachment in specification_attachments(files, REPLAYED_PREFIX):
+    for attachment in replay.attachments():
         sink.add_attachment(attachment.name, attachment.media_type, attachment.data)
 
 
 def _copy_kept(sink: Sink, source: Source) -> None:
     """Copy what the source keeps beside its messages, but for what a replay writes anew."""
     for name, data in source.metadata():
-        if name not in (METADATA, CERTIFICATE):
+        if name not in (METADATA, AUTOMATA, CERTIFICATE):
             sink.add_metadata(name, data)
     for attachment in source.attachments():
-        if not attachment.name.startswith(REPLAYED_PREFIX) and attachment.name != LAYOUT:
+        if not attachment.name.startswith(_REPLACED) and attachment.name != LAYOUT:
             sink.add_attachment(attachment.name, attachment.media_type, attachment.data)
 
 

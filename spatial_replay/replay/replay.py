@@ -9,7 +9,12 @@ import numpy as np
 
 from spatial_replay.errors import LogError, SpecificationError, UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.inspection.annotation import AnnotatedEvaluation, kept_files, messages_of
+from spatial_replay.inspection.annotation import (
+    AnnotatedEvaluation,
+    kept_files,
+    messages_of,
+    specification_attachments,
+)
 from spatial_replay.inspection.certificate import MessageHash, ResultHash, SampleHash, certificate
 from spatial_replay.logs.block import Block, Messages
 from spatial_replay.logs.merging import merge, select
@@ -18,7 +23,7 @@ from spatial_replay.logs.objects import encode_objects
 from spatial_replay.logs.reading import read_blocks
 from spatial_replay.logs.sink import Attachment
 from spatial_replay.logs.source import Source, within
-from spatial_replay.logs.topics import OBJECTS, protobuf_channel
+from spatial_replay.logs.topics import OBJECTS, REPLAYED_PREFIX, protobuf_channel
 from spatial_replay.monitor.inquiry import Inquiry
 from spatial_replay.monitor.instances import Choice, Instance, find_instances
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
@@ -129,7 +134,9 @@ class Replay:
         self._window = window or Window()
         self.files = kept_files(files)
         self._instances = [self._find_instances(file, each or {}) for file in self.files]
-        self._evaluation = AnnotatedEvaluation(self.files, self._instances, self._semantics)
+        self._evaluation = AnnotatedEvaluation(
+            self.files, self._instances, self._semantics, source.attachments
+        )
         self.trees = self._evaluation.trees
         self._keep_series, self._keep_leaves = keep_series, keep_leaves
         self._kept: list[list[Stretch]] = [[] for _ in self.trees]
@@ -183,6 +190,15 @@ class Replay:
             certificate=self.certificate(),
             semantics=self._semantics,
         )
+
+    def automata_metadata(self) -> Mapping[str, str]:
+        """For each spec, how large its automaton is, or why there is none."""
+        return self._evaluation.automata_metadata()
+
+    def attachments(self) -> list[Attachment]:
+        """What an annotated log keeps of the specifications: their texts and their automata."""
+        texts = specification_attachments(self.files, REPLAYED_PREFIX)
+        return [*texts, *self._evaluation.automata_attachments(REPLAYED_PREFIX)]
 
     def layout(self) -> Attachment:
         """How to open the annotated log in a viewer, once all messages were taken."""

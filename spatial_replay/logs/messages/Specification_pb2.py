@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\"spatial_replay/Specification.proto\x12\x0espatial_replay\"w\n\rSpecification\x12\x30\n\x05\x66iles\x18\x01 \x03(\x0b\x32!.spatial_replay.SpecificationFile\x12\x34\n\x07results\x18\x02 \x03(\x0b\x32#.spatial_replay.SpecificationResult\"U\n\x11SpecificationFile\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06source\x18\x02 \x01(\t\x12\x11\n\tcanonical\x18\x03 \x01(\t\x12\x0f\n\x07profile\x18\x04 \x01(\t\"t\n\x13SpecificationResult\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06object\x18\x02 \x01(\t\x12\x11\n\x04\x66ile\x18\x03 \x01(\rH\x00\x88\x01\x01\x12#\n\x05nodes\x18\x04 \x03(\x0b\x32\x14.spatial_replay.NodeB\x07\n\x05_file\"\xc6\x01\n\x04Node\x12\x0f\n\x02id\x18\x01 \x01(\rH\x00\x88\x01\x01\x12\x13\n\x06parent\x18\x02 \x01(\rH\x01\x88\x01\x01\x12\x10\n\x08operator\x18\x03 \x01(\t\x12\x0c\n\x04name\x18\x04 \x01(\t\x12\x0c\n\x04text\x18\x05 \x01(\t\x12\x17\n\nspan_start\x18\x06 \x01(\rH\x02\x88\x01\x01\x12\x15\n\x08span_end\x18\x07 \x01(\rH\x03\x88\x01\x01\x12\x0c\n\x04unit\x18\x08 \x01(\tB\x05\n\x03_idB\t\n\x07_parentB\r\n\x0b_span_startB\x0b\n\t_span_endb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\"spatial_replay/Specification.proto\x12\x0espatial_replay\"w\n\rSpecification\x12\x30\n\x05\x66iles\x18\x01 \x03(\x0b\x32!.spatial_replay.SpecificationFile\x12\x34\n\x07results\x18\x02 \x03(\x0b\x32#.spatial_replay.SpecificationResult\"U\n\x11SpecificationFile\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06source\x18\x02 \x01(\t\x12\x11\n\tcanonical\x18\x03 \x01(\t\x12\x0f\n\x07profile\x18\x04 \x01(\t\"\x8a\x01\n\x13SpecificationResult\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06object\x18\x02 \x01(\t\x12\x11\n\x04\x66ile\x18\x03 \x01(\rH\x00\x88\x01\x01\x12#\n\x05nodes\x18\x04 \x03(\x0b\x32\x14.spatial_replay.Node\x12\x14\n\x0cpropositions\x18\x05 \x03(\rB\x07\n\x05_file\"\xc6\x01\n\x04Node\x12\x0f\n\x02id\x18\x01 \x01(\rH\x00\x88\x01\x01\x12\x13\n\x06parent\x18\x02 \x01(\rH\x01\x88\x01\x01\x12\x10\n\x08operator\x18\x03 \x01(\t\x12\x0c\n\x04name\x18\x04 \x01(\t\x12\x0c\n\x04text\x18\x05 \x01(\t\x12\x17\n\nspan_start\x18\x06 \x01(\rH\x02\x88\x01\x01\x12\x15\n\x08span_end\x18\x07 \x01(\rH\x03\x88\x01\x01\x12\x0c\n\x04unit\x18\x08 \x01(\tB\x05\n\x03_idB\t\n\x07_parentB\r\n\x0b_span_startB\x0b\n\t_span_endb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -35,8 +35,8 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_SPECIFICATION']._serialized_end=173
   _globals['_SPECIFICATIONFILE']._serialized_start=175
   _globals['_SPECIFICATIONFILE']._serialized_end=260
-  _globals['_SPECIFICATIONRESULT']._serialized_start=262
-  _globals['_SPECIFICATIONRESULT']._serialized_end=378
-  _globals['_NODE']._serialized_start=381
-  _globals['_NODE']._serialized_end=579
+  _globals['_SPECIFICATIONRESULT']._serialized_start=263
+  _globals['_SPECIFICATIONRESULT']._serialized_end=401
+  _globals['_NODE']._serialized_start=404
+  _globals['_NODE']._serialized_end=602
 # @@protoc_insertion_point(module_scope)

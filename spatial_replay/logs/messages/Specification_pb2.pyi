@@ -80,6 +80,7 @@ class SpecificationResult(google.protobuf.message.Message):
     OBJECT_FIELD_NUMBER: builtins.int
     FILE_FIELD_NUMBER: builtins.int
     NODES_FIELD_NUMBER: builtins.int
+    PROPOSITIONS_FIELD_NUMBER: builtins.int
     name: builtins.str
     """Name of the specification."""
     object: builtins.str
@@ -90,6 +91,12 @@ class SpecificationResult(google.protobuf.message.Message):
     def nodes(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___Node]:
         """In the order of their ids."""
 
+    @property
+    def propositions(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]:
+        """The nodes that are propositions of the automaton, in the order in which AutomatonState has them; none if
+        there is no automaton.
+        """
+
     def __init__(
         self,
         *,
@@ -97,9 +104,10 @@ class SpecificationResult(google.protobuf.message.Message):
         object: builtins.str = ...,
         file: builtins.int | None = ...,
         nodes: collections.abc.Iterable[global___Node] | None = ...,
+        propositions: collections.abc.Iterable[builtins.int] | None = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["_file", b"_file", "file", b"file"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_file", b"_file", "file", b"file", "name", b"name", "nodes", b"nodes", "object", b"object"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["_file", b"_file", "file", b"file", "name", b"name", "nodes", b"nodes", "object", b"object", "propositions", b"propositions"]) -> None: ...
     def WhichOneof(self, oneof_group: typing.Literal["_file", b"_file"]) -> typing.Literal["file"] | None: ...
 
 global___SpecificationResult = SpecificationResult
