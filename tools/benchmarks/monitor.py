@@ -54,12 +54,18 @@ def bench_monitor(bench: Any) -> None:
         monitor.update(sample)
         times[k] = time.perf_counter() - start
     grown = _resident_bytes() - resident
+    pauses = sorted(_nothing_for(sorted(times[10:STRETCH])[STRETCH // 2]))
+    is_quiet = pauses[int(len(pauses) * 0.999)] < 1e-3
+    if not is_quiet:
+        bench.remark("the machine is busy: doing nothing takes over 1 ms for one turn in 1000, too")
     starts = {10, SHORT - STRETCH, count - STRETCH}
     for start_at in sorted(starts):
         stretch = times[start_at : start_at + STRETCH]
         bench.quantile(f"from sample {start_at:,}: median", stretch, 0.5, limit_s=50e-6)
-        bench.quantile(f"from sample {start_at:,}: 99.9 %", stretch, 0.999, limit_s=1e-3)
-    bench.quantile("doing nothing: 99.9 %", _nothing_for(bench.figures[0].median_s), 0.999)
+        bench.quantile(
+            f"from sample {start_at:,}: 99.9 %", stretch, 0.999, limit_s=1e-3 if is_quiet else None
+        )
+    bench.quantile("doing nothing: 99.9 %", pauses, 0.999)
     bench.size(f"grown over {count:,} samples", grown, 5_000_000)
 
     def read_all(update: Any) -> object:
