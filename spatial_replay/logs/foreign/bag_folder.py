@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TypeAlias
 
@@ -136,14 +136,23 @@ class BagFolder:
         return one_by_one(self.iter_columns(topics, start_ns, end_ns))
 
     def iter_columns(
-        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+        self,
+        topics: Collection[str],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        *,
+        as_recorded: bool = False,
     ) -> Columns:
-        """What `iter_messages` gives, as columns."""
-        runs = [
-            Run(file.start_ns or 0, lambda file=file: file.iter_columns(topics, start_ns, end_ns))  # type: ignore[misc]
-            for file in self._files
+        """See `ColumnReader.iter_columns`."""
+        reads = [
+            partial(self._read, number, file, topics, start_ns, end_ns, as_recorded)
+            for number, file in enumerate(self._files)
         ]
-        columns = runs[0].read() if len(runs) == 1 else merged(runs)
+        if as_recorded or len(reads) == 1:
+            columns: Columns = (each for read in reads for each in read())
+        else:
+            runs = zip(self._files, reads, strict=True)
+            columns = merged(Run(file.start_ns or 0, read) for file, read in runs)
         if self._metadata and self._metadata.compression == "message":
             columns = map(self._unpacked, columns)
         if start_ns or end_ns is not None or self._metadata is None:
@@ -153,6 +162,18 @@ class BagFolder:
         counted = CountedTopics({each.name: each.count for each in self._topics if each.name in topics})
         yield from counted.counted(columns)
         counted.compare(f"{self.name}/{METADATA_FILE}", self._faults)
+
+    @staticmethod
+    def _read(
+        number: int,
+        file: _File,
+        topics: Collection[str],
+        start_ns: int | None,
+        end_ns: int | None,
+        as_recorded: bool,
+    ) -> Columns:
+        for each in file.iter_columns(topics, start_ns, end_ns, as_recorded=as_recorded):
+            yield replace(each, place=(np.int64(number) << 48) + each.place)
 
     def _told(self) -> Iterable[_File]:
         """The files that were opened so far."""

@@ -29,6 +29,7 @@ class MessageColumns:
         topics: (M,) names.
         log_time_ns, publish_time_ns, sequence: (M,) int64.
         payloads: M messages, each in its topic's encoding.
+        place: (M,) int64, numbers that increase in the order in which the messages were recorded.
     """
 
     topics: Sequence[str] = ()
@@ -36,6 +37,7 @@ class MessageColumns:
     publish_time_ns: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
     sequence: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
     payloads: Sequence[bytes] = ()
+    place: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __len__(self) -> int:
         return len(self.topics)
@@ -48,6 +50,7 @@ class MessageColumns:
             self.publish_time_ns[begin:end],
             self.sequence[begin:end],
             self.payloads[begin:end],
+            self.place[begin:end],
         )
 
     def take(self, places: Integers) -> MessageColumns:
@@ -59,6 +62,7 @@ class MessageColumns:
             self.publish_time_ns[places],
             self.sequence[places],
             [self.payloads[place] for place in listed],
+            self.place[places],
         )
 
     def ordered(self) -> MessageColumns:
@@ -100,6 +104,7 @@ def joined(several: Sequence[MessageColumns]) -> MessageColumns:
         np.concatenate([np.zeros(0, np.int64), *(each.publish_time_ns for each in several)]),
         np.concatenate([np.zeros(0, np.int64), *(each.sequence for each in several)]),
         [payload for each in several for payload in each.payloads],
+        np.concatenate([np.zeros(0, np.int64), *(each.place for each in several)]),
     )
 
 
@@ -116,6 +121,13 @@ def one_by_one(columns: Columns) -> Iterator[Message]:
         yield from piece.messages()
 
 
-def unnumbered(topics: Sequence[str], times_ns: Integers, payloads: Sequence[bytes]) -> MessageColumns:
+def unnumbered(
+    topics: Sequence[str], times_ns: Integers, payloads: Sequence[bytes], place: Integers
+) -> MessageColumns:
     """Messages of a container that knows one time and no sequence."""
-    return MessageColumns(topics, times_ns, times_ns, np.zeros(len(times_ns), np.int64), payloads)
+    return MessageColumns(topics, times_ns, times_ns, np.zeros(len(times_ns), np.int64), payloads, place)
+
+
+def places_in(part: int, within: Integers) -> Integers:
+    """Places in a log of several parts, such as chunks: in the order of the parts, then within each."""
+    return (np.int64(part) << 28) + within

@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 from spatial_replay.errors import LogError
 from spatial_replay.logs.block import Channel
 from spatial_replay.logs.faults import FaultList
-from spatial_replay.logs.foreign.columns import Columns, MessageColumns, one_by_one
+from spatial_replay.logs.foreign.columns import Columns, MessageColumns, one_by_one, places_in
 from spatial_replay.logs.foreign.decoders import decoder_of
 from spatial_replay.logs.foreign.definitions import full_type_name
 from spatial_replay.logs.foreign.messages import Decoder, Message, Topic
@@ -93,23 +93,31 @@ class McapLog:
         return one_by_one(self.iter_columns(topics, start_ns, end_ns))
 
     def iter_columns(
-        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+        self,
+        topics: Collection[str],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        *,
+        as_recorded: bool = False,
     ) -> Columns:
-        """What `iter_messages` gives, as columns."""
+        """See `ColumnReader.iter_columns`."""
         first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else end_ns
         directory, channels = self._contents
         wanted = {number: channel.topic for number, channel in channels.items() if channel.topic in topics}
         places = [
-            place
-            for place in directory.chunks
+            (rank, place)
+            for rank, place in enumerate(directory.chunks)
             if place.start_ns < last
             and place.end_ns >= first
             and (place.channels is None or not place.channels.isdisjoint(wanted))
         ]
-        places.sort(key=lambda place: (place.start_ns, place.offset))
+        if not as_recorded:
+            places.sort(key=lambda ranked: ranked[1].start_ns)
         with self._path.open("rb") as stream:
-            stretches = (self._messages(stream, place, wanted, first, last) for place in places)
-            columns = in_order([place.start_ns for place in places], stretches)
+            stretches = (self._messages(stream, *ranked, wanted, first, last) for ranked in places)
+            columns = (
+                stretches if as_recorded else in_order([place.start_ns for _, place in places], stretches)
+            )
             if (first, last) != (0, LATEST_NS + 1):
                 yield from columns
                 return
@@ -118,7 +126,7 @@ class McapLog:
             counted.compare(self.name, self._faults)
 
     def _messages(
-        self, stream: BinaryIO, place: ChunkPlace, wanted: dict[int, str], first: int, last: int
+        self, stream: BinaryIO, rank: int, place: ChunkPlace, wanted: dict[int, str], first: int, last: int
     ) -> MessageColumns:
         """The messages in a place; what is lost of them goes to the faults."""
         span = f"messages between {place.start_ns} and {place.end_ns} ns"
@@ -145,6 +153,7 @@ class McapLog:
             heads.publish_time[rows].view(np.int64),
             heads.sequence[rows].view(np.int64),
             [content[begin:end] for begin, end in bounds],
+            places_in(rank, np.flatnonzero(rows)),
         )
 
     def _fault(self, place: ChunkPlace, what: str) -> None:

@@ -22,9 +22,18 @@ class ColumnReader(MessageReader, Protocol):
     """A reader that hands on many messages at once."""
 
     def iter_columns(
-        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+        self,
+        topics: Collection[str],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        *,
+        as_recorded: bool = False,
     ) -> Columns:
-        """What `iter_messages` gives, as columns."""
+        """What `iter_messages` gives, as columns.
+
+        Args:
+            as_recorded: in the order of recording instead, which may jump back in time.
+        """
 
 
 def open_messages(path: Path) -> ColumnReader:

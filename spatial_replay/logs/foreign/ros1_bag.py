@@ -13,7 +13,13 @@ import numpy as np
 from spatial_replay.errors import LogError
 from spatial_replay.logs.block import Schema
 from spatial_replay.logs.faults import FaultList
-from spatial_replay.logs.foreign.columns import Columns, MessageColumns, one_by_one, unnumbered
+from spatial_replay.logs.foreign.columns import (
+    Columns,
+    MessageColumns,
+    one_by_one,
+    places_in,
+    unnumbered,
+)
 from spatial_replay.logs.foreign.decoders import decoder_of
 from spatial_replay.logs.foreign.definitions import full_type_name
 from spatial_replay.logs.foreign.messages import Decoder, Message, Topic
@@ -86,22 +92,30 @@ class Ros1Bag:
         return one_by_one(self.iter_columns(topics, start_ns, end_ns))
 
     def iter_columns(
-        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+        self,
+        topics: Collection[str],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        *,
+        as_recorded: bool = False,
     ) -> Columns:
-        """What `iter_messages` gives, as columns."""
+        """See `ColumnReader.iter_columns`."""
         first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else end_ns
         wanted = {c.number: c for c in self._directory.connections.values() if c.topic in topics}
         chunks = [
-            chunk
-            for chunk in self._directory.chunks
+            (rank, chunk)
+            for rank, chunk in enumerate(self._directory.chunks)
             if chunk.start_ns < last
             and chunk.end_ns >= first
             and (chunk.counts is None or not wanted.keys().isdisjoint(chunk.counts))
         ]
-        chunks.sort(key=lambda chunk: (chunk.start_ns, chunk.offset))
+        if not as_recorded:
+            chunks.sort(key=lambda ranked: ranked[1].start_ns)
         with self._path.open("rb") as stream:
-            stretches = (self._messages(stream, chunk, wanted, first, last) for chunk in chunks)
-            columns = in_order([chunk.start_ns for chunk in chunks], stretches)
+            stretches = (self._messages(stream, *ranked, wanted, first, last) for ranked in chunks)
+            columns = (
+                stretches if as_recorded else in_order([chunk.start_ns for _, chunk in chunks], stretches)
+            )
             if (first, last) != (0, LATEST_NS + 1) or not self._directory.is_indexed:
                 yield from columns
                 return
@@ -110,7 +124,13 @@ class Ros1Bag:
             counted.compare(self.name, self._faults)
 
     def _messages(
-        self, stream: BinaryIO, chunk: BagChunk, wanted: dict[int, Connection], first: int, last: int
+        self,
+        stream: BinaryIO,
+        rank: int,
+        chunk: BagChunk,
+        wanted: dict[int, Connection],
+        first: int,
+        last: int,
     ) -> MessageColumns:
         """The messages of a chunk; what is lost of them goes to the faults."""
         span = f"messages between {chunk.start_ns} and {chunk.end_ns} ns"
@@ -139,6 +159,7 @@ class Ros1Bag:
             [names[number] for number in table.connection[rows].tolist()],
             table.time_ns[rows],
             [content[begin:end] for begin, end in bounds],
+            places_in(rank, np.flatnonzero(rows)),
         )
 
     def _topic(self, connection: Connection) -> Topic:

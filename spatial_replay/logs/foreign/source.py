@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -15,6 +15,7 @@ from spatial_replay.logs.block import Block
 from spatial_replay.logs.faults import FaultList
 from spatial_replay.logs.foreign.channels import CopiedMessages
 from spatial_replay.logs.foreign.columns import Columns, MessageColumns, in_pieces
+from spatial_replay.logs.foreign.jumps import without_jumps
 from spatial_replay.logs.foreign.messages import MessageReader, Topic
 from spatial_replay.logs.foreign.opening import ColumnReader, open_messages
 from spatial_replay.logs.mapping.assembler import Assembler
@@ -66,8 +67,12 @@ class ForeignSource:
             concave=self.concave,
         )
         blocks = _Blocks(assembler, reader, CopiedMessages(read, _WAITING_BYTES), start_ns, end_ns)
-        for columns in in_pieces(_columns(reader, plan, start_ns, end_ns)):
-            yield from blocks.of(assembler.add(columns.messages()), columns)
+        as_recorded = self.on_time_jump == "split"
+        columns = _columns(reader, plan, start_ns, end_ns, as_recorded=as_recorded)
+        if not as_recorded:
+            columns = without_jumps(columns, self.name)
+        for piece in in_pieces(columns):
+            yield from blocks.of(assembler.add(piece.messages()), piece)
             if assembler.is_finished:
                 break
         yield from blocks.of(assembler.finish(), MessageColumns(), last=True)
@@ -142,14 +147,18 @@ class _Blocks:
             yield Block(replace(trace, faults=faults), copied, remarks)
 
 
-def _columns(reader: ColumnReader, plan: Plan, start_ns: int | None, end_ns: int | None) -> Columns:
+def _columns(
+    reader: ColumnReader, plan: Plan, start_ns: int | None, end_ns: int | None, *, as_recorded: bool
+) -> Columns:
     """The messages that samples of a window depend on."""
     if not plan.by_log_time or (not start_ns and end_ns is None):
-        return reader.iter_columns(plan.topics)
+        return reader.iter_columns(plan.topics, as_recorded=as_recorded)
     last = None if end_ns is None else end_ns + plan.margin_ns
     lookback = {topic: plan.lookback_ns(topic) for topic in plan.topics}
     known = [each for each in lookback.values() if each is not None]
     first = max(0, (start_ns or 0) - max(known, default=0))
     lasting = [topic for topic, each in lookback.items() if each is None]
-    before: Iterable[MessageColumns] = reader.iter_columns(lasting, None, first) if lasting and first else ()
-    return chain(before, reader.iter_columns(plan.topics, first or None, last))
+    window = reader.iter_columns(plan.topics, first or None, last, as_recorded=as_recorded)
+    if not lasting or not first:
+        return window
+    return chain(reader.iter_columns(lasting, None, first, as_recorded=as_recorded), window)

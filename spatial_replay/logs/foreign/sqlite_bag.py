@@ -16,6 +16,7 @@ from spatial_replay.logs.foreign.messages import Decoder, Message, Topic
 from spatial_replay.logs.foreign.ordering import CountedTopics
 from spatial_replay.logs.foreign.sqlite_tables import (
     BagTables,
+    Query,
     Row,
     extent_of,
     iter_rows,
@@ -106,12 +107,17 @@ class SqliteBag:
         return one_by_one(self.iter_columns(topics, start_ns, end_ns))
 
     def iter_columns(
-        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+        self,
+        topics: Collection[str],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        *,
+        as_recorded: bool = False,
     ) -> Columns:
-        """What `iter_messages` gives, as columns."""
+        """See `ColumnReader.iter_columns`."""
         first, last = start_ns or 0, LATEST_NS if end_ns is None else min(end_ns - 1, LATEST_NS)
         counts = {each.name: each.count for each in self._topics if each.name in topics}
-        columns = self._messages(counts, first, last)
+        columns = self._messages(counts, first, last, as_recorded=as_recorded)
         if (first, last) != (0, LATEST_NS):
             yield from columns
             return
@@ -119,20 +125,22 @@ class SqliteBag:
         yield from counted.counted(columns)
         counted.compare(self.name, self._faults)
 
-    def _messages(self, topics: Collection[str], first: int, last: int) -> Columns:
+    def _messages(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
         wanted = {number: topic.name for number, topic in self._tables.topics.items() if topic.name in topics}
         most = self._path.stat().st_size // _ROW_BYTES
         with opened(self._whole) as database:
-            for rows in iter_rows(database, sorted(wanted), first, last, self._faults, self.name):
+            query = Query(sorted(wanted), first, last, as_recorded)
+            for rows in iter_rows(database, query, self._faults, self.name):
                 most -= len(rows)
                 if most < 0:
                     raise LogError(f"{self.name} is damaged: it lists more messages than it has room for")
                 yield self._columns(rows, wanted)
 
     def _columns(self, rows: Sequence[Row], wanted: Mapping[int, str]) -> MessageColumns:
-        _, numbers, times, payloads = zip(*rows, strict=True)
+        places, numbers, times, payloads = zip(*rows, strict=True)
         if set(map(type, payloads)) != {bytes} or set(map(type, times)) != {int}:
             good = [row for row in rows if type(row[3]) is bytes and type(row[2]) is int]
             self._faults.add(f"{self.name}: {len(rows) - len(good)} messages have no time or no content")
             return self._columns(good, wanted) if good else MessageColumns()
-        return unnumbered([wanted[number] for number in numbers], np.array(times, np.int64), payloads)
+        topics = [wanted[number] for number in numbers]
+        return unnumbered(topics, np.array(times, np.int64), payloads, np.array(places, np.int64))

@@ -131,31 +131,38 @@ def read_tables(database: sqlite3.Connection, name: str) -> BagTables:
     return BagTables(topics, metadata, distribution)
 
 
+class Query(NamedTuple):
+    """Which messages to read: topics by number, times from `first_ns` to `last_ns`, in which order."""
+
+    topics: Sequence[int]
+    first_ns: int
+    last_ns: int
+    as_recorded: bool
+
+
 def iter_rows(
-    database: sqlite3.Connection,
-    topics: Sequence[int],
-    first_ns: int,
-    last_ns: int,
-    faults: FaultList,
-    name: str,
+    database: sqlite3.Connection, query: Query, faults: FaultList, name: str
 ) -> Iterator[list[Row]]:
-    """The messages of some topics with times from `first_ns` to `last_ns`, in order.
+    """The messages that a query asks for, in order.
 
     Where the file is damaged, what can be reached of the rest follows in the order in which it was written.
     """
-    marks = ", ".join("?" * len(topics))
+    marks = ", ".join("?" * len(query.topics))
     inside = f"{_COLUMNS} WHERE topic_id IN ({marks}) AND timestamp BETWEEN ? AND ?"
-    time_ns, row_id = first_ns, -1
+    arguments = (*query.topics, query.first_ns, query.last_ns)
+    time_ns, row_id = query.first_ns, -1
     try:
-        cursor = database.execute(f"{inside} ORDER BY timestamp, id", (*topics, first_ns, last_ns))
+        order = "id" if query.as_recorded else "timestamp, id"
+        cursor = database.execute(f"{inside} ORDER BY {order}", arguments)
         for rows in _fetched(cursor):
             yield rows
             row_id, _, time_ns, _ = rows[-1]
         return
     except sqlite3.Error as error:
         faults.add(f"{name}: after {time_ns} ns: the database is damaged ({error})")
-    rest = f"{inside} AND (timestamp, id) > (?, ?) AND id > ? ORDER BY id"
-    arguments = (*topics, first_ns, last_ns, time_ns, row_id)
+    seen = "id" if query.as_recorded else "(timestamp, id)"
+    rest = f"{inside} AND {seen} > {'?' if query.as_recorded else '(?, ?)'} AND id > ? ORDER BY id"
+    arguments += (row_id,) if query.as_recorded else (time_ns, row_id)
     reached, step = 0, 0
     for _ in range(_SKIPS):
         try:
