@@ -1,0 +1,118 @@
+"""Changes that are told: which they are, and that it does not matter how a run is cut."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+from foxglove_schemas_protobuf.Event_pb2 import Event
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from laws.strategies_monitor import Recording, cuts, recordings, specifications
+from spatial_replay.inspection.events import EventTeller, Told
+from spatial_replay.inspection.specification import reported_trees
+from spatial_replay.inspection.standings import LASTING, SATISFIED, START, Standings, follow
+from spatial_replay.monitor.instances import find_instances
+from spatial_replay.monitor.stream import EvaluationStream
+from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.specification import parse_specification
+
+_VALUES = st.one_of(st.sampled_from([-2.0, -1.0, 0.0, 1.0, math.inf, -math.inf]), st.just(math.nan))
+_SETTLED = st.sampled_from([None] * 12 + [0.5, -0.5])
+
+
+@st.composite
+def stands(draw: st.DrawFn) -> np.ndarray:
+    """(1, 4, T) numbers of a node: mostly pending, perhaps settled from some sample on."""
+    values = draw(st.lists(_VALUES, min_size=1, max_size=30))
+    settled = draw(_SETTLED)
+    since = draw(st.integers(0, len(values)))
+    series = np.full((1, 4, len(values)), np.nan)
+    series[0, 0] = values
+    series[0, 2], series[0, 3] = -np.inf, np.inf
+    if settled is not None:
+        series[0, :, since:] = settled
+    return series
+
+
+def _told(series: np.ndarray) -> list[tuple[int, int, int, float]]:
+    """Confirmed at, code, since, worst: by reading the rule aloud."""
+    codes = []
+    for value, _, lower, upper in series[0].T:
+        sign = START if math.isnan(value) else 1 if value >= 0 else 2
+        codes.append(3 if lower >= 0 else 4 if upper < 0 else sign)
+    current, found = START, []
+    for t, code in enumerate(codes):
+        if current >= SATISFIED or code in (START, current):
+            continue
+        lasts = t >= LASTING - 1 and set(codes[t - LASTING + 1 : t + 1]) == {code}
+        if code >= SATISFIED:
+            found.append((t, code, t, float(series[0, 2, t])))
+        elif current == START:
+            pass
+        elif lasts:
+            since = t - LASTING + 1
+            found.append((t, code, since, float(series[0, 0, since : t + 1].min())))
+        else:
+            continue
+        current = code
+    return found
+
+
+@given(stands(), st.data())
+def test_a_verdict_counts_at_once_and_a_sign_when_it_lasts(series: np.ndarray, data: st.DataObject) -> None:
+    count = series.shape[2]
+    times_ns = np.arange(count, dtype=np.int64) * 10
+    ends = data.draw(cuts(count))
+    standings, found = Standings.begin(1), []
+    for begin, end in pairwise(ends):
+        part = np.ascontiguousarray(series[:, :, begin:end])
+        followed = follow(standings, times_ns[begin:end], part, np.array([0]))
+        standings = followed.standings
+        found += [
+            (begin + each.sample, each.after.code, each.after.start_ns // 10, each.after.worst)
+            for each in followed.changes
+        ]
+    assert found == _told(series)
+
+
+def _all_told(spec: Specification, recording: Recording, ends: list[int]) -> list[Told]:
+    trace = recording.trace()
+    each = {one.parameter: "all" for one in spec.results if one.parameter is not None}
+    instances = find_instances(spec, each, [trace], 0, 2**63 - 1)
+    evaluation = EvaluationStream(instances, spec.regions)
+    trees = reported_trees([spec], [instances])
+    tellers = [
+        EventTeller(tree, stream.instance, spec)
+        for tree, stream in zip(trees, evaluation.streams, strict=True)
+    ]
+    told: list[list[Told]] = [[] for _ in tellers]
+    for begin, end in pairwise(ends):
+        for own, teller, stretch in zip(
+            told, tellers, evaluation.extend(trace.slice(begin, end)), strict=True
+        ):
+            own += teller.tell(stretch)
+    return [one for own in told for one in sorted(own, key=lambda each: each.time_ns)]
+
+
+@settings(max_examples=60)
+@given(specifications(), recordings(max_size=12), st.data())
+def test_how_a_run_is_cut_changes_no_event(
+    spec: Specification, recording: Recording, data: st.DataObject
+) -> None:
+    count = len(recording.trace())
+    whole = _all_told(spec, recording, [0, count])
+    assert _all_told(spec, recording, list(range(count + 1))) == whole
+    assert _all_told(spec, recording, data.draw(cuts(count))) == whole
+
+
+@settings(max_examples=40)
+@given(recordings(max_size=12))
+def test_the_witness_of_a_change_has_its_number(recording: Recording) -> None:
+    spec = parse_specification("spec s = F battery >= 0.5\nspec t = G not battery >= 0.75")
+    for told in _all_told(spec, recording, [0, len(recording.trace())]):
+        facts = {pair.key: pair.value for pair in Event.FromString(told.event).metadata}
+        number = abs(float(facts["robustness"]))
+        assert facts["witness"].endswith("just holds" if number == 0 else f"by {number:.6g}")
