@@ -39,6 +39,9 @@ def test_samples_are_read_back_as_they_were_written(tmp_path: Path) -> None:
     assert read_trace(path) == run(12)
     content = content_of(path)
     assert content.topics() == {
+        "/spatial/automaton",
+        "/spatial/events",
+        "/spatial/log",
         "/spatial/objects",
         "/spatial/robustness",
         "/spatial/scene",

@@ -14,9 +14,10 @@ from spatial_replay.spec.specification import parse_specification
 def test_what_describes_the_log_comes_before_the_samples() -> None:
     sink = MemorySink()
     Recording(sink, [parse_specification(SPECIFICATION)], {"seed": "7"})
-    assert [name for name, _ in sink.metadata] == ["spatial_replay"]
+    assert [name for name, _ in sink.metadata] == ["spatial_replay", "spatial_replay_automata"]
     assert sink.metadata[0][1]["seed"] == "7"
-    assert [each.name for each in sink.attachments] == ["recorded/text.spatial"]
+    assert sink.attachments[0].name == "recorded/text.spatial"
+    assert all(each.name.startswith("automata/recorded/") for each in sink.attachments[1:])
     assert sink.messages == []
 
 

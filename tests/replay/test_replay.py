@@ -22,7 +22,14 @@ from spatial_replay.spec.specification import load_specification, parse_specific
 from spatial_replay.trace.trace import Trace
 
 SPEC = parse_specification(SPECIFICATION, filename="blocks.spatial")
-ANNOTATION = {"/spatial/scene", "/spatial/specification", "/spatial/robustness"}
+ANNOTATION = {
+    "/spatial/scene",
+    "/spatial/specification",
+    "/spatial/robustness",
+    "/spatial/automaton",
+    "/spatial/events",
+    "/spatial/log",
+}
 
 
 @pytest.fixture
