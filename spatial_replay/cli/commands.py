@@ -15,8 +15,10 @@ COMMANDS: dict[str, str] = {
     "explain": "Say why a verdict is what it is.",
     "export": "Write an annotated log's numbers as a table.",
     "info": "Say what a log holds.",
+    "plan": "Plan a run in a simulated world.",
     "record": "Record a run as a log.",
     "replay": "Evaluate specifications over a log.",
+    "verify": "Say whether a log is what it says it is.",
 }
 """Name and summary; `spatial_replay/cli/NAME.py` holds the command under its name."""
 

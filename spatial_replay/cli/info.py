@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from spatial_replay.cli.decisions import decision_lines, decision_rows
 from spatial_replay.cli.exit_codes import ExitCode
 from spatial_replay.cli.failures import say
 from spatial_replay.cli.options import Reading, reading_options
@@ -33,8 +34,9 @@ _EPOCH_LIKELY_NS = 10**18
 @click.argument("log", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 @click.option("--suggest-mapping", is_flag=True, help="Print a mapping file to start from instead (YAML).")
+@click.option("--decisions", is_flag=True, help="Tell what was decided in a planned run instead, and why.")
 @reading_options
-def info(log: Path, as_json: bool, suggest_mapping: bool, reading: Reading) -> int:
+def info(log: Path, as_json: bool, suggest_mapping: bool, decisions: bool, reading: Reading) -> int:
     """Say what a log holds: samples, objects, signals, topics, attachments.
 
     Of a log of messages by others it says what could be read as objects; with a mapping, which objects are.
@@ -46,7 +48,10 @@ def info(log: Path, as_json: bool, suggest_mapping: bool, reading: Reading) -> i
       spatial-replay info annotated.mcap
       spatial-replay info blocks.jsonl.gz --json
       spatial-replay info drive.bag --suggest-mapping > drive.yaml
+      spatial-replay info push.mcap --decisions
     """
+    if decisions:
+        return _decisions(log, as_json)
     # the numerical libraries load when there is work for them
     from spatial_replay.logs.overview import overview_of, overview_of_survey
     from spatial_replay.logs.source import open_source
@@ -73,6 +78,17 @@ def info(log: Path, as_json: bool, suggest_mapping: bool, reading: Reading) -> i
         for line in _lines(overview, surveyed, bool(faults)):
             click.echo(line)
     return ExitCode.DAMAGED if faults else ExitCode.SATISFIED
+
+
+def _decisions(log: Path, as_json: bool) -> int:
+    """Print what was decided in a planned run."""
+    if as_json:
+        document = {"name": log.name, "decisions": decision_rows(log)}
+        click.echo(json.dumps(document, indent=2, ensure_ascii=False))
+        return ExitCode.SATISFIED
+    for line in decision_lines(log):
+        click.echo(line)
+    return ExitCode.SATISFIED
 
 
 def _suggest(log: Path, reader: MessageReader | None, as_json: bool) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Literal, Protocol, TypeAlias
 
 from spatial_replay.planning.maps import Cubes, GradientMap
@@ -57,8 +58,7 @@ class Target:
     @property
     def length(self) -> float:
         """Of the way, in footprint units."""
-        pairs = zip(self.waypoints, self.waypoints[1:], strict=False)
-        return sum(math.dist(one, other) for one, other in pairs)
+        return sum(math.dist(one, other) for one, other in pairwise(self.waypoints))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

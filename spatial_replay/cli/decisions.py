@@ -1,0 +1,119 @@
+"""The decisions of a planned run, in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from spatial_replay.cli.verdicts import counted
+
+if TYPE_CHECKING:
+    from spatial_replay.logs.messages.PlanDecision_pb2 import (
+        PlanCandidate,
+        PlanDecision,
+        PlanEdge,
+        PlanTarget,
+    )
+
+
+def decision_lines(log: Path) -> Iterator[str]:
+    """Step by step: what was aimed at, tried, rejected and chosen, and how it went.
+
+    Raises:
+        UsageError: the log holds no decisions.
+    """
+    from spatial_replay.planning.told import read_decisions
+
+    decisions = read_decisions(log)
+    motions = sum(decision.HasField("target") for decision in decisions)
+    given_up = len(decisions[-1].pruned)
+    yield (
+        f"{log.name}: {counted(len(decisions), 'decision')} for {decisions[-1].specification!r}, "
+        f"{counted(motions, 'motion')}, {counted(given_up, 'edge')} given up"
+    )
+    for decision in decisions:
+        yield from _lines(decision)
+
+
+def decision_rows(log: Path) -> list[dict[str, Any]]:
+    """The same as values for JSON.
+
+    Raises:
+        UsageError: the log holds no decisions.
+    """
+    from google.protobuf.json_format import MessageToDict
+
+    from spatial_replay.planning.told import read_decisions
+
+    rows: list[dict[str, Any]] = []
+    for decision in read_decisions(log):
+        row = MessageToDict(decision, preserving_proto_field_name=True, use_integers_for_enums=False)
+        rows.append(_with_plain_times(row, decision))
+    return rows
+
+
+def _with_plain_times(row: dict[str, Any], decision: PlanDecision) -> dict[str, Any]:
+    """The library writes 64-bit integers as texts; here they are numbers, as elsewhere."""
+    row["time_ns"] = decision.time_ns
+    row["kind"] = decision.Kind.Name(decision.kind).removeprefix("KIND_").lower().replace("_", " ")
+    if decision.HasField("outcome"):
+        row["outcome"]["end_ns"] = decision.outcome.end_ns
+    return row
+
+
+def _lines(decision: PlanDecision) -> Iterator[str]:
+    states = ", ".join(map(str, decision.states))
+    yield f"step {decision.number} at {_seconds(decision.time_ns)}, state {states}"
+    for edge in decision.considered:
+        yield from _edge_lines(edge, is_aim=decision.HasField("target") and edge is decision.considered[-1])
+    yield f"  {decision.reason}"
+    if decision.HasField("target"):
+        yield f"  {_way(decision.target)}"
+    if decision.HasField("outcome"):
+        outcome = decision.outcome
+        how = "done" if outcome.succeeded else "failed"
+        after = ", ".join(map(str, outcome.states))
+        yield f"  {how} at {_seconds(outcome.end_ns)}: {outcome.reason}; state {after}"
+
+
+def _edge_lines(edge: PlanEdge, *, is_aim: bool) -> Iterator[str]:
+    path = " -> ".join(map(str, edge.path))
+    yield f"  {'aimed at' if is_aim else 'looked into'} {edge.source} -> {edge.target} on the path {path}"
+    yield f"    to reach  {_either([guard.text for guard in edge.progress])}"
+    if edge.constraints:
+        yield f"    never     {_either([guard.text for guard in edge.constraints])}"
+    for candidate in edge.candidates:
+        yield f"    {_candidate(candidate)}"
+    if edge.pruned:
+        yield "    given up: " + edge.pruned.split(" (", 1)[0]
+
+
+def _candidate(candidate: PlanCandidate) -> str:
+    best = "-inf" if math.isinf(candidate.best) else f"{candidate.best:.4g}"
+    if candidate.rejected:
+        return f"{candidate.object}: rejected, {candidate.rejected}"
+    mark = "chosen" if candidate.chosen else "possible"
+    return f"{candidate.object}: {mark}, {best} at best; {_way(candidate.target)}"
+
+
+def _way(target: PlanTarget) -> str:
+    points = list(zip(target.waypoints[::2], target.waypoints[1::2], strict=True))
+    length = sum(math.dist(one, other) for one, other in pairwise(points))
+    turned = f", turned by {math.degrees(target.turn):.3g} deg" if target.turn else ""
+    return (
+        f"{target.object} to ({target.x:.4g}, {target.y:.4g}){turned}, a way of {length:.4g}, "
+        f"robustness {target.robustness:.4g}"
+    )
+
+
+def _either(texts: Sequence[str]) -> str:
+    shown = [f"({text})" if len(texts) > 1 else text for text in texts[:4]]
+    more = f" or {len(texts) - 4} more" if len(texts) > 4 else ""
+    return " or ".join(shown) + more
+
+
+def _seconds(time_ns: int) -> str:
+    return f"{time_ns / 1e9:.3f} s"

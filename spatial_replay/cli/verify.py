@@ -1,0 +1,67 @@
+"""`spatial-replay verify`: is a log what it says it is?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from spatial_replay.cli.exit_codes import ExitCode
+from spatial_replay.cli.failures import say
+from spatial_replay.cli.options import Reading, reading_options
+from spatial_replay.cli.progress import progress
+from spatial_replay.cli.verdicts import counted
+from spatial_replay.errors import UsageError
+
+
+@click.command()
+@click.argument("log", type=click.Path(path_type=Path))
+@click.option(
+    "--source",
+    metavar="SOURCE",
+    type=click.Path(path_type=Path),
+    help="Evaluate what the log was made of instead of the log itself.",
+)
+@click.option("--decisions", is_flag=True, help="Make the decisions of a planned run again, too.")
+@reading_options
+def verify(log: Path, source: Path | None, decisions: bool, reading: Reading) -> int:
+    """Compute a log's certificate again, and compare it with the one in the log.
+
+    The log is evaluated with its own specifications and options. With --decisions, every decision of a
+    planner is made again from the recorded samples, with all its maps, and compared bit for bit. Exits with 0
+    if all is equal, else with 1.
+
+    \b
+    Examples:
+      spatial-replay verify annotated.mcap
+      spatial-replay verify annotated.mcap --source run.mcap
+      spatial-replay verify push.mcap --decisions
+    """
+    # the numerical libraries load when there is work for them
+    from spatial_replay.logs.source import open_source
+    from spatial_replay.planning.redo import redo_decisions
+    from spatial_replay.replay.verification import verify_certificate
+
+    if source is None and reading["mapping"] is not None:
+        raise UsageError("--mapping is about the log's source; add --source SOURCE")
+    own = open_source(log)
+    made_of = None if source is None else open_source(source, **reading)
+    with progress("samples") as advance:
+        verified = verify_certificate(own, made_of, advance)
+    for fault in verified.faults:
+        say("warning", fault, colour="yellow")
+    differences = list(verified.differences)
+    if verified.recorded and not differences:
+        click.echo(f"{log.name}: samples, messages, specifications and results are as recorded")
+    if decisions:
+        with progress("samples") as advance:
+            redone = redo_decisions(own, advance)
+        differences += redone.differences
+        if not redone.differences:
+            click.echo(
+                f"{log.name}: {counted(redone.decisions, 'decision')} made again on "
+                f"{counted(redone.maps, 'map')}, all as recorded"
+            )
+    for difference in differences:
+        click.echo(f"{log.name}: {difference}")
+    return ExitCode.VIOLATED if differences else ExitCode.SATISFIED

@@ -1,0 +1,106 @@
+"""Certificates compared with what a log, or its source, gives now."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+from spatial_replay.errors import LogError, UsageError
+from spatial_replay.logs.source import Source
+from spatial_replay.logs.topics import CERTIFICATE, METADATA
+from spatial_replay.monitor.semantics import Semantics
+from spatial_replay.replay.annotated import load_files, run_replay
+from spatial_replay.replay.window import Window
+from spatial_replay.spec.formula import Specification
+
+_HASHES: Mapping[str, str] = MappingProxyType(
+    {
+        "samples_sha256": "other samples",
+        "messages_sha256": "other messages",
+        "specification_sha256": "another specification",
+        "results_sha256": "other results",
+    }
+)
+"""What it means that a hash of a certificate differs."""
+
+_WINDOW = ("start_ns", "end_ns", "every")
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """What a certificate says, and what it would say now.
+
+    Attributes:
+        recorded: the log's certificate; empty where it has none.
+        computed: the one computed now.
+        faults: what could not be read.
+    """
+
+    recorded: Mapping[str, str]
+    computed: Mapping[str, str]
+    faults: tuple[str, ...] = ()
+
+    @property
+    def differences(self) -> tuple[str, ...]:
+        """What differs, in words; none where all is as it was."""
+        if not self.recorded:
+            return ("the log has no certificate: it was not written to its end",)
+        return tuple(
+            f"{what}: {self.computed.get(key, 'nothing')} now, {self.recorded.get(key, 'nothing')} recorded"
+            for key, what in _HASHES.items()
+            if self.recorded.get(key) != self.computed.get(key)
+        )
+
+
+def verify_certificate(
+    log: Source, source: Source | None = None, advance: Callable[[int], None] = lambda samples: None
+) -> Verified:
+    """Evaluate a log, or its source, again with the log's own specifications and options.
+
+    Args:
+        source: what the log was made of; None for the log itself.
+        advance: told how many more samples are done.
+
+    Raises:
+        UsageError, LogError, SpecificationError: what cannot be evaluated.
+    """
+    metadata = dict(log.metadata())
+    recorded, about = metadata.get(CERTIFICATE, {}), metadata.get(METADATA, {})
+    if not recorded:
+        return Verified({}, {})
+    options = _options(about)
+    replayed = run_replay(
+        log if source is None else source,
+        _files(log),
+        window=Window(**{name: options[name] for name in _WINDOW if name in options}),
+        each=options.get("each", {}),
+        semantics=_semantics(about),
+        advance=advance,
+    )
+    return Verified(dict(recorded), dict(replayed.certificate), replayed.faults)
+
+
+def _files(log: Source) -> list[Specification]:
+    """The specifications that a log was written with; none for a log without."""
+    try:
+        return load_files((), log)
+    except UsageError:
+        return []
+
+
+def _options(about: Mapping[str, str]) -> dict[str, Any]:
+    """How the log was replayed; nothing for a recording."""
+    if about.get("written_by") != "replay":
+        return {}
+    try:
+        options = json.loads(about.get("options", "{}"))
+    except ValueError as error:
+        raise LogError(f"the options in the log's metadata cannot be read: {error}") from error
+    return options if isinstance(options, dict) else {}
+
+
+def _semantics(about: Mapping[str, str]) -> Semantics:
+    return "paper" if about.get("semantics") == "paper" else "ltlf"
