@@ -22,8 +22,20 @@ from spatial_replay.spec.formula import Diagnostic, NamedSpec, Specification
 @profile_option
 @reading_options
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
+@click.option(
+    "--dfa",
+    metavar="FILE|-",
+    help="Write the automaton to a file that ends in .dot, .hoa or .svg; - shows it in words.",
+)
+@click.option("--of", metavar="NAME", help="Whose automaton it is, where SPEC has several results.")
 def check(
-    specification: Path, log: Path | None, profile: str | None, as_json: bool, reading: Reading
+    specification: Path,
+    log: Path | None,
+    profile: str | None,
+    as_json: bool,
+    dfa: str | None,
+    of: str | None,
+    reading: Reading,
 ) -> None:
     """Check a specification and show its tree.
 
@@ -33,7 +45,12 @@ def check(
     \b
     Example:
       spatial-replay check blocks.spatial --log run.mcap
+      spatial-replay check blocks.spatial --dfa blocks.svg
     """
+    if of is not None and dfa is None:
+        raise UsageError("--of is about an automaton; add --dfa FILE")
+    if as_json and dfa == "-":
+        raise UsageError("--json and --dfa - both write to standard output; give --dfa a file")
     if log is None and reading["mapping"] is not None:
         raise UsageError("--mapping is about a log to compare with; add --log LOG")
     parsed = load_specification(specification, profile=profile)
@@ -45,6 +62,11 @@ def check(
     if faults:
         raise SpecificationError(faults)
     click.echo(_json_of(parsed, remarks) if as_json else _text_of(parsed))
+    if dfa is not None:
+        # a mere check does without what compiles and writes
+        from spatial_replay.cli.automata import show_automata
+
+        show_automata(parsed, of, dfa, [specification, *([] if log is None else [log])], quiet=as_json)
 
 
 def _compared_with_log(specification: Specification, log: Path, reading: Reading) -> tuple[Diagnostic, ...]:
