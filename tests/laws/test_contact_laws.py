@@ -10,6 +10,7 @@ from hypothesis import given
 from laws.strategies_geometry import footprints, radii
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.contact import contact, enlarged, protrusion_contact
+from spatial_replay.geometry.contacts import contacts
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.geometry.measure import Operand, Request, measure
 
@@ -60,3 +61,38 @@ def test_what_sticks_out_is_the_protrusion(inner, outer):
 def test_enlarging_takes_from_the_distance(a, b, radius):
     before, after = contact(a, b).distance, contact(a, enlarged(b, radius)).distance
     assert math.isclose(after, before - radius, abs_tol=TOLERANCE)
+
+
+def many(first, second, *, is_protrusion):
+    """The row of `contacts` for one pair."""
+    batch = FootprintBatch.from_footprints([first, second])
+    return contacts(batch, *(Operand(np.array([[row]])) for row in range(2)), is_protrusion=is_protrusion)[0]
+
+
+@given(footprints, footprints)
+def test_contacts_of_many_are_those_of_one_pair(a, b):
+    for is_protrusion, one in ((False, contact(a, b)), (True, protrusion_contact(a, b))):
+        *found, distance, top = many(a, b, is_protrusion=is_protrusion)
+        assert math.isclose(distance, one.distance, abs_tol=TOLERANCE)
+        assert math.isclose(math.dist(found[:2], found[2:]), abs(distance), abs_tol=TOLERANCE)
+        assert math.isnan(top)
+
+
+@given(footprints, footprints)
+def test_contacts_lie_on_both_borders(a, b):
+    *found, distance, _ = many(a, b, is_protrusion=False)
+    if distance > TOLERANCE:
+        assert abs(to(found[:2], a)) < TOLERANCE
+        assert abs(to(found[2:], b)) < TOLERANCE
+
+
+def test_contacts_of_groups_are_those_of_the_members_that_decide():
+    shapes = [Footprint.box(0, 0, 1, 1), Footprint.box(5, 0, 6, 1), Footprint.box(8, 0, 10, 1)]
+    batch = FootprintBatch.from_footprints(shapes, [None, (0.0, 2.0), None])
+    group, single = Operand(np.array([[0, 1], [0, -1], [-1, -1]])), Operand(np.array([[2]] * 3), 0.5)
+    near = contacts(batch, group, single, is_protrusion=False)
+    assert near[:, 4].tolist()[:2] == [1.5, 6.5]
+    assert near[0, [0, 2]].tolist() == [6.0, 7.5]
+    assert near[0, 5] == 2.0
+    assert np.isnan(near[2]).all()
+    assert contacts(batch, group, single, is_protrusion=True)[:, 4].tolist()[:2] == [7.5, 7.5]
