@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import TypeVar
+
+import numpy as np
 
 from spatial_replay.logs.mapping.fields import Style, field_names, style_of, type_name
 from spatial_replay.logs.mapping.model import Measure, Stamp
@@ -20,6 +23,9 @@ from spatial_replay.logs.mapping.paths import (
     walk,
 )
 from spatial_replay.logs.mapping.readings import Reading
+from spatial_replay.trace.times import LATEST_NS
+
+SECOND_NS = 10**9
 
 _Option = TypeVar("_Option")
 _Found = TypeVar("_Found")
@@ -43,13 +49,27 @@ class TimeGetter:
     unit_ns: int
 
     def nanoseconds(self, values: Sequence[object]) -> list[int]:
-        """The times in what `path` begins at."""
-        get = self.get
+        """The times in what `path` begins at.
+
+        Raises:
+            FieldError: one lies outside the times that a log can have.
+            TypeError, ValueError, OverflowError: one is no time.
+        """
+        found = map(self.get, values)
         if self.parts is None:
             unit = self.unit_ns
-            found = [get(value) for value in values]
-            return [v * unit if type(v) is int else round(float(v) * unit) for v in found]
-        return [seconds * 1_000_000_000 + rest for seconds, rest in map(get, values)]
+            return [self._checked(v * unit if type(v) is int else round(float(v) * unit)) for v in found]
+        pairs = np.fromiter(chain.from_iterable(found), np.int64, 2 * len(values))
+        seconds, rest = pairs[::2], pairs[1::2]
+        if len(seconds) and max(np.abs(seconds).max(), np.abs(rest).max()) >= LATEST_NS // SECOND_NS:
+            raise FieldError(f"{self.path.text}: the time lies outside those of a log")
+        times: list[int] = (seconds * SECOND_NS + rest).tolist()
+        return times
+
+    def _checked(self, time_ns: int) -> int:
+        if abs(time_ns) > LATEST_NS:
+            raise FieldError(f"{self.path.text}: the time lies outside those of a log")
+        return time_ns
 
 
 @dataclass(frozen=True, slots=True)

@@ -177,8 +177,9 @@ class Channel:
         except MISFITS as error:
             if not extractor.is_bound:
                 self._bind_first(extractor, chunk, error)
-        _, kept = self._one_by_one(chunk, lambda content: extractor.harvest([content], 0), log_times_ns)
-        parts.append(extractor.harvest([chunk[i] for i in kept], first))
+        found, kept = self._one_by_one(chunk, lambda content: extractor.harvest([content], 0), log_times_ns)
+        # not together: each may be of a form of its own
+        parts += [part.shifted(first + place) for place, part in enumerate(found)]
         return kept
 
     def _read_signals(
@@ -220,6 +221,8 @@ class Channel:
                 self._time = bind_time(stamps, content, content)
                 self._has_time = True
         except FieldError as error:
+            if self._has_time or (self.extractor is not None and self.extractor.is_timed):
+                raise
             raise self._misfit(f"the clock is header, but {error}") from None
         if self._time is None:
             raise self._misfit(_NO_STAMP)

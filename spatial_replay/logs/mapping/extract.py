@@ -61,6 +61,11 @@ class Extractor:
         return self._binding is not None
 
     @property
+    def is_timed(self) -> bool:
+        """Whether it is known how stamps are read."""
+        return self._time is not None
+
+    @property
     def lacks_stamp(self) -> bool:
         """Whether a message was seen, and there was no stamp where there could be one."""
         return self._has_time and self._time is None

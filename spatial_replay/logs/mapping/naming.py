@@ -36,6 +36,7 @@ class Namer:
         self._wanted: dict[int, bool] = {}
         self._by_values: dict[Any, int] = {}
         self._get: Get | None = None
+        self._has_places_only = False
         self._is_planned = False
 
     def codes(self, objects: Sequence[object], places: Sequence[int], style: Style) -> list[int]:
@@ -56,6 +57,11 @@ class Namer:
             self._plan(objects[0], style)
         get = self._get
         known = self._by_values
+        if self._has_places_only:
+            for place, thing in zip(places, objects, strict=True):
+                if place not in known:
+                    known[place] = self._codes[self._name(thing, place)]
+            return [known[place] for place in places]
         if get is None or not objects:
             return [self._codes[self._name(each, place)] for each, place in zip(objects, places, strict=True)]
         # most names depend on one field alone
@@ -84,6 +90,10 @@ class Namer:
         """Find out how the one field is read that names depend on, where it is as simple as that."""
         self._is_planned = True
         fields = [part for part in self._template.parts if not isinstance(part, str)]
+        given = {INDEX, TOPIC}.difference(field_names(example))
+        if all(alternatives[0].text in given for alternatives in fields):
+            self._has_places_only = True
+            return
         if len(fields) == 1 and len(fields[0]) == 1:
             (path,) = fields[0]
             if path.text in (INDEX, TOPIC) and path.text not in field_names(example):

@@ -73,6 +73,12 @@ class Part:
     corners: Floats = field(default_factory=lambda: np.empty((0, 3)))
     skipped: int = 0
 
+    def shifted(self, count: int) -> Part:
+        """The same of messages that come so many later."""
+        self.message = [number + count for number in self.message]
+        self.gone = [(number + count, name) for number, name in self.gone]
+        return self
+
 
 def seen_from_parts(reading: Reading, binding: Binding | None, parts: Sequence[Part]) -> Seen:
     """The parts of consecutive messages as columns."""

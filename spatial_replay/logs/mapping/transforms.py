@@ -8,6 +8,7 @@ from typing import Any
 from spatial_replay.logs.mapping.fields import field_names, style_of
 from spatial_replay.logs.mapping.frames import FrameTree
 from spatial_replay.logs.mapping.paths import FieldError, Get, Path, getter, leads_somewhere, tuple_getter
+from spatial_replay.trace.times import LATEST_NS
 
 _SECONDS = ("sec", "secs", "seconds")
 _REST = ("nanosec", "nsec", "nsecs", "nanos")
@@ -32,7 +33,7 @@ class TransformReader:
                 str(child).removeprefix("/"),
                 str(parent).removeprefix("/"),
                 tuple(map(float, pose)),
-                stamp_ns=int(seconds) * 1_000_000_000 + int(rest),
+                stamp_ns=_nanoseconds(seconds, rest),
                 clock_ns=clock_ns,
                 is_static=is_static,
             )
@@ -41,7 +42,7 @@ class TransformReader:
         """The stamp of a message's first transform; None where it has no transform."""
         for transform in self._each(message):
             _, _, seconds, rest, *_ = self._values(transform)
-            return int(seconds) * 1_000_000_000 + int(rest)
+            return _nanoseconds(seconds, rest)
         return None
 
     def _each(self, message: object) -> Iterator[Any]:
@@ -73,3 +74,10 @@ def _getter(example: object) -> Get:
     paths += [f"{place}translation.{axis}" for axis in "xyz"]
     paths += [f"{place}rotation.{axis}" for axis in "xyzw"]
     return tuple_getter([Path.of(path) for path in paths], style_of(example))
+
+
+def _nanoseconds(seconds: Any, rest: Any) -> int:
+    time_ns = int(seconds) * 1_000_000_000 + int(rest)
+    if abs(time_ns) > LATEST_NS:
+        raise FieldError(f"its stamp {time_ns} ns lies outside the times of a log")
+    return time_ns

@@ -116,10 +116,8 @@ def tf(*transforms: Any) -> Any:
 
 def type_of(content: Any) -> str:
     """What a log would call the type of a message."""
-    if isinstance(content, dict):
-        return "unknown"
     descriptor = getattr(content, "DESCRIPTOR", None)
-    return str(content.__msgtype__ if descriptor is None else descriptor.full_name)
+    return str(getattr(content, "__msgtype__", "unknown") if descriptor is None else descriptor.full_name)
 
 
 @dataclass
