@@ -1,0 +1,162 @@
+"""Laws of automata: they accept what is satisfied, and each of their parts says the same."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from laws.reference import Prefix
+from laws.strategies_automaton import compiled, formulas_and_symbols, formulas_with_automata
+from laws.strategies_monitor import leaf_runs
+from spatial_replay.automata.automaton import Automaton
+from spatial_replay.automata.compiling import automaton
+from spatial_replay.automata.stepping import Table
+from spatial_replay.automata.stored import automaton_from, stored_text
+from spatial_replay.spec.formula import NamedSpec, Specification
+
+known = st.booleans()
+perhaps_unknown = st.sampled_from([False, True, None])
+
+
+@given(formulas_with_automata, leaf_runs(max_size=8))
+def test_the_sign_of_robustness_and_acceptance_agree(formula, run):
+    # only the first of its channels is looked at: everything is known
+    run = type(run)(run.times_ns, {name: _known(cells) for name, cells in run.nominal.items()}, run.wide, 1)
+    machine = compiled(formula)
+    samples = Prefix(run.times_ns, run.nominal_leaf, goes_on=False)
+    rho = samples.rho(formula, 0).low
+    symbols = [
+        [samples.rho(each.formula, t).low >= 0.0 for each in machine.propositions] for t in range(len(run))
+    ]
+    if rho != 0.0:
+        assert machine.accepts(symbols) == (rho > 0.0)
+
+
+def _known(cells):
+    """What is not known is 1."""
+    return tuple(cell if cell.low == cell.high else type(cell)(1.0, 1.0) for cell in cells)
+
+
+@given(formulas_and_symbols(perhaps_unknown, max_size=3))
+def test_what_is_not_known_leaves_the_states_of_everything_that_it_may_be(given_symbols):
+    machine, symbols = given_symbols
+    possible = frozenset({machine.initial})
+    for symbol in symbols:
+        reached = {
+            machine.step(state, completed)
+            for state in possible
+            for completed in product(*([value] if value is not None else [False, True] for value in symbol))
+        }
+        possible = machine.step_set(possible, symbol)
+        assert possible == reached
+
+
+@given(formulas_and_symbols(perhaps_unknown))
+def test_many_samples_at_once_are_as_one_by_one(given_symbols):
+    machine, symbols = given_symbols
+    values = np.array([[-1 if each is None else int(each) for each in symbol] for symbol in symbols], np.int8)
+    values = values.reshape(len(symbols), len(machine.propositions)).T.copy()
+    begin = np.zeros(len(machine.states), np.bool_)
+    begin[machine.initial] = True
+    sets = Table.of(machine).state_sets(begin, values)
+    possible = frozenset({machine.initial})
+    for t, symbol in enumerate(symbols):
+        possible = machine.step_set(possible, symbol)
+        assert set(np.flatnonzero(sets[t]).tolist()) == possible
+    if not (values < 0).any():
+        states = Table.of(machine).states(machine.initial, values)
+        assert [{state} for state in states.tolist()] == [set(np.flatnonzero(row)) for row in sets]
+
+
+@given(formulas_and_symbols(known))
+def test_of_the_guards_of_a_state_one_holds_and_leads_where_the_step_does(given_symbols):
+    machine, symbols = given_symbols
+    state = machine.initial
+    for symbol in symbols:
+        taken = [
+            each.target
+            for each in machine.transitions
+            if each.source == state
+            and any(all(symbol[number] == value for number, value in cube) for cube in each.guard)
+        ]
+        state = machine.step(state, symbol)
+        assert taken == [state]
+
+
+@given(formulas_with_automata)
+def test_no_literal_of_a_guard_can_be_left_out(formula):
+    machine = compiled(formula)
+    for each in machine.transitions:
+        for cube in each.guard:
+            for literal in cube:
+                wider = {number: value for number, value in cube if (number, value) != literal}
+                symbol = [wider.get(number) for number in range(len(machine.propositions))]
+                assert machine.step_set([each.source], symbol) != {each.target}
+
+
+@given(formulas_with_automata)
+def test_no_two_states_are_alike(formula):
+    machine = compiled(formula)
+    assert len(_classes(machine)) == len(machine.states)
+
+
+def _classes(machine: Automaton) -> set[tuple[object, ...]]:
+    """States by what runs from them on lead to; the initial one, in which none ends, by its moves."""
+    symbols = list(product([False, True], repeat=len(machine.propositions)))
+    names: dict[int, object] = {state: state in machine.accepting for state in machine.states}
+    for _ in machine.states:
+        signatures = {
+            state: (names[state], *(names[machine.step(state, symbol)] for symbol in symbols))
+            for state in machine.states
+        }
+        numbers = {signature: number for number, signature in enumerate(dict.fromkeys(signatures.values()))}
+        names = {state: numbers[signature] for state, signature in signatures.items()}
+    return {(name,) for name in names.values()}
+
+
+@given(formulas_with_automata)
+def test_paths_are_as_short_as_can_be_and_lead_to_acceptance(formula):
+    machine = compiled(formula)
+    for state in machine.states:
+        ways = [way for way, _ in zip(machine.paths(state), range(20), strict=False)]
+        reachable = {state} & machine.accepting or {
+            end for end in _reached(machine, state) if end in machine.accepting
+        }
+        assert bool(ways) == bool(reachable)
+        assert len({len(way) for way in ways}) <= 1
+        for way in ways:
+            ends = [state, *(each.target for each in way)]
+            assert [each.source for each in way] == ends[:-1]
+            assert ends[-1] in machine.accepting
+            assert not set(ends[:-1]) & machine.accepting
+
+
+def _reached(machine: Automaton, state: int) -> set[int]:
+    found: set[int] = set()
+    waiting = [state]
+    while waiting:
+        more = set(machine.successors[waiting.pop()]) - found
+        found |= more
+        waiting += more
+    return found
+
+
+@given(formulas_with_automata)
+def test_traps_and_acceptance_for_good_are_where_nothing_can_change(formula):
+    machine = compiled(formula)
+    for state in machine.states:
+        ends = _reached(machine, state) | ({state} if state != machine.initial else set())
+        assert (state in machine.can_accept) == bool(ends & machine.accepting)
+        assert (state in machine.can_reject) == bool(ends - machine.accepting)
+
+
+@given(formulas_with_automata)
+def test_reading_an_automaton_gives_back_what_was_stored(formula):
+    spec = NamedSpec("s", formula)
+    specification = Specification((spec,), "paper")
+    machine = automaton(specification)
+    text = stored_text(machine, specification, spec)
+    assert automaton_from(text.encode(), specification, spec) == machine
