@@ -24,6 +24,7 @@ SCENARIOS: Mapping[str, str] = MappingProxyType(
     {
         "push": "three blocks on a table, and a robot that pushes them",
         "pick-place": "nine things on a table, and a robot that picks and places them",
+        "table-setting": "cutlery, a cup and a plate, and a robot that sets the table",
     }
 )
 """The simulated worlds, and what there is in each."""

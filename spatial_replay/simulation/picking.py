@@ -25,17 +25,17 @@ def picking(scene: Scene, name: str, goal: Point, yaw: float | None) -> Generato
     if isinstance(grasp, str):
         return Execution(False, grasp)
     stood = scene.pose(name).stands
-    trouble = yield from _pick_up(scene, name, grasp)
+    trouble = yield from pick_up(scene, name, grasp)
     if not trouble:
-        trouble = yield from _set_down(scene, name, grasp, goal)
-    x, y, _ = scene.arm.commanded
-    yield from scene.arm.grip(grasp.opening)
-    yield from scene.arm.move(x, y, ABOVE)
-    trouble = trouble or _missed(scene, name, goal, stood=stood)
+        trouble = yield from carry(scene, name, grasp, goal)
+    if not trouble:
+        trouble = yield from set_down(scene, name, goal)
+    yield from let_go(scene, grasp.opening)
+    trouble = trouble or missed(scene, name, goal, stood=stood)
     return Execution(not trouble, trouble or f"placed {name}")
 
 
-def _pick_up(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str]:
+def pick_up(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str]:
     """Grasp a body and lift it; returns what went wrong, if anything."""
     arm, (x, y) = scene.arm, scene.place_of(name)
     z = scene.height(name)[0] + grasp.above_bottom
@@ -50,19 +50,38 @@ def _pick_up(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str
     return "" if lifted else f"{name} slipped out of the fingers as it was lifted"
 
 
-def _set_down(scene: Scene, name: str, grasp: Grasp, goal: Point) -> Generator[None, None, str]:
-    """Carry what is held to a point and lower it; returns what went wrong, if anything."""
-    arm = scene.arm
+def carry(scene: Scene, name: str, grasp: Grasp, goal: Point) -> Generator[None, None, str]:
+    """Bring what is held above a point; returns what went wrong, if anything."""
     x, y = _tool_for(scene, name, goal, grasp.turn)
-    carried = yield from _holding(scene, name, arm.travel(x, y, grasp.turn))
-    if not carried:
-        return f"{name} was lost on the way"
+    carried = yield from _holding(scene, name, scene.arm.travel(x, y, grasp.turn))
+    return "" if carried else f"{name} slipped out of the fingers on the way"
+
+
+def set_down(scene: Scene, name: str, goal: Point) -> Generator[None, None, str]:
+    """Lower what is held above a point; returns what went wrong, if anything."""
+    arm = scene.arm
+    x, y, above = arm.commanded
     # it may hang otherwise than it stood
-    hanging = arm.commanded[2] - scene.height(name)[0]
-    z = surface(scene, name, goal) + hanging + _SETTING_DOWN
-    yield from _holding(scene, name, arm.move(x, y, z + 0.03))
-    lowered = yield from _holding(scene, name, arm.move(x, y, z, speed=_SLOW / 2))
+    z = surface(scene, name, goal) + above - scene.height(name)[0] + _SETTING_DOWN
+    lowered = yield from _holding(scene, name, arm.move(x, y, z + 0.03))
+    if lowered:
+        lowered = yield from _holding(scene, name, arm.move(x, y, z, speed=_SLOW / 2))
     return "" if lowered else f"{name} slipped out of the fingers as it was set down"
+
+
+def let_go(scene: Scene, opening: float) -> Motion:
+    """Open the fingers, and lift them."""
+    x, y, _ = scene.arm.commanded
+    yield from scene.arm.grip(opening)
+    yield from scene.arm.move(x, y, ABOVE)
+
+
+def missed(scene: Scene, name: str, goal: Point, *, stood: bool = True) -> str:
+    """How a body that was let go is not as it should be, if so."""
+    if stood and not scene.pose(name).stands:
+        return f"{name} fell over"
+    away = math.dist(scene.place_of(name), goal)
+    return "" if away <= _NEAR else f"{name} lies {away * 100:.1f} cm from where it was put"
 
 
 def _tool_for(scene: Scene, name: str, goal: Point, turn: float) -> Point:
@@ -83,11 +102,3 @@ def _holding(scene: Scene, name: str, motion: Motion) -> Generator[None, None, b
         if lost >= _LOST_TICKS:
             return False
     return True
-
-
-def _missed(scene: Scene, name: str, goal: Point, *, stood: bool) -> str:
-    """How a body that was let go is not as it should be, if so."""
-    if stood and not scene.pose(name).stands:
-        return f"{name} fell over"
-    missed = math.dist(scene.place_of(name), goal)
-    return "" if missed <= _NEAR else f"{name} lies {missed * 100:.1f} cm from where it was put"

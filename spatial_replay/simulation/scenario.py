@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
-from typing import Literal
 
+from spatial_replay.simulation.grasp import Point
+from spatial_replay.simulation.picking import picking
 from spatial_replay.simulation.scene import Scene
-from spatial_replay.simulation.world import Body, Execution, Workspace
+from spatial_replay.simulation.world import Body, Execution, Skill, Workspace
 
-Skill = Literal["push", "place"]
+Placing = Callable[[Scene, str, Point, float | None], Generator[None, None, Execution]]
+"""How a robot picks a body up and places it: `picking`, or something more careful."""
 
 Script = Callable[[Scene], Generator[None, None, Execution]]
 """What the robot does when nobody plans."""
@@ -22,6 +24,7 @@ class Placement:
     Attributes:
         body: what it is.
         x, y, yaw: where its centre is, in metres and radians.
+        bottom: the height of what it lies on, in metres.
         mass_kg: its mass.
         colour: red, green, blue from 0 to 1.
     """
@@ -32,6 +35,7 @@ class Placement:
     yaw: float
     mass_kg: float
     colour: tuple[float, float, float]
+    bottom: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +48,7 @@ class Scenario:
         workspace: where the robot can put them.
         skill: what the robot does with them.
         script: its motion when nobody plans.
+        placing: how it picks and places, where that is its skill.
         scatter_m, scatter_rad: how far a seed moves and turns each body, at most.
     """
 
@@ -52,5 +57,6 @@ class Scenario:
     workspace: Workspace
     skill: Skill
     script: Script
+    placing: Placing = picking
     scatter_m: float = 0.01
     scatter_rad: float = 0.2

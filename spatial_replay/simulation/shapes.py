@@ -55,6 +55,10 @@ class Pose:
         """The angle of the body's axis x in the plane, in radians, counter-clockwise from the world's."""
         return math.atan2(self.rotation[1, 0], self.rotation[0, 0])
 
+    def turned_from(self, yaw: float) -> float:
+        """By how much the body is turned against `yaw`, -pi to pi."""
+        return math.remainder(self.yaw - yaw, 2 * math.pi)
+
     @property
     def lean(self) -> float:
         """The angle between the body's axis z and the vertical, 0 to pi."""

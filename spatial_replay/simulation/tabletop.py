@@ -16,7 +16,6 @@ from spatial_replay.simulation.arm import STEPS_PER_TICK, TICKS_PER_S, Arm
 from spatial_replay.simulation.engine import Engine
 from spatial_replay.simulation.injection import Injection
 from spatial_replay.simulation.noise import displacements
-from spatial_replay.simulation.picking import picking
 from spatial_replay.simulation.pushing import pushing
 from spatial_replay.simulation.scenario import Scenario
 from spatial_replay.simulation.scene import Scene
@@ -131,7 +130,7 @@ class Tabletop:
                 each.body.name,
                 each.body.shape,
                 mass=each.mass_kg,
-                position=(x, y, tall / 2 + 5e-4),
+                position=(x, y, each.bottom + tall / 2 + 5e-4),
                 yaw=each.yaw + turn * scenario.scatter_rad,
                 colour=each.colour,
             )
@@ -165,7 +164,7 @@ class Tabletop:
     def place(self, name: str, x: float, y: float, yaw: float | None = None) -> Execution:
         """See `World`."""
         self._refuse_unless("place", name)
-        return self.run(picking(self._scene, name, (x, y), yaw))
+        return self.run(self._scenario.placing(self._scene, name, (x, y), yaw))
 
     def script(self) -> Generator[None, None, Execution]:
         """The robot's motion when nobody plans."""

@@ -11,7 +11,6 @@ from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.simulation.shapes import Shape
 from spatial_replay.trace.sample import Sample
 
-
 Skill = Literal["push", "place"]
 """What a robot does with an object: push it along a path, or pick it up and place it."""
 

@@ -12,7 +12,7 @@ from spatial_replay.simulation.tabletop import Tabletop
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.formula import Specification
 
-SCENARIOS: tuple[str, ...] = ("push", "pick-place")
+SCENARIOS: tuple[str, ...] = ("push", "pick-place", "table-setting")
 """Each has a module of that name in `scenarios`, and a specification beside it."""
 
 
