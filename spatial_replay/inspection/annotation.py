@@ -23,6 +23,7 @@ from spatial_replay.inspection.automata import (
 from spatial_replay.inspection.automaton import AutomatonRun
 from spatial_replay.inspection.events import EventTeller
 from spatial_replay.inspection.involvement import Evaluated, concerns_of
+from spatial_replay.inspection.pointing import Judged, pointing_of
 from spatial_replay.inspection.robustness import encode_robustness
 from spatial_replay.inspection.scene import SceneEncoder, SceneState
 from spatial_replay.inspection.specification import encode_specification, reported_trees
@@ -84,6 +85,10 @@ class AnnotatedEvaluation:
         self.trees = reported_trees(files, instances)
         self._concerns = [concerns_of(tree.formula, tree.object) for tree in self.trees]
         self._names = [[node.name for _, _, node in iter_nodes(tree.formula)] for tree in self.trees]
+        self._pointing = [
+            pointing_of(stream.instance, concerns, files[tree.file].regions)
+            for tree, stream, concerns in zip(self.trees, self.streams, self._concerns, strict=True)
+        ]
         self._tellers = [
             EventTeller(tree, stream.instance, files[tree.file])
             for tree, stream in zip(self.trees, self.streams, strict=True)
@@ -114,7 +119,11 @@ class AnnotatedEvaluation:
             Evaluated(concerns, stretch.times_ns, stretch.series)
             for concerns, stretch in zip(self._concerns, stretches, strict=True)
         ]
-        scene = self._encoder.encode(trace, evaluated, self._state)
+        judged = [
+            Judged(each, stretch.leaves, pointing)
+            for each, stretch, pointing in zip(evaluated, stretches, self._pointing, strict=True)
+        ]
+        scene = self._encoder.encode(trace, evaluated, self._state, judged)
         self._state = scene.state
         messages.append(self._messages(_SCENE, scene.times_ns, scene.payloads))
         return messages

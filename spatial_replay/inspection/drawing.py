@@ -12,9 +12,12 @@ from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.inspection.palette import LABEL
+from spatial_replay.inspection.palette import LABEL, NEGATIVE
 
 FRAME: Final = "world"
+
+ARROW_HEAD: Final = 0.15
+"""The length of an arrow's head by the size of the objects in a scene; of a short arrow it is half."""
 
 _LINE_PIXELS: Final = 2.0
 _LABEL_PIXELS: Final = 14.0
@@ -70,6 +73,24 @@ def draw(
     )
     label.pose.position.x, label.pose.position.y = anchor
     label.color.r, label.color.g, label.color.b, label.color.a = *LABEL, 1.0
+
+
+def point_at(entity: SceneEntity, label: str, lift: float) -> None:
+    """Add an arrow and its label to an entity; where they are and how long is to be filled in.
+
+    Args:
+        lift: what is drawn above the plane, and a fifth of an arrow's width.
+    """
+    arrow = entity.arrows.add(
+        shaft_length=_NAN, shaft_diameter=5.0 * lift, head_length=_NAN, head_diameter=12.0 * lift
+    )
+    arrow.pose.position.x = arrow.pose.position.y = arrow.pose.position.z = _NAN
+    arrow.pose.orientation.z = arrow.pose.orientation.w = _NAN
+    arrow.color.r, arrow.color.g, arrow.color.b, arrow.color.a = *NEGATIVE, 1.0
+    text = entity.texts.add(billboard=True, font_size=_LABEL_PIXELS, scale_invariant=True, text=label)
+    text.pose.position.x = text.pose.position.y = text.pose.position.z = _NAN
+    text.pose.orientation.w = 1.0
+    text.color.r, text.color.g, text.color.b, text.color.a = *LABEL, 1.0
 
 
 def _add_outline(entity: SceneEntity, ring: Floats, z: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -12,13 +13,17 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.inspection.drawing import FRAME, Elevation, draw
+from spatial_replay.inspection.drawing import ARROW_HEAD, FRAME, Elevation, draw, point_at
 from spatial_replay.inspection.rings import Form
 from spatial_replay.logs.wire import Bytes, Template
 from spatial_replay.spec.formula import Outline
 
 OBJECT: Final = "object/"
 REGION: Final = "region/"
+WITNESS: Final = "witness"
+
+LABEL_LENGTH: Final = 8
+"""Characters of a witness' number, spaces around it included."""
 
 
 class Layout(NamedTuple):
@@ -27,10 +32,12 @@ class Layout(NamedTuple):
     Attributes:
         deleted: objects that were in the message before and are not seen now.
         objects: name and form of those seen.
+        witness: whether the worst violation is pointed at; or, with None, was so in the message before.
     """
 
     deleted: tuple[str, ...]
     objects: tuple[tuple[str, Form], ...]
+    witness: bool | None = False
 
 
 class Region(NamedTuple):
@@ -77,13 +84,20 @@ def make_template(layout: Layout, regions: tuple[Region, ...], lift: float) -> S
     message = SceneUpdate()
     for name in layout.deleted:
         message.deletions.add(id=OBJECT + name, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
+    if layout.witness is None:
+        message.deletions.add(id=WITNESS, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
     for region in regions:
         _add_region(_add_entity(message, REGION + region.name), region)
     for name, form in layout.objects:
         _add_object(_add_entity(message, OBJECT + name), name, form, lift)
+    if layout.witness:
+        point_at(_add_entity(message, WITNESS), _A_LABEL, lift)
     payload = np.frombuffer(message.SerializeToString(deterministic=True), np.uint8).copy()
     words = Template.of(message).word_offsets
     slots = words[np.isnan(payload[words[:, None] + np.arange(8)].view("<f8")[:, 0])]
+    if layout.witness:
+        # the last text of all: names come before it
+        slots = np.append(slots, payload.tobytes().rindex(_A_LABEL.encode()))
     payload[slots[:, None] + np.arange(8)] = 0
     return SceneTemplate(Template(payload, slots, np.empty(0, np.int64)), _stamp_offsets(payload.tobytes()))
 
@@ -120,6 +134,29 @@ def words_of_object(form: Form, points: Floats, bottom: Floats, top: Floats, col
     # half the sum of the ends does not depend on the order in which points are added up
     words.append((points.min(axis=1) + points.max(axis=1)) / 2.0)
     return words + upper
+
+
+def words_of_witness(points: Floats, z: Floats, scale: float, labels: Sequence[str]) -> list[Floats]:
+    """What a template leaves open in the arrow at the worst violation.
+
+    Args:
+        points: (S, 2, 2), where it begins and where it ends.
+        z: (S,), how high.
+        scale: the size of objects in the scene.
+        labels: S texts, of at most `LABEL_LENGTH` ASCII characters.
+
+    Returns:
+        columns (S, n).
+    """
+    begin, end = points[:, 0], points[:, 1]
+    length = np.hypot(*(end - begin).T)
+    half = 0.5 * np.arctan2(*(end - begin).T[::-1])
+    head = np.minimum(0.5 * length, ARROW_HEAD * scale)
+    arrow = [begin, z, np.sin(half), np.cos(half), length - head, head]
+    middle = [(begin + end) / 2.0, z]
+    text = "".join(f"{label:^{LABEL_LENGTH}}" for label in labels).encode()
+    label = np.frombuffer(text, "<f8")
+    return [column.reshape(len(points), -1) for column in (*arrow, *middle, label)]
 
 
 def _add_entity(message: SceneUpdate, identifier: str) -> SceneEntity:
@@ -164,6 +201,9 @@ def _raised(ring: Floats, height: Floats) -> Floats:
     """(S, n, 2) points and (S,) heights → (S, 3 n): x, y, z, x, y, z …"""
     z = np.broadcast_to(height[:, None, None], (*ring.shape[:2], 1))
     return _flat(np.concatenate([ring, z], axis=2))
+
+
+_A_LABEL: Final = "#" * LABEL_LENGTH
 
 
 # ------------------------------------------------------------------------------------------- timestamps

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
@@ -15,14 +15,17 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.inspection.involvement import Evaluated, Seen, worst_robustness
 from spatial_replay.inspection.layout import (
+    LABEL_LENGTH,
     Layout,
     Region,
     SceneTemplate,
     make_template,
     words_of_object,
     words_of_region,
+    words_of_witness,
 )
 from spatial_replay.inspection.palette import colours
+from spatial_replay.inspection.pointing import Judged, Pointers, pointers
 from spatial_replay.inspection.rings import Form, Rings, extents, rings_of
 from spatial_replay.logs.wire import payloads_of
 from spatial_replay.monitor.operands import footprint_from_outline
@@ -50,6 +53,7 @@ class SceneState:
     Attributes:
         written_ns: the time of the last message, or None before the first.
         shown: the objects in it.
+        is_pointing: whether it points at a violation.
         scale: the robustness at which colours are full: the median size (longer side of the bounding box) of
             the objects in the first message that shows any; None before that.
         templates: the layouts met so far; they save time and change no message.
@@ -57,6 +61,7 @@ class SceneState:
 
     written_ns: int | None = None
     shown: tuple[str, ...] = ()
+    is_pointing: bool = False
     scale: float | None = None
     templates: Mapping[Layout, SceneTemplate] = field(default_factory=lambda: MappingProxyType({}))
 
@@ -77,6 +82,8 @@ class _Cast(NamedTuple):
         rows: (S, names), rows of the trace; below 0 where an object is not seen.
         forms: (S, names), `_ABSENT`, `_DELETED`, or from `_FIRST_FORM` on the number of its form.
         observations: (S, names), rows of `rings` and `footprints`.
+        pointers: of the S samples.
+        witness: (S,), the same as `forms` for the arrow at the worst violation.
     """
 
     names: tuple[str, ...]
@@ -85,6 +92,8 @@ class _Cast(NamedTuple):
     observations: Integers
     footprints: FootprintBatch
     rings: Rings
+    pointers: Pointers
+    witness: Integers
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +102,8 @@ class SceneEncoder:
 
     Every message holds all regions and all objects seen, so that a viewer that jumps to it misses nothing;
     objects no longer seen are deleted. Blue, vermillion and grey say how the worst of what is asked of an
-    object or region stands now (see `palette` and `involvement`).
+    object or region stands now (see `palette` and `involvement`). Where that is violated, an arrow with the
+    number points at the worst (see `pointing`).
 
     Attributes:
         regions: by name.
@@ -107,7 +117,11 @@ class SceneEncoder:
         object.__setattr__(self, "_drawn", drawn)
 
     def encode(
-        self, trace: Trace, evaluated: Sequence[Evaluated] = (), state: SceneState | None = None
+        self,
+        trace: Trace,
+        evaluated: Sequence[Evaluated] = (),
+        state: SceneState | None = None,
+        judged: Sequence[Judged] = (),
     ) -> SceneMessages:
         """The messages of the next samples; it does not matter into how many blocks a run is cut.
 
@@ -115,6 +129,7 @@ class SceneEncoder:
             trace: the next samples, after those of the state.
             evaluated: what specifications say of these samples; others have no say in the colours.
             state: what the call before returned, or None to begin.
+            judged: the same of those whose violations are to be pointed at.
         """
         state = state or SceneState()
         written = _spaced(trace.times_ns, state.written_ns)
@@ -123,7 +138,7 @@ class SceneEncoder:
             return SceneMessages(times_ns, [], state)
         state, scales = _scaled(state, trace, trace.rows[written])
         scale = state.scale or _UNSCALED
-        cast = _cast(trace, trace.rows[written], state.shown, scale)
+        cast = _cast(trace, trace.rows[written], state, scale, pointers(judged, trace, written))
         seen = Seen(times_ns, cast.names, _class_codes(trace, cast.rows), trace.classes)
         objects, regions = worst_robustness(evaluated, seen, [region.name for region in self._drawn])
         shades = colours(objects, scales), colours(regions, scales)
@@ -132,7 +147,7 @@ class SceneEncoder:
         for layout, samples in _by_layout(cast):
             if layout not in templates:
                 templates[layout] = make_template(layout, self._drawn, _LIFT * scale)
-            words = self._words(layout, samples, cast, *shades)
+            words = self._words(layout, samples, cast, *shades, scale)
             rows = templates[layout].fill(times_ns[samples], words)
             for sample, payload in zip(samples.tolist(), payloads_of(rows), strict=True):
                 payloads[sample] = payload
@@ -140,13 +155,14 @@ class SceneEncoder:
         after = SceneState(
             written_ns=int(times_ns[-1]),
             shown=tuple(name for name, is_shown in zip(cast.names, last.tolist(), strict=True) if is_shown),
+            is_pointing=bool(cast.pointers.is_shown[-1]),
             scale=state.scale,
             templates=MappingProxyType(dict(list(templates.items())[-_TEMPLATES_KEPT:])),
         )
         return SceneMessages(times_ns, payloads, after)
 
     def _words(
-        self, layout: Layout, samples: Integers, cast: _Cast, objects: Floats, regions: Floats
+        self, layout: Layout, samples: Integers, cast: _Cast, objects: Floats, regions: Floats, scale: float
     ) -> Floats:
         """(S, W) what the layout's template leaves open."""
         columns = []
@@ -158,7 +174,21 @@ class SceneEncoder:
             points = cast.rings.points[cast.rings.start[rows][:, None] + np.arange(sum(form.rings))]
             bottom, top = cast.footprints.bottom[rows], cast.footprints.top[rows]
             columns += words_of_object(form, points, bottom, top, objects[samples, column])
+        if layout.witness:
+            columns += _words_of_witness(cast.pointers, samples, scale)
         return np.concatenate([np.empty((len(samples), 0)), *columns], axis=1)
+
+
+def _words_of_witness(found: Pointers, samples: Integers, scale: float) -> list[Floats]:
+    z = np.fmax(found.top[samples], 0.0) + 3.0 * _LIFT * scale
+    labels = [_label(number) for number in found.robustness[samples].tolist()]
+    return words_of_witness(found.points[samples], z, scale, labels)
+
+
+def _label(number: float) -> str:
+    """A number in as many digits, up to three, as there is room for."""
+    texts = (f"{number:.{digits}g}" for digits in (3, 2, 1))
+    return next(text for text in texts if len(text) <= LABEL_LENGTH)
 
 
 def _region(name: str, outline: Outline) -> Region:
@@ -194,22 +224,24 @@ def _scaled(state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState
     seen = rows[first][rows[first] >= 0]
     scale = float(np.median(extents(trace.footprints.select(seen)))) or _UNSCALED
     scales[first:] = scale
-    return SceneState(state.written_ns, state.shown, scale, state.templates), scales
+    return replace(state, scale=scale), scales
 
 
-def _cast(trace: Trace, rows: Integers, shown: tuple[str, ...], scale: float) -> _Cast:
-    names = tuple(sorted({*trace.names, *shown}))
+def _cast(trace: Trace, rows: Integers, before: SceneState, scale: float, found: Pointers) -> _Cast:
+    names = tuple(sorted({*trace.names, *before.shown}))
     of_all = np.full((len(rows), len(names)), -1, np.int64)
     of_all[:, [names.index(name) for name in trace.names]] = rows
     is_seen = of_all >= 0
-    was_seen = np.concatenate([[[name in shown for name in names]], is_seen[:-1]])
+    was_seen = np.concatenate([[[name in before.shown for name in names]], is_seen[:-1]])
     footprints = trace.footprints.select(of_all[is_seen])
     rings = rings_of(footprints, _POINT * scale)
     observations = np.full(of_all.shape, -1, np.int64)
     observations[is_seen] = np.arange(len(footprints))
     forms = np.where(was_seen, _DELETED, _ABSENT)
     forms[is_seen] = _FIRST_FORM + rings.form
-    return _Cast(names, of_all, forms, observations, footprints, rings)
+    was_pointing = np.append(before.is_pointing, found.is_shown[:-1])
+    witness = np.where(found.is_shown, _FIRST_FORM, np.where(was_pointing, _DELETED, _ABSENT))
+    return _Cast(names, of_all, forms, observations, footprints, rings, found, witness)
 
 
 def _class_codes(trace: Trace, rows: Integers) -> Integers:
@@ -220,17 +252,20 @@ def _class_codes(trace: Trace, rows: Integers) -> Integers:
 
 def _by_layout(cast: _Cast) -> Iterator[tuple[Layout, Integers]]:
     """The layouts, and the samples (S,) that have each."""
-    if (cast.forms == cast.forms[0]).all():
-        yield _layout(cast, cast.forms[0]), np.arange(len(cast.forms))
+    forms = np.column_stack([cast.forms, cast.witness])
+    if (forms == forms[0]).all():
+        yield _layout(cast, forms[0]), np.arange(len(forms))
         return
-    rows, which = np.unique(cast.forms, axis=0, return_inverse=True)
+    rows, which = np.unique(forms, axis=0, return_inverse=True)
     for number, row in enumerate(rows):
         yield _layout(cast, row), np.flatnonzero(which.reshape(-1) == number)
 
 
 def _layout(cast: _Cast, forms: NDArray[np.int64]) -> Layout:
-    listed: list[tuple[str, int]] = list(zip(cast.names, forms.tolist(), strict=True))
+    *of_objects, witness = forms.tolist()
+    listed: list[tuple[str, int]] = list(zip(cast.names, of_objects, strict=True))
     seen: list[tuple[str, Form]] = [
         (name, cast.rings.forms[form - _FIRST_FORM]) for name, form in listed if form >= _FIRST_FORM
     ]
-    return Layout(tuple(name for name, form in listed if form == _DELETED), tuple(seen))
+    deleted = tuple(name for name, form in listed if form == _DELETED)
+    return Layout(deleted, tuple(seen), None if witness == _DELETED else witness == _FIRST_FORM)

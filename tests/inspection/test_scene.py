@@ -13,8 +13,12 @@ from hypothesis import strategies as st
 
 from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
 from spatial_replay.inspection.involvement import Evaluated, concerns_of
+from spatial_replay.inspection.pointing import Judged, pointing_of
 from spatial_replay.inspection.scene import PERIOD_NS, SceneEncoder
+from spatial_replay.monitor.instances import find_instances
+from spatial_replay.monitor.stream import EvaluationStream
 from spatial_replay.spec.formula import Atom, Outline, RegionName, SignedDistance, TrackedName, iter_nodes
+from spatial_replay.spec.specification import parse_specification
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
@@ -320,3 +324,92 @@ def test_what_is_seen_later_does_not_change_earlier_colours():
     trace = run({}, {"a": Footprint.box(0.0, 0.0, 90.0, 90.0)})
     said = says(near("a", "goal"), trace, 0.5)
     assert messages(trace, said, regions=REGIONS)[0] == messages(trace.slice(0, 1), said, regions=REGIONS)[0]
+
+
+# ------------------------------------------------------------------------------------- the worst violation
+
+
+def pointed(text: str, *samples: dict, cuts: tuple[int, ...] = ()) -> list[SceneUpdate]:
+    """The messages of a specification over samples, evaluated and drawn in one or more stretches."""
+    spec = parse_specification(text)
+    trace = run(*samples)
+    instances = find_instances(spec, {}, (), 0, 2**63 - 1)
+    evaluation = EvaluationStream(instances, spec.regions)
+    concerns = [concerns_of(instance.formula) for instance in instances]
+    encoder, state, payloads = SceneEncoder(spec.regions), None, []
+    for begin, end in pairwise((0, *cuts, len(trace))):
+        part = trace.slice(begin, end)
+        judged = [
+            Judged(
+                Evaluated(own, stretch.times_ns, stretch.series),
+                stretch.leaves,
+                pointing_of(instance, own, spec.regions),
+            )
+            for instance, own, stretch in zip(instances, concerns, evaluation.extend(part), strict=True)
+        ]
+        encoded = encoder.encode(part, [each.evaluated for each in judged], state, judged)
+        state = encoded.state
+        payloads += encoded.payloads
+    return [SceneUpdate.FromString(payload) for payload in payloads]
+
+
+def box_at(x: float) -> Footprint:
+    return Footprint.box(x, 0.0, x + 1.0, 1.0)
+
+
+def arrow(message: SceneUpdate) -> tuple[list[float], list[float], str]:
+    """Where the arrow at the worst violation begins and ends, and its label."""
+    drawn = entity(message, "witness")
+    [shape], [label] = drawn.arrows, drawn.texts
+    length = shape.shaft_length + shape.head_length
+    angle = 2.0 * np.arctan2(shape.pose.orientation.z, shape.pose.orientation.w)
+    begin = np.array([shape.pose.position.x, shape.pose.position.y])
+    end = begin + length * np.array([np.cos(angle), np.sin(angle)])
+    return begin.round(9).tolist(), end.round(9).tolist(), label.text.strip()
+
+
+def test_an_arrow_with_its_number_points_at_the_worst_violation():
+    samples = [{"a": box_at(0.0), "b": box_at(x), "c": box_at(-20.0)} for x in (3.0, 1.5, 1.2, 9.0)]
+    shown = pointed("spec s = G (a closeto[1] b) and G (a farfrom[0] c)", *samples)
+    identifiers = [{each.id for each in message.entities} for message in shown]
+    assert ["witness" in each for each in identifiers] == [True, False, False, True]
+    assert [each.id for each in shown[1].deletions] == ["witness"]
+    assert not shown[2].deletions
+    assert arrow(shown[0])[2] == "-1"
+    begin, end, label = arrow(shown[3])
+    assert (begin[0], end[0], label) == (1.0, 9.0, "-7")
+    assert begin[1] == end[1]
+
+
+def test_the_arrow_of_an_enclosure_shows_what_sticks_out():
+    text = "region goal = box(0, 0, 2, 2)\nspec s = G a enclosedin goal"
+    [message] = pointed(text, {"a": Footprint.box(1.0, 0.5, 3.5, 1.0)})
+    begin, end, label = arrow(message)
+    assert (begin[0], end[0], label) == (3.5, 2.0, "-1.5")
+
+
+def test_the_arrow_of_a_direction_joins_what_is_nearest():
+    [message] = pointed("spec s = G a leftof b", {"a": box_at(4.0), "b": box_at(0.0)})
+    begin, end, label = arrow(message)
+    assert (begin[0], end[0], label) == (4.0, 1.0, "-5")
+
+
+def test_what_is_asked_not_to_hold_is_pointed_at_too():
+    [message] = pointed("spec s = G not a closeto[3] b", {"a": box_at(0.0), "b": box_at(2.0)})
+    assert arrow(message)[2] == "-2"
+
+
+def test_an_open_quantifier_and_a_look_back_have_no_arrow():
+    text = "group all_of = all\nspec s = G forall o in all_of: o closeto[1] a\nspec t = G a moved[9] a[-1]"
+    for message in pointed(text, *[{"a": box_at(0.0), "b": box_at(9.0)}] * 3):
+        assert "witness" not in {each.id for each in message.entities}
+
+
+def test_how_a_run_is_cut_moves_no_arrow():
+    samples = [
+        {"a": TrackedObject(box_at(0.0), height=(0.0, 2.0)), "b": box_at(x)} if x else {"b": box_at(1.0)}
+        for x in (3.0, 1.5, 0.0, 9.0, 0.0, 0.0, 9.0)
+    ]
+    whole = pointed("spec s = G (a closeto[1] b)", *samples)
+    assert pointed("spec s = G (a closeto[1] b)", *samples, cuts=tuple(range(1, 7))) == whole
+    assert entity(whole[0], "witness").arrows[0].pose.position.z > 2.0
