@@ -1,0 +1,37 @@
+"""What the documentation says about mapping files can be used, and it says everything."""
+
+from __future__ import annotations
+
+import json
+import re
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from spatial_replay.logs.mapping.load import parse_mapping
+from spatial_replay.logs.mapping.readings import BUILT_IN
+
+ROOT = Path(__file__).parents[3]
+PAGE = (ROOT / "docs/mapping.md").read_text(encoding="utf-8")
+EXAMPLES = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
+
+
+@pytest.mark.parametrize("text", EXAMPLES)
+def test_every_example_is_a_mapping(text: str) -> None:
+    assert parse_mapping(text).topics
+
+
+def test_every_key_is_told() -> None:
+    schema = json.loads(files("spatial_replay.logs.mapping").joinpath("mapping.schema.json").read_text())
+    keys = [
+        *schema["properties"],
+        *schema["$defs"]["topic"]["properties"],
+        *schema["$defs"]["shape"]["properties"],
+    ]
+    assert [key for key in keys if not re.search(rf"`{{?{key}[`:]", PAGE)] == []
+
+
+def test_every_type_is_told() -> None:
+    names = [name.rpartition("/")[2] for name in BUILT_IN]
+    assert [name for name in names if not re.search(rf"\b{name}`", PAGE)] == []
