@@ -64,6 +64,7 @@ def ros_definitions(
     return (check_definitions({**standard, **own}, type_name, empty_bytes=empty_bytes),)
 
 
+@lru_cache(64)
 def ros_decoder(
     type_name: str, encoding: RosEncoding, schema: Schema | None, distribution: str | None = None
 ) -> Decoder:

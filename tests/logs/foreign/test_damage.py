@@ -50,7 +50,7 @@ class Outcome(NamedTuple):
     told: tuple[str, ...]
 
 
-def read(path: Path) -> Outcome:
+def read(path: Path, *, decodes: bool = True) -> Outcome:
     """Everything that can be read and decoded, and all that is said of the rest."""
     reader = open_messages(path)
     try:
@@ -58,7 +58,8 @@ def read(path: Path) -> Outcome:
         told = [topic.unreadable for topic in topics if topic.unreadable]
         messages = list(reader.iter_messages([topic.name for topic in topics]))
         told += reader.take_faults()
-        decoders = {topic.name: reader.decoder(topic.name) for topic in topics if not topic.unreadable}
+        decodable = [topic.name for topic in topics if decodes and not topic.unreadable]
+        decoders = {topic: reader.decoder(topic) for topic in decodable}
     except LogError as error:
         return Outcome([], (str(error),))
     for message in messages:
@@ -141,6 +142,24 @@ def test_a_database_is_read_past_its_damage(tmp_path: Path) -> None:
     assert 1_000 < len(messages) < 1_800
     assert len(set(messages)) == len(messages)
     assert "the database is damaged" in told[0]
+
+
+def test_changed_metadata_are_told_or_make_no_difference(tmp_path: Path) -> None:
+    folder = write_ros2(tmp_path / "drive", SENT[:9])
+    metadata = folder / "metadata.yaml"
+    said, whole = metadata.read_bytes(), read(folder).messages
+    randomly = random.Random(5)
+    for _ in range(300):
+        changed = bytearray(said)
+        for _ in range(randomly.randrange(1, 4)):
+            changed[randomly.randrange(len(changed))] = randomly.choice(
+                b"0123456789:-[]{}&*!|>'\"#\n abcz\xff"
+            )
+        metadata.write_bytes(
+            changed[: randomly.randrange(len(changed))] if randomly.random() < 0.2 else changed
+        )
+        messages, told = read(folder, decodes=False)
+        assert told or messages == whole
 
 
 @pytest.mark.parametrize("junk", [b"", b"\x00" * 5_000, b"\xff" * 5_000, bytes(range(256)) * 20])
