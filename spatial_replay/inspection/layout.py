@@ -154,7 +154,7 @@ def words_of_witness(points: Floats, z: Floats, scale: float, labels: Sequence[s
     head = np.minimum(0.5 * length, ARROW_HEAD * scale)
     arrow = [begin, z, np.sin(half), np.cos(half), length - head, head]
     middle = [(begin + end) / 2.0, z]
-    text = "".join(f"{label:^{LABEL_LENGTH}}" for label in labels).encode()
+    text = "".join([label.center(LABEL_LENGTH) for label in labels]).encode()
     label = np.frombuffer(text, "<f8")
     return [column.reshape(len(points), -1) for column in (*arrow, *middle, label)]
 

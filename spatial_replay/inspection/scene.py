@@ -187,8 +187,10 @@ def _words_of_witness(found: Pointers, samples: Integers, scale: float) -> list[
 
 def _label(number: float) -> str:
     """A number in as many digits, up to three, as there is room for."""
-    texts = (f"{number:.{digits}g}" for digits in (3, 2, 1))
-    return next(text for text in texts if len(text) <= LABEL_LENGTH)
+    text = f"{number:.3g}"
+    if len(text) > LABEL_LENGTH:
+        text = next(text for digits in (2, 1) if len(text := f"{number:.{digits}g}") <= LABEL_LENGTH)
+    return text
 
 
 def _region(name: str, outline: Outline) -> Region:
