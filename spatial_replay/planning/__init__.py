@@ -1,5 +1,62 @@
 """Planning by specification: what to move where, and why; knows no robot and no simulator.
 
 Section 5.2 of the paper: progress and constraint sets of an automaton's edge, gradient maps, paths,
-Algorithm 1. `Planner` is where to begin.
+Algorithm 1. Names are loaded when they are first used.
 """
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from spatial_replay.planning.maps import gradient_map, proposition_maps
+    from spatial_replay.planning.planner import Planner
+    from spatial_replay.planning.settings import Settings
+    from spatial_replay.planning.step import Candidate, Executor, Outcome, Step, Target
+    from spatial_replay.planning.workspace import Grid, Workspace
+
+__all__ = [
+    "Candidate",
+    "Executor",
+    "Grid",
+    "Outcome",
+    "Planner",
+    "Settings",
+    "Step",
+    "Target",
+    "Workspace",
+    "gradient_map",
+    "proposition_maps",
+]
+
+_HOMES: Mapping[str, str] = MappingProxyType(
+    {
+        "Candidate": "spatial_replay.planning.step",
+        "Executor": "spatial_replay.planning.step",
+        "Grid": "spatial_replay.planning.workspace",
+        "Outcome": "spatial_replay.planning.step",
+        "Planner": "spatial_replay.planning.planner",
+        "Settings": "spatial_replay.planning.settings",
+        "Step": "spatial_replay.planning.step",
+        "Target": "spatial_replay.planning.step",
+        "Workspace": "spatial_replay.planning.workspace",
+        "gradient_map": "spatial_replay.planning.maps",
+        "proposition_maps": "spatial_replay.planning.maps",
+    }
+)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(_HOMES[name]), name)
+    # kept, so that the next use does not come here
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -79,12 +79,14 @@ class GradientMap:
         name: of the object.
         robustness: (A, rows, columns), in the unit of the relations; also at blocked cells.
         blocked: (A, rows, columns) uint8, `FREE` or why the object must not be there (see `REASONS`).
+        clearance: (A, rows, columns), signed distance to the nearest obstacle; +inf where there is none.
         turns: (A,) radians by which the object is turned.
     """
 
     name: str
     robustness: Floats
     blocked: NDArray[np.uint8]
+    clearance: Floats
     turns: Floats
 
     @property
@@ -161,7 +163,7 @@ def gradient_map(
     blocked[~np.broadcast_to(workspace.within_reach, shape)] = OUT_OF_REACH
     blocked[maps.clearance <= workspace.clearance] = OCCUPIED
     blocked[danger >= -margin] = CONSTRAINED
-    return GradientMap(maps.name, robustness, blocked, maps.turns)
+    return GradientMap(maps.name, robustness, blocked, maps.clearance, maps.turns)
 
 
 def _holds(positive: Floats, negative: Floats, cube: Cube, shape: tuple[int, ...]) -> Floats:

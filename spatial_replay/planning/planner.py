@@ -20,6 +20,7 @@ from spatial_replay.planning.observing import Observer, Symbol
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.step import Candidate, Consideration, Edge, Guards, Kind, Outcome, Step
 from spatial_replay.planning.targets import find_target
+from spatial_replay.planning.workspace import Workspace
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
 
@@ -29,7 +30,7 @@ class Planner:
 
     Use as:
 
-        planner = Planner(specification, settings)
+        planner = Planner(specification)
         planner.observe(sample)
         while (step := planner.next_step()).kind == "execute":
             outcome = executor.execute(step)
@@ -42,13 +43,16 @@ class Planner:
 
     Attributes:
         automaton: of the specification.
-        settings: as given.
     """
 
-    def __init__(self, specification: Specification, settings: Settings, *, name: str | None = None) -> None:
+    def __init__(
+        self, specification: Specification, settings: Settings | None = None, *, name: str | None = None
+    ) -> None:
         """Begin before the first sample.
 
         Args:
+            settings: where and how to plan; without them, every object can be picked up and placed around
+                where the first sample shows objects.
             name: which spec of the file to plan for; without it, its only result.
 
         Raises:
@@ -56,7 +60,7 @@ class Planner:
             UsageError: no such spec, several to choose from, or propositions about earlier samples.
         """
         self.automaton: Automaton = automaton_of(specification, name)
-        self.settings = settings
+        self._settings = settings
         self._regions = specification.regions
         self._formulas = [each.formula for each in self.automaton.propositions]
         refuse_delays(self._formulas)
@@ -70,6 +74,17 @@ class Planner:
         self._failed: dict[tuple[Edge, str], tuple[tuple[float, float], ...]] = {}
         self._running: Step | None = None
         self._steps = 0
+
+    @property
+    def settings(self) -> Settings:
+        """Where and how it plans.
+
+        Raises:
+            UsageError: none were given, and no sample has been observed yet.
+        """
+        if self._settings is None:
+            raise UsageError("where to plan depends on the first sample; observe one first, or give settings")
+        return self._settings
 
     @property
     def states(self) -> tuple[int, ...]:
@@ -92,6 +107,8 @@ class Planner:
                 f"a sample at {sample.time_ns} ns follows one at {self._sample.time_ns} ns; give times that "
                 "increase"
             )
+        if self._settings is None:
+            self._settings = Settings(Workspace.around(sample))
         self._sample = sample
         self._maps = {}
         self._symbol = self._observer.symbol(sample)
@@ -261,7 +278,14 @@ class Planner:
         return ", ".join(each.label for each, value in labels if value is None)
 
     def _why_no_path(self, state: int) -> str:
+        ahead, found = [state], {state}
+        while ahead:
+            after = set(self.automaton.successors[ahead.pop()]) - found
+            found |= after
+            ahead += after
         edges = "; ".join(
-            f"{source} -> {target}: {reason}" for (source, target), reason in sorted(self._pruned.items())
+            f"{source} -> {target}: {reason}"
+            for (source, target), reason in sorted(self._pruned.items())
+            if source in found
         )
         return f"no path left: every way from state {state} was given up ({edges})"

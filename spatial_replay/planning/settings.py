@@ -25,6 +25,8 @@ class Settings:
         movable: names of the objects that the robot can move; None for all that a sample has.
         margin: how well progress has to hold at a target, in the unit of the relations, at least 0.
         constraint_margin: how far constraints have to stay from holding, in the same unit, at least 0.
+        room: how far from obstacles an object is placed if it can be, in footprint units, so that it and its
+            neighbours can be grasped later; at least 0.
         attempts: how often an edge is tried before it is given up, at least 1.
 
     Raises:
@@ -36,12 +38,13 @@ class Settings:
     movable: tuple[str, ...] | None = None
     margin: float = 0.0
     constraint_margin: float = 0.0
+    room: float = 0.0
     attempts: int = 3
 
     def __post_init__(self) -> None:
         if self.skill not in _SKILLS:
             raise UsageError(f"skill is {self.skill!r}; the skills are {', '.join(_SKILLS)}")
-        for name in ("margin", "constraint_margin"):
+        for name in ("margin", "constraint_margin", "room"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise UsageError(f"{name} is {getattr(self, name)}; give a number of at least 0")
         if self.attempts < 1:

@@ -21,6 +21,7 @@ def text_from_settings(settings: Settings) -> str:
             "movable": settings.movable,
             "margin": settings.margin,
             "constraint_margin": settings.constraint_margin,
+            "room": settings.room,
             "attempts": settings.attempts,
             "grid": [grid.xmin, grid.ymin, grid.cell_size, grid.columns, grid.rows],
             "yaws": workspace.yaws,
@@ -70,5 +71,6 @@ def _settings(read: dict[str, Any]) -> Settings:
         movable=None if read["movable"] is None else tuple(read["movable"]),
         margin=float(read["margin"]),
         constraint_margin=float(read["constraint_margin"]),
+        room=float(read["room"]),
         attempts=int(read["attempts"]),
     )

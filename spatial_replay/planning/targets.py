@@ -39,7 +39,8 @@ def find_target(
 
 
 def _best_cell(found: GradientMap, good: np.ndarray, tracked: TrackedObject, settings: Settings) -> Target:
-    values = np.where(good, found.robustness, -np.inf)
+    roomy = good & (found.clearance >= settings.room)
+    values = np.where(roomy if roomy.any() else good, found.robustness, -np.inf)
     turn, row, column = (int(index) for index in np.unravel_index(int(np.argmax(values)), values.shape))
     here, there = centre_of(tracked.footprint), settings.workspace.grid.centre(row, column)
     return _target(found, tracked, (turn, row, column), (here, there))

@@ -11,12 +11,16 @@ from numpy.typing import NDArray
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.geometry.footprint import Footprint
+from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.trace.sample import Sample
 
 Booleans = NDArray[np.bool_]
 
 MOST_CELLS = 4_000_000
 """Cells of a grid, over all angles; beyond it a cell size was mistyped."""
+
+CELLS_AROUND = 80
+"""Cells along the longer side of a workspace that nobody gave."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +126,27 @@ class Workspace:
             raise UsageError("yaws, base, nearest and clearance of a workspace must be finite numbers")
         if not self.nearest <= self.farthest:
             raise UsageError(f"nothing is farther than {self.nearest} and nearer than {self.farthest}")
+
+    @classmethod
+    def around(cls, sample: Sample) -> Workspace:
+        """A workspace over everything in a sample and half as far again to each side.
+
+        Raises:
+            UsageError: the sample has no object.
+        """
+        parts = [
+            (part.vertices, part.radius)
+            for tracked in sample.objects.values()
+            if isinstance(tracked, TrackedObject)
+            for part in tracked.footprint.parts
+        ]
+        if not parts:
+            raise UsageError("there is nothing in the sample to lay a grid around; give a workspace")
+        low = np.min([vertices.min(axis=0) - radius for vertices, radius in parts], axis=0)
+        high = np.max([vertices.max(axis=0) + radius for vertices, radius in parts], axis=0)
+        longer = float((high - low).max()) or 1.0
+        (xmin, ymin), (xmax, ymax) = (low - longer / 2).tolist(), (high + longer / 2).tolist()
+        return cls(Grid.over(xmin, ymin, xmax, ymax, 2.0 * longer / CELLS_AROUND))
 
     @cached_property
     def within_reach(self) -> Booleans:

@@ -181,14 +181,15 @@ class _Care:
     margin: float
     constraint_margin: float
     clearance: float
+    room: float
 
 
 _CARE: MappingProxyType[Skill, _Care] = MappingProxyType(
     {
         # a block that is pushed ends up within a centimetre of where it should
-        "push": _Care(cell_size=0.005, margin=0.012, constraint_margin=0.008, clearance=0.0),
-        # fingers need room beside what they hold
-        "place": _Care(cell_size=0.01, margin=0.01, constraint_margin=0.01, clearance=0.02),
+        "push": _Care(cell_size=0.005, margin=0.012, constraint_margin=0.008, clearance=0.0, room=0.0),
+        # fingers need room beside what they hold, and the hand above that beside taller things
+        "place": _Care(cell_size=0.02, margin=0.01, constraint_margin=0.01, clearance=0.02, room=0.09),
     }
 )
 
@@ -212,4 +213,5 @@ def settings_for(world: World) -> Settings:
         movable=tuple(body.name for body in bodies if body.movable),
         margin=care.margin,
         constraint_margin=care.constraint_margin,
+        room=care.room,
     )

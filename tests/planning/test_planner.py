@@ -60,6 +60,16 @@ def test_only_what_can_be_moved_is_moved():
     assert [candidate.name for candidate in steps[0].candidates] == ["cup"]
 
 
+@pytest.mark.parametrize(("room", "is_roomy"), [(0.0, False), (2.0, True), (50.0, False)])
+def test_things_are_placed_with_room_around_them_where_there_is(room, is_roomy):
+    settings = Settings(TABLE.workspace, movable=("cup",), room=room)
+    steps, table = run(planner("F (cup dist fork <= 4)", settings), THINGS)
+    assert steps[-1].kind == "hold"
+    apart = sr.parse_specification("F (cup dist fork >= 2)")
+    last = sr.Trace.from_samples(table.samples[-1:])
+    assert (sr.evaluate(apart, last).verdict == "satisfied") == is_roomy
+
+
 def test_an_object_is_turned_where_that_is_asked_for():
     yaws = tuple(k * math.pi / 4 for k in range(8))
     settings = Settings(Workspace(Grid.over(0, 0, 10, 10, 0.5), yaws))
@@ -156,6 +166,17 @@ def test_formulas_that_cannot_be_planned_are_refused():
 def test_settings_that_cannot_be_are_refused(options, message):
     with pytest.raises(UsageError, match=message):
         Settings(TABLE.workspace, **options)
+
+
+def test_without_settings_it_plans_around_what_it_sees():
+    one = Planner(sr.parse_specification("F (cup leftof plate and cup dist plate <= 1)"))
+    with pytest.raises(UsageError, match="observe one first"):
+        _ = one.settings
+    with pytest.raises(UsageError, match="nothing in the sample"):
+        one.observe(sr.Sample(0))
+    steps, _ = run(one, {**THINGS, "cup": block(9, 1, size=1)})
+    assert [step.kind for step in steps] == ["execute", "hold"]
+    assert max(one.settings.workspace.grid.shape) == 80
 
 
 def test_what_is_pushed_is_not_turned():

@@ -1,0 +1,110 @@
+"""`verify`, and `info --decisions`, on logs that were planned and on others."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+import spatial_replay as sr
+from planning.plans import PUSH, record_plan_of
+from spatial_replay.cli.application import application
+
+
+def call(*arguments: object) -> tuple[int, str]:
+    result = CliRunner().invoke(application, [str(each) for each in arguments], standalone_mode=False)
+    if result.exception is not None:
+        raise result.exception
+    return int(result.return_value), result.output
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Path:
+    specification = sr.parse_specification("F (a leftof b)")
+    with sr.Recorder(tmp_path / "run.mcap", specifications=specification) as recorder:
+        for k in range(40):
+            box = sr.Footprint.box(20 - k, 0, 21 - k, 1)
+            recorder.write(sr.Sample(k * 10**8, {"a": box, "b": sr.Footprint.disc(5, 5, 1)}))
+    return tmp_path / "run.mcap"
+
+
+def test_a_log_is_what_it_says(recorded: Path) -> None:
+    code, said = call("verify", recorded)
+    assert code == 0
+    assert "as recorded" in said
+
+
+def test_an_annotated_log_is_verified_alone_and_against_its_source(recorded: Path, tmp_path: Path) -> None:
+    call("replay", recorded, "-o", tmp_path / "annotated.mcap", "--from", "1s", "--every", "2")
+    assert call("verify", tmp_path / "annotated.mcap")[0] == 0
+    assert call("verify", tmp_path / "annotated.mcap", "--source", recorded)[0] == 0
+
+
+def test_another_source_shows(recorded: Path, tmp_path: Path) -> None:
+    with sr.Recorder(tmp_path / "other.mcap") as recorder:
+        recorder.write(sr.Sample(0, {"a": sr.Footprint.disc(1, 1, 1), "b": sr.Footprint.disc(5, 5, 1)}))
+    code, said = call("verify", recorded, "--source", tmp_path / "other.mcap")
+    assert code == 1
+    assert "other samples" in said
+    assert "other results" in said
+    assert "another specification" not in said
+
+
+def test_a_log_that_was_cut_short_has_no_certificate(recorded: Path, tmp_path: Path) -> None:
+    (tmp_path / "cut.mcap").write_bytes(recorded.read_bytes()[: recorded.stat().st_size // 2])
+    code, said = call("verify", tmp_path / "cut.mcap")
+    assert code == 1
+    assert "no certificate" in said
+
+
+def test_decisions_are_made_again(tmp_path: Path) -> None:
+    record_plan_of(tmp_path / "run.mcap")
+    code, said = call("verify", tmp_path / "run.mcap", "--decisions")
+    assert code == 0
+    assert "3 decisions made again on 9 maps" in said
+
+
+def test_decisions_that_differ_are_named(tmp_path: Path) -> None:
+    record_plan_of(tmp_path / "run.mcap", told=replace(PUSH, margin=0.03))
+    code, said = call("verify", tmp_path / "run.mcap", "--decisions")
+    assert code == 1
+    assert "of decision 0" in said
+
+
+def test_decisions_are_told_step_by_step(tmp_path: Path) -> None:
+    record_plan_of(tmp_path / "run.mcap", slips=1)
+    code, said = call("info", tmp_path / "run.mcap", "--decisions")
+    lines = said.splitlines()
+    assert code == 0
+    assert lines[0].startswith("run.mcap: 4 decisions for 'push', 3 motions, 1 edge given up")
+    assert next(line for line in lines if line.startswith("step ")) == "step 0 at 0.000 s, state 0"
+    assert "    given up: no object can do it" in lines
+    assert any(line.startswith("  failed at") and "it slipped" in line for line in lines)
+    assert any("chosen" in line for line in lines)
+    assert lines[-1] == "  the specification is satisfied: hold"
+
+
+def test_machines_get_decisions_in_json(tmp_path: Path) -> None:
+    record_plan_of(tmp_path / "run.mcap")
+    code, said = call("info", tmp_path / "run.mcap", "--decisions", "--json")
+    decisions = json.loads(said)["decisions"]
+    assert code == 0
+    assert [each["kind"] for each in decisions] == ["execute", "execute", "hold"]
+    assert decisions[0]["time_ns"] == 0
+    assert decisions[0]["outcome"]["succeeded"] is True
+    assert decisions[0]["target"]["object"] in {"red", "blue"}
+
+
+def test_a_log_without_decisions_says_so(recorded: Path) -> None:
+    with pytest.raises(sr.UsageError, match="holds no decisions"):
+        call("info", recorded, "--decisions")
+    with pytest.raises(sr.UsageError, match="holds no decisions"):
+        call("verify", recorded, "--decisions")
+
+
+def test_a_mapping_is_for_a_source(recorded: Path) -> None:
+    with pytest.raises(sr.UsageError, match="add --source"):
+        call("verify", recorded, "--mapping", "m.yaml")

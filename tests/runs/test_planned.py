@@ -1,0 +1,58 @@
+"""Simulated runs that are planned, end to end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import spatial_replay as sr
+from spatial_replay.logs.source import open_source
+from spatial_replay.planning.redo import redo_decisions
+from spatial_replay.planning.told import read_decisions
+from spatial_replay.replay import load_files, run_replay
+from spatial_replay.replay.verification import verify_certificate
+from spatial_replay.runs.planned import PlannedRun, record_plan
+
+
+@pytest.fixture(scope="module")
+def pushed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PlannedRun]:
+    """A planned push, and its log."""
+    pytest.importorskip("pybullet", reason="PyBullet is not installed; it has wheels for Python 3.11")
+    path = tmp_path_factory.mktemp("planned") / "push.mcap"
+    return path, record_plan("push", path, seed=3)
+
+
+def test_three_blocks_are_pushed_one_after_the_other(pushed: tuple[Path, PlannedRun]) -> None:
+    path, planned = pushed
+    assert planned.satisfied
+    assert planned.pruned >= 1
+    first, *_ = read_decisions(path)
+    assert "no object can do it" in first.considered[0].pruned
+    assert len(first.considered[0].path) == 2
+    assert planned.steps >= 2
+
+
+def test_a_replay_says_that_it_is_satisfied(pushed: tuple[Path, PlannedRun]) -> None:
+    source = open_source(pushed[0])
+    replayed = run_replay(source, load_files((), source))
+    assert replayed.verdict == "satisfied"
+
+
+def test_decisions_and_certificate_are_confirmed(pushed: tuple[Path, PlannedRun]) -> None:
+    source = open_source(pushed[0])
+    assert verify_certificate(source).differences == ()
+    redone = redo_decisions(source)
+    assert redone.differences == ()
+    assert redone.decisions == len(read_decisions(pushed[0]))
+
+
+def test_what_cannot_be_done_ends_and_says_why(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet", reason="PyBullet is not installed; it has wheels for Python 3.11")
+    impossible = sr.parse_specification("F (red leftof blue and red rightof blue)")
+    planned = record_plan("push", tmp_path / "run.mcap", impossible)
+    assert planned.ended == "no path"
+    assert planned.reason.startswith("no path left")
+    assert planned.steps == 0
+    (decision,) = read_decisions(tmp_path / "run.mcap")
+    assert [(each.source, each.target) for each in decision.pruned] == [(0, 1)]

@@ -1,0 +1,105 @@
+"""Maps and paths of the pushing task, and whole planned runs in simulated worlds."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import spatial_replay as sr
+from spatial_replay.automata.compiling import automaton
+from spatial_replay.planning import Grid, Workspace, gradient_map, proposition_maps
+from spatial_replay.planning.paths import shortest_path
+from spatial_replay.planning.poses import moved_object
+
+PUSHING = """
+use spatial_spec
+spec push = (F (green rightof red and green rightof blue))
+    and ((not (green rightof red and green rightof blue)) U (red above blue))
+    and (G (green dist red >= 0.03 and green dist blue >= 0.03 and red dist blue >= 0.03))
+"""
+RUNS = {"push": 60.0, "pick-place": 300.0, "table-setting": 300.0}
+"""How long a whole run may take, in seconds of real time."""
+SEEDS = 10
+
+
+def _blocks() -> sr.Sample:
+    def block(x: float, y: float, yaw: float) -> sr.TrackedObject:
+        shape = sr.TrackedObject(sr.Footprint.box(-0.016, -0.016, 0.016, 0.016), yaw=0.0, height=(0.0, 0.032))
+        return moved_object(shape, x, y, yaw)
+
+    places = {
+        "green": (0.4, 0.0, 0.0),
+        "red": (0.5, -0.05, math.pi / 4),
+        "blue": (0.6, 0.15, math.pi / 4),
+    }
+    return sr.Sample(0, {name: block(*place) for name, place in places.items()})
+
+
+def bench_gradient_map(bench: Any) -> None:
+    """One step's progress and constraint sets for each block, 90 x 90 cells; published code: 2.1 s."""
+    specification = sr.parse_specification(PUSHING)
+    machine, sample = automaton(specification), _blocks()
+    formulas = [each.formula for each in machine.propositions]
+    (first, *_) = next(machine.paths(0, {(0, 3)}))
+    progress = first.guard
+    constraints = tuple(
+        cube
+        for each in machine.transitions
+        if each.source == 0 and each.target not in (0, first.target)
+        for cube in each.guard
+    )
+    workspace = Workspace(Grid.over(0.3, -0.225, 0.75, 0.225, 0.005))
+    for name in sample.objects:
+
+        def run(_: object, name: str = name) -> object:
+            maps = proposition_maps(formulas, specification.regions, sample, name, workspace)
+            return gradient_map(maps, progress, constraints, workspace)
+
+        bench.measure(f"moving {name}", run, unit="object", runs=21, limit_s=0.010, reference_s=2.1)
+
+
+def bench_path(bench: Any) -> None:
+    """Jump-point search over 90 x 90 cells, a fifth of them blocked."""
+    free = np.random.default_rng(1).random((90, 90)) >= 0.2
+    goals = np.zeros((90, 90), np.bool_)
+    goals[85:, 85:] = True
+    bench.measure("over 90 x 90 cells", lambda _: shortest_path(free, (0, 0), goals), unit="path", runs=51)
+
+
+def bench_planned_runs(bench: Any) -> None:
+    """Whole planned runs, recorded; ten seeds with --full."""
+    if importlib.util.find_spec("pybullet") is None:
+        bench.remark("the simulator is not installed: pip install '.[sim]'")
+        return
+    from spatial_replay.runs.planned import record_plan
+    from spatial_replay.simulation.worlds import SCENARIOS
+
+    with tempfile.TemporaryDirectory() as folder:
+        for scenario in SCENARIOS:
+            runs = []
+
+            def run(seed: int, scenario: str = scenario, runs: list[Any] = runs) -> object:
+                runs.append(record_plan(scenario, Path(folder, "run.mcap"), seed=seed))
+                return runs[-1]
+
+            seeds = iter(range(1000))
+            count = SEEDS if bench.full else 1
+            bench.measure(
+                scenario,
+                run,
+                prepare=lambda seeds=seeds: next(seeds),
+                unit="run",
+                runs=count,
+                limit_s=RUNS[scenario],
+            )
+            thought = [each.planning_s for each in runs]
+            bench.quantile(f"{scenario}: planning", thought, 0.5, unit="run", limit_s=1.0)
+            failed = [each.reason for each in runs if not each.satisfied]
+            bench.remark(f"{scenario}: {len(runs) - len(failed)} of {len(runs)} runs end satisfied")
+            for reason in failed:
+                bench.remark(f"{scenario}: {reason}")
