@@ -41,6 +41,7 @@ class Workspace:
     Attributes:
         xmin, ymin, xmax, ymax: the box, in metres.
         nearest, farthest: distances from the base, in metres.
+        yaws: how the robot may turn objects, in radians; none to leave them as they are.
     """
 
     xmin: float
@@ -49,6 +50,7 @@ class Workspace:
     ymax: float
     nearest: float = 0.0
     farthest: float = math.inf
+    yaws: tuple[float, ...] = ()
 
     def contains(self, x: float, y: float) -> bool:
         """Whether a point lies in it, its border included."""

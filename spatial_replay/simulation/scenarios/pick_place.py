@@ -48,7 +48,7 @@ SCENARIO = Scenario(
     name="pick-place",
     placements=(
         _thing("bottle", "bottle", Cylinder(0.025, 0.12), (-0.15, 0.5), 0.2, (0.2, 0.5, 0.3)),
-        _thing("banana", "fruit", Box(0.11, 0.032, 0.032), (0.45, 0.23), 0.12, (0.95, 0.85, 0.2)),
+        _thing("banana", "fruit", Box(0.11, 0.032, 0.032), (0.6, 0.2), 0.12, (0.95, 0.85, 0.2)),
         _thing("mug", "mug", Cylinder(0.032, 0.075), (0.38, -0.45), 0.15, (0.3, 0.4, 0.8)),
         _thing("gelatin", "box", Box(0.07, 0.045, 0.03), (0.15, -0.5), 0.1, (0.8, 0.3, 0.3)),
         _thing("sugarbox", "box", Box(0.085, 0.045, 0.12), (0.3, 0.42), 0.25, (0.9, 0.75, 0.3), math.pi / 2),
