@@ -80,7 +80,7 @@ class Assembler:
         self._scene = Scene(
             plan, self._channels, names, classes, self._tree, self._remarks, self._add_fault, concave
         )
-        self._instants = Instants(plan, name)
+        self._instants = Instants(plan, name, self._start_ns)
         self._newest_ns = -1
         self._latest_ns = self._settled_ns = -1
         self._count = self._bytes = 0

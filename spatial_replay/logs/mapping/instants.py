@@ -13,11 +13,17 @@ _MOST_STEPS = 100_000
 
 
 class Instants:
-    """The times of samples, as the messages go by."""
+    """The times of samples, as the messages go by.
 
-    def __init__(self, plan: Plan, name: str) -> None:
+    Args:
+        start_ns: where the samples begin that matter; those at multiples of a step are counted from there.
+    """
+
+    def __init__(self, plan: Plan, name: str, start_ns: int) -> None:
         self._name = name
         self._step_ns = plan.mapping.sampling.step_ns
+        self._start_ns = start_ns
+        self._from_ns: int | None = None
         self._last_ns = -1
 
     def upto(self, times_ns: Integers, upto_ns: int) -> Integers:
@@ -41,14 +47,13 @@ class Instants:
         return times
 
     def _multiples(self, times_ns: Integers, upto_ns: int, step_ns: int) -> Integers:
-        if self._last_ns < 0:
-            if not len(times_ns):
-                return np.empty(0, np.int64)
-            first = -(-int(times_ns.min()) // step_ns)
-        else:
-            first = self._last_ns // step_ns + 1
-        stop = upto_ns // step_ns + 1
-        marks = np.unique(np.concatenate([[first * step_ns, upto_ns], times_ns]))
+        if self._from_ns is None and len(times_ns):
+            self._from_ns = max(int(times_ns.min()), self._start_ns)
+        if self._from_ns is None or upto_ns < self._from_ns:
+            return np.empty(0, np.int64)
+        begin_ns = max(self._from_ns, self._last_ns + 1)
+        first, stop = -(-begin_ns // step_ns), upto_ns // step_ns + 1
+        marks = np.unique(np.concatenate([[begin_ns, upto_ns], times_ns[times_ns > begin_ns]]))
         gaps = np.diff(marks)
         if len(gaps) and int(gaps.max()) // step_ns > _MOST_STEPS:
             at = int(np.argmax(gaps))

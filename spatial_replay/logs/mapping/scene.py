@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -219,9 +219,11 @@ class Scene:
 
     def _count_stale(self, topic: str, times_ns: Integers, names: Integers, rows: Integers) -> None:
         stale = rows == STALE
-        for column in np.flatnonzero(stale.any(axis=0)).tolist():
+        columns = np.flatnonzero(stale.any(axis=0)).tolist()
+        name_of = _Names(self._names if columns else ())
+        for column in columns:
             at = np.flatnonzero(stale[:, column])
-            name = _Names(self._names)[int(names[column])]
+            name = name_of[int(names[column])]
             self._remarks.count_stale(topic, name, len(at), int(times_ns[at[0]]))
 
     def _signal_columns(self, times_ns: Integers) -> dict[str, Floats]:
@@ -261,7 +263,7 @@ class Scene:
 class _Names:
     """Names by their codes."""
 
-    def __init__(self, codes: Codes) -> None:
+    def __init__(self, codes: Iterable[str]) -> None:
         self._texts: Sequence[str] = list(codes)
 
     def __getitem__(self, code: int) -> str:

@@ -140,6 +140,15 @@ def test_a_clock_that_jumps_forward_does_not_make_billions_of_samples() -> None:
         make("sample: {every: 100ms}\ntopics: {/p: {}}", feed)
 
 
+def test_a_window_long_after_what_lasts_is_no_jump() -> None:
+    feed = Feed(latched=frozenset({"/map"})).add("/map", 0, point(7))
+    for tick in range(10):
+        feed.add("/p", 1_000_000 * SECOND + tick * 100 * MS, point(tick))
+    text = "sample: {every: 100ms}\ntopics: {/p: {}, /map: {}}"
+    made = make(text, feed, start_ns=1_000_000 * SECOND)
+    assert (len(made.trace), made.states("map")) == (10, "+" * 10)
+
+
 def test_the_three_clocks() -> None:
     feed = Feed().add("/p", 7 * SECOND, pose_stamped(0, 0, time_ns=3 * SECOND))
     assert seconds(make("clock: log\ntopics: {/p: {}}", feed).trace.times_ns) == [7]
