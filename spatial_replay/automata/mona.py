@@ -22,6 +22,8 @@ _MAX_MEMORY = 4 * 2**30
 """Bytes that MONA may use."""
 _MAX_OUTPUT = 32 * 2**20
 """Bytes that are read of what MONA prints."""
+_MAX_MOVES = 100_000
+"""Moves that are taken of an automaton."""
 _MAX_TEXT = 200_000
 """Characters of a formula as a text."""
 _MAX_DEPTH = 60
@@ -162,8 +164,11 @@ def _machine(printed: str, propositions: int) -> Machine:
         raise NoAutomatonError(f"MONA printed no automaton: {printed.strip()[:200]!r}")
     order = [int(name.removeprefix("P")) for name in header[1].split()]
     states = int(count[1])
+    found = _MOVE.findall(printed)
+    if len(found) > _MAX_MOVES:
+        raise NoAutomatonError(f"the automaton has {states} states and more than {_MAX_MOVES} moves")
     cubes: list[list[_Cube]] = [[] for _ in range(states)]
-    for state, symbol, target in _MOVE.findall(printed):
+    for state, symbol, target in found:
         letters = ["X"] * propositions
         for number, letter in zip(order, symbol, strict=True):
             letters[number] = letter

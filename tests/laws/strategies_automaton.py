@@ -1,4 +1,4 @@
-"""Formulas that have an automaton: no past operators, bounds in samples; and what their propositions may be."""
+"""Formulas that have an automaton, without past operators and seconds, and runs of their propositions."""
 
 from __future__ import annotations
 

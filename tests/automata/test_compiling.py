@@ -1,0 +1,131 @@
+"""From texts to automata: what is a proposition, what has no automaton, and what they come out as."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+import spatial_replay as sr
+from automata.golden import FILE, FORMULAS, as_values
+from spatial_replay.automata.automaton import Automaton
+from spatial_replay.automata.compiling import automaton
+from spatial_replay.errors import NoAutomatonError, UsageError
+from spatial_replay.spec.specification import parse_specification
+
+GOLDEN = json.loads(FILE.read_text())
+
+
+def machine_of(text: str) -> Automaton:
+    return automaton(parse_specification(text, filename="task.spatial"))
+
+
+@pytest.mark.parametrize("text", FORMULAS)
+def test_automata_are_those_that_mona_gives(text: str) -> None:
+    assert as_values(automaton(parse_specification(text), compiler="own")) == GOLDEN[text]
+
+
+def test_it_can_be_used_from_the_package_itself() -> None:
+    machine = sr.automaton(sr.parse_specification("F p >= 0"))
+    assert isinstance(machine, sr.Automaton)
+    assert machine.accepts([[False], [True]]) and not machine.accepts([[False], [False]])
+
+
+# ------------------------------------------------------------------------------------------- propositions
+
+
+def test_propositions_are_the_largest_parts_about_one_sample() -> None:
+    machine = machine_of("G ((a ovlp b and c ovlp d) -> F exists x in all: x ovlp a)")
+    assert [each.text for each in machine.propositions] == [
+        "(a ovlp b) and (c ovlp d)",
+        "exists x in all: (x ovlp a)",
+    ]
+
+
+def test_a_named_proposition_goes_by_its_name() -> None:
+    machine = automaton(parse_specification("spec near = a closeto[1] b\nspec done = F near"), "done")
+    assert [(each.label, each.text) for each in machine.propositions] == [("near", "a closeto[1] b")]
+    assert machine.guard_words(machine.transitions[0]) == "not near"
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ("a ovlp b and c ovlp d", "c ovlp d and a ovlp b"),
+        ("a ovlp b and (c ovlp d and e ovlp f)", "(e ovlp f and a ovlp b) and c ovlp d"),
+        ("a ovlp b -> c ovlp d", "not (a ovlp b) or c ovlp d"),
+        ("not (a ovlp b and c ovlp d)", "not (a ovlp b) or not (c ovlp d)"),
+        ("a ovlp b xor c ovlp d", "not (a ovlp b <-> c ovlp d)"),
+        ("a ovlp b", "not not (a ovlp b)"),
+        ("forall x in all: x ovlp a", "not (exists x in all: not (x ovlp a))"),
+    ],
+)
+def test_what_says_the_same_is_one_proposition(first: str, second: str) -> None:
+    machine = machine_of(f"(F ({first})) and (G ({second}))")
+    assert [each.formula for each in machine.propositions] == [
+        parse_specification(f"F ({first})").specs[0].formula.operands[0]
+    ]
+
+
+def test_a_proposition_and_its_negation_are_one() -> None:
+    machine = machine_of("(not (a ovlp b)) U (a ovlp b)")
+    assert [each.text for each in machine.propositions] == ["not (a ovlp b)"]
+    assert machine.accepts([[True], [False]])
+    assert not machine.accepts([[True], [True]])
+
+
+def test_a_template_has_one_automaton_for_all_objects() -> None:
+    machine = machine_of(
+        'group people = class "person"\nspec apart(ego) = G (ego dist (people except ego) >= 1)'
+    )
+    assert len(machine.states) == 2
+
+
+# ------------------------------------------------------------------------------------------ what has none
+
+
+def test_every_operator_that_has_no_automaton_is_told_with_its_place() -> None:
+    with pytest.raises(NoAutomatonError) as raised:
+        machine_of("spec done = (F[0, 2s] a ovlp b) and\n  (G (O a ovlp b))")
+    told = str(raised.value)
+    assert "task.spatial:1:13: error: `F[0s, 2s]` counts seconds" in told
+    assert "task.spatial:2:6: error: `O` looks back" in told
+
+
+def test_seconds_that_bound_nothing_are_no_obstacle() -> None:
+    assert machine_of("F[0s, inf] a ovlp b") == machine_of("F a ovlp b")
+    assert machine_of("G[0s, 0s] a ovlp b").accepting == machine_of("G[0, 0] a ovlp b").accepting
+
+
+@pytest.mark.parametrize("bound", ["[0, 4000]", "[5000, inf]", "[999999999, 9999999999]"])
+def test_a_bound_of_too_many_samples_is_told(bound: str) -> None:
+    with pytest.raises(NoAutomatonError, match="unrolled into steps, there are more than 4000") as raised:
+        machine_of(f"G{bound} a ovlp b")
+    assert "task.spatial:1:1" in str(raised.value)
+
+
+def test_a_bound_of_many_samples_is_unrolled() -> None:
+    assert len(machine_of("F[0, 300] a ovlp b").states) == 303
+
+
+def test_too_many_propositions_are_told() -> None:
+    text = " and ".join(f"(F p{number} >= 0)" for number in range(65))
+    with pytest.raises(NoAutomatonError, match="65 propositions, an automaton at most 64"):
+        machine_of(text)
+
+
+def test_guards_that_nobody_could_read_are_told() -> None:
+    text = " xor ".join(f"(X p{number} >= 0)" for number in range(24))
+    with pytest.raises(NoAutomatonError, match="guards"):
+        automaton(parse_specification(text), compiler="own")
+
+
+def test_which_spec_must_be_clear() -> None:
+    specification = parse_specification("spec reach = F p >= 0\nspec stay = G p >= 0")
+    with pytest.raises(UsageError, match="several results; choose one with name=: reach, stay"):
+        automaton(specification)
+    with pytest.raises(UsageError, match="did you mean 'reach'"):
+        automaton(specification, "raech")
+    with pytest.raises(UsageError, match="'own' and 'mona'"):
+        automaton(specification, "reach", compiler="spot")  # type: ignore[arg-type]
+    assert automaton(specification, "stay").name == "stay"

@@ -1,0 +1,111 @@
+"""Automata through programs of others: MONA, which compiles them, and Graphviz, which draws them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from hypothesis import given, settings
+
+from automata.golden import FORMULAS
+from laws.strategies_automaton import compiled, formulas_with_automata
+from spatial_replay.automata.automaton import Automaton
+from spatial_replay.automata.compiling import automaton
+from spatial_replay.automata.drawing import svg_text
+from spatial_replay.errors import NoAutomatonError, OutputError, UsageError
+from spatial_replay.spec.specification import parse_specification
+
+needs_mona = pytest.mark.skipif(shutil.which("mona") is None, reason="MONA is not installed")
+needs_graphviz = pytest.mark.skipif(shutil.which("dot") is None, reason="Graphviz is not installed")
+
+
+@needs_mona
+@settings(max_examples=60)
+@given(formulas_with_automata)
+def test_both_compilers_give_one_automaton(formula) -> None:
+    assert compiled(formula, "own") == compiled(formula, "mona")
+
+
+def _through_mona(text: str) -> Automaton:
+    return automaton(parse_specification(text), compiler="mona")
+
+
+@needs_mona
+def test_any_number_of_processes_compile_at_once() -> None:
+    texts = [FORMULAS[number % len(FORMULAS)] for number in range(100)]
+    with ProcessPoolExecutor(4) as pool:
+        results = list(pool.map(_through_mona, texts))
+    assert results == [automaton(parse_specification(text)) for text in texts]
+
+
+@needs_mona
+def test_mona_takes_over_where_this_package_reaches_its_limits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # 10^3 states for how long each has been waited for, and a trap
+    text = " and ".join(f"(G ((p{number} >= 0) -> F[0, 9] q{number} >= 0))" for number in range(3))
+    with pytest.raises(NoAutomatonError, match="more than 1000 states"):
+        automaton(parse_specification(text), compiler="own")
+    assert len(automaton(parse_specification(text)).states) == 1001
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(NoAutomatonError, match="apt-get install mona"):
+        automaton(parse_specification(text))
+
+
+def _program(folder: Path, name: str, script: str) -> None:
+    path = folder / name
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+
+
+@pytest.mark.parametrize(
+    ("script", "told"),
+    [
+        ("cat >/dev/null; echo 'out of memory'; exit 3", "code 3: out of memory"),
+        ("exit 1", "code 1"),
+        ("cat >/dev/null; echo hello", "printed no automaton"),
+        ("kill -9 $$", "ended after"),
+    ],
+)
+def test_what_goes_wrong_in_mona_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, told: str
+) -> None:
+    _program(tmp_path, "mona", script)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    with pytest.raises(NoAutomatonError, match=told):
+        _through_mona("F p >= 0")
+
+
+@needs_mona
+def test_an_automaton_that_is_too_large_is_told() -> None:
+    # 2^11 sets of what has been seen already
+    text = " and ".join(f"(F p{number} >= 0)" for number in range(11))
+    with pytest.raises(NoAutomatonError, match="states and more than 100000 moves"):
+        automaton(parse_specification(text))
+
+
+@needs_graphviz
+def test_an_automaton_is_drawn() -> None:
+    text = svg_text(automaton(parse_specification('F "a<b\\"\\\\" ovlp q')))
+    root = ElementTree.fromstring(text)
+    words = "".join(root.itertext())
+    assert 'not ("a<b\\"\\\\" ovlp q)' in words
+
+
+def test_without_graphviz_the_error_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = automaton(parse_specification("F p >= 0"))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UsageError, match="apt-get install graphviz"):
+        svg_text(machine)
+
+
+def test_what_goes_wrong_in_graphviz_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _program(tmp_path, "dot", "cat >/dev/null; echo 'no fonts' >&2; exit 2")
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    with pytest.raises(OutputError, match="code 2: no fonts"):
+        svg_text(automaton(parse_specification("F p >= 0")))
