@@ -201,6 +201,7 @@ def settings_for(world: World) -> Settings:
     care = _CARE[skill]
     workspace = Workspace(
         Grid.over(space.xmin, space.ymin, space.xmax, space.ymax, care.cell_size),
+        yaws=space.yaws,
         nearest=space.nearest,
         farthest=space.farthest,
         obstacles=tuple(world.obstacles),
