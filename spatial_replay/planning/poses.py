@@ -17,7 +17,8 @@ _LESS_THAN_AREA = 1e-12
 def centre_of(footprint: Footprint) -> tuple[float, float]:
     """The point that says where an object is: the centroid of its parts' areas.
 
-    Of parts without an area it is the mean of their vertices. Where parts overlap, their area counts twice.
+    Each part counts by its area, with the centroid of its polygon before it is rounded: for parts without one,
+    the mean of their vertices. Where parts overlap, their area counts twice.
     """
     weights, centres = zip(*map(_weight_and_centre, footprint.parts), strict=True)
     if sum(weights) <= 0.0:
@@ -79,19 +80,23 @@ def _placed(vertices: Floats, centre: Floats, positions: Floats, turn: float) ->
 
 
 def _weight_and_centre(part: ConvexPart) -> tuple[float, tuple[float, float]]:
-    vertices = part.vertices
-    first = vertices[0]
-    a, b = vertices[1:-1] - first, vertices[2:] - first
-    crosses = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
-    doubled = float(crosses.sum())
-    length = float(np.hypot(*(vertices - np.roll(vertices, 1, axis=0)).T).sum())
+    """A part's area, and the centroid of its polygon before it is rounded."""
+    # a few vertices at most: plain numbers are quicker than arrays
+    corners = part.vertices.tolist()
+    (x0, y0), *_ = corners
+    doubled = sum_x = sum_y = length = 0.0
+    for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
+        cross = (ax - x0) * (by - y0) - (bx - x0) * (ay - y0)
+        doubled += cross
+        sum_x += cross * (ax + bx - 2.0 * x0)
+        sum_y += cross * (ay + by - 2.0 * y0)
+        length += math.hypot(bx - ax, by - ay)
     # a rounded polygon: its own area, a strip along its sides and a disc in all of its corners together
     area = doubled / 2 + length * part.radius + math.pi * part.radius**2
-    if len(vertices) > 2 and doubled > _LESS_THAN_AREA * length**2:
-        x, y = first + (crosses[:, None] * (a + b)).sum(axis=0) / (3.0 * doubled)
-    else:
-        x, y = vertices.mean(axis=0)
-    return area, (float(x), float(y))
+    if len(corners) > 2 and doubled > _LESS_THAN_AREA * length**2:
+        return area, (x0 + sum_x / (3.0 * doubled), y0 + sum_y / (3.0 * doubled))
+    count = len(corners)
+    return area, (sum(x for x, _ in corners) / count, sum(y for _, y in corners) / count)
 
 
 def _starts(counts: Integers) -> Integers:
