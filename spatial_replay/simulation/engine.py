@@ -34,14 +34,17 @@ class Engine:
     """A table with a robot on it and bodies around it, that move by the laws of mechanics.
 
     Raises:
-        UsageError: the simulator is not installed.
+        UsageError: the simulator is not installed, or there is no display for its window.
     """
 
     def __init__(self, *, gui: bool = False) -> None:
         self._bullet = bullet = _load()
+        if gui and not os.environ.get("DISPLAY"):
+            # the simulator would end the process
+            raise UsageError("there is no display to show the world on (DISPLAY is not set); run without gui")
         self._client: int = bullet.connect(bullet.GUI if gui else bullet.DIRECT)
         if self._client < 0:
-            raise UsageError("the simulator cannot open a window; run without --gui")
+            raise UsageError("the simulator could not be started; run without gui if it shows a window")
         self._bodies: dict[str, int] = {}
         call = self._call
         if gui:
