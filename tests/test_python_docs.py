@@ -39,4 +39,5 @@ def test_the_examples_run_and_say_what_the_text_says(
     assert "'plate'" in printed[5][0]
     assert printed[6] == ["satisfied"]
     assert printed[7] == ["()"]
-    assert [line.split()[0] for line in printed[8]] == ["1", "2"]
+    assert [line.split()[0] for line in printed[8]] == ["cup", "hold"]
+    assert [line.split()[0] for line in printed[9]] == ["1", "2"]

@@ -17,7 +17,7 @@ _LESS_THAN_AREA = 1e-12
 def centre_of(footprint: Footprint) -> tuple[float, float]:
     """The point that says where an object is: the centroid of its parts' areas.
 
-    Each part counts by its area, with the centroid of its polygon before it is rounded: for parts without one,
+    Each part counts by its area, with the centroid of its polygon before it is rounded: for one without area,
     the mean of their vertices. Where parts overlap, their area counts twice.
     """
     weights, centres = zip(*map(_weight_and_centre, footprint.parts), strict=True)
