@@ -16,10 +16,7 @@ _WIDTH = 60
 
 def words_text(automaton: Automaton) -> str:
     """States, what they mean, and their moves in words."""
-    states, propositions = len(automaton.states), len(automaton.propositions)
-    lines = [
-        f"automaton of {automaton.name}: {_count(states, 'state')}, {_count(propositions, 'proposition')}"
-    ]
+    lines = [f"automaton of {automaton.name}: {size_words(automaton)}"]
     lines += [f"  {each.name} means {each.text}" for each in automaton.propositions if each.name is not None]
     for state in automaton.states:
         lines.append(f"  state {state}: {state_words(automaton, state)}")
@@ -28,6 +25,11 @@ def words_text(automaton: Automaton) -> str:
                 to = "stays" if each.target == state else f"to {each.target}"
                 lines.append(f"    {to} if {automaton.guard_words(each)}")
     return "\n".join(lines)
+
+
+def size_words(automaton: Automaton) -> str:
+    """How large it is: "33 states, 6 propositions"."""
+    return f"{_count(len(automaton.states), 'state')}, {_count(len(automaton.propositions), 'proposition')}"
 
 
 def state_words(automaton: Automaton, state: int) -> str:

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import click
 
-from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compiling import automaton
-from spatial_replay.automata.drawing import dot_text, hoa_text, svg_text, words_text
+from spatial_replay.automata.drawing import dot_text, hoa_text, size_words, svg_text, words_text
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.logs.output import replacing
 from spatial_replay.spec.formula import Specification
@@ -54,7 +53,7 @@ def show_automata(
     text = written[path.suffix](chosen)
     with replacing(path, inputs) as stream:
         stream.write(text.encode())
-    click.echo(f"wrote {path}: {_size(chosen)}", err=quiet)
+    click.echo(f"wrote {path}: {size_words(chosen)}", err=quiet)
 
 
 def _show(specification: Specification, names: Sequence[str]) -> None:
@@ -66,7 +65,3 @@ def _show(specification: Specification, names: Sequence[str]) -> None:
             faults.append(str(error))
     if faults:
         raise NoAutomatonError("\n".join(faults))
-
-
-def _size(chosen: Automaton) -> str:
-    return f"{len(chosen.states)} states, {len(chosen.transitions)} transitions"

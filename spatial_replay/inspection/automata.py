@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compiling import automaton
+from spatial_replay.automata.drawing import size_words
 from spatial_replay.automata.stored import automaton_from, stored_text
 from spatial_replay.errors import NoAutomatonError
 from spatial_replay.inspection.specification import ReportedTree
@@ -41,7 +42,7 @@ class KeptAutomaton:
         """What there is, in a few words."""
         if self.automaton is None:
             return f"none: {self.reason}"
-        return f"{len(self.automaton.states)} states, {len(self.automaton.propositions)} propositions"
+        return size_words(self.automaton)
 
 
 def automata_of(

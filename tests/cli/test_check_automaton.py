@@ -1,0 +1,73 @@
+"""`spatial-replay check --dfa`: the automaton of a specification."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from spatial_replay.cli.application import run
+from spatial_replay.spec.specification import parse_specification
+
+TEXT = "spec reach = F (cube enclosedin tray)\nspec calm = G (battery >= 0.2)\nspec done = reach and calm\n"
+
+
+@pytest.fixture
+def specification(tmp_path: Path) -> Path:
+    path = tmp_path / "done.spatial"
+    path.write_text(TEXT)
+    return path
+
+
+def test_the_automaton_is_shown_in_words_below_the_tree(
+    specification: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["check", str(specification), "--dfa", "-"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "spec done"
+    assert "automaton of done: 3 states, 2 propositions" in lines
+    assert "    to 2 if cube enclosedin tray and battery >= 0.2" in lines
+
+
+@pytest.mark.parametrize(("suffix", "begin"), [("dot", 'digraph "done" {'), ("hoa", "HOA: v1")])
+def test_the_end_of_a_files_name_says_what_it_is(
+    specification: Path, suffix: str, begin: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = specification.with_suffix(f".{suffix}")
+    assert run(["check", str(specification), "--dfa", str(output)]) == 0
+    assert output.read_text().splitlines()[0] == begin
+    assert f"wrote {output}: 3 states, 2 propositions" in capsys.readouterr().out
+
+
+def test_json_stays_whole_beside_a_file(specification: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = specification.with_suffix(".dot")
+    assert run(["check", str(specification), "--json", "--dfa", str(output)]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["file"] == "done.spatial"
+    assert "wrote" in captured.err
+    assert run(["check", str(specification), "--json", "--dfa", "-"]) == 2
+
+
+def test_other_files_are_refused(specification: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["check", str(specification), "--dfa", "done.png"]) == 2
+    assert "ends in .dot, .hoa or .svg" in capsys.readouterr().err
+    same = specification.rename(specification.with_suffix(".dot"))
+    assert run(["check", str(same), "--dfa", str(same)]) == 2
+    assert parse_specification(same.read_text()).results
+
+
+def test_one_of_several_results_is_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, output = tmp_path / "two.spatial", tmp_path / "two.dot"
+    path.write_text("spec reach = F p >= 0\nspec before = G (O p >= 0)\n")
+    assert run(["check", str(path), "--dfa", str(output)]) == 2
+    assert "choose one with --of: reach, before" in capsys.readouterr().err
+    assert run(["check", str(path), "--dfa", str(output), "--of", "reach"]) == 0
+    assert output.read_text().startswith('digraph "reach"')
+    assert run(["check", str(path), "--of", "reach"]) == 2
+    capsys.readouterr()
+    # those that have one are shown all the same
+    assert run(["check", str(path), "--dfa", "-"]) == 2
+    captured = capsys.readouterr()
+    assert "automaton of reach" in captured.out
+    assert "two.spatial:2:17: error: `O` looks back" in captured.err
