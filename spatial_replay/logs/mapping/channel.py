@@ -126,11 +126,16 @@ class Channel:
             UsageError: there are no stamps where the mapping says.
         """
         found, kept = self._one_by_one(contents, self._stamp, log_times_ns)
-        pairs = [(time, place) for time, place in zip(found, kept, strict=True) if isinstance(time, int)]
-        late = [time for time, _ in pairs if not 0 <= time <= LATEST_NS]
-        if late:
-            raise self._misfit(f"its stamp {late[0]} ns lies outside the times of a log; take another clock")
-        return [time for time, _ in pairs], [place for _, place in pairs]
+        times: list[int] = []
+        places: list[int] = []
+        for time_ns, place in zip(found, kept, strict=True):
+            if time_ns is not None and not 0 <= time_ns <= LATEST_NS:
+                what = f"its stamp {time_ns} ns lies outside the times of a log"
+                self._fault(self.name, log_times_ns[place], what)
+            elif time_ns is not None:
+                times.append(time_ns)
+                places.append(place)
+        return times, places
 
     def harvest(self, log_times_ns: Integers, contents: Sequence[Any]) -> Harvest:
         """What messages tell of: payloads, or what they hold where the channel `keeps_decoded`.

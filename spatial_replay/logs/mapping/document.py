@@ -84,7 +84,7 @@ def _unwanted(events: Iterable[yaml.Event]) -> tuple[int, str] | None:
     for event in events:
         line = event.start_mark.line + 1 if event.start_mark else 1
         if isinstance(event, yaml.AliasEvent):
-            return line, f"*{event.anchor} repeats another part; write it out"
+            return line, f"*{event.anchor} repeats another part; write it out, or in quotes if it is a text"
         if (tag := getattr(event, "tag", None)) is not None:
             return line, f"the tag {tag} means nothing here; leave it out"
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)

@@ -1,0 +1,128 @@
+"""Field paths and names by template, over messages of every kind."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+from logs.mapping.feeding import pose_stamped, tf, transform
+from spatial_replay.errors import UsageError
+from spatial_replay.logs.mapping.fields import field_names, style_of
+from spatial_replay.logs.mapping.naming import Codes, Namer
+from spatial_replay.logs.mapping.paths import FieldError, Path, getter, iter_elements, tuple_getter, walk
+from spatial_replay.logs.mapping.templates import Template, name_from_topic
+
+
+def scene() -> SceneUpdate:
+    update = SceneUpdate()
+    for name in ("cup", "plate"):
+        update.entities.add(id=name).cubes.add().size.x = 2.0
+    return update
+
+
+MESSAGES: list[tuple[Any, str, Any]] = [
+    (pose_stamped(1.0, 2.0), "pose.position.y", 2.0),
+    (tf(transform("map", "base", (1, 2, 3))), "transforms[0].child_frame_id", "base"),
+    (scene(), "entities[1].cubes[0].size.x", 2.0),
+    ({"a": [{"b-c": [1, 2]}]}, "a[0].b-c[1]", 2),
+]
+
+
+@pytest.mark.parametrize(("message", "text", "value"), MESSAGES)
+def test_a_path_finds_the_same_in_messages_of_every_kind(message: Any, text: str, value: Any) -> None:
+    path = Path.of(text)
+    assert walk(path, message) == value
+    assert getter(path, style_of(message))(message) == value
+    assert tuple_getter([path, path], style_of(message))(message) == (value, value)
+
+
+def test_every_element_of_lists_in_lists() -> None:
+    message = {"rows": [{"cells": [1, 2]}, {"cells": []}, {"cells": [3]}]}
+    assert list(iter_elements(Path.of("rows[*].cells[*]"), message)) == [1, 2, 3]
+    entities = iter_elements(Path.of("entities[*]"), scene())
+    assert [walk(Path.of("id"), entity) for entity in entities] == ["cup", "plate"]
+
+
+@pytest.mark.parametrize(
+    ("message", "text", "what"),
+    [
+        (
+            pose_stamped(0, 0),
+            "pose.positon",
+            "geometry_msgs/msg/Pose has no field 'positon'; did you mean 'position'",
+        ),
+        (pose_stamped(0, 0), "header.frame_id.x", "a text has no field 'x'"),
+        (scene(), "entitys", "foxglove.SceneUpdate has no field 'entitys'; did you mean 'entities'"),
+        (scene(), "entities[7]", r"there are only 2 elements where \[7\] is asked for"),
+        (scene(), "entities[0].id[0]", "follows a text, which is no list"),
+        ({"a": 1}, "b", "the JSON object has no field 'b'; its fields are a"),
+        ({"a": None}, "a.b", "nothing has no field 'b'"),
+        # what every object has in Python is no field
+        (pose_stamped(0, 0), "__class__", "has no field '__class__'"),
+        (scene(), "SerializeToString", "has no field 'SerializeToString'"),
+        ({"a": 1}, "keys", "has no field 'keys'"),
+    ],
+)
+def test_a_path_that_leads_nowhere_says_what_is_there(message: Any, text: str, what: str) -> None:
+    with pytest.raises(FieldError, match=what):
+        walk(Path.of(text), message)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "a..b", ".a", "a.", "a[", "a[-1]", "a[x]", "1a", "a b", "a()", "$a", "a.$.b"]
+)
+def test_what_is_no_path(text: str) -> None:
+    with pytest.raises(UsageError, match="is no field path"):
+        Path.of(text)
+
+
+def test_fields_of_messages_of_every_kind() -> None:
+    assert field_names(pose_stamped(0, 0)) == ("header", "pose")
+    assert field_names(scene()) == ("deletions", "entities")
+    assert field_names({"a": 1, "b": 2}) == ("a", "b")
+    assert field_names([1]) == field_names("x") == field_names(None) == ()
+
+
+def names(template: str, *things: dict[str, Any], topic: str = "/a/pose") -> list[str]:
+    codes = Codes()
+    namer = Namer(Template.of(template), topic, codes, (), ())
+    found = namer.codes(things, range(len(things)), "keys")
+    texts = list(codes)
+    return [texts[code] for code in found]
+
+
+def test_names_by_template() -> None:
+    assert names("robot", {}, {}) == ["robot", "robot"]
+    assert names("tag{id}", {"id": 3}, {"id": 4}, {"id": 3}) == ["tag3", "tag4", "tag3"]
+    assert names("{ns}_{id}", {"ns": "cup", "id": 1.0}) == ["cup_1"]
+    assert names("{ns|topic}_{id|index}", {"ns": "", "id": ""}, {"id": 7}) == ["a_0", "a_7"]
+    assert names("{index}", {"index": 9}) == ["9"]
+    assert names("{a.b[0]}", {"a": {"b": ["x"]}}) == ["x"]
+
+
+@pytest.mark.parametrize(
+    ("template", "thing"),
+    [
+        ("{id}", {"id": ""}),
+        ("{id}", {}),
+        ("{id}", {"id": []}),
+        ("{id}", {"id": "a\nb"}),
+        ("{id}", {"id": "x" * 999}),
+    ],
+)
+def test_names_that_are_none(template: str, thing: dict[str, Any]) -> None:
+    with pytest.raises(FieldError):
+        names(template, thing)
+
+
+@pytest.mark.parametrize("text", ["{", "}", "a{b", "{}", "{a b}", "{a|}", ""])
+def test_what_is_no_template(text: str) -> None:
+    with pytest.raises(UsageError, match="is no name"):
+        Template.of(text)
+
+
+def test_names_after_topics() -> None:
+    found = [name_from_topic(topic) for topic in ("/turtle1/pose", "/pose", "/a/b/scan", "/", "/robot/odom")]
+    assert found == ["turtle1", "pose", "a_b_scan", "object", "robot"]
