@@ -35,8 +35,11 @@ _EPOCH_LIKELY_NS = 10**18
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 @click.option("--suggest-mapping", is_flag=True, help="Print a mapping file to start from instead (YAML).")
 @click.option("--decisions", is_flag=True, help="Tell what was decided in a planned run instead, and why.")
+@click.option("--layout", is_flag=True, help="Print the log's layout, to import in a viewer, instead.")
 @reading_options
-def info(log: Path, as_json: bool, suggest_mapping: bool, decisions: bool, reading: Reading) -> int:
+def info(
+    log: Path, as_json: bool, suggest_mapping: bool, decisions: bool, layout: bool, reading: Reading
+) -> int:
     """Say what a log holds: samples, objects, signals, topics, attachments.
 
     Of a log of messages by others it says what could be read as objects; with a mapping, which objects are.
@@ -49,7 +52,12 @@ def info(log: Path, as_json: bool, suggest_mapping: bool, decisions: bool, readi
       spatial-replay info blocks.jsonl.gz --json
       spatial-replay info drive.bag --suggest-mapping > drive.yaml
       spatial-replay info push.mcap --decisions
+      spatial-replay info annotated.mcap --layout > layout.json
     """
+    if layout:
+        if as_json or suggest_mapping or decisions:
+            raise UsageError("--layout prints a layout and nothing else; leave the other options out")
+        return _print_layout(log)
     if decisions:
         return _decisions(log, as_json)
     # the numerical libraries load when there is work for them
@@ -89,6 +97,21 @@ def _decisions(log: Path, as_json: bool) -> int:
     for line in decision_lines(log):
         click.echo(line)
     return ExitCode.SATISFIED
+
+
+def _print_layout(log: Path) -> int:
+    """Print the layout that is kept in a log."""
+    from spatial_replay.inspection.viewer import LAYOUT
+    from spatial_replay.logs.source import open_source
+
+    source = open_source(log)
+    for attachment in source.attachments():
+        if attachment.name == LAYOUT:
+            click.echo(attachment.data.decode("utf-8", "replace"))
+            return ExitCode.SATISFIED
+    raise UsageError(
+        f"{source.name} holds no layout; write it with spatial-replay record or replay … -o FILE.mcap"
+    )
 
 
 def _suggest(log: Path, reader: MessageReader | None, as_json: bool) -> int:

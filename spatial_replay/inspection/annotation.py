@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import PurePath
@@ -27,7 +27,7 @@ from spatial_replay.inspection.pointing import Judged, pointing_of
 from spatial_replay.inspection.robustness import encode_robustness
 from spatial_replay.inspection.scene import SceneEncoder, SceneState
 from spatial_replay.inspection.specification import encode_specification, reported_trees
-from spatial_replay.inspection.viewer import Extent, layout_attachment
+from spatial_replay.inspection.viewer import Contents, Extent, layout_attachment
 from spatial_replay.logs.block import Channel, Messages
 from spatial_replay.logs.messages.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.messages.Robustness_pb2 import Robustness
@@ -136,9 +136,16 @@ class AnnotatedEvaluation:
         """The automata, to be kept beside the specifications of `specification_attachments`."""
         return automata_attachments(self._automata, prefix)
 
-    def layout(self) -> Attachment:
-        """How to open the log in a viewer, once all samples are written."""
-        return layout_attachment(self.trees, self._extent)
+    def layout(self, beside: Collection[str] = ()) -> Attachment:
+        """How to open the log in a viewer, once all samples are written.
+
+        Args:
+            beside: topics of messages of others in it.
+        """
+        written = {topic for topic, count in self._written.items() if count}
+        has_states = [bool(self._written[AUTOMATON]) and run is not None for run in self._runs]
+        scale = self._state.scale or 1.0
+        return layout_attachment(Contents(self.trees, has_states, self._extent, written | set(beside), scale))
 
     def _robustness(self, stretches: Sequence[Stretch]) -> Messages:
         """One message per sample and result."""

@@ -18,6 +18,9 @@ NEUTRAL: Final = (0.55, 0.55, 0.55)
 LABEL: Final = (0.95, 0.95, 0.95)
 """Red, green and blue from 0 to 1."""
 
+CURVES: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c8c8c")
+"""Colours of curves beside each other, also told apart with every common colour blindness (Okabe and Ito)."""
+
 _LEAST = 0.4
 """How far the colour of the slightest robustness is from grey: its sign can be seen."""
 
@@ -34,3 +37,8 @@ def colours(robustness: ArrayLike, scale: ArrayLike) -> Floats:
     mixed = np.where(np.isnan(values), NEUTRAL, NEUTRAL + share * (hue - NEUTRAL))
     # the steps of a screen: finer ones nobody sees, and a log of them is larger
     return np.asarray(np.round(mixed * 255.0) / 255.0)
+
+
+def hexadecimal(colour: tuple[float, float, float]) -> str:
+    """A colour as texts name it: "#0072b2"."""
+    return "#" + "".join(f"{round(255.0 * share):02x}" for share in colour)

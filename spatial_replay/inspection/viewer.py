@@ -6,21 +6,31 @@ The form is the one that Foxglove and Lichtblick import: panels by id, and a tre
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.inspection.panels import (
+    Panel,
+    constants,
+    decision_words,
+    event_list,
+    node_table,
+    part_curves,
+    result_curves,
+    scene_panel,
+    specification_text,
+    state_strips,
+)
 from spatial_replay.inspection.specification import ReportedTree
 from spatial_replay.logs.sink import Attachment
-from spatial_replay.logs.topics import ROBUSTNESS, SCENE, SPECIFICATION
+from spatial_replay.logs.topics import EVENT_LOG, PLAN_DECISION
 from spatial_replay.trace.trace import Trace
 
 LAYOUT = "layout.json"
 """Name of the attachment; a replay replaces it."""
-
-_SCENE_PANEL, _CURVES_PANEL, _SPECIFICATION_PANEL = "3D!scene", "Plot!robustness", "RawMessages!specification"
-_PLOTTED = 12
 
 
 class Extent(NamedTuple):
@@ -35,60 +45,112 @@ class Extent(NamedTuple):
     def of(cls, trace: Trace, before: Extent | None) -> Extent | None:
         """The box of some samples and of those before; None while nothing was seen."""
         vertices = trace.footprints.vertices
-        vertices = vertices[np.isfinite(vertices).all(axis=1)]
+        low, high = _corners(vertices)
+        if not np.isfinite([low, high]).all():
+            vertices = vertices[np.isfinite(vertices).all(axis=1)]
+            low, high = _corners(vertices)
         if not len(vertices):
             return before
-        low, high = vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()
         if before is not None:
             low = [min(low[0], before.xmin), min(low[1], before.ymin)]
             high = [max(high[0], before.xmax), max(high[1], before.ymax)]
         return cls(low[0], low[1], high[0], high[1])
 
 
-def layout_attachment(trees: Sequence[ReportedTree], extent: Extent | None) -> Attachment:
-    """The layout as a file to be kept in the log: the scene from above, the curves, the specification."""
-    text = json.dumps(viewer_layout(trees, extent), indent=1, sort_keys=True, ensure_ascii=False)
+class Contents(NamedTuple):
+    """What a log has that a layout shows.
+
+    Attributes:
+        trees: its results.
+        has_states: of each, whether the log has the states of its automaton.
+        extent: where its footprints are; None if it has none.
+        topics: all that have messages.
+        scale: robustness at which colours are full, in footprint units.
+    """
+
+    trees: Sequence[ReportedTree]
+    has_states: Sequence[bool]
+    extent: Extent | None
+    topics: Collection[str]
+    scale: float
+
+
+def layout_attachment(contents: Contents) -> Attachment:
+    """The layout of a log as a file to be kept in it (see `viewer_layout`)."""
+    text = json.dumps(viewer_layout(contents), indent=1, sort_keys=True, ensure_ascii=False)
     return Attachment(LAYOUT, "application/json", text.encode())
 
 
-def viewer_layout(trees: Sequence[ReportedTree], extent: Extent | None) -> dict[str, Any]:
-    """The layout as a value; the first results are plotted, each by the value of its root."""
-    scene = {
-        "cameraState": _camera(extent),
-        "followMode": "follow-none",
-        "topics": {SCENE: {"visible": True}},
-        "scene": {"labelScaleFactor": 1},
-    }
+def viewer_layout(contents: Contents) -> dict[str, Any]:
+    """The layout of a log: the scene on the left, what is said of it on the right.
+
+    Where a planner's decisions are in the log, its map lies under the scene and its words below.
+    """
+    return _layout(_shown(contents), _said(contents))
+
+
+def layout_for_live(contents: Contents) -> dict[str, Any]:
+    """The layout for a server that replays a log: the same, and the constants that it lets one change."""
+    return _layout([*_shown(contents), (constants(), 1.0)], _said(contents))
+
+
+_Weighted = tuple[Panel, float]
+"""A panel, and its share of the room beside its neighbours."""
+
+
+def _shown(contents: Contents) -> list[_Weighted]:
+    """The scene and, of a planner, its words."""
+    scene = scene_panel(_camera(contents.extent), contents.scale, contents.topics)
+    return [(scene, 4.0), *([(decision_words(), 1.0)] if PLAN_DECISION in contents.topics else [])]
+
+
+def _said(contents: Contents) -> list[_Weighted]:
+    """What is said of the samples, from above to below."""
+    trees = contents.trees
     if not trees:
-        return _layout({_SCENE_PANEL: scene}, _SCENE_PANEL)
-    curves = {
-        "paths": [_curve(tree) for tree in trees[:_PLOTTED]],
-        "isSynced": True,
-        "showLegend": True,
-        "xAxisVal": "timestamp",
+        return []
+    said = [(result_curves(trees), 3.0)]
+    parts = part_curves(trees)
+    if parts is not None:
+        said.append((parts, 2.0))
+    said.append((state_strips(trees, contents.has_states), 2.0))
+    if EVENT_LOG in contents.topics:
+        said.append((event_list(), 2.0))
+    return [*said, (node_table(trees[0]), 2.0), (specification_text(), 1.0)]
+
+
+def _layout(left: Sequence[_Weighted], right: Sequence[_Weighted]) -> dict[str, Any]:
+    tree: str | dict[str, Any] = _column(left)
+    if right:
+        tree = {"direction": "row", "first": tree, "second": _column(right), "splitPercentage": 55}
+    return {
+        "configById": {panel.identifier: panel.config for panel, _ in (*left, *right)},
+        "globalVariables": {},
+        "layout": tree,
+        "playbackConfig": {"speed": 1},
+        "userNodes": {},
     }
-    panels = {_SCENE_PANEL: scene, _CURVES_PANEL: curves, _SPECIFICATION_PANEL: {"topicPath": SPECIFICATION}}
-    beside = {
+
+
+def _column(panels: Sequence[_Weighted]) -> str | dict[str, Any]:
+    """Panels one below the other, as splits in two."""
+    (first, share), *rest = panels
+    if not rest:
+        return first.identifier
+    whole = share + sum(other for _, other in rest)
+    return {
         "direction": "column",
-        "first": _CURVES_PANEL,
-        "second": _SPECIFICATION_PANEL,
-        "splitPercentage": 65,
+        "first": first.identifier,
+        "second": _column(rest),
+        "splitPercentage": round(100.0 * share / whole),
     }
-    return _layout(
-        panels, {"direction": "row", "first": _SCENE_PANEL, "second": beside, "splitPercentage": 55}
-    )
 
 
-def curve_path(tree: ReportedTree) -> str:
-    """The message path of a result's root in /spatial/robustness."""
-    name = json.dumps(tree.name, ensure_ascii=False)
-    instance = json.dumps(tree.object or "", ensure_ascii=False)
-    return f"{ROBUSTNESS}{{specification=={name}}}{{object=={instance}}}.nodes[:]{{id==0}}.value"
-
-
-def _curve(tree: ReportedTree) -> dict[str, Any]:
-    label = tree.name if tree.object is None else f"{tree.name}({tree.object})"
-    return {"enabled": True, "label": label, "timestampMethod": "receiveTime", "value": curve_path(tree)}
+def _corners(vertices: Floats) -> tuple[list[float], list[float]]:
+    """The least and the greatest coordinates (V, 2); of no vertices, none that is finite."""
+    columns = [vertices[:, axis] for axis in (0, 1)]
+    low = [float(column.min(initial=np.inf)) for column in columns]
+    return low, [float(column.max(initial=-np.inf)) for column in columns]
 
 
 def _camera(extent: Extent | None) -> dict[str, Any]:
@@ -106,14 +168,4 @@ def _camera(extent: Extent | None) -> dict[str, Any]:
         "fovy": 45,
         "near": distance / 1000,
         "far": distance * 100,
-    }
-
-
-def _layout(panels: dict[str, Any], tree: str | dict[str, Any]) -> dict[str, Any]:
-    return {
-        "configById": panels,
-        "globalVariables": {},
-        "layout": tree,
-        "playbackConfig": {"speed": 1},
-        "userNodes": {},
     }

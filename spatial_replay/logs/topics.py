@@ -18,6 +18,11 @@ EVENT_LOG = "/spatial/log"
 DERIVED = frozenset({SCENE, SPECIFICATION, ROBUSTNESS, AUTOMATON, EVENTS, EVENT_LOG})
 """Topics computed from the samples and a specification: a replay replaces them."""
 
+PLAN_DECISION = "/plan/decision"
+GRADIENT_MAP = "/plan/gradient_map"
+PLAN_PATH = "/plan/path"
+"""What a planner writes; a replay keeps them."""
+
 METADATA = "spatial_replay"
 """The metadata record that comes first: who wrote the log, from what, with which options."""
 

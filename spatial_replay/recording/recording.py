@@ -61,6 +61,7 @@ class Recording:
             files, [find_instances(file, {}, (), 0, FOREVER) for file in files]
         )
         self._samples = 0
+        self._topics: set[str] = set()
         self._sample_hash, self._message_hash = SampleHash(), MessageHash()
         self._result_hash = ResultHash([(tree.name, tree.object) for tree in self._evaluation.trees])
         sink.add_metadata(METADATA, _metadata(files, about or {}))
@@ -88,6 +89,7 @@ class Recording:
         own = messages_of(_OBJECTS, trace.times_ns, encode_objects(trace), self._samples)
         if beside is not None and len(beside):
             own = merge([own, beside])
+            self._topics.update(channel.topic for channel in beside.channels.values())
         derived = self._evaluation.messages(trace, stretches)
         self._sink.write_messages(merge([own, *derived]))
         self._samples += len(trace)
@@ -103,7 +105,7 @@ class Recording:
             "dropped": str(dropped),
             "interrupted": json.dumps(interrupted),
         }
-        layout = self._evaluation.layout()
+        layout = self._evaluation.layout(self._topics)
         self._sink.add_attachment(layout.name, layout.media_type, layout.data)
         self._sink.add_metadata(ENDING, ending)
         hashes = certificate(self._sample_hash, self._message_hash, self._files, self._result_hash)

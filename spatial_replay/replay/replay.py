@@ -144,6 +144,7 @@ class Replay:
         self._result_hash = ResultHash([(tree.name, tree.object) for tree in self.trees])
         self._faults: list[str] = []
         self._remarks: list[str] = []
+        self._topics: set[str] = set()
         self._names: set[str] = set()
         self._signals: set[str] = set()
         self._samples = self._unreadable = self._encoded = 0
@@ -161,6 +162,8 @@ class Replay:
             inside = within(trace, self._window.start_ns, self._window.end_ns)
             own = self._own_messages(block)
             self._remarks += block.remarks
+            if not layer:
+                self._topics.update(channel.topic for channel in own.channels.values())
             self._count(inside, own, stretches)
             derived = self._evaluation.messages(inside, stretches) if annotate else []
             written = [*derived, *([] if layer else [own])]
@@ -202,7 +205,7 @@ class Replay:
 
     def layout(self) -> Attachment:
         """How to open the annotated log in a viewer, once all messages were taken."""
-        return self._evaluation.layout()
+        return self._evaluation.layout(self._topics)
 
     def certificate(self) -> Mapping[str, str]:
         """The certificate over what was taken in so far."""

@@ -1,0 +1,166 @@
+"""The panels of a viewer's layout: what each shows of a log.
+
+Their kinds, the part of an identifier before `!`, are those that Foxglove and Lichtblick both have.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+from spatial_replay.inspection.drawing import FRAME
+from spatial_replay.inspection.palette import CURVES, NEGATIVE, POSITIVE, hexadecimal
+from spatial_replay.inspection.specification import ReportedTree, unit_of
+from spatial_replay.logs.topics import (
+    AUTOMATON,
+    EVENT_LOG,
+    GRADIENT_MAP,
+    PLAN_DECISION,
+    PLAN_PATH,
+    ROBUSTNESS,
+    SCENE,
+    SPECIFICATION,
+)
+from spatial_replay.monitor.signal_table import looks_ahead
+from spatial_replay.spec.formula import iter_nodes
+
+_MOST_CURVES: Final = 12
+_MOST_STRIPS: Final = 8
+"""More curves, or strips of states, than these nobody tells apart."""
+
+Config = dict[str, Any]
+
+
+class Panel(NamedTuple):
+    """A panel: its identifier, and how it is set."""
+
+    identifier: str
+    config: Config
+
+
+def scene_panel(camera: Mapping[str, Any], scale: float, topics: Collection[str]) -> Panel:
+    """The scene from above; under it the planner's map, over it the path.
+
+    Args:
+        scale: robustness at which the colours of the map are full, in footprint units.
+    """
+    colours = {
+        "colorMode": "gradient",
+        "colorField": "robustness",
+        "gradient": [hexadecimal(NEGATIVE), hexadecimal(POSITIVE)],
+        "minValue": -scale,
+        "maxValue": scale,
+    }
+    shown: dict[str, Config] = {SCENE: {}, GRADIENT_MAP: colours, PLAN_PATH: {}}
+    config = {
+        "cameraState": camera,
+        "followMode": "follow-none",
+        "followTf": FRAME,
+        "topics": {topic: {"visible": True, **how} for topic, how in shown.items() if topic in topics},
+        "scene": {"labelScaleFactor": 1},
+    }
+    return Panel("3D!scene", config)
+
+
+def result_curves(trees: Sequence[ReportedTree]) -> Panel:
+    """The value of each result."""
+    paths = [(_label(tree), node_path(tree, id=0)) for tree in trees]
+    return Panel("Plot!robustness", _plot(paths[:_MOST_CURVES]))
+
+
+def part_curves(trees: Sequence[ReportedTree]) -> Panel | None:
+    """Each spec that results are made of, what does not look ahead as it is now; None if there is none."""
+    paths = [
+        (f"{name} in {_title(tree)}", node_path(tree, name=name, field="value" if ahead else "now"))
+        for tree in trees
+        for name, ahead in named_parts(tree).items()
+    ]
+    return Panel("Plot!parts", _plot(paths[:_MOST_CURVES])) if paths else None
+
+
+def state_strips(trees: Sequence[ReportedTree], has_states: Sequence[bool]) -> Panel:
+    """The verdict of each result over time and, where it has an automaton, the state of that."""
+    strips = []
+    for tree, has_state in zip(trees, has_states, strict=True):
+        strips.append((f"{_title(tree)}: verdict", node_path(tree, id=0, field="verdict")))
+        if has_state:
+            strips.append((f"{_title(tree)}: state", f"{AUTOMATON}{_of(tree)}.states[0]"))
+    paths = [
+        {"enabled": True, "label": label, "timestampMethod": "receiveTime", "value": path}
+        for label, path in strips[:_MOST_STRIPS]
+    ]
+    return Panel("StateTransitions!verdicts", {"isSynced": True, "paths": paths})
+
+
+def node_table(tree: ReportedTree) -> Panel:
+    """The numbers and verdicts of every node of a result, at the time looked at."""
+    return Panel("Table!nodes", {"topicPath": f"{ROBUSTNESS}{_of(tree)}.nodes[:]"})
+
+
+def event_list() -> Panel:
+    """What changed, in words."""
+    return Panel("RosOut!events", {"minLogLevel": 1, "searchTerms": [], "topicToRender": EVENT_LOG})
+
+
+def specification_text() -> Panel:
+    """The specification, with the table of nodes."""
+    return Panel("RawMessages!specification", {"topicPath": SPECIFICATION})
+
+
+def decision_words() -> Panel:
+    """The planner's decision in words."""
+    return Panel("RawMessages!decision", {"topicPath": f"{PLAN_DECISION}.reason"})
+
+
+def constants() -> Panel:
+    """What a live server lets one change."""
+    return Panel("Parameters!constants", {"title": "Constants of the specification"})
+
+
+def node_path(
+    tree: ReportedTree, *, id: int | None = None, name: str | None = None, field: str = "value"
+) -> str:
+    """The message path of one number of a node, by its id or by its name."""
+    which = f"id=={id}" if name is None else f"name=={_quoted(name)}"
+    return f"{ROBUSTNESS}{_of(tree)}.nodes[:]{{{which}}}.{field}"
+
+
+def named_parts(tree: ReportedTree) -> dict[str, bool]:
+    """Names that one node of a tree has, the root aside, so that a path by name finds it; with whether it
+    looks ahead."""
+    named = [(node.name, node) for _, _, node in iter_nodes(tree.formula) if node.name]
+    names = [name for name, _ in named]
+    return {name: looks_ahead(node) for name, node in named[1:] if names.count(name) == 1}
+
+
+def _plot(labelled: Sequence[tuple[str, str]]) -> Config:
+    paths = [
+        {
+            "color": CURVES[index % len(CURVES)],
+            "enabled": True,
+            "label": label,
+            "timestampMethod": "receiveTime",
+            "value": path,
+        }
+        for index, (label, path) in enumerate(labelled)
+    ]
+    return {"paths": paths, "isSynced": True, "showLegend": True, "xAxisVal": "timestamp"}
+
+
+def _of(tree: ReportedTree) -> str:
+    return f"{{specification=={_quoted(tree.name)}}}{{object=={_quoted(tree.object or '')}}}"
+
+
+def _title(tree: ReportedTree) -> str:
+    return tree.name if tree.object is None else f"{tree.name}({tree.object})"
+
+
+def _label(tree: ReportedTree) -> str:
+    """With the unit, where it is not that of footprints."""
+    unit = unit_of(tree.formula, {})
+    return f"{_title(tree)} [{unit}]" if unit else _title(tree)
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False)
