@@ -40,4 +40,6 @@ def test_the_examples_run_and_say_what_the_text_says(
     assert printed[6] == ["satisfied"]
     assert printed[7] == ["()"]
     assert [line.split()[0] for line in printed[8]] == ["cup", "hold"]
-    assert [line.split()[0] for line in printed[9]] == ["1", "2"]
+    assert printed[9][1:3] == ["False True True", "frozenset({0, 2})"]
+    assert printed[9][3].startswith("0 2 ")
+    assert [line.split()[0] for line in printed[10]] == ["1", "2"]
