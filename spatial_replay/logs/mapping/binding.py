@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from typing import TypeVar
-
-import numpy as np
 
 from spatial_replay.logs.mapping.fields import Style, field_names, style_of, type_name
 from spatial_replay.logs.mapping.model import Measure, Stamp
@@ -15,61 +12,20 @@ from spatial_replay.logs.mapping.paths import (
     FieldError,
     Get,
     Path,
+    below,
     check,
     getter,
     is_list,
+    is_number,
     leads_somewhere,
     tuple_getter,
     walk,
 )
 from spatial_replay.logs.mapping.readings import Reading
-from spatial_replay.trace.times import LATEST_NS
-
-SECOND_NS = 10**9
+from spatial_replay.logs.mapping.stamps import TimeGetter, bind_time
 
 _Option = TypeVar("_Option")
 _Found = TypeVar("_Found")
-
-_TIME_FIELDS = (
-    ("sec", "nanosec"),
-    ("sec", "nsec"),
-    ("secs", "nsecs"),
-    ("seconds", "nanos"),
-    ("sec", "nanos"),
-)
-
-
-@dataclass(frozen=True, slots=True)
-class TimeGetter:
-    """How a time is read: two fields, or one number of `unit_ns`."""
-
-    path: Path
-    get: Get
-    parts: tuple[str, str] | None
-    unit_ns: int
-
-    def nanoseconds(self, values: Sequence[object]) -> list[int]:
-        """The times in what `path` begins at.
-
-        Raises:
-            FieldError: one lies outside the times that a log can have.
-            TypeError, ValueError, OverflowError: one is no time.
-        """
-        found = map(self.get, values)
-        if self.parts is None:
-            unit = self.unit_ns
-            return [self._checked(v * unit if type(v) is int else round(float(v) * unit)) for v in found]
-        pairs = np.fromiter(chain.from_iterable(found), np.int64, 2 * len(values))
-        seconds, rest = pairs[::2], pairs[1::2]
-        if len(seconds) and max(np.abs(seconds).max(), np.abs(rest).max()) >= LATEST_NS // SECOND_NS:
-            raise FieldError(f"{self.path.text}: the time lies outside those of a log")
-        times: list[int] = (seconds * SECOND_NS + rest).tolist()
-        return times
-
-    def _checked(self, time_ns: int) -> int:
-        if abs(time_ns) > LATEST_NS:
-            raise FieldError(f"{self.path.text}: the time lies outside those of a log")
-        return time_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +71,7 @@ class _Columns:
         if path.from_message:
             raise FieldError(f"{path.text}: $. is for frame, stamp and signals; give a field of the object")
         value = walk(path, self.example)
-        if not _is_number(value):
+        if not is_number(value):
             raise FieldError(f"{path.text}: {type_name(value)} where a number belongs")
         texts = [known.text for known in self.paths]
         if path.text in texts:
@@ -128,9 +84,9 @@ class _Columns:
         value = walk(path, self.example)
         known = field_names(value)
         if all(name in known for name in names[:2]):
-            return tuple(self.add(_below(path, name)) for name in names if name in known)
+            return tuple(self.add(below(path, name)) for name in names if name in known)
         if is_list(value) and 2 <= len(value) <= len(names):
-            return tuple(self.add(_below(path, index)) for index in range(len(value)))
+            return tuple(self.add(below(path, index)) for index in range(len(value)))
         fields = f"; its fields are {', '.join(known)}" if known else ""
         raise FieldError(f"{path.text}: {type_name(value)} has no {' and '.join(names[:2])}{fields}")
 
@@ -185,30 +141,6 @@ def bind(reading: Reading, example: object, message: object, *, needs_frame: boo
         frame=_frame(reading, example, message, needs_frame),
         lifetime=lifetime,
     )
-
-
-def bind_time(stamps: Sequence[Stamp], example: object, message: object) -> TimeGetter | None:
-    """How the first of some stamps that is there is read; None if none is.
-
-    Raises:
-        FieldError: the only stamp leads nowhere, or to something that is no time.
-    """
-    for stamp in stamps:
-        path = Path.of(stamp.field)
-        root = message if path.from_message else example
-        if len(stamps) > 1 and not leads_somewhere(path, root):
-            continue
-        value = walk(path, root)
-        style = style_of(root)
-        names = field_names(value)
-        for parts in _TIME_FIELDS:
-            if all(part in names for part in parts):
-                pair = tuple_getter([_below(path, part) for part in parts], style)
-                return TimeGetter(path, pair, parts, 1)
-        if _is_number(value):
-            return TimeGetter(path, getter(path, style), None, stamp.unit_ns)
-        raise FieldError(f"{path.text}: {type_name(value)} is no time; give the path of a stamp or a number")
-    return None
 
 
 def _position(reading: Reading, columns: _Columns) -> tuple[int, ...]:
@@ -294,18 +226,3 @@ def _frame(reading: Reading, example: object, message: object, needs_frame: bool
             raise FieldError(f"{path.text}: {type_name(value)} where a frame's name belongs")
         return getter(path, style_of(root)), path.from_message
     return None
-
-
-def _below(path: Path, step: str | int) -> Path:
-    text = f"{path.text}[{step}]" if isinstance(step, int) else f"{path.text}.{step}"
-    return Path(text, (*path.steps, step), path.from_message)
-
-
-def _is_number(value: object) -> bool:
-    if isinstance(value, str | bytes) or value is None or field_names(value):
-        return value is None
-    try:
-        float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError, OverflowError):
-        return False
-    return True

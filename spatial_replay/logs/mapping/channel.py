@@ -11,7 +11,6 @@ import numpy as np
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.foreign.messages import Decoder
-from spatial_replay.logs.mapping.binding import TimeGetter, bind_time
 from spatial_replay.logs.mapping.extract import Extractor
 from spatial_replay.logs.mapping.fields import style_of
 from spatial_replay.logs.mapping.naming import Codes
@@ -20,6 +19,7 @@ from spatial_replay.logs.mapping.pending import Pending
 from spatial_replay.logs.mapping.plan import PlannedTopic
 from spatial_replay.logs.mapping.readings import GENERIC
 from spatial_replay.logs.mapping.seen import Part, Seen
+from spatial_replay.logs.mapping.stamps import TimeGetter, bind_time
 from spatial_replay.logs.mapping.transforms import TransformReader
 from spatial_replay.trace.times import LATEST_NS
 

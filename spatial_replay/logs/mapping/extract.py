@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from spatial_replay.logs.mapping.binding import Binding, TimeGetter, bind, bind_time
+from spatial_replay.logs.mapping.binding import Binding, bind
 from spatial_replay.logs.mapping.bodies import (
     DELETE_ALL_ENTITIES,
     MARKER_ADD,
@@ -21,6 +21,7 @@ from spatial_replay.logs.mapping.naming import Codes, Namer, class_codes
 from spatial_replay.logs.mapping.paths import Get, Path, iter_elements, list_getter
 from spatial_replay.logs.mapping.readings import Reading
 from spatial_replay.logs.mapping.seen import EVERYONE, Part, Seen, covariances, seen_from_parts
+from spatial_replay.logs.mapping.stamps import TimeGetter, bind_time
 from spatial_replay.logs.mapping.substance import bodies_of, points_of, rows_of
 from spatial_replay.logs.mapping.templates import Template
 

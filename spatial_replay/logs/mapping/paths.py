@@ -212,3 +212,20 @@ def _step(step: Step, style: Literal["attributes", "keys"]) -> Get:
 
 def _itself(value: Any) -> Any:
     return value
+
+
+def below(path: Path, step: str | int) -> Path:
+    """A path with one more step."""
+    text = f"{path.text}[{step}]" if isinstance(step, int) else f"{path.text}.{step}"
+    return Path(text, (*path.steps, step), path.from_message)
+
+
+def is_number(value: object) -> bool:
+    """Whether a field holds a number, or nothing where JSON may have one."""
+    if isinstance(value, str | bytes) or value is None or field_names(value):
+        return value is None
+    try:
+        float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return False
+    return True
