@@ -180,7 +180,7 @@ class Planner:
         )
         tried = self._tried.get(edge, 0)
         if tried >= self.settings.attempts:
-            return replace(consideration, pruned=f"tried {tried} times in vain")
+            return replace(consideration, pruned=f"tried {tried} times")
         candidates = [
             self._candidate(name, consideration, sample) for name in self._movable(progress, sample)
         ]

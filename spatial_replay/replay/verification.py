@@ -72,6 +72,10 @@ def verify_certificate(
     if not recorded:
         return Verified({}, {})
     options = _options(about)
+    if source is None and options.get("layer"):
+        raise UsageError(
+            f"{log.name} holds what was derived and no samples; name what it was made of: --source SOURCE"
+        )
     replayed = run_replay(
         log if source is None else source,
         _files(log),

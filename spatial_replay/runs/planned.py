@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from spatial_replay.errors import UsageError
+from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.inspection.annotation import kept_files
 from spatial_replay.planning.black_box import PLAN_METADATA, BlackBox
 from spatial_replay.planning.planner import Planner
@@ -22,6 +22,7 @@ from spatial_replay.runs.scripted import run_options
 from spatial_replay.simulation.injection import Injection
 from spatial_replay.simulation.world import World
 from spatial_replay.simulation.worlds import default_specification, make_world
+from spatial_replay.spec import check_names
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
 
@@ -80,6 +81,7 @@ def record_plan(
 
     Raises:
         NoAutomatonError: a specification without an automaton.
+        SpecificationError: names that the world does not have.
         UsageError: no such scenario, no simulator, a specification that cannot be planned for.
         OutputError: the output cannot be written.
     """
@@ -89,6 +91,7 @@ def record_plan(
     # a world or a planner that cannot be made leaves the output alone
     with closing(make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, gui=gui)) as world:
         planner = Planner(kept, settings_for(world))
+        _check_names(kept, world.sample())
         with run_log(output, [kept], about, inputs) as log:
             plan = {
                 "settings": text_from_settings(planner.settings),
@@ -97,6 +100,18 @@ def record_plan(
             }
             log.add_metadata(PLAN_METADATA, plan)
             return _Loop(world, BlackBox(planner), log, advance).run()
+
+
+def _check_names(file: Specification, sample: Sample) -> None:
+    """That a world has what a specification names.
+
+    Raises:
+        SpecificationError: with every name that it does not have.
+    """
+    remarks = check_names(file, sorted(sample.objects), sorted(sample.signals))
+    missing = [remark for remark in remarks if remark.severity == "error"]
+    if missing:
+        raise SpecificationError(missing)
 
 
 class WorldExecutor:

@@ -43,6 +43,13 @@ def test_an_annotated_log_is_verified_alone_and_against_its_source(recorded: Pat
     assert call("verify", tmp_path / "annotated.mcap", "--source", recorded)[0] == 0
 
 
+def test_a_layer_is_verified_against_its_source(recorded: Path, tmp_path: Path) -> None:
+    call("replay", recorded, "-o", tmp_path / "layer.mcap", "--layer")
+    assert call("verify", tmp_path / "layer.mcap", "--source", recorded)[0] == 0
+    with pytest.raises(sr.UsageError, match="--source"):
+        call("verify", tmp_path / "layer.mcap")
+
+
 def test_another_source_shows(recorded: Path, tmp_path: Path) -> None:
     with sr.Recorder(tmp_path / "other.mcap") as recorder:
         recorder.write(sr.Sample(0, {"a": sr.Footprint.disc(1, 1, 1), "b": sr.Footprint.disc(5, 5, 1)}))

@@ -56,3 +56,10 @@ def test_what_cannot_be_done_ends_and_says_why(tmp_path: Path) -> None:
     assert planned.steps == 0
     (decision,) = read_decisions(tmp_path / "run.mcap")
     assert [(each.source, each.target) for each in decision.pruned] == [(0, 1)]
+
+
+def test_names_that_the_world_does_not_have_are_refused(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet", reason="PyBullet is not installed; it has wheels for Python 3.11")
+    with pytest.raises(sr.SpecificationError, match="never has the object 'pink'"):
+        record_plan("push", tmp_path / "run.mcap", sr.parse_specification("F (pink leftof red)"))
+    assert not (tmp_path / "run.mcap").exists()
