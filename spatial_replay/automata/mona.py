@@ -6,6 +6,7 @@ import re
 import resource
 import shutil
 import subprocess
+from contextlib import suppress
 from functools import cache
 from threading import Timer
 from typing import NamedTuple, Protocol
@@ -116,7 +117,9 @@ def _output(program: str) -> str:
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
     ) as process:
-        resource.prlimit(process.pid, resource.RLIMIT_AS, (_MAX_MEMORY, _MAX_MEMORY))
+        with suppress(OSError):
+            # it may have ended already, or the machine forbid to limit it
+            resource.prlimit(process.pid, resource.RLIMIT_AS, (_MAX_MEMORY, _MAX_MEMORY))
         timer = Timer(_TIMEOUT_S, process.kill)
         timer.start()
         try:

@@ -72,7 +72,7 @@ class AnnotatedEvaluation:
 
         Args:
             instances: what to evaluate of each file.
-            compiled_before: gives the attachments of a log; automata among them are not compiled again.
+            compiled_before: gives the attachments of a log; automata among them need no MONA.
         """
         self._files = files
         self._semantics = semantics

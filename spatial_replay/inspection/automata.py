@@ -54,7 +54,7 @@ def automata_of(
     """The automaton of each tree's spec, one for each of `trees`; instances of a template share theirs.
 
     Args:
-        compiled_before: attachments of a log; an automaton among them is taken instead of compiling it again.
+        compiled_before: attachments of a log; an automaton among them is taken where it would take MONA.
     """
     stored = [each.data for each in compiled_before if _is_stored(each)]
     found: dict[int, KeptAutomaton] = {}
@@ -102,10 +102,14 @@ def _kept(
 ) -> KeptAutomaton:
     if semantics != "ltlf":
         return KeptAutomaton(name, file, spec, None, "an automaton is of the semantics ltlf")
-    for data in stored:
-        before = automaton_from(data, file, spec)
-        if before is not None:
-            return KeptAutomaton(name, file, spec, before)
+    try:
+        # rather than read what a log claims, where that takes no other program
+        return KeptAutomaton(name, file, spec, automaton(file, spec.name, compiler="own"))
+    except NoAutomatonError:
+        for data in stored:
+            before = automaton_from(data, file, spec)
+            if before is not None:
+                return KeptAutomaton(name, file, spec, before)
     try:
         return KeptAutomaton(name, file, spec, automaton(file, spec.name))
     except NoAutomatonError as error:
