@@ -5,6 +5,8 @@ Read in the order of time, the two passes over the same time would look like one
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
 from spatial_replay.errors import LogError
@@ -44,12 +46,12 @@ def without_jumps(columns: Columns, name: str) -> Columns:
 
 
 class _Recorded:
-    """How far the recording had come, up to a second before the newest message."""
+    """How far the recording had come at each of the last messages, a second back and a little more."""
 
     def __init__(self) -> None:
-        self._times = np.zeros(0, np.int64)
-        self._furthest = np.zeros(0, np.int64)
-        self._base = np.int64(-1)
+        self._latest: deque[tuple[Integers, Integers]] = deque()
+        self._before = -1
+        self._furthest = -1
 
     def first_jump(self, times_ns: Integers, places: Integers) -> int | None:
         """The first message that was recorded before one of more than a second earlier, or None.
@@ -59,13 +61,18 @@ class _Recorded:
         """
         if not len(times_ns):
             return None
-        times = np.concatenate([self._times, times_ns])
-        furthest = np.maximum(np.maximum.accumulate(np.concatenate([self._furthest, places])), self._base)
-        before = np.searchsorted(times, times_ns - DISORDER_NS) - 1
-        reached = np.where(before >= 0, furthest[before], self._base)
-        jumps = np.flatnonzero(places < reached)
-        settled = int(np.searchsorted(times, times[-1] - DISORDER_NS))
-        if settled:
-            self._base = furthest[settled - 1]
-        self._times, self._furthest = times[settled:], furthest[settled:]
+        is_ordered = places[0] >= self._furthest and (places[1:] >= places[:-1]).all()
+        furthest = places if is_ordered else np.maximum(np.maximum.accumulate(places), self._furthest)
+        self._latest.append((times_ns, furthest))
+        self._furthest = int(furthest[-1])
+        found = None if is_ordered else self._search(times_ns, places)
+        while self._latest[0][0][-1] < times_ns[-1] - DISORDER_NS:
+            self._before = int(self._latest.popleft()[1][-1])
+        return found
+
+    def _search(self, times_ns: Integers, places: Integers) -> int | None:
+        times = np.concatenate([times for times, _ in self._latest])
+        furthest = np.concatenate([[self._before], *(furthest for _, furthest in self._latest)])
+        earlier = np.searchsorted(times, times_ns - DISORDER_NS)
+        jumps = np.flatnonzero(places < furthest[earlier])
         return int(jumps[0]) if len(jumps) else None

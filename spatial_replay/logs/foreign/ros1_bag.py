@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator
 from functools import cached_property
 from pathlib import Path
@@ -59,7 +60,12 @@ class Ros1Bag:
 
     @cached_property
     def _topics(self) -> tuple[Topic, ...]:
-        return topics_named([self._topic(each) for each in self._directory.connections.values()])
+        counts: Counter[int] = Counter()
+        for chunk in self._directory.chunks:
+            counts.update(chunk.counts or {})
+        return topics_named(
+            self._topic(each, counts[each.number]) for each in self._directory.connections.values()
+        )
 
     @property
     def start_ns(self) -> int | None:
@@ -162,14 +168,13 @@ class Ros1Bag:
             places_in(rank, np.flatnonzero(rows)),
         )
 
-    def _topic(self, connection: Connection) -> Topic:
+    def _topic(self, connection: Connection, count: int) -> Topic:
         definition = connection.data.get("message_definition", b"")
-        counts = [chunk.counts.get(connection.number, 0) for chunk in self._directory.chunks if chunk.counts]
         return Topic(
             name=connection.topic,
             type=full_type_name(connection.type),
             encoding="ros1",
-            count=sum(counts) if self._directory.is_indexed else None,
+            count=count if self._directory.is_indexed else None,
             schema=Schema(connection.type, "ros1msg", definition),
             latched=connection.is_latched,
             metadata=MappingProxyType(

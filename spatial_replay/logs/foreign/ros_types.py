@@ -29,8 +29,9 @@ if TYPE_CHECKING:
 RosEncoding = Literal["ros1", "cdr"]
 
 _DISTRIBUTIONS = ("jazzy", "kilted", "lyrical", "iron", "humble", "galactic", "foxy", "eloquent", "dashing")
-_LITTLE_ENDIAN = b"\x00\x01"
-_MOST_PADDING = 3
+_PLAIN = (b"\x00\x01", b"\x00\x00")
+_MOST_AROUND = 7
+"""Bytes of a message that hold no field: four before them, and up to three that fill it up."""
 _KINDS: dict[int, Kind] = {3: "array", 4: "sequence"}
 
 
@@ -113,15 +114,17 @@ def _cdr_decoder(store: Typestore, type_name: str) -> Decoder:
     little, big, message_class = definition.deserialize_cdr_le, definition.deserialize_cdr_be, definition.cls
 
     def decode(payload: bytes) -> object:
-        deserialize = little if payload[:2] == _LITTLE_ENDIAN else big
         try:
             # alignment counts from behind the four bytes that say how the rest is encoded
-            message, end = deserialize(payload[4:], 0, message_class, store)
+            if payload[1]:
+                message, end = little(payload[4:], 0, message_class, store)
+            else:
+                message, end = big(payload[4:], 0, message_class, store)
         except Exception as error:
             raise LogError(f"a message is no {type_name}: {_reason(error)}") from None
-        if not 0 <= len(payload) - 4 - end <= _MOST_PADDING or payload[0] or payload[1] > 1:
-            expected = f"it has {len(payload)} bytes, {end + 4} were expected"
-            raise LogError(f"a message is no {type_name} in plain CDR: {expected}")
+        if not 4 <= len(payload) - end <= _MOST_AROUND or payload[:2] not in _PLAIN:
+            sizes = f"it has {len(payload)} bytes, {end + 4} were expected"
+            raise LogError(f"a message is no {type_name} in plain CDR: {sizes}")
         return message
 
     return decode
