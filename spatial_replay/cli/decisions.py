@@ -19,15 +19,8 @@ if TYPE_CHECKING:
     )
 
 
-def decision_lines(log: Path) -> Iterator[str]:
-    """Step by step: what was aimed at, tried, rejected and chosen, and how it went.
-
-    Raises:
-        UsageError: the log holds no decisions.
-    """
-    from spatial_replay.planning.told import read_decisions
-
-    decisions = read_decisions(log)
+def decision_lines(log: Path, decisions: Sequence[PlanDecision]) -> Iterator[str]:
+    """Step by step: what was aimed at, tried, rejected and chosen, and how it went."""
     motions = sum(decision.HasField("target") for decision in decisions)
     given_up = len(decisions[-1].pruned)
     yield (
@@ -38,21 +31,14 @@ def decision_lines(log: Path) -> Iterator[str]:
         yield from _lines(decision)
 
 
-def decision_rows(log: Path) -> list[dict[str, Any]]:
-    """The same as values for JSON.
-
-    Raises:
-        UsageError: the log holds no decisions.
-    """
+def decision_rows(decisions: Sequence[PlanDecision]) -> list[dict[str, Any]]:
+    """The same as values for JSON."""
     from google.protobuf.json_format import MessageToDict
 
-    from spatial_replay.planning.told import read_decisions
-
-    rows: list[dict[str, Any]] = []
-    for decision in read_decisions(log):
-        row = MessageToDict(decision, preserving_proto_field_name=True, use_integers_for_enums=False)
-        rows.append(_with_plain_times(row, decision))
-    return rows
+    return [
+        _with_plain_times(MessageToDict(decision, preserving_proto_field_name=True), decision)
+        for decision in decisions
+    ]
 
 
 def _with_plain_times(row: dict[str, Any], decision: PlanDecision) -> dict[str, Any]:

@@ -90,13 +90,19 @@ def info(
 
 def _decisions(log: Path, as_json: bool) -> int:
     """Print what was decided in a planned run."""
+    from spatial_replay.planning.told import read_decisions
+
+    told = read_decisions(log)
+    for warning in told.faults:
+        say("warning", warning, colour="yellow")
     if as_json:
-        document = {"name": log.name, "decisions": decision_rows(log)}
+        rows = decision_rows(told.decisions)
+        document = {"name": log.name, "damaged": bool(told.faults), "decisions": rows}
         click.echo(json.dumps(document, indent=2, ensure_ascii=False))
-        return ExitCode.SATISFIED
-    for line in decision_lines(log):
-        click.echo(line)
-    return ExitCode.SATISFIED
+    else:
+        for line in decision_lines(log, told.decisions):
+            click.echo(line)
+    return ExitCode.DAMAGED if told.faults else ExitCode.SATISFIED
 
 
 def _print_layout(log: Path) -> int:

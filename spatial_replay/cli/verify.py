@@ -48,20 +48,21 @@ def verify(log: Path, source: Path | None, decisions: bool, reading: Reading) ->
     made_of = None if source is None else open_source(source, **reading)
     with progress("samples") as advance:
         verified = verify_certificate(own, made_of, advance)
-    for fault in verified.faults:
-        say("warning", fault, colour="yellow")
-    differences = list(verified.differences)
+    faults, differences = list(verified.faults), list(verified.differences)
     if verified.recorded and not differences:
         click.echo(f"{log.name}: samples, messages, specifications and results are as recorded")
     if decisions:
         with progress("samples") as advance:
             redone = redo_decisions(own, advance)
+        faults += redone.faults
         differences += redone.differences
         if not redone.differences:
             click.echo(
                 f"{log.name}: {counted(redone.decisions, 'decision')} made again on "
                 f"{counted(redone.maps, 'map')}, all as recorded"
             )
+    for fault in dict.fromkeys(faults):
+        say("warning", fault, colour="yellow")
     for difference in differences:
         click.echo(f"{log.name}: {difference}")
     return ExitCode.VIOLATED if differences else ExitCode.SATISFIED

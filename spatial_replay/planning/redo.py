@@ -31,11 +31,13 @@ class Redone:
         decisions: how many there are in the log.
         maps: how many gradient maps were computed again, those of edges given up included.
         differences: what differs from the log, each with its place; none where all is as it was.
+        faults: what was lost while reading, each with its place.
     """
 
     decisions: int
     maps: int
     differences: tuple[str, ...]
+    faults: tuple[str, ...] = ()
 
 
 def redo_decisions(source: Source, advance: Callable[[int], None] = lambda samples: None) -> Redone:
@@ -51,10 +53,12 @@ def redo_decisions(source: Source, advance: Callable[[int], None] = lambda sampl
         LogError: what the plan was made with cannot be read.
     """
     check = _Check(BlackBox(planner_of(source)))
-    for samples, messages in _stretches(source):
-        check.run(samples, messages)
-        advance(len(samples))
-    return check.end()
+    faults: list[str] = []
+    for block in read_blocks(source):
+        faults += block.trace.faults
+        check.run(list(block.trace.samples()), list(_planned(block.messages)))
+        advance(len(block.trace))
+    return check.end(tuple(faults))
 
 
 def planner_of(source: Source) -> Planner:
@@ -78,13 +82,8 @@ def planner_of(source: Source) -> Planner:
     return Planner(specification, settings, name=kept.get("specification"))
 
 
-def _stretches(source: Source) -> Iterator[tuple[list[Sample], list[tuple[int, str, bytes]]]]:
-    """Samples, with the planner's messages of the same times as (time, topic, payload), in order."""
-    for block in read_blocks(source):
-        yield list(block.trace.samples()), list(_planned(block.messages))
-
-
 def _planned(messages: Messages) -> Iterator[tuple[int, str, bytes]]:
+    """The planner's messages, as (time, topic, payload)."""
     topics: Mapping[int, str] = {
         number: channel.topic for number, channel in messages.channels.items() if channel.topic in _TOPICS
     }
@@ -113,10 +112,11 @@ class _Check:
         if samples:
             self._compare_until(samples[-1].time_ns + 1)
 
-    def end(self) -> Redone:
+    def end(self, faults: tuple[str, ...]) -> Redone:
+        """What came of it, with what was lost meanwhile."""
         if self._waiting:
             self._compare_until(self._waiting[-1][0] + 1)
-        return Redone(self._decisions, self._maps, tuple(self._differences))
+        return Redone(self._decisions, self._maps, tuple(self._differences), faults)
 
     def _compare_until(self, end_ns: int) -> None:
         """Make the decisions again whose messages come before a time."""

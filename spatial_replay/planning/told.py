@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from google.protobuf.message import DecodeError
 
-from spatial_replay.errors import LogError, UsageError
+from spatial_replay.errors import UsageError
 from spatial_replay.logs.mcap_reader import McapSource
 from spatial_replay.logs.messages.PlanDecision_pb2 import PlanDecision
 from spatial_replay.logs.source import open_source
 from spatial_replay.planning.black_box import DECISION
 
 
-def read_decisions(log: Path) -> list[PlanDecision]:
-    """Every decision in a log, in order, each with its outcome if it has one.
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What a log tells of decisions.
+
+    Attributes:
+        decisions: one or more, in order, each with its outcome if it has one.
+        faults: what was lost while reading, each with its place.
+    """
+
+    decisions: tuple[PlanDecision, ...]
+    faults: tuple[str, ...]
+
+
+def read_decisions(log: Path) -> Told:
+    """Every decision in a log.
 
     Raises:
         UsageError: the log holds none.
@@ -22,17 +36,18 @@ def read_decisions(log: Path) -> list[PlanDecision]:
     """
     source = open_source(log)
     decisions: dict[int, PlanDecision] = {}
+    faults: list[str] = []
     if isinstance(source, McapSource):
-        for payloads, _ in source.iter_payloads(DECISION):
+        for payloads, lost in source.iter_payloads(DECISION):
+            faults += lost
             for payload in payloads:
                 try:
                     decision = PlanDecision.FromString(payload)
                 except DecodeError as error:
-                    raise LogError(
-                        f"{source.name}: a message on {DECISION} cannot be read: {error}"
-                    ) from error
+                    faults.append(f"{source.name}: a message on {DECISION} cannot be read: {error}")
+                    continue
                 # the one with the outcome comes later and says everything that the first one does
                 decisions[decision.number] = decision
     if not decisions:
         raise UsageError(f"{source.name} holds no decisions; `spatial-replay plan` makes logs that do")
-    return [decisions[number] for number in sorted(decisions)]
+    return Told(tuple(decisions[number] for number in sorted(decisions)), tuple(faults))

@@ -94,6 +94,19 @@ def test_decisions_are_told_step_by_step(tmp_path: Path) -> None:
     assert lines[-1] == "  the specification is satisfied: hold"
 
 
+def test_decisions_of_a_log_that_was_cut_short_are_told(tmp_path: Path) -> None:
+    record_plan_of(tmp_path / "run.mcap", slips=1)
+    whole = (tmp_path / "run.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])
+    code, said = call("info", tmp_path / "cut.mcap", "--decisions")
+    assert code == 3
+    assert "step 0 at 0.000 s, state 0" in said
+    code, said = call("verify", tmp_path / "cut.mcap", "--decisions")
+    assert code == 1
+    assert "made again" in said
+    assert "no certificate" in said
+
+
 def test_machines_get_decisions_in_json(tmp_path: Path) -> None:
     record_plan_of(tmp_path / "run.mcap")
     code, said = call("info", tmp_path / "run.mcap", "--decisions", "--json")

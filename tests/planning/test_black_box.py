@@ -32,7 +32,7 @@ def payloads(path, topic, kind):
 
 def test_decisions_are_told_with_their_outcomes(tmp_path):
     steps = record_plan_of(tmp_path / "run.mcap", slips=1)
-    told = read_decisions(tmp_path / "run.mcap")
+    told = read_decisions(tmp_path / "run.mcap").decisions
     assert [each.number for each in told] == list(range(len(steps)))
     assert [each.outcome.succeeded for each in told[:-1]] == [False, *[True] * (len(steps) - 2)]
     assert told[0].outcome.reason == "it slipped"

@@ -27,7 +27,7 @@ def test_three_blocks_are_pushed_one_after_the_other(pushed: tuple[Path, Planned
     path, planned = pushed
     assert planned.satisfied
     assert planned.pruned >= 1
-    first, *_ = read_decisions(path)
+    first, *_ = read_decisions(path).decisions
     assert "no object can do it" in first.considered[0].pruned
     assert len(first.considered[0].path) == 2
     assert planned.steps >= 2
@@ -44,7 +44,7 @@ def test_decisions_and_certificate_are_confirmed(pushed: tuple[Path, PlannedRun]
     assert verify_certificate(source).differences == ()
     redone = redo_decisions(source)
     assert redone.differences == ()
-    assert redone.decisions == len(read_decisions(pushed[0]))
+    assert redone.decisions == len(read_decisions(pushed[0]).decisions)
 
 
 def test_what_cannot_be_done_ends_and_says_why(tmp_path: Path) -> None:
@@ -54,7 +54,7 @@ def test_what_cannot_be_done_ends_and_says_why(tmp_path: Path) -> None:
     assert planned.ended == "no path"
     assert planned.reason.startswith("no path left")
     assert planned.steps == 0
-    (decision,) = read_decisions(tmp_path / "run.mcap")
+    (decision,) = read_decisions(tmp_path / "run.mcap").decisions
     assert [(each.source, each.target) for each in decision.pruned] == [(0, 1)]
 
 
