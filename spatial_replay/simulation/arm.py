@@ -35,6 +35,8 @@ _SETTLING_TICKS = 30
 _GRIP_FORCE = 25.0
 _MIDDLE, _FURTHEST = 0.78, 2.75
 """The middle of what the tool turns against the direction from the base, and how far it turns either way."""
+_NEAREST, _FARTHEST = 0.27, 0.77
+"""How near to the base and how far from it the tool comes to the table, in metres."""
 _INSIDE = 0.33
 """The tool travels around the base at no less than this distance from it, in metres."""
 
@@ -159,6 +161,11 @@ def turn_towards(yaw: float, x: float, y: float, period: float = math.pi) -> flo
     """
     low = math.atan2(y, x) + _MIDDLE - period / 2
     return low + (yaw - low) % period
+
+
+def in_reach(x: float, y: float) -> bool:
+    """Whether the tool, pointing down, comes to a point on the table."""
+    return _NEAREST <= math.hypot(x, y) <= _FARTHEST
 
 
 def can_turn(yaw: float, x: float, y: float) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,8 @@ _FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
 _GAINS = (0.3,) * JOINTS
 _WOOD = 0.5
 """Friction of what has no other."""
+_FRICTION = MappingProxyType({"lateralFriction": _WOOD, "spinningFriction": 2e-3, "rollingFriction": 2e-3})
+"""Friction of bodies; what rolls comes to rest, as on a table that is not quite smooth."""
 
 
 class Engine:
@@ -81,7 +83,7 @@ class Engine:
     ) -> None:
         """Put a body into the world, its axis z upwards; a mass of 0 fixes it."""
         number = self._add(shape, mass, position, yaw, (*colour, 1.0))
-        self._call("changeDynamics", number, -1, lateralFriction=_WOOD, spinningFriction=2e-3)
+        self._call("changeDynamics", number, -1, **_FRICTION)
         self._bodies[name] = number
 
     def pose(self, name: str) -> Pose:

@@ -12,6 +12,7 @@ from spatial_replay.simulation.arm import (
     FINGERTIP,
     WIDEST,
     can_turn,
+    in_reach,
     turn_towards,
 )
 from spatial_replay.simulation.scene import Scene, extent, rectangle
@@ -51,12 +52,16 @@ class Grasp:
 
 def best_grasp(scene: Scene, name: str, goal: Point, yaw: float | None) -> Grasp | str:
     """The grasp with the most room, of those the thinnest; or why there is none."""
+    start = scene.place_of(name)
+    if not in_reach(*start):
+        return f"{name} lies out of the robot's reach"
+    if not in_reach(*goal):
+        return f"({goal[0]:.2f}, {goal[1]:.2f}) is out of the robot's reach"
     across = [(thickness, angle) for thickness, angle in _angles(scene, name) if thickness <= _THICKEST]
     if not across:
         return f"{name} is too thick for the gripper as it lies"
     bottom, top = scene.height(name)
     above_bottom = max(FINGERTIP + 0.003, top - bottom - _BELOW_TOP)
-    start = scene.place_of(name)
     best, best_room, can_pick = None, _ROOM, False
     for thickness, angle in sorted(across):
         opening = min(WIDEST, thickness + _OPENING)

@@ -7,7 +7,14 @@ from collections.abc import Generator, Sequence
 
 import numpy as np
 
-from spatial_replay.simulation.arm import FINGER_DEPTH, FINGER_WIDTH, FINGERTIP, TICKS_PER_S, turn_towards
+from spatial_replay.simulation.arm import (
+    FINGER_DEPTH,
+    FINGER_WIDTH,
+    FINGERTIP,
+    TICKS_PER_S,
+    in_reach,
+    turn_towards,
+)
 from spatial_replay.simulation.scene import Scene, extent, rectangle
 from spatial_replay.simulation.world import Execution
 
@@ -82,6 +89,8 @@ def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, str]:
     u, v = math.cos(heading), math.sin(heading)
     back = u * x + v * y - extent(scene.footprint(name), heading)[0] + FINGER_DEPTH / 2
     behind = (x - u * (back + _AWAY), y - v * (back + _AWAY))
+    if not (in_reach(*behind) and in_reach(*goal)):
+        return f"the robot does not reach far enough to push {name} there"
     gap = _gap(scene, name, behind, heading)
     if gap is None:
         return f"no room for the fingers behind {name}"

@@ -140,3 +140,12 @@ def test_wrong_uses_are_refused() -> None:
         make_world("chess")
     with pytest.raises(UsageError, match="the noise is -1"):
         make_world("push", noise_m=-1)
+
+
+def test_what_is_out_of_reach_is_said() -> None:
+    with world("pick-place") as (made, _):
+        assert made.place("banana", 0.1, 0.1).reason == "(0.10, 0.10) is out of the robot's reach"
+    with world("push") as (made, _):
+        done = made.push("green", [(0.9, 0.0)])
+        assert done.reason == "the robot does not reach far enough to push green there"
+        assert made.time_ns == 0
