@@ -1,4 +1,4 @@
-"""What must hold for every gradient map."""
+"""What must hold for every gradient map and every planner."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from hypothesis import strategies as st
 
 import spatial_replay as sr
 from spatial_replay.planning.maps import proposition_maps
+from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.poses import centre_of, moved_object
+from spatial_replay.planning.settings import Settings
+from spatial_replay.planning.step import Outcome
 from spatial_replay.planning.workspace import Grid, Workspace
 
 TEXTS = (
@@ -82,3 +85,108 @@ def test_a_moved_object_is_where_it_was_moved_to(body, x, y, turn):
     assert np.allclose(centre_of(moved.footprint), (x, y), atol=1e-9)
     if body.yaw is not None:
         assert moved.yaw == body.yaw + turn
+
+
+# ------------------------------------------------------------------------------------------ planners
+
+THINGS = ("a", "b", "c")
+GOALS = (
+    "{0} leftof {1}",
+    "{0} above {1}",
+    "{0} dist {1} >= 3",
+    "{0} dist {1} <= 1",
+    "{0} enclosedin here",
+    "not ({0} closeto[2] {1})",
+    "{0} leftof {1} and {0} rightof {1}",
+    "{0} dist unseen <= 1",
+)
+TASKS = (
+    "F ({0})",
+    "G ({0})",
+    "(not ({0})) U ({1})",
+    "F ({0} and X ({1}))",
+    "G (({0}) -> F ({1}))",
+    "F[0,3] ({0})",
+)
+
+
+@st.composite
+def tasks(draw):
+    """Specifications with an automaton, many of which cannot be satisfied."""
+
+    def goal():
+        first, second = draw(st.permutations(THINGS))[:2]
+        return draw(st.sampled_from(GOALS)).format(first, second)
+
+    count = draw(st.integers(1, 3))
+    parts = [f"({draw(st.sampled_from(TASKS)).format(goal(), goal())})" for _ in range(count)]
+    return sr.parse_specification(f"region here = circle((3, 3), 2)\nspec s = {' and '.join(parts)}")
+
+
+@st.composite
+def settings_of_planners(draw):
+    workspace = Workspace(
+        Grid(-6.0, -6.0, 1.0, 12, 12),
+        nearest=draw(st.sampled_from([0.0, 2.0])),
+        clearance=draw(st.sampled_from([0.0, 0.5])),
+    )
+    return Settings(
+        workspace,
+        draw(st.sampled_from(["push", "place"])),
+        movable=draw(st.sampled_from([None, ("a",), ("a", "b"), ()])),
+        margin=draw(st.sampled_from([0.0, 0.3])),
+        constraint_margin=draw(st.sampled_from([0.0, 0.3])),
+        attempts=draw(st.integers(1, 2)),
+    )
+
+
+@given(tasks(), settings_of_planners(), st.integers(0, 2**32 - 1))
+@settings(max_examples=60)
+def test_a_planner_comes_to_an_end_and_says_what_it_gave_up(specification, options, seed):
+    random = np.random.default_rng(seed)
+    planner = Planner(specification, options)
+    most = 1 + options.attempts * len(planner.automaton.transitions)
+    places = random.uniform(-5, 5, (len(THINGS), 2))
+    shape = sr.TrackedObject(sr.Footprint.box(0, 0, 1, 1))
+    scene = {name: moved_object(shape, *place) for name, place in zip(THINGS, places, strict=True)}
+    planner.observe(sr.Sample(0, scene))
+    for time_ns in range(1, most + 1):
+        step = planner.next_step()
+        if step.kind != "execute":
+            break
+        # now and then an object ends up anywhere
+        name, succeeds = step.target.name, random.random() < 0.7
+        x, y = (step.target.x, step.target.y) if succeeds else random.uniform(-5, 5, 2)
+        scene = {**scene, name: moved_object(scene[name], x, y)}
+        planner.observe(sr.Sample(time_ns, scene))
+        planner.conclude(Outcome(succeeds))
+        assert name in (options.movable or THINGS)
+    assert step.kind != "execute"
+    assert planner.is_accepting or step.kind != "hold" or len(planner.states) > 1
+    if step.kind == "no path":
+        assert step.reason.startswith("no path left")
+        assert all(reason for _, reason in step.pruned)
+
+
+@given(tasks(), settings_of_planners(), st.integers(0, 2**32 - 1))
+@settings(max_examples=40)
+def test_a_target_is_free_and_holds_as_well_as_it_says(specification, options, seed):
+    random = np.random.default_rng(seed)
+    planner = Planner(specification, options)
+    shape = sr.TrackedObject(sr.Footprint.box(0, 0, 1, 1))
+    scene = {name: moved_object(shape, *random.uniform(-5, 5, 2)) for name in THINGS}
+    planner.observe(sr.Sample(0, scene))
+    step = planner.next_step()
+    if step.target is None:
+        return
+    (chosen,) = [each for each in step.candidates if each.is_chosen]
+    cell = options.workspace.grid.cell(step.target.x, step.target.y)
+    assert chosen.map.values[0][cell] == step.target.robustness
+    assert step.target.robustness >= options.margin
+    assert math.dist((step.target.x, step.target.y), (0.0, 0.0)) >= options.workspace.nearest
+    assert step.target.waypoints[-1] == (step.target.x, step.target.y)
+    # and the automaton takes the edge once the object is there
+    moved = moved_object(scene[step.target.name], step.target.x, step.target.y)
+    planner.observe(sr.Sample(1, {**scene, step.target.name: moved}))
+    if options.margin > 0.0:
+        assert planner.states == (step.considered[-1].edge[1],)
