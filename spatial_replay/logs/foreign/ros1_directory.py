@@ -30,7 +30,11 @@ from spatial_replay.logs.mcap_records import DamageError
 
 _STRIDE = 2**20
 _CHUNK_MARK = b"\x04\x00\x00\x00op=\x05"
+_BEFORE_MARK = (4, 17, 23, 24, 36, 37)
+"""Where a chunk's head may begin before its opcode: its length, then its other fields in any order."""
 _CHUNK_HEAD_BYTES = range(20, 80)
+_MOST_GAPS, _MOST_MARKS = 1_000, 100_000
+"""Damaged stretches, and bytes that look like a chunk's, after which the rest of a file is not searched."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,14 +224,17 @@ class _Scan:
         self._faults = faults
         self._name = name
         self._found = BagDirectory()
+        self._marks = 0
 
     def directory(self) -> BagDirectory:
         position = len(BAG_MAGIC)
+        gaps = 0
         while position < self._size:
             try:
                 position = self._take_in(position)
             except DamageError as damage:
-                following = self._next_chunk(position + 1)
+                gaps += 1
+                following = self._next_chunk(position + 1) if gaps < _MOST_GAPS else None
                 lost = (following or self._size) - position
                 self._faults.add(f"{self._name}: at byte {position}: {damage}; {lost} bytes cannot be read")
                 if following is None:
@@ -266,9 +273,12 @@ class _Scan:
             window = self._stream.read(_STRIDE + overlap)
             found = window.find(_CHUNK_MARK)
             while found >= 0:
-                for begin in range(max(0, found - max(_CHUNK_HEAD_BYTES)), found - 3):
-                    length = int.from_bytes(window[begin : begin + 4], "little")
-                    if length in _CHUNK_HEAD_BYTES and self._is_chunk(position + begin):
+                self._marks += 1
+                if self._marks > _MOST_MARKS:
+                    return None
+                for begin in (found - before for before in reversed(_BEFORE_MARK)):
+                    length = int.from_bytes(window[max(0, begin) : max(0, begin) + 4], "little")
+                    if begin >= 0 and length in _CHUNK_HEAD_BYTES and self._is_chunk(position + begin):
                         return position + begin
                 found = window.find(_CHUNK_MARK, found + 1)
             position += _STRIDE
