@@ -90,7 +90,7 @@ class AnnotatedEvaluation:
             for tree, stream, concerns in zip(self.trees, self.streams, self._concerns, strict=True)
         ]
         self._tellers = [
-            EventTeller(tree, stream.instance, files[tree.file])
+            EventTeller(tree, stream.instance, files[tree.file], semantics)
             for tree, stream in zip(self.trees, self.streams, strict=True)
         ]
         self._encoder = SceneEncoder(shown_regions(files))

@@ -28,6 +28,7 @@ from spatial_replay.inspection.standings import (
 from spatial_replay.inspection.words import number_text
 from spatial_replay.monitor.channels import low_and_high
 from spatial_replay.monitor.instances import Instance
+from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.signal_table import looks_ahead
 from spatial_replay.monitor.stream import Stretch
 from spatial_replay.spec.format import format_formula
@@ -68,8 +69,11 @@ class EventTeller:
     What it keeps from one stretch of samples to the next is a few numbers for each of these.
     """
 
-    def __init__(self, tree: ReportedTree, instance: Instance, file: Specification) -> None:
+    def __init__(
+        self, tree: ReportedTree, instance: Instance, file: Specification, semantics: Semantics = "ltlf"
+    ) -> None:
         """Before the first sample."""
+        self._settles = semantics == "ltlf"  # the paper's knows no continuation, and so no verdict that stays
         self._tree, self._filename = tree, "" if file.filename == "<text>" else file.filename
         self._watched = _watched(tree, instance, file)
         self._nodes = np.array([each.node for each in self._watched], np.int64)
@@ -83,7 +87,9 @@ class EventTeller:
         """Take in the next samples; the changes that they confirm, by node, then in the order of time."""
         if not len(stretch.times_ns) or self._standings.are_final:
             return []
-        followed = follow(self._standings, stretch.times_ns, stretch.series, self._nodes)
+        followed = follow(
+            self._standings, stretch.times_ns, stretch.series, self._nodes, settles=self._settles
+        )
         self._standings = followed.standings
         told = [self._told(change, stretch) for change in followed.changes]
         carried = {}
@@ -108,11 +114,11 @@ class EventTeller:
         watched, after, before = self._watched[change.node], change.after, change.before
         witness = self._words(self._attained(change.node, after, stretch))
         sentence = _sentence(watched.title, after, witness)
-        facts = self._facts(watched) | _facts(after, witness, "")
+        facts = self._facts(watched) | self._facts_of(after, witness, "")
         if before is not None:
             witness = self._words(self._attained(change.node, before, stretch), past=True)
             sentence += _before(before, after.start_ns, witness)
-            facts |= _facts(before, witness, "_before")
+            facts |= self._facts_of(before, witness, "_before")
             facts |= {"start_ns_before": str(before.start_ns), "end_ns_before": str(before.end_ns)}
         event = Event(start_time=_stamp(after.start_ns), end_time=_stamp(after.end_ns))
         for key, text in (facts | {"message": sentence}).items():
@@ -142,6 +148,16 @@ class EventTeller:
     def _facts(self, watched: Watched) -> dict[str, str]:
         of = {} if self._tree.object is None else {"object": self._tree.object}
         return {"specification": self._tree.name, **of, "node": str(watched.node), "name": watched.name}
+
+    def _facts_of(self, period: Period, witness: str, suffix: str) -> dict[str, str]:
+        sign = "positive" if period.code in (HOLDING, SATISFIED) else "negative"
+        verdict = "pending"
+        if not self._settles or period.code in (SATISFIED, VIOLATED):
+            verdict = "satisfied" if sign == "positive" else "violated"
+        facts = {"verdict": verdict, "sign": sign, "robustness": repr(period.worst)}
+        if witness:
+            facts["witness"] = witness
+        return {f"{key}{suffix}": text for key, text in facts.items()}
 
 
 def _watched(tree: ReportedTree, instance: Instance, file: Specification) -> list[Watched]:
@@ -181,12 +197,6 @@ _LEVELS: Final[Mapping[int, Log.Level.ValueType]] = {
     SATISFIED: Log.INFO,
     VIOLATED: Log.ERROR,
 }
-_VERDICTS: Final[Mapping[int, tuple[str, str]]] = {
-    HOLDING: ("pending", "positive"),
-    FAILING: ("pending", "negative"),
-    SATISFIED: ("satisfied", "positive"),
-    VIOLATED: ("violated", "negative"),
-}
 
 
 def _sentence(title: str, after: Period, witness: str) -> str:
@@ -206,14 +216,6 @@ def _before(before: Period, until_ns: int, witness: str) -> str:
         number = number_text(abs(before.worst))
         worst = f", by {number} or more" if before.code == HOLDING else f", by up to {number}"
     return f" Before, it {did} for {seconds}{worst}."
-
-
-def _facts(period: Period, witness: str, suffix: str) -> dict[str, str]:
-    verdict, sign = _VERDICTS[period.code]
-    facts = {"verdict": verdict, "sign": sign, "robustness": repr(period.worst)}
-    if witness:
-        facts["witness"] = witness
-    return {f"{key}{suffix}": text for key, text in facts.items()}
 
 
 def _stamp(time_ns: int) -> Timestamp:

@@ -98,19 +98,22 @@ class Followed(NamedTuple):
     places: Integers
 
 
-def follow(before: Standings, times_ns: Integers, series: Floats, nodes: Integers) -> Followed:
+def follow(
+    before: Standings, times_ns: Integers, series: Floats, nodes: Integers, *, settles: bool = True
+) -> Followed:
     """Take in the next samples.
 
     Args:
         times_ns: (T,).
         series: (N, 4, T): value, now, lower, upper.
         nodes: (K,) int64, ids of the nodes that are watched.
+        settles: whether an interval on one side of 0 is a verdict that stays.
     """
     integers, worst = before.integers.copy(), before.worst.copy()
     places = np.tile(np.array([OF_STANDING, OF_CANDIDATE], np.int64), (len(nodes), 1))
     room = len(nodes) * (len(times_ns) // LASTING + 2)
     found, numbers = np.empty((room, 10), np.int64), np.empty((room, 2))
-    count = _follow(times_ns, series, nodes, integers, worst, places, found, numbers)
+    count = _follow(times_ns, series, nodes, settles, integers, worst, places, found, numbers)
     changes = []
     for row, (worst_before, worst_after) in zip(
         found[:count].tolist(), numbers[:count].tolist(), strict=True
@@ -127,6 +130,7 @@ def _follow(
     times_ns: Integers,
     series: Floats,
     nodes: Integers,
+    settles: bool,
     integers: Integers,
     worst: Floats,
     places: Integers,
@@ -142,9 +146,9 @@ def _follow(
             if state[_CODE] >= SATISFIED:
                 break
             code, number = START, value[t]
-            if lower[t] >= 0.0:
+            if settles and lower[t] >= 0.0:
                 code, number = SATISFIED, lower[t]
-            elif upper[t] < 0.0:
+            elif settles and upper[t] < 0.0:
                 code, number = VIOLATED, upper[t]
             elif value[t] >= 0.0:
                 code = HOLDING

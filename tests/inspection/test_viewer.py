@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
-import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
 
 import spatial_replay as sr
+from inspection.message_paths import split, values
+from spatial_replay.inspection.viewer import Contents, layout_for_live
 from spatial_replay.logs.source import MemorySource, open_source
 from spatial_replay.replay import run_replay
 
@@ -38,13 +42,121 @@ def panels(tree: object) -> set[str]:
     return {tree} if isinstance(tree, str) else panels(tree["first"]) | panels(tree["second"])
 
 
-def test_every_panel_is_placed_and_every_topic_is_in_the_log(tmp_path):
-    log = run(tmp_path, TEXT)
+def paths_of(config: Any) -> Iterator[str]:
+    """Every message path, and every topic, in a layout."""
+    if isinstance(config, str):
+        if config.startswith("/"):
+            yield config
+    elif isinstance(config, dict):
+        for key, value in config.items():
+            yield from paths_of(key)
+            yield from paths_of(value)
+    elif isinstance(config, list):
+        for value in config:
+            yield from paths_of(value)
+
+
+def check_layout(log: Path) -> dict:
+    """That every panel is placed once and finds what it shows; the layout."""
     layout = layout_of(log)
     assert panels(layout["layout"]) == set(layout["configById"])
-    with log.open("rb") as stream:
-        topics = {channel.topic for channel in make_reader(stream).get_summary().channels.values()}
-    assert set(re.findall(r"/spatial/\w+", json.dumps(layout))) <= topics
+    for path in paths_of(layout["configById"]):
+        assert values(log, path), path
+    return layout
+
+
+RECORDINGS = Path(__file__).parents[2] / "recordings"
+
+
+@pytest.mark.parametrize("specification", ["table.spatial", "table_edited.spatial"])
+def test_every_path_of_a_layout_finds_something_in_its_log(tmp_path, specification):
+    output = tmp_path / "annotated.mcap"
+    files = [sr.load_specification(RECORDINGS / specification)]
+    run_replay(open_source(RECORDINGS / "table.jsonl"), files, output=output)
+    layout = check_layout(output)
+    kinds = {panel.partition("!")[0] for panel in layout["configById"]}
+    assert kinds == {"3D", "Plot", "RawMessages", "RosOut", "StateTransitions", "Table"}
+
+
+def test_a_layout_shows_nothing_that_its_log_has_not(tmp_path):
+    text = "spec settled = G[0s, 0.2s] battery >= 0"  # no automaton, no event, nothing to draw
+    log = tmp_path / "run.mcap"
+    with sr.Recorder(log, specifications=[sr.parse_specification(text)]) as recorder:
+        recorder.write(sr.Sample(0, {}, {"battery": -1.0}))
+        recorder.write(sr.Sample(10**8, {}, {"battery": 1.0}))
+    layout = check_layout(log)
+    assert [path["label"] for path in layout["configById"]["Plot!robustness"]["paths"]] == [
+        "settled [units of battery]"
+    ]
+
+
+def test_any_node_is_found_by_name_and_by_id(tmp_path):
+    log = run(tmp_path, 'spec close = a closeto[2] b\nspec "so near" = F (close and a farfrom[0] b)')
+    [document] = sr.evaluate(
+        sr.parse_specification('spec close = a closeto[2] b\nspec "so near" = F (close and a farfrom[0] b)'),
+        sr.read_trace(log),
+    ).results
+    close = document.node("close")
+    for field in ("value", "now", "lower", "upper"):
+        by_name = values(
+            log, f'/spatial/robustness{{specification=="so near"}}.nodes[:]{{name=="close"}}.{field}'
+        )
+        by_id = values(
+            log, f'/spatial/robustness{{specification=="so near"}}.nodes[:]{{id=={close.id}}}.{field}'
+        )
+        assert by_name == by_id == getattr(close, field).tolist()
+
+
+def test_parts_that_look_ahead_are_plotted_by_their_value_and_others_as_they_are_now(tmp_path):
+    text = "spec close = a closeto[2] b\nspec met = F close\nspec all_of_it = met and G a farfrom[0] b"
+    parts = layout_of(run(tmp_path, text))["configById"]["Plot!parts"]["paths"]
+    assert [(path["label"], path["value"].rpartition("}")[2]) for path in parts] == [
+        ("met in all_of_it", ".value"),
+        ("close in all_of_it", ".now"),
+    ]
+
+
+def test_a_planned_run_has_its_map_path_and_decision(tmp_path):
+    first = run(tmp_path, TEXT)
+    planned = tmp_path / "planned.mcap"
+    with first.open("rb") as source, planned.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        channels = {
+            topic: writer.register_channel(topic, "json", 0)
+            for topic in ("/plan/decision", "/plan/gradient_map", "/plan/path")
+        }
+        for channel in channels.values():
+            writer.add_message(channel, 0, b"{}", 0)
+        for schema, channel, message in make_reader(source).iter_messages(["/spatial/objects"]):
+            if channel.topic not in channels:
+                kept = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, "protobuf", kept)
+            writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    files = [sr.parse_specification(TEXT)]
+    annotated, layer = tmp_path / "annotated.mcap", tmp_path / "layer.mcap"
+    run_replay(open_source(planned), files, output=annotated)
+    run_replay(open_source(planned), files, output=layer, layer=True)
+    layout = layout_of(annotated)
+    shown = layout["configById"]["3D!scene"]["topics"]
+    assert set(shown) == {"/spatial/scene", "/plan/gradient_map", "/plan/path"}
+    low, high = (shown["/plan/gradient_map"][end] for end in ("minValue", "maxValue"))
+    assert -low == high > 0
+    assert layout["configById"]["RawMessages!decision"] == {"topicPath": "/plan/decision.reason"}
+    assert panels(layout["layout"]) == set(layout["configById"])
+    assert "/plan/" not in json.dumps(layout_of(layer))
+
+
+def test_the_layout_for_a_live_server_has_its_constants():
+    layout = layout_for_live(Contents((), (), None, (), 1.0))
+    assert panels(layout["layout"]) == set(layout["configById"]) == {"3D!scene", "Parameters!constants"}
+
+
+@pytest.mark.parametrize("path", ["spatial/a", "/a.", "/a{b=1}", "/a[x]", '/a{b=="c}'])
+def test_what_is_no_path_is_not_taken_for_one(path):
+    with pytest.raises(ValueError, match=r"path|topic"):
+        split(path)
 
 
 def test_every_result_has_its_curve_under_its_name(tmp_path):

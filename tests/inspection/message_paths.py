@@ -1,0 +1,58 @@
+"""The part of viewers' message paths that layouts use, read and followed as they do it.
+
+A topic, then any number of filters `{field==literal}`, fields `.name` and slices `[1]`, `[:]`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+_PARTS = re.compile(
+    r"\.(?P<field>\w+)"
+    r"|\[(?P<slice>\d+|:)\]"
+    r'|\{(?P<key>\w+(?:\.\w+)*)==(?P<literal>-?\d+|true|false|"(?:[^"\\]|\\.)*")\}'
+)
+
+
+def split(path: str) -> tuple[str, list[re.Match[str]]]:
+    """The topic and the parts of a path; raises ValueError for anything else."""
+    topic = re.match(r"(/\w+)+", path)
+    if topic is None:
+        raise ValueError(f"{path!r} begins with no topic")
+    parts, at = [], topic.end()
+    while at < len(path):
+        found = _PARTS.match(path, at)
+        if found is None:
+            raise ValueError(f"{path[at:]!r} in {path!r} is no part of a path")
+        parts.append(found)
+        at = found.end()
+    return topic.group(), parts
+
+
+def values(log: Path, path: str) -> list[Any]:
+    """What a path finds in a log, message after message."""
+    topic, parts = split(path)
+    with log.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        decoded = reader.iter_decoded_messages(topics=[topic])
+        return [value for each in decoded for value in _follow([each.decoded_message], parts)]
+
+
+def _follow(items: list[Any], parts: list[re.Match[str]]) -> Iterator[Any]:
+    for part in parts:
+        if part["field"]:
+            items = [getattr(item, part["field"]) for item in items]
+        elif part["slice"] == ":":
+            items = [inner for item in items for inner in item]
+        elif part["slice"]:
+            items = [item[int(part["slice"])] for item in items if len(item) > int(part["slice"])]
+        else:
+            items = [item for item in items if getattr(item, part["key"]) == json.loads(part["literal"])]
+    yield from items

@@ -1,0 +1,159 @@
+"""What is told of a run: which changes, when, and in which words."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from foxglove_schemas_protobuf.Event_pb2 import Event
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from mcap.reader import make_reader
+from mcap.records import Message
+
+import spatial_replay as sr
+from spatial_replay.logs.source import MemorySource
+from spatial_replay.replay import run_replay
+
+STEP_NS = 10**8
+
+
+def told(
+    tmp_path: Path, text: str, *charges: float | None, **options: object
+) -> list[tuple[int, Event, Log]]:
+    """The events and sentences of a run of batteries, with the number of the sample they are logged at."""
+    samples = [
+        sr.Sample(10**9 + t * STEP_NS, {}, {} if charge is None else {"battery": charge})
+        for t, charge in enumerate(charges)
+    ]
+    return written(tmp_path, text, samples, **options)
+
+
+def written(
+    tmp_path: Path, text: str, samples: list[sr.Sample], **options: object
+) -> list[tuple[int, Event, Log]]:
+    output = tmp_path / "annotated.mcap"
+    files = [sr.parse_specification(text, filename="battery.spatial")]
+    run_replay(MemorySource.from_samples(samples), files, output=output, **options)
+    events, lines = (_messages(output, topic) for topic in ("/spatial/events", "/spatial/log"))
+    found = []
+    for event, line in zip(events, lines, strict=True):
+        assert event.log_time == line.log_time == line.publish_time
+        number = (event.log_time - samples[0].time_ns) // STEP_NS
+        found.append((number, Event.FromString(event.data), Log.FromString(line.data)))
+    return found
+
+
+def _messages(log: Path, topic: str) -> list[Message]:
+    with log.open("rb") as stream:
+        return [message for *_, message in make_reader(stream).iter_messages([topic])]
+
+
+def facts(event: Event) -> dict[str, str]:
+    return {pair.key: pair.value for pair in event.metadata}
+
+
+def test_a_sign_is_told_when_it_lasts_three_samples(tmp_path):
+    charges = [1.0, -1.0, -2.0, 1.0, -3.0, -4.0, -2.0, -1.0, 5.0]
+    [(number, event, line)] = told(tmp_path, "spec last = F G battery >= 0", *charges)
+    assert number == 6
+    assert event.start_time.ToNanoseconds() == 10**9 + 4 * STEP_NS
+    assert event.end_time.ToNanoseconds() == line.timestamp.ToNanoseconds() == 10**9 + 6 * STEP_NS
+    assert facts(event) == {
+        "specification": "last",
+        "node": "0",
+        "name": "last",
+        "verdict": "pending",
+        "sign": "negative",
+        "robustness": "-4.0",
+        "witness": "`battery >= 0` fails by 4",
+        "verdict_before": "pending",
+        "sign_before": "positive",
+        "robustness_before": "1.0",
+        "witness_before": "`battery >= 0` held by 1",
+        "start_ns_before": "1000000000",
+        "end_ns_before": "1300000000",
+        "message": line.message,
+    }
+    assert line.message == (
+        "`last` fails so far: `battery >= 0` fails by 4. "
+        "Before, it held for 0.400 s; its worst was that `battery >= 0` held by 1."
+    )
+    assert (line.level, line.name, line.file, line.line) == (Log.WARNING, "last", "battery.spatial", 1)
+
+
+def test_a_verdict_is_told_at_once(tmp_path):
+    text = "# a comment\nspec kept = G battery >= 0"
+    [(number, event, line)] = told(tmp_path, text, 2.0, 1.0, -1.0, 5.0, -7.0)
+    assert number == 2
+    assert event.start_time == event.end_time
+    assert facts(event)["verdict"] == "violated"
+    assert (line.level, line.line) == (Log.ERROR, 2)
+    assert line.message.startswith("`kept` is violated, whatever comes: `battery >= 0` fails by 1.")
+
+
+def test_a_verdict_of_the_first_sample_has_nothing_before(tmp_path):
+    [(number, event, line)] = told(tmp_path, "spec kept = G battery >= 0", -1.0, 1.0)
+    assert number == 0
+    assert not any(key.endswith("_before") for key in facts(event))
+    assert line.message == "`kept` is violated, whatever comes: `battery >= 0` fails by 1."
+
+
+def test_how_it_begins_is_no_change(tmp_path):
+    assert not told(tmp_path, "spec last = F G battery >= 0", 1.0, 1.0, 1.0, 1.0)
+
+
+def test_samples_that_say_nothing_are_no_sign(tmp_path):
+    charges = [1.0, -1.0, None, -1.0, -1.0, None, -1.0, -1.0, -1.0]
+    [(number, *_)] = told(tmp_path, "spec last = F G battery >= 0", *charges)
+    assert number == 8
+
+
+def test_without_a_witness_in_the_same_sample_there_is_none(tmp_path):
+    # what decides is the second sample; that it does is known when the window closes
+    [(number, event, line)] = told(tmp_path, "spec soon = F[0s, 0.3s] battery >= 5", 1.0, 4.0, 3.0, 2.0, 1.0)
+    assert number == 3
+    assert "witness" not in facts(event)
+    assert line.message.startswith("`soon` is violated, whatever comes, by 1.")
+
+
+def test_named_parts_that_later_samples_can_change_are_told_too(tmp_path):
+    text = (
+        "spec full = battery >= 1\nspec filled = F full\nspec never_empty = G battery >= 0\n"
+        "spec both = filled and never_empty"
+    )
+    names = [(line.name, line.message) for *_, line in told(tmp_path, text, 0.5, 2.0, 2.0, 2.0, 2.0)]
+    assert [name for name, _ in names] == ["filled", "both"]
+    assert names[0][1].startswith("`filled` in `both` is satisfied")
+
+
+def test_a_template_says_for_whom(tmp_path):
+    samples = [
+        sr.Sample(t * STEP_NS, {"a": sr.Footprint.box(0, 0, 1, 1), "b": sr.Footprint.box(t, 0, t + 1, 1)})
+        for t in range(6)
+    ]
+    found = written(tmp_path, "spec near(x) = G x closeto[2] a", samples, each={"x": "all"})
+    [(_, event, line)] = found
+    assert facts(event)["object"] == "b"
+    assert line.message.startswith("`near` for b is violated, whatever comes: `b closeto[2] a` fails by 1.")
+
+
+def test_negated_and_implied_atoms_are_witnesses_in_their_own_sign(tmp_path):
+    [(_, event, _)] = told(tmp_path, "spec spared = G not battery >= 2", 1.0, 3.0)
+    assert facts(event)["robustness"] == "-1.0"
+    assert facts(event)["witness"] == "`battery >= 2` holds by 1"
+
+
+def test_the_paper_semantics_knows_signs_only(tmp_path):
+    found = told(tmp_path, "spec kept = G battery >= 0", 2.0, -1.0, -1.0, -1.0, semantics="paper")
+    [(number, event, _)] = found
+    assert (number, facts(event)["verdict"], facts(event)["sign"]) == (3, "violated", "negative")
+
+
+@pytest.mark.parametrize("semantics", ["ltlf", "paper"])
+def test_events_come_in_the_order_of_time(tmp_path, semantics):
+    text = "spec last = F G battery >= 0\nspec high = F battery >= 3\nspec kept = G battery >= -4"
+    charges = [1.0, *[-1.0] * 4, *[2.0] * 4, *[-2.0] * 4, *[3.0] * 4, *[-5.0] * 3]
+    numbers = [number for number, *_ in told(tmp_path, text, *charges, semantics=semantics)]
+    assert len(numbers) >= 5
+    assert all(first <= second for first, second in pairwise(numbers))
