@@ -11,6 +11,7 @@ from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.faults import FaultList
+from spatial_replay.logs.foreign.columns import MessageColumns
 from spatial_replay.logs.foreign.messages import Decoder, Message
 from spatial_replay.logs.mapping.channel import MISFITS, Channel
 from spatial_replay.logs.mapping.frames import HISTORY_NS, FrameTree
@@ -92,21 +93,22 @@ class Assembler:
         """Whether no further message can change anything: after a jump that splits, or past the end."""
         return self._has_split or self._settled_ns >= self._end_ns - 1
 
-    def add(self, messages: Sequence[Message]) -> Trace:
+    def add(self, messages: Sequence[Message] | MessageColumns) -> Trace:
         """Take messages in the order of the log; the samples that are final now, maybe none.
 
         Raises:
             LogError: time jumps back by more than a second, and `on_time_jump` is "error".
             UsageError: the mapping does not fit what the messages hold.
         """
+        columns = messages if isinstance(messages, MessageColumns) else _columns(messages)
         traces: list[Trace] = []
-        ends = np.cumsum(np.fromiter((len(message[4]) for message in messages), np.int64, len(messages)))
+        ends = np.cumsum(np.fromiter(map(len, columns.payloads), np.int64, len(columns)))
         begin = 0
-        while begin < len(messages) and not self.is_finished:
+        while begin < len(columns) and not self.is_finished:
             read = int(ends[begin - 1]) if begin else 0
             by_size = int(np.searchsorted(ends, read + _STEP_BYTES - self._bytes)) + 1
-            stop = min(begin + self._step - self._count, by_size, len(messages))
-            self._accept(messages[begin:stop])
+            stop = min(begin + self._step - self._count, by_size, len(columns))
+            self._accept(columns.slice(begin, stop))
             self._count += stop - begin
             self._bytes += int(ends[stop - 1]) - read
             begin = stop
@@ -133,39 +135,32 @@ class Assembler:
         """
         return self._remarks.take() if self._settled_ns == LATEST_NS else ()
 
-    def _accept(self, messages: Sequence[Message]) -> None:
+    def _accept(self, arrived: MessageColumns) -> None:
         """Put transforms into the tree, and the other messages where they wait."""
-        topics, log_times_ns, publish_times_ns, sequences, payloads = zip(*messages, strict=True)
-        code = np.fromiter(map(self._codes.__getitem__, topics), np.int64, len(messages))
-        arrived = _Arrived(
-            np.array(log_times_ns, np.int64),
-            np.array(publish_times_ns, np.int64),
-            np.array(sequences),
-            payloads,
-        )
+        code = np.fromiter(map(self._codes.__getitem__, arrived.topics), np.int64, len(arrived))
         taken: list[_Timed] = []
         for number, channel in enumerate(self._channels.values()):
             places = np.flatnonzero(code == number)
             if len(places):
                 taken.append(self._timed(channel, places, arrived))
-        end = self._jump(taken, topics, arrived)
+        end = self._jump(taken, arrived)
         for timed in taken:
             self._put(timed.before(end), arrived)
 
-    def _timed(self, channel: Channel, places: Integers, arrived: _Arrived) -> _Timed:
+    def _timed(self, channel: Channel, places: Integers, arrived: MessageColumns) -> _Timed:
         """The messages of one topic with their times on its clock; decoded, where that is needed."""
         contents: list[Any] = [arrived.payloads[place] for place in places.tolist()]
         clock = channel.planned.clock
         if channel.keeps_decoded:
-            contents, kept = channel.decoded(contents, arrived.log_times_ns[places].tolist())
+            contents, kept = channel.decoded(contents, arrived.log_time_ns[places].tolist())
             places = places[kept]
         if clock == "header":
-            times, kept = channel.stamps(arrived.log_times_ns[places].tolist(), contents)
+            times, kept = channel.stamps(arrived.log_time_ns[places].tolist(), contents)
             return _Timed(channel, places[kept], np.array(times, np.int64), [contents[i] for i in kept])
-        times_ns = arrived.log_times_ns if clock == "log" else arrived.publish_times_ns
+        times_ns = arrived.log_time_ns if clock == "log" else arrived.publish_time_ns
         return _Timed(channel, places, times_ns[places], contents)
 
-    def _jump(self, taken: list[_Timed], topics: Sequence[str], arrived: _Arrived) -> int:
+    def _jump(self, taken: list[_Timed], arrived: MessageColumns) -> int:
         """Take note of how far the log has come; where it ends: at a jump back that splits, or not at all.
 
         Raises:
@@ -173,7 +168,7 @@ class Assembler:
         """
         moving = [timed for timed in taken if timed.channel.is_moving]
         if not moving:
-            return len(topics)
+            return len(arrived)
         places = np.concatenate([timed.places for timed in moving])
         times_ns = np.concatenate([timed.times_ns for timed in moving])
         order = np.argsort(places, kind="stable")
@@ -182,13 +177,14 @@ class Assembler:
         late = np.flatnonzero(times_ns < newest[:-1] - DISORDER_NS)
         if not len(late):
             self._newest_ns = int(newest[-1])
-            return len(topics)
+            return len(arrived)
         at = int(late[0])
         self._newest_ns = int(newest[at])
         place = int(places[at])
         where = (
             f"time jumps back by {(int(newest[at]) - int(times_ns[at])) / 1e9:.3f} s, from {newest[at]} ns to"
-            f" {times_ns[at]} ns, at a message of {topics[place]} logged at {arrived.log_times_ns[place]} ns"
+            f" {times_ns[at]} ns, at a message of {arrived.topics[place]} logged at"
+            f" {arrived.log_time_ns[place]} ns"
         )
         if self._on_time_jump == "error":
             raise LogError(
@@ -199,9 +195,9 @@ class Assembler:
         self._remarks.add(f"{where}: the log is taken to end there; cut it to evaluate what comes after")
         return place
 
-    def _put(self, timed: _Timed, arrived: _Arrived) -> None:
+    def _put(self, timed: _Timed, arrived: MessageColumns) -> None:
         channel, planned = timed.channel, timed.channel.planned
-        log_times_ns = arrived.log_times_ns[timed.places]
+        log_times_ns = arrived.log_time_ns[timed.places]
         if channel.transforms is not None:
             for time_ns, log_ns, content in zip(
                 timed.times_ns.tolist(), log_times_ns.tolist(), timed.contents, strict=True
@@ -214,7 +210,7 @@ class Assembler:
             # what is stamped before what is settled came too late for that, and counts from now on
             times_ns = np.maximum(timed.times_ns, self._settled_ns + 1)
             self._latest_ns = max(self._latest_ns, int(times_ns.max(initial=-1)))
-            channel.pending.add(times_ns, arrived.sequences[timed.places], log_times_ns, timed.contents)
+            channel.pending.add(times_ns, arrived.sequence[timed.places], log_times_ns, timed.contents)
 
     def _settle(self, upto_ns: int) -> Trace:
         """The samples up to a time, all of whose messages are there."""
@@ -230,13 +226,14 @@ class Assembler:
         self._faults.add(f"{self._name}: {topic} at {log_time_ns} ns: {what}")
 
 
-class _Arrived(NamedTuple):
-    """Messages as they came, in columns."""
-
-    log_times_ns: Integers
-    publish_times_ns: Integers
-    sequences: Integers
-    payloads: Sequence[bytes]
+def _columns(messages: Sequence[Message]) -> MessageColumns:
+    if not messages:
+        return MessageColumns()
+    topics, log_times_ns, publish_times_ns, sequences, payloads = zip(*messages, strict=True)
+    log, publish, sequence = (
+        np.array(each, np.int64) for each in (log_times_ns, publish_times_ns, sequences)
+    )
+    return MessageColumns(topics, log, publish, sequence, payloads, np.arange(len(messages)))
 
 
 class _Timed(NamedTuple):

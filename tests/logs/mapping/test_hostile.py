@@ -102,7 +102,7 @@ def spoilt(draw: st.DrawFn, example: Any) -> Any:
 
 @pytest.mark.parametrize("kind", EXAMPLES)
 @pytest.mark.parametrize("head", ["", "fixed_frame: map\n", "clock: header\n"])
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(data=st.data())
 def test_a_spoilt_message_costs_itself_only(kind: str, head: str, data: st.DataObject) -> None:
     example = EXAMPLES[kind]
@@ -124,7 +124,7 @@ def test_a_spoilt_message_costs_itself_only(kind: str, head: str, data: st.DataO
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(data=st.data())
 def test_a_first_message_that_is_spoilt_is_told(kind: str, data: st.DataObject) -> None:
     feed = (

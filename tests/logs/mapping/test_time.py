@@ -8,6 +8,11 @@ import pytest
 
 from logs.mapping.feeding import SECOND, Feed, header, make, pose_stamped, ros
 from spatial_replay.errors import LogError, UsageError
+from spatial_replay.logs.foreign.columns import MessageColumns
+from spatial_replay.logs.mapping.assembler import Assembler
+from spatial_replay.logs.mapping.load import parse_mapping
+from spatial_replay.logs.mapping.plan import Plan
+from spatial_replay.trace.trace import Trace
 
 MS = 10**6
 
@@ -211,6 +216,25 @@ def test_however_messages_are_handed_over_they_make_the_same_samples(batch: int)
     whole = make(text, feed, batch=100_000)
     assert len(whole.trace) == 3000
     assert make(text, feed, batch=batch).trace == whole.trace
+
+
+def test_columns_of_messages_make_the_same_samples() -> None:
+    feed = Feed()
+    for tick in range(20):
+        feed.add("/p", tick * 10 * MS, point(tick))
+    plan = Plan.of(parse_mapping("topics: {/p: {}}"), feed.topics())
+    raw = feed.raw()
+    columns = MessageColumns(
+        topics=[message.topic for message in raw],
+        log_time_ns=np.array([message.log_time_ns for message in raw]),
+        publish_time_ns=np.array([message.publish_time_ns for message in raw]),
+        sequence=np.array([message.sequence for message in raw]),
+        payloads=[message.payload for message in raw],
+        place=np.arange(len(raw)),
+    )
+    assembler = Assembler(plan, feed.decoder, name="test.bag")
+    found = Trace.concatenate([assembler.add(columns), assembler.finish()])
+    assert found == make("topics: {/p: {}}", feed).trace
 
 
 def test_a_window_has_the_samples_of_the_whole_log() -> None:
