@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from logs.mapping.feeding import SECOND, Feed, header, make, pose_stamped, ros
