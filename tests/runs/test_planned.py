@@ -63,3 +63,23 @@ def test_names_that_the_world_does_not_have_are_refused(tmp_path: Path) -> None:
     with pytest.raises(sr.SpecificationError, match="never has the object 'pink'"):
         record_plan("push", tmp_path / "run.mcap", sr.parse_specification("F (pink leftof red)"))
     assert not (tmp_path / "run.mcap").exists()
+
+
+def test_a_bun_is_placed_on_a_plate(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet", reason="PyBullet is not installed; it has wheels for Python 3.11")
+    bun = sr.parse_specification("F (kanelbulle enclosedin plate)")
+    planned = record_plan("pick-place", tmp_path / "run.mcap", bun)
+    assert planned.satisfied
+    assert planned.steps == 1
+
+
+def test_a_knife_is_turned_as_it_should_lie(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet", reason="PyBullet is not installed; it has wheels for Python 3.11")
+    knife = sr.parse_specification(
+        "F (plate leftof knife and knife dist plate <= 0.08 and knife oriented[0.05] mat)"
+    )
+    planned = record_plan("table-setting", tmp_path / "run.mcap", knife)
+    assert planned.satisfied
+    decision, *_ = read_decisions(tmp_path / "run.mcap").decisions
+    assert decision.target.object == "knife"
+    assert decision.target.turn != 0.0
