@@ -143,6 +143,8 @@ def _deciding(own: Judged, concern: Integers, at: Integers) -> Integers:
     for number in np.unique(concern).tolist():
         there = np.flatnonzero(concern == number)
         below = own.pointing.below[number]
+        if not len(below.indices):
+            continue  # a constant
         places = below.indices[:, None], at[there][None, :]
         lows, highs = own.leaves[low][places], own.leaves[high][places]
         now = own.evaluated.series[own.evaluated.concerns[number].node, 1, at[there]]

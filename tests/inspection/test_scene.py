@@ -399,6 +399,11 @@ def test_what_is_asked_not_to_hold_is_pointed_at_too():
     assert arrow(message)[2] == "-2"
 
 
+def test_a_constant_has_no_arrow():
+    [message] = pointed("spec s = G false and G a closeto[9] a", {"a": BOX})
+    assert not {each.id for each in message.entities} - {"object/a"}
+
+
 def test_an_open_quantifier_and_a_look_back_have_no_arrow():
     text = "group all_of = all\nspec s = G forall o in all_of: o closeto[1] a\nspec t = G a moved[9] a[-1]"
     for message in pointed(text, *[{"a": box_at(0.0), "b": box_at(9.0)}] * 3):
