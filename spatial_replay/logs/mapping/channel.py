@@ -14,7 +14,7 @@ from spatial_replay.logs.foreign.messages import Decoder
 from spatial_replay.logs.mapping.extract import Extractor
 from spatial_replay.logs.mapping.fields import style_of
 from spatial_replay.logs.mapping.naming import Codes
-from spatial_replay.logs.mapping.paths import FieldError, Get, Path, check, getter, walk
+from spatial_replay.logs.mapping.paths import ContentError, FieldError, Get, Path, check, getter, walk
 from spatial_replay.logs.mapping.pending import Pending
 from spatial_replay.logs.mapping.plan import PlannedTopic
 from spatial_replay.logs.mapping.readings import GENERIC
@@ -179,9 +179,9 @@ class Channel:
         try:
             parts.append(extractor.harvest(chunk, first))
             return None
-        except MISFITS as error:
+        except MISFITS:
             if not extractor.is_bound:
-                self._bind_first(extractor, chunk, error)
+                self._bind_first(extractor, chunk)
         found, kept = self._one_by_one(chunk, lambda content: extractor.harvest([content], 0), log_times_ns)
         # not together: each may be of a form of its own
         parts += [part.shifted(first + place) for place, part in enumerate(found)]
@@ -233,18 +233,20 @@ class Channel:
             raise self._misfit(_NO_STAMP)
         return self._time.nanoseconds([content])[0]
 
-    def _bind_first(self, extractor: Extractor, contents: list[Any], error: Exception) -> None:
-        """Find the message that no path is known to fit yet, and say what is wrong with it."""
+    def _bind_first(self, extractor: Extractor, contents: list[Any]) -> None:
+        """Find the first message that tells of an object, and say what is wrong if no path fits it."""
         for content in contents:
             try:
                 extractor.harvest([content], 0)
+            except ContentError:
+                # this message alone is to blame
+                continue
             except FieldError as fault:
                 raise self._misfit(str(fault)) from None
             except MISFITS as fault:
                 raise self._misfit(f"its messages are not as expected: {fault}") from None
             if extractor.is_bound:
                 return
-        raise self._misfit(str(error)) from None
 
     def _bind_signal(self, text: str, content: object) -> Get:
         path = Path.of(text)

@@ -87,6 +87,8 @@ def _unwanted(events: Iterable[yaml.Event]) -> tuple[int, str] | None:
             return line, f"*{event.anchor} repeats another part; write it out, or in quotes if it is a text"
         if (tag := getattr(event, "tag", None)) is not None:
             return line, f"the tag {tag} means nothing here; leave it out"
+        if isinstance(event, yaml.ScalarEvent) and any("\ud800" <= sign <= "\udfff" for sign in event.value):
+            return line, f"{event.value[:40]!r} holds half a character; write it whole"
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > _DEEPEST:
             return line, f"it is nested more than {_DEEPEST} deep; a mapping is not"

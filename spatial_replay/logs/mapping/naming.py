@@ -8,7 +8,7 @@ from typing import Any
 
 from spatial_replay.logs.mapping.binding import Binding
 from spatial_replay.logs.mapping.fields import Style, field_names, type_name
-from spatial_replay.logs.mapping.paths import FieldError, Path, getter, walk
+from spatial_replay.logs.mapping.paths import ContentError, FieldError, Path, getter, walk
 from spatial_replay.logs.mapping.readings import Reading
 from spatial_replay.logs.mapping.templates import INDEX, TOPIC, Template, name_from_topic
 
@@ -119,7 +119,9 @@ class Namer:
                 continue
             if word:
                 return word
-        raise FieldError(f"{{{'|'.join(path.text for path in alternatives)}}} is empty; choose another name")
+        raise ContentError(
+            f"{{{'|'.join(path.text for path in alternatives)}}} is empty; choose another name"
+        )
 
 
 def class_codes(reading: Reading, binding: Binding, objects: Sequence[object], codes: Codes) -> list[int]:
@@ -151,7 +153,8 @@ def _first_value(gets: Sequence[Get], thing: object) -> Any:
 def _class_name(reading: Reading, value: object) -> str | None:
     if value is None or value == "":
         return None
-    text = str(value)
+    # halves of surrogate pairs, which JSON can spell, cannot be written
+    text = str(value).encode("utf-8", "replace").decode()
     if text in reading.class_table:
         return reading.class_table[text]
     return reading.class_other if reading.class_has_other else text
@@ -175,7 +178,7 @@ _LONGEST_NAME = 500
 
 def _checked(name: str) -> str:
     if not name or len(name) > _LONGEST_NAME or not name.isprintable():
-        raise FieldError(
+        raise ContentError(
             f"the name {name[:40]!r} is empty, too long or not printable; give another with `name`"
         )
     return name

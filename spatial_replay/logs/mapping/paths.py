@@ -33,6 +33,10 @@ class FieldError(Exception):
     """A path that leads nowhere in a message; its text names the fields that are there."""
 
 
+class ContentError(FieldError):
+    """A field that is there, but holds what cannot be used."""
+
+
 @dataclass(frozen=True, slots=True)
 class Each:
     """The step `[*]`: every element of a list."""

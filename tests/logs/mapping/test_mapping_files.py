@@ -114,6 +114,7 @@ shapes:
             "topics: !!python/object:os.system {}",
             "the tag tag:yaml.org,2002:python/object:os.sys",
         ),
+        ('topics: {/a: {class: "\\ud800"}}', "holds half a character"),
         ("topics: !own {}", "the tag !own means nothing"),
         ("[" * 5000, "nested more than 20 deep"),
         ("topics: [1", "this is no YAML"),

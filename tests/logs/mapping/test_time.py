@@ -263,3 +263,9 @@ def test_messages_that_are_not_as_the_others_are_told_and_left_out() -> None:
     assert made.trace.signals["speed"].tolist() == [0.0, 3.0]
     assert [fault.partition(":")[0] for fault in made.faults] == ["test.bag"] * 2
     assert {fault.split()[3] for fault in made.faults} == {"1", "2"}
+
+
+def test_a_first_message_with_a_name_that_is_none_costs_itself_only() -> None:
+    feed = Feed().add("/p", 0, point(0, id="\x00")).add("/p", 1, point(1, id="cup"))
+    made = make("topics: {/p: {name: '{id}'}}", feed)
+    assert (made.trace.names, len(made.faults)) == (("cup",), 1)
