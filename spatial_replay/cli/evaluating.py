@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from spatial_replay.cli.options import Reading, profile_option, reading_options
-from spatial_replay.cli.times import time_point_from_text
+from spatial_replay.cli.times import read_for, time_point_from_text
 from spatial_replay.errors import UsageError
 
 if TYPE_CHECKING:
@@ -145,8 +145,10 @@ def _window(source: Source, request: Request) -> Window:
 
     if request.start is None and request.end is None:
         return Window(every=request.every)
-    start_point = None if request.start is None else time_point_from_text(request.start)
-    end_point = None if request.end is None else time_point_from_text(request.end)
+    with read_for("--from"):
+        start_point = None if request.start is None else time_point_from_text(request.start)
+    with read_for("--to"):
+        end_point = None if request.end is None else time_point_from_text(request.end)
     first_ns = first_sample_ns(source)
     whole = Window()
     start_ns = whole.start_ns if start_point is None else start_point.absolute_ns(first_ns)

@@ -9,8 +9,9 @@ import click
 
 from spatial_replay.cli.evaluating import Request, Task, evaluation_options, prepared, report_reading
 from spatial_replay.cli.exit_codes import exit_code_from_verdicts
+from spatial_replay.cli.failures import say
 from spatial_replay.cli.progress import progress
-from spatial_replay.cli.times import time_point_from_text
+from spatial_replay.cli.times import read_for, text_from_duration_ns, time_point_from_text
 from spatial_replay.errors import UsageError
 
 
@@ -54,6 +55,9 @@ def explain(
         )
     report_reading(replayed)
     goes_on = at is not None and has_samples_from(task.source, task.window.end_ns)
+    if at is not None and not goes_on and replayed.end_ns < task.window.end_ns - 1:
+        last = text_from_duration_ns(replayed.end_ns - replayed.first_ns)
+        say("warning", f"--at {at} lies after the last sample, at {last}", colour="yellow")
     found = explanations(replayed, node=node, object=object_name, goes_on=goes_on)
     if as_json:
         click.echo(json.dumps([each.document for each in found], indent=2, ensure_ascii=False))
@@ -68,7 +72,8 @@ def _until(task: Task, at: str | None) -> Task:
 
     if at is None:
         return task
-    at_ns = time_point_from_text(at).absolute_ns(first_sample_ns(task.source))
+    with read_for("--at"):
+        at_ns = time_point_from_text(at).absolute_ns(first_sample_ns(task.source))
     if at_ns < task.window.start_ns:
         raise UsageError(f"--at {at} lies before --from; no sample is left")
     return replace(task, window=replace(task.window, end_ns=at_ns + 1))

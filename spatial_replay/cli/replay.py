@@ -11,7 +11,7 @@ from spatial_replay.cli.evaluating import Request, evaluation_options, prepared,
 from spatial_replay.cli.exit_codes import exit_code_from_verdicts
 from spatial_replay.cli.options import output_option
 from spatial_replay.cli.progress import progress
-from spatial_replay.cli.times import duration_ns_from_text
+from spatial_replay.cli.times import duration_ns_from_text, read_for
 from spatial_replay.cli.verdicts import print_verdicts, write_document
 from spatial_replay.errors import UsageError
 
@@ -105,7 +105,8 @@ def replay(
 
 
 def _width_ns(text: str) -> int:
-    width_ns = duration_ns_from_text(text)
+    with read_for("--window"):
+        width_ns = duration_ns_from_text(text)
     if width_ns == 0:
         raise UsageError(f"--window {text} holds no sample; give it a width, as in --window 10s")
     return width_ns

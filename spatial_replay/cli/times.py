@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal
@@ -75,6 +77,15 @@ def duration_ns_from_text(text: str) -> int:
     )
 
 
+@contextmanager
+def read_for(option: str) -> Iterator[None]:
+    """Name the option in what is said of a time or duration that cannot be read."""
+    try:
+        yield
+    except UsageError as error:
+        raise UsageError(f"{option}: {error}") from None
+
+
 def text_from_duration_ns(nanoseconds: int) -> str:
     """A duration as `duration_ns_from_text` reads it, to the nanosecond: "2s", "0.25s"."""
     seconds, fraction_ns = divmod(nanoseconds, 10**9)
@@ -93,5 +104,5 @@ def _ns_from_calendar(match: re.Match[str], text: str) -> int:
 
 def _checked_ns(nanoseconds: int, text: str) -> int:
     if not 0 <= nanoseconds <= LATEST_NS:
-        raise UsageError(f"{text!r} lies outside the times of a log, 0 to 2**63 - 1 ns after 1970")
+        raise UsageError(f"{text!r} is longer than a log can be, or outside its times, 0 to 2**63 - 1 ns")
     return nanoseconds

@@ -36,6 +36,8 @@ def sentences_of(
     else:
         sentences.append(_decision(witness, witness.deciding, first_ns))
         sentences.append(_flip(witness, witness.deciding, witness.threshold))
+    if witness.open_end is not None:
+        sentences.append(_open_end(*witness.open_end, first_ns))
     return tuple(sentences)
 
 
@@ -68,7 +70,10 @@ def _decision(witness: Witness, deciding: DecidingAtom, first_ns: int) -> str:
         how = "just holds"
     what = " and ".join(map(_measured, deciding.measured))
     when = time_text(witness.time_ns, first_ns)
-    return f"What decides is `{deciding.text}`, which {how} at {when}{_in_time(witness)}: {what}."
+    where = (
+        _in_time_of_all(witness) if witness.path[-1].operator == deciding.atom.relation else _in_time(witness)
+    )
+    return f"What decides is `{deciding.text}`, which {how} at {when}{where}: {what}."
 
 
 def _end(witness: Witness, deciding: DecidingAtom) -> float:
@@ -76,14 +81,25 @@ def _end(witness: Witness, deciding: DecidingAtom) -> float:
 
 
 def _in_time(witness: Witness) -> str:
-    """Which sample that is of those that the innermost temporal operator looks at."""
-    superlatives = {"F": "greatest", "O": "greatest", "G": "least", "H": "least"}
+    """Which temporal operator the sample was chosen by."""
     for step in reversed(witness.path[:-1]):
-        if step.operator in superlatives:
-            return f" (its {superlatives[step.operator]} within `{_shortened(step)}`)"
-        if step.operator in ("X", "WX", "Y", "U", "R", "W", "S"):
+        if step.operator in ("F", "G", "U", "R", "W", "X", "WX", "O", "H", "S", "Y"):
             return f" (within `{_shortened(step)}`)"
     return ""
+
+
+def _in_time_of_all(witness: Witness) -> str:
+    """The same, and that the atom is nowhere greater or less there, where that is so."""
+    passed: set[str] = set()
+    for step in reversed(witness.path[:-1]):
+        if step.operator in ("F", "O") and passed <= {"or", "spec"}:
+            return f" (its greatest within `{_shortened(step)}`)"
+        if step.operator in ("G", "H") and passed <= {"and", "spec"}:
+            return f" (its least within `{_shortened(step)}`)"
+        if step.operator not in ("and", "or", "spec"):
+            break
+        passed.add(step.operator)
+    return _in_time(witness)
 
 
 def _shortened(step: WitnessStep) -> str:
@@ -112,6 +128,8 @@ def _measured(measured: Measured) -> str:
             return f"{names[0]} is turned by {number_text(degrees)}° from {names[1]}"
         case "signal":
             return f"{names[0]} is {number_text(value)}"
+    if math.isinf(value):
+        return f"nobody is in {names[0]}"
     axis = measured.quantity[-1]
     if measured.quantity.startswith("centroid"):
         return f"the centroid of {names[0]} is at {axis} = {number_text(value)}"
@@ -122,17 +140,33 @@ def _measured(measured: Measured) -> str:
 def _flip(witness: Witness, deciding: DecidingAtom, threshold: Threshold | None) -> str:
     if threshold is None:
         opposite = "violated" if witness.verdict is Verdict.SATISFIED else "satisfied"
+        match witness.obstacle:
+            case "infinity":
+                return f"No number in it makes that {opposite}: it is infinite."
+            case "limits":
+                return f"No number that can stand in it makes that {opposite}."
         return f"No number of this atom alone makes it {opposite}: other atoms decide it, too."
-    rises = threshold.flips_at > threshold.value
-    rounded = _rounded(threshold.flips_at, up=rises)
-    more = "more" if rises else "less"
+    change = _change(threshold)
     if threshold.is_written:
-        limit = f"{rounded} or {more} in place of {number_text(threshold.value)}"
+        limit = f"{change} in place of {number_text(threshold.value)}"
         return f"It would be {threshold.verdict} with {limit} in `{deciding.text}`."
-    margin = rounded.lstrip("-")
-    if threshold.flips_at < 0.0:
-        return f"It would be {threshold.verdict} if `{deciding.text}` were allowed to fail by {margin}."
-    return f"It would be {threshold.verdict} if `{deciding.text}` had to hold by {margin}."
+    margin = change.removeprefix("-").removesuffix(" or less").removesuffix(" or more")
+    how = "were allowed to fail by" if threshold.flips_at < 0.0 else "had to hold by"
+    return f"It would be {threshold.verdict} if `{deciding.text}` {how} {margin}."
+
+
+def _change(threshold: Threshold) -> str:
+    """The numbers that flip a verdict."""
+    if threshold.is_exact:
+        return f"exactly {threshold.flips_at!r}"
+    rises = threshold.flips_at > threshold.value
+    if threshold.flips_at == 0.0:
+        return "0"
+    for limit in (threshold.value, 0.0):
+        # what is told of rounding's sake would be hard to read
+        if abs(threshold.flips_at - limit) <= 1e-12 * max(abs(threshold.value), 1.0):
+            return f"anything {'above' if rises else 'below'} {number_text(limit)}"
+    return f"{_rounded(threshold.flips_at, up=rises)} or {'more' if rises else 'less'}"
 
 
 def _rounded(number: float, *, up: bool) -> str:
@@ -155,6 +189,17 @@ def _uncertain(witness: Witness, deciding: DecidingAtom, first_ns: int) -> str:
         f"`{deciding.text}` lies between {low} and {high} at {time_text(witness.time_ns, first_ns)}"
         f"{_in_time(witness)}: the uncertainty of the objects leaves open whether it holds."
     )
+
+
+def _open_end(deciding: DecidingAtom, time_ns: int, first_ns: int) -> str:
+    """What leaves open by how much a formula is satisfied or violated."""
+    when = time_text(time_ns, first_ns)
+    if deciding.unknown:
+        return (
+            f"By how much is open: `{deciding.text}` is unknown at {when}, {' and '.join(deciding.unknown)}."
+        )
+    low, high = number_text(deciding.lower), number_text(deciding.upper)
+    return f"By how much is uncertain: `{deciding.text}` lies between {low} and {high} at {when}."
 
 
 def _dead_end(step: WitnessStep, first_ns: int) -> str:

@@ -284,11 +284,13 @@ def evaluate(
 
     Raises:
         UsageError: no sample in the window, a template without its objects, unknown semantics, an
-            operator that the semantics lacks, something else than a specification or a trace.
+            operator that the semantics lacks, something else than a specification, a trace or a time.
     """
     require_specification(specification)
     _require_trace(trace)
     checked_semantics(semantics, [specification])
+    require_time(start_ns, "start_ns")
+    require_time(end_ns, "end_ns")
     window = (0 if start_ns is None else start_ns, FOREVER if end_ns is None else end_ns)
     begin, end = window_of(trace.times_ns, *window)
     if begin >= end:
@@ -314,6 +316,17 @@ def require_specification(value: object) -> None:
     if not isinstance(value, Specification):
         remedy = "give a Specification, from parse_specification(text) or load_specification(path)"
         raise UsageError(f"specification is {shortened(value)}; {remedy}")
+
+
+def require_time(value: object, name: str) -> None:
+    """
+    Raises:
+        UsageError: for anything else than None or an integer of at least 0.
+    """
+    if value is None:
+        return
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
+        raise UsageError(f"{name} is {shortened(value)}; give integer nanoseconds, 0 or more")
 
 
 def _require_trace(value: object) -> None:

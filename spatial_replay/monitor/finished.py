@@ -73,7 +73,7 @@ def window_signal(
         UsageError: a width that is no positive number of ns.
     """
     if isinstance(width_ns, bool) or not isinstance(width_ns, int) or not 0 < width_ns <= LATEST_NS:
-        raise UsageError(f"a window of {width_ns!r} ns; give its width as an integer of at least 1 ns")
+        raise UsageError(f"a window of {width_ns!r} ns; give its width as an integer, 1 to 2**63 - 1 ns")
     table, nodes, width = _compiled(formula, order)
     leaves = np.ascontiguousarray(leaves[:2])
     starts = np.searchsorted(times_ns, times_ns - width_ns, side="right").astype(np.int64)

@@ -50,8 +50,15 @@ class Inquiry:
         return window_signal(instance.formula, instance.program.leaves, self.leaves, self.times_ns, width_ns)
 
     def witness(self, node: int = 0) -> Witness:
-        """What decides a node's verdict over the whole log."""
+        """What decides a node's verdict over the whole log.
+
+        Raises:
+            UsageError: no node has that id.
+        """
         self._require_ltlf("a witness")
+        nodes = len(self.evidence.instance.program.reports)
+        if not 0 <= node < nodes:
+            raise UsageError(f"no node has the id {node}; they go from 0 to {nodes - 1}")
         return find_witness(self.evidence, self.leaves, self.times_ns, node)
 
     def _require_ltlf(self, what: str) -> None:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.monitor.evaluation import no_such_node, require_specification
+from spatial_replay.monitor.evaluation import no_such_node, require_specification, require_time
 from spatial_replay.monitor.live import ROOM
 from spatial_replay.monitor.semantics import checked_semantics, live_evaluation
 from spatial_replay.monitor.verdict import Verdict, online_verdict, worst_verdict
@@ -94,8 +94,8 @@ class Update:
         Raises:
             UsageError: no node has the name.
         """
-        if name not in self.places or self.specs[0].numbers is None:
-            raise UsageError(no_such_node(name, sorted(self.places) if self.specs[0].nodes else ()))
+        if name not in self.places:
+            raise UsageError(no_such_node(name, sorted(self.places)))
         spec, identifier = self.places[name]
         return self.specs[spec].node(identifier)
 
@@ -118,11 +118,12 @@ class Monitor:
             start_ns: samples before this time are only there to be looked back at (`a[-3]`).
 
         Raises:
-            UsageError: something else than a specification, unknown semantics, or a template: it stands
-                for objects that are not known yet.
+            UsageError: something else than a specification, unknown semantics, a start that is no time, or a
+                template: it stands for objects that are not known yet.
         """
         require_specification(specification)
         checked = checked_semantics(semantics, [specification])
+        require_time(start_ns, "start_ns")
         templates = [spec for spec in specification.results if spec.parameter is not None]
         if templates:
             names = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates)

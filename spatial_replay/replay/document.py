@@ -100,6 +100,7 @@ def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
         "path": [{"node": step.node, "time_ns": step.time_ns} for step in witness.path],
         "atom": None,
         "threshold": None,
+        "obstacle": witness.obstacle,
         "explanation": list(sentences_of(witness, first_ns=first_ns)),
     }
     if deciding is not None:
@@ -118,6 +119,7 @@ def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
             "value": threshold.value,
             "flips_at": threshold.flips_at,
             "written": threshold.is_written,
+            "exact": threshold.is_exact,
             "verdict": str(threshold.verdict),
         }
     return value

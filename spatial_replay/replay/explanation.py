@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from spatial_replay.errors import UsageError
+from spatial_replay.geometry.arrays import Floats
 from spatial_replay.inspection.words import sentences_of
 from spatial_replay.monitor.evaluation import no_such_node
 from spatial_replay.monitor.verdict import Verdict, online_verdict
@@ -77,7 +78,8 @@ def _explanation(result: ReplayedSpec, node: int, first_ns: int, goes_on: bool) 
         raise ValueError("series and leaves of the replay were not kept")
     witness = result.inquiry.witness(node)
     value, _, lower, upper = result.series[node]
-    since_ns = int(result.times_ns[_since(value >= 0.0)]) if witness.verdict is not Verdict.UNKNOWN else None
+    since = _since(value, lower, upper) if witness.verdict is not Verdict.UNKNOWN else None
+    since_ns = None if since is None else int(result.times_ns[since])
     is_open = goes_on and online_verdict(float(lower[-1]), float(upper[-1])) is Verdict.PENDING
     sentences = sentences_of(witness, first_ns=first_ns, since_ns=since_ns, is_open=is_open)
     document = {
@@ -91,7 +93,18 @@ def _explanation(result: ReplayedSpec, node: int, first_ns: int, goes_on: bool) 
     return Explanation(witness.verdict, sentences, document)
 
 
-def _since(holds: np.ndarray[Any, np.dtype[np.bool_]]) -> int:
-    """The first sample from which on it has been as it is at the last."""
-    other = np.flatnonzero(holds != holds[-1])
-    return int(other[-1]) + 1 if len(other) else 0
+def _since(value: Floats, lower: Floats, upper: Floats) -> int | None:
+    """The first sample from which on it has been as it is at the last; None where it is not known when.
+
+    Args:
+        value, lower, upper: (T,), the node's, of which the last settle its verdict.
+    """
+    holds = (value >= 0.0) | (lower >= 0.0)
+    fails = (value < 0.0) | (upper < 0.0)
+    same = holds if holds[-1] else fails
+    others = np.flatnonzero(~same)
+    if not len(others):
+        return 0
+    last = int(others[-1])
+    is_known = holds[last] or fails[last]
+    return last + 1 if is_known and last + 1 < len(value) else None

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -18,9 +19,10 @@ from spatial_replay.monitor.witness.atom import DecidingAtom
 from spatial_replay.monitor.witness.dial import Dial, rewritten
 from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.monitor.witness.extremum import End
-from spatial_replay.spec.formula import Atom, Formula, Quantified
+from spatial_replay.spec.formula import Atom, Formula, Number, Quantified, Sum
 from spatial_replay.spec.terms import iter_formulas
 
+_FAR = 1e300
 _DOUBLINGS = 40
 _ROUNDS, _PARTS = 4, 16
 """How a number is searched for that does not move all samples alike: in rounds, each of which reads the log
@@ -37,13 +39,20 @@ class Threshold:
         flips_at: with this number instead the verdict is another. Nearer ones leave it as it is (but for
             rounding; of a relation under an open quantifier, or between two limits, to within 0.01 %).
         is_written: whether the number is in the text.
+        is_exact: whether just this number flips it, and none beyond (`a dist b == c`).
         verdict: what the verdict is then.
     """
 
     value: float
     flips_at: float
     is_written: bool
+    is_exact: bool
     verdict: Verdict
+
+
+Obstacle: TypeAlias = Literal["others", "limits", "infinity"]
+"""Why no number of an atom flips a verdict: other atoms decide it, too; no number that can be written goes
+far enough; or the atom is infinite."""
 
 
 def threshold_of(
@@ -53,8 +62,8 @@ def threshold_of(
     node: int,
     verdict: Verdict,
     deciding: DecidingAtom,
-) -> Threshold | None:
-    """How far the deciding atom's number has to move to flip a verdict; None where no number of it does.
+) -> Threshold | Obstacle | None:
+    """How far the deciding atom's number has to move to flip a verdict, or why none does.
 
     All atoms that were written in the same place move together: those that a quantifier over a named group,
     or a macro, made of one text.
@@ -62,15 +71,21 @@ def threshold_of(
     Args:
         leaves: (C, A, T), the instance's leaves in each sample.
         node: whose verdict.
+
+    Returns:
+        None of an atom that is itself open.
     """
-    if deciding.end is End.OPEN or not math.isfinite(deciding.lower) or not math.isfinite(deciding.upper):
+    if deciding.end is End.OPEN or deciding.unknown:
         return None
+    if not math.isfinite(deciding.lower) or not math.isfinite(deciding.upper):
+        return "infinity"
     search = _Search(evidence, leaves, times_ns, node, verdict, deciding)
     flips_at = search.number()
     if flips_at is None:
-        return None
+        return "limits" if search.would_flip() else "others"
     dial = search.dial
-    return Threshold(dial.value, flips_at, dial.kind != "margin", search.verdicts([flips_at])[0])
+    flipped = search.verdicts([flips_at])[0]
+    return Threshold(dial.value, flips_at, dial.kind != "margin", dial.is_exact, flipped)
 
 
 class _Search:
@@ -88,28 +103,38 @@ class _Search:
         self._leaves, self._times, self._node = leaves, times_ns, node
         self._verdict, self._deciding = verdict, deciding
         self.dial = Dial.of(deciding)
+        # from the formula: equal leaves share the place of the first, wherever it was written
+        meant = {each.expression for each in _atoms_of([self._formula]) if self._is_meant(each)}
         self._moving = {
             index: leaf
             for index, leaf in enumerate(self._order)
-            if isinstance(leaf, Atom) and self._is_meant(leaf)
+            if isinstance(leaf, Atom) and leaf.expression in meant
         }
-        in_groups = (
-            each for leaf in self._order if isinstance(leaf, Quantified) for each in iter_formulas(leaf)
-        )
-        self._is_uniform = self.dial.is_uniform and not any(
-            isinstance(each, Atom) and self._is_meant(each) for each in in_groups
-        )
-        self._direction = self.dial.slope * (1 if deciding.end is End.HIGH else -1)
+        quantifiers = [each for each in iter_formulas(self._formula) if isinstance(each, Quantified)]
+        in_group = any(map(self._is_meant, _atoms_of(quantifiers)))
+        self._is_uniform = self.dial.is_uniform and not in_group
+        self._rises = deciding.end is End.HIGH
 
     def number(self) -> float | None:
         """The nearest number that flips the verdict."""
-        if self._direction == 0:
+        if self.dial.slope == 0:
             return None
         nearest = abs(self._deciding.lower if self._deciding.end is End.LOW else self._deciding.upper)
         if self._flips([nearest])[0]:
             return self._moved(nearest)
         size = self._size_by_samples(nearest) if self._is_uniform else self._size_by_rounds(nearest)
         return None if size is None else self._moved(size)
+
+    def would_flip(self) -> bool:
+        """Whether the verdict would flip if the atom could be moved as far as one likes."""
+        far = _FAR if self._rises else -_FAR
+
+        def change(atom: Atom) -> Atom:
+            return replace(atom, expression=Sum(atom.expression, Number(far)))
+
+        formula = rewritten(self._formula, self._is_meant, change)
+        added = new_leaves(formula, self._order)
+        return self._evaluated(formula, added, self._evidence.columns(added)) is not self._verdict
 
     def verdicts(self, numbers: Sequence[float]) -> list[Verdict]:
         """The verdict with each number in place of the dial's."""
@@ -125,18 +150,19 @@ class _Search:
 
     def _flips(self, sizes: Sequence[float]) -> list[bool]:
         numbers = [self._moved(size) for size in sizes]
-        possible = [number for number in numbers if self._is_possible(number)]
+        possible = [number for number in numbers if math.isfinite(number)]
         verdicts = dict(zip(possible, self.verdicts(possible), strict=True)) if possible else {}
         return [verdicts.get(number, self._verdict) is not self._verdict for number in numbers]
 
-    def _is_possible(self, number: float) -> bool:
-        return math.isfinite(number) and (self.dial.kind != "radius" or number >= 0.0)
-
     def _moved(self, size: float) -> float:
-        """The number so far off, and a little further: rounding must not bring it back."""
-        value = self.dial.value
-        beyond = 0.0 if self.dial.is_exact else 8.0 * float(np.spacing(abs(value) + size))
-        return value + self._direction * (size + beyond)
+        """The number that moves the atom so far, and a little further: rounding must not bring it back.
+
+        A radius goes no lower than 0.
+        """
+        value, slope = self.dial.value, self.dial.slope
+        beyond = 0.0 if self.dial.is_exact else 8.0 * float(np.spacing(max(abs(value) + size, 1.0)))
+        number = value + math.copysign((size + beyond) / slope, slope if self._rises else -slope)
+        return max(number, 0.0) if self.dial.kind == "radius" else number
 
     def _size_by_samples(self, nearest: float) -> float | None:
         """Where the dial moves the atom alike in every sample, one of them decides when the verdict flips."""
@@ -181,3 +207,11 @@ class _Search:
         done = finished(formula, (*self._order, *added), leaves, self._times)
         low, high = done.ends(self._node)
         return final_verdict(float(low[0]), float(high[0]))
+
+
+def _atoms_of(formulas: Iterable[Formula]) -> Iterator[Atom]:
+    """Every atom in some formulas, those in the bodies of quantifiers too."""
+    for formula in formulas:
+        for each in iter_formulas(formula):
+            if isinstance(each, Atom):
+                yield each

@@ -11,7 +11,7 @@ from spatial_replay.monitor.witness.atom import DecidingAtom, deciding_atom
 from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.monitor.witness.extremum import End
 from spatial_replay.monitor.witness.path import deciding_path
-from spatial_replay.monitor.witness.threshold import Threshold, threshold_of
+from spatial_replay.monitor.witness.threshold import Obstacle, Threshold, threshold_of
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Atom, Formula, Quantified, iter_nodes, operator_of
 
@@ -50,6 +50,9 @@ class Witness:
         deciding: the atom; None where the path ends at `true` or `false`, at a window or a next sample
             that the log does not have, or at a quantifier over an empty group.
         threshold: which change of the atom's number flips the verdict; None where none does.
+        obstacle: why none does, where there is such an atom.
+        open_end: of a verdict that is settled though one end of its interval is open, the atom that leaves it
+            open, and the time of its sample.
     """
 
     name: str
@@ -60,6 +63,8 @@ class Witness:
     path: tuple[WitnessStep, ...]
     deciding: DecidingAtom | None
     threshold: Threshold | None
+    obstacle: Obstacle | None
+    open_end: tuple[DecidingAtom, int] | None
 
     @property
     def node(self) -> int:
@@ -88,16 +93,37 @@ def find_witness(evidence: Evidence, leaves: Floats, times_ns: Integers, node: i
     lower, upper = (float(end[0]) + 0.0 for end in done.ends(node))
     verdict = final_verdict(lower, upper)
     end = {Verdict.SATISFIED: End.LOW, Verdict.VIOLATED: End.HIGH}.get(verdict, End.OPEN)
-    found = deciding_path(instance.formula, done, times_ns, node, end)
     nodes = [evidence.bound(formula) for _, _, formula in iter_nodes(instance.formula)]
-    path = tuple(_step(step.node, nodes[step.node], int(times_ns[step.sample])) for step in found.steps)
-    deciding = threshold = None
-    leaf = nodes[path[-1].node]
-    if isinstance(leaf, Atom | Quantified):
-        deciding = deciding_atom(evidence.scene(path[-1].time_ns), leaf, found.end)
+
+    def follow(end: End) -> tuple[tuple[WitnessStep, ...], DecidingAtom | None]:
+        found = deciding_path(instance.formula, done, times_ns, node, end)
+        path = tuple(_step(step.node, nodes[step.node], int(times_ns[step.sample])) for step in found.steps)
+        leaf = nodes[path[-1].node]
+        if not isinstance(leaf, Atom | Quantified):
+            return path, None
+        return path, deciding_atom(evidence.scene(path[-1].time_ns), leaf, found.end)
+
+    path, deciding = follow(end)
+    told = None
     if deciding is not None:
-        threshold = threshold_of(evidence, leaves, times_ns, node, verdict, deciding)
-    return Witness(instance.name, instance.object, verdict, lower, upper, path, deciding, threshold)
+        told = threshold_of(evidence, leaves, times_ns, node, verdict, deciding)
+    open_end = None
+    if end is not End.OPEN and lower < upper:
+        other_path, other = follow(end.turned)
+        if other is not None and other.lower < other.upper:
+            open_end = other, other_path[-1].time_ns
+    return Witness(
+        instance.name,
+        instance.object,
+        verdict,
+        lower,
+        upper,
+        path,
+        deciding,
+        told if isinstance(told, Threshold) else None,
+        None if isinstance(told, Threshold) else told,
+        open_end,
+    )
 
 
 def _step(node: int, formula: Formula, time_ns: int) -> WitnessStep:
