@@ -31,10 +31,11 @@ from spatial_replay.spec.formula import (
     Group,
     Outline,
     Quantified,
+    SignedDistance,
     Term,
     TrackedName,
 )
-from spatial_replay.spec.terms import base_of, iter_formulas, terms_of
+from spatial_replay.spec.terms import base_of, iter_expressions, iter_formulas, terms_of
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
@@ -122,19 +123,21 @@ def proposition_maps(
     here = Trace.from_samples([sample])
     everywhere = _trace_over_cells(here, tracked, name, workspace, turns)
     moving = [concerns(each, name) for each in propositions]
-    over_cells = _intervals(
-        everywhere, [p for p, moves in zip(propositions, moving, strict=True) if moves], regions
-    )
+    standing = _standing(propositions, sample, name, workspace)
+    concerned = [each for each, moves in zip(propositions, moving, strict=True) if moves]
+    over_cells = _intervals(everywhere, [*concerned, *standing], regions)
     fixed = _intervals(here, propositions, regions)
     ends = []
     for one, of_all in zip(over_cells, fixed, strict=True):
         # what the object has no part in is measured once
         values = np.repeat(of_all, len(everywhere), axis=1)
-        values[moving] = one
+        values[moving] = one[: len(concerned)]
         ends.append(values.reshape(len(propositions), *shape))
-    clearance = _clearance(everywhere, sample, name, workspace).reshape(shape)
+    clearance = over_cells[0][len(concerned) :].min(axis=0, initial=np.inf)
+    if workspace.obstacles:
+        clearance = np.minimum(clearance, _to_static(everywhere, name, workspace))
     lower, upper = ends
-    return PropositionMaps(name, lower, upper, clearance, turns)
+    return PropositionMaps(name, lower, upper, clearance.reshape(shape), turns)
 
 
 def gradient_map(
@@ -222,24 +225,36 @@ def _intervals(
     return leaves[0], leaves[min(1, len(leaves) - 1)]
 
 
-def _clearance(trace: Trace, sample: Sample, name: str, workspace: Workspace) -> Floats:
-    """(T,): the distance from the object to everything in its way; +inf where nothing is.
+def _standing(propositions: Sequence[Formula], sample: Sample, name: str, workspace: Workspace) -> list[Atom]:
+    """The distance from the object to each other one in its way.
 
-    It is at most 0 just where the object's centre lies in the Minkowski sum of an obstacle with the mirrored
-    object.
+    It is at most 0 just where the object's centre lies in the Minkowski sum of the other with the object
+    mirrored.
     """
-    column = trace.names.index(name)
-    others = [
-        trace.names.index(other)
-        for other in sample.objects
-        if other != name and other not in workspace.supports
-    ]
+    measured = {
+        part
+        for proposition in propositions
+        for each in iter_formulas(proposition)
+        if isinstance(each, Atom)
+        for part in iter_expressions(each.expression)
+    }
+    atoms = []
+    for other in sorted(sample.objects):
+        if other != name and other not in workspace.supports:
+            one, two = TrackedName(name), TrackedName(other)
+            # what a proposition measures anyway is not measured twice
+            swapped = SignedDistance(two, one)
+            atoms.append(Atom("", "dist", swapped if swapped in measured else SignedDistance(one, two)))
+    return atoms
+
+
+def _to_static(trace: Trace, name: str, workspace: Workspace) -> Floats:
+    """(T,): the distance from the object to what stands in its way besides objects."""
+    own = trace.rows[:, [trace.names.index(name)]]
     static = np.arange(len(workspace.obstacles), dtype=np.int64) + len(trace.footprints)
-    batch = FootprintBatch.concatenate(
-        [trace.footprints, FootprintBatch.from_footprints(workspace.obstacles)]
-    )
-    rows = np.concatenate((trace.rows[:, others], np.tile(static, (len(trace), 1))), axis=1)
-    operands = (Operand(trace.rows[:, [column]]), Operand(rows))
+    obstacles = FootprintBatch.from_footprints(workspace.obstacles)
+    batch = FootprintBatch.concatenate([trace.footprints, obstacles])
+    operands = (Operand(own), Operand(np.tile(static, (len(trace), 1))))
     distance: Floats = measure(batch, operands, [Request("signed_distance", 0, 1)])[0]
     return distance
 
