@@ -81,9 +81,9 @@ def _chain(joints: Floats) -> tuple[Floats, Floats, Floats]:
         rotation = rotation @ _about_z(angle)
     position = position + rotation[:, 2] * _TOOL
     rotation = rotation @ _about_z(-math.pi / 4)
-    around = np.array(axes)
-    levers = position - np.array(origins)
-    return position, rotation, np.concatenate([np.cross(around, levers).T, around.T])
+    a, b, c = around = np.array(axes).T
+    x, y, z = position[:, None] - np.array(origins).T
+    return position, rotation, np.stack([b * z - c * y, c * x - a * z, a * y - b * x, *around])
 
 
 def _rotation_between(first: Floats, second: Floats) -> Floats:
