@@ -31,9 +31,15 @@ class Proposition:
         """In words, that it is true, or that it is not."""
         if self.name is not None:
             return self.name if value else f"not {self.name}"
-        if not value:
-            return f"not ({self.text})"
-        return self.text if not isinstance(self.formula, (Boolean, Quantified)) else f"({self.text})"
+        if isinstance(self.formula, Boolean) and self.formula.operator == "not":
+            # the opposite of a negation is what it negates
+            return self.text if value else _bracketed(self.formula.operands[0])
+        return _bracketed(self.formula) if value else f"not ({self.text})"
+
+
+def _bracketed(formula: Formula) -> str:
+    text = format_formula(formula)
+    return f"({text})" if isinstance(formula, (Boolean, Quantified)) else text
 
 
 def is_spatial(formula: Formula) -> bool:

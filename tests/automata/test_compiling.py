@@ -70,6 +70,11 @@ def test_what_says_the_same_is_one_proposition(first: str, second: str) -> None:
 def test_a_proposition_and_its_negation_are_one() -> None:
     machine = machine_of("(not (a ovlp b)) U (a ovlp b)")
     assert [each.text for each in machine.propositions] == ["not (a ovlp b)"]
+    assert {machine.guard_words(each) for each in machine.transitions} == {
+        "not (a ovlp b)",
+        "a ovlp b",
+        "true",
+    }
     assert machine.accepts([[True], [False]])
     assert not machine.accepts([[True], [True]])
 
