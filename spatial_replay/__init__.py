@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from spatial_replay.monitor.evaluation import Evaluation, evaluate
     from spatial_replay.monitor.monitor import Monitor
     from spatial_replay.monitor.verdict import Verdict
+    from spatial_replay.planning.planner import Planner
     from spatial_replay.recording.recorder import Recorder
     from spatial_replay.spec.formula import Specification
     from spatial_replay.spec.specification import load_specification, parse_specification
@@ -47,6 +48,7 @@ __all__ = [
     "Monitor",
     "NoAutomatonError",
     "OutputError",
+    "Planner",
     "Recorder",
     "Sample",
     "SpatialReplayError",
@@ -71,6 +73,7 @@ _HOMES = {
     "Evaluation": "spatial_replay.monitor.evaluation",
     "Footprint": "spatial_replay.geometry.footprint",
     "Monitor": "spatial_replay.monitor.monitor",
+    "Planner": "spatial_replay.planning.planner",
     "Recorder": "spatial_replay.recording.recorder",
     "Sample": "spatial_replay.trace.sample",
     "Specification": "spatial_replay.spec.formula",

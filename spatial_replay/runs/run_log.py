@@ -101,7 +101,7 @@ class RunLog:
     def _write_waiting(self) -> None:
         waiting, self._waiting = self._waiting, []
         beside, self._beside = self._beside, []
-        if waiting:
+        if waiting or beside:
             self._recording.add(Trace.from_samples(waiting), merge(beside))
 
 
