@@ -22,6 +22,9 @@ from spatial_replay.logs.mcap_walk import walk_records
 LARGEST_CHUNK = 2**30
 """Bytes, uncompressed; a chunk that claims more is taken for damage, not for data."""
 
+_ALWAYS_ALLOWED, _MOST_TIMES_LARGER = 2**26, 1_000
+"""Bytes, and times its own size, that a chunk may decompress to: no recorder's chunk needs more."""
+
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _FIXED_HEAD = RECORD_HEAD.size + _CHUNK_HEAD.size
 _LONGEST_HEAD = 80
@@ -138,6 +141,8 @@ def _outcome(stream: BinaryIO, place: ChunkPlace) -> Callable[[], bytes]:
 
 
 def _decompressed(compression: bytes, data: bytes, size: int) -> bytes:
+    if compression and size > max(_ALWAYS_ALLOWED, _MOST_TIMES_LARGER * len(data)):
+        raise DamageError(f"the chunk claims to hold {size} bytes in {len(data)}")
     try:
         if compression == b"zstd":
             if zstandard.frame_content_size(data) > size:

@@ -7,6 +7,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from heapq import merge
 from typing import BinaryIO
 
 from mcap import records
@@ -23,6 +24,8 @@ _MESSAGE_INDEX = struct.Struct("<HQ")
 _LOOSE_BYTES = 2**22
 _LARGEST_RECORD = 2**30
 _STRIDE = 2**20
+_MOST_GAPS = 1_000
+"""Damaged stretches after which the rest of a file is not searched."""
 _COMPRESSIONS = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
 _BEFORE_COMPRESSION = RECORD_HEAD.size + 28
 
@@ -186,11 +189,13 @@ class _Scan:
 
     def directory(self) -> Directory:
         position = sound = len(MAGIC)
+        gaps = 0
         while position < self._size and not self._ended:
             try:
                 position = self._record(position)
             except DamageError as damage:
-                following = self._next_chunk(sound)
+                gaps += 1
+                following = self._next_chunk(sound) if gaps < _MOST_GAPS else None
                 lost = (following or self._size) - position
                 where = f"{self._name}: at byte {position}"
                 self._faults.add(f"{where}: {damage}; {max(lost, 0)} bytes cannot be read")
@@ -268,7 +273,7 @@ class _Scan:
         while position < self._size:
             self._stream.seek(position)
             window = self._stream.read(_STRIDE + overlap)
-            for place in sorted(_candidates(window)):
+            for place in merge(*(_iter_places(window, mark) for mark in _COMPRESSIONS)):
                 record = window[place : place + _CHUNK_HEAD_BYTES]
                 opcode, length = RECORD_HEAD.unpack_from(record)
                 if opcode != Opcode.CHUNK or position + place + RECORD_HEAD.size + length > self._size:
@@ -282,11 +287,10 @@ class _Scan:
         return None
 
 
-def _candidates(window: bytes) -> Iterator[int]:
-    """Where the name of a compression stands as it does in a chunk."""
-    for mark in _COMPRESSIONS:
-        found = window.find(mark)
-        while found >= 0:
-            if found >= _BEFORE_COMPRESSION:
-                yield found - _BEFORE_COMPRESSION
-            found = window.find(mark, found + 1)
+def _iter_places(window: bytes, mark: bytes) -> Iterator[int]:
+    """Where a chunk would begin, by the name of its compression, in order."""
+    found = window.find(mark)
+    while found >= 0:
+        if found >= _BEFORE_COMPRESSION:
+            yield found - _BEFORE_COMPRESSION
+        found = window.find(mark, found + 1)

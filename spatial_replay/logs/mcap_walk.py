@@ -15,11 +15,11 @@ Words = NDArray[np.uint64]
 
 _RECORD_HEAD = 9
 _MESSAGE_FIELDS = 22
-_MESSAGE = 5
+_SCHEMA, _CHANNEL, _MESSAGE = 3, 4, 5
 
 
 class RecordHeads(NamedTuple):
-    """N records.
+    """N schemas, channels and messages.
 
     Attributes:
         opcode: (N,) int64.
@@ -37,12 +37,14 @@ class RecordHeads(NamedTuple):
 
 
 def walk_records(content: bytes) -> tuple[RecordHeads, bool]:
-    """The records in some bytes, and whether the last of them breaks off."""
-    most = len(content) // _RECORD_HEAD
-    places = np.empty((3, most), np.int64)
-    fields = np.empty((4, most), np.uint64)
-    count, end = _walk(np.frombuffer(content, np.uint8), places, fields)
-    return RecordHeads(*places[:, :count], *fields[:, :count]), end < len(content)
+    """The schemas, channels and messages in some bytes, and whether the last record breaks off."""
+    view = np.frombuffer(content, np.uint8)
+    # counted first: room for as many as there could be is many times the bytes
+    count, _ = _walk(view, np.empty((3, 0), np.int64), np.empty((4, 0), np.uint64))
+    places = np.empty((3, count), np.int64)
+    fields = np.empty((4, count), np.uint64)
+    _, end = _walk(view, places, fields)
+    return RecordHeads(*places, *fields), end < len(content)
 
 
 @piece
@@ -56,7 +58,7 @@ def _word(content: Bytes, begin: int, size: int) -> int:
 
 @kernel
 def _walk(content: Bytes, places: Integers, fields: Words) -> tuple[int, int]:
-    """Fill in the records' places and fields; how many there are, and where the last whole one ends."""
+    """Fill in as many as there is room for; how many there are, and where the last whole record ends."""
     size = content.shape[0]
     position = 0
     count = 0
@@ -65,14 +67,18 @@ def _walk(content: Bytes, places: Integers, fields: Words) -> tuple[int, int]:
         begin = position + _RECORD_HEAD
         if length > np.uint64(size - begin):
             break
-        end = position + _RECORD_HEAD + int(length)
-        places[0, count], places[1, count], places[2, count] = content[position], begin, end
-        fields[0, count] = fields[1, count] = fields[2, count] = fields[3, count] = 0
-        if content[position] == _MESSAGE and end - begin >= _MESSAGE_FIELDS:
-            fields[0, count] = _word(content, begin, 2)
-            fields[1, count] = _word(content, begin + 2, 4)
-            fields[2, count] = _word(content, begin + 6, 8)
-            fields[3, count] = _word(content, begin + 14, 8)
+        end = begin + int(length)
+        opcode = content[position]
+        is_message = opcode == _MESSAGE and end - begin >= _MESSAGE_FIELDS
+        if is_message or _SCHEMA <= opcode <= _CHANNEL:
+            if count < places.shape[1]:
+                places[0, count], places[1, count], places[2, count] = opcode, begin, end
+                fields[0, count] = fields[1, count] = fields[2, count] = fields[3, count] = 0
+                if is_message:
+                    fields[0, count] = _word(content, begin, 2)
+                    fields[1, count] = _word(content, begin + 2, 4)
+                    fields[2, count] = _word(content, begin + 6, 8)
+                    fields[3, count] = _word(content, begin + 14, 8)
+            count += 1
         position = end
-        count += 1
     return count, position
