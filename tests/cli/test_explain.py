@@ -60,7 +60,7 @@ def test_every_result_is_explained_in_a_few_sentences(
     assert "satisfied with 1.00001 or more in place of 0.5" in met
     assert apart.splitlines() == [
         "`apart` is unknown: robustness between -inf and 0.5.",
-        "`cube dist cup >= 0.5` is unknown at 0.000 s, where it could decide (its least within `apart`): "
+        "`cube dist cup >= 0.5` is unknown at 0.000 s, where it could decide (within `apart`): "
         "cup is not in the sample.",
     ]
 
