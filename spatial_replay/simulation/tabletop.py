@@ -142,6 +142,7 @@ class Tabletop:
 
     def sample(self) -> Sample:
         """See `World`."""
+        self._working()
         number = self._ticks // _TICKS_PER_SAMPLE
         errors = displacements(self._noise_m, self._seed, number, len(self._scene.bodies))
         objects = {
@@ -158,12 +159,12 @@ class Tabletop:
 
     def push(self, name: str, path: Sequence[tuple[float, float]]) -> Execution:
         """See `World`."""
-        self._refuse_unless("push", name)
+        self._refuse_unless("push", name, [number for point in path for number in point])
         return self.run(pushing(self._scene, name, path))
 
     def place(self, name: str, x: float, y: float, yaw: float | None = None) -> Execution:
         """See `World`."""
-        self._refuse_unless("place", name)
+        self._refuse_unless("place", name, [x, y, 0.0 if yaw is None else yaw])
         return self.run(self._scenario.placing(self._scene, name, (x, y), yaw))
 
     def script(self) -> Generator[None, None, Execution]:
@@ -208,9 +209,7 @@ class Tabletop:
 
     def tick(self) -> None:
         """Advance by the time that one command of the arm holds."""
-        engine = self._engine
-        if engine is None:
-            raise UsageError(f"the world {self.name} is closed; make another one")
+        engine = self._working()
         self._tell()
         began = time.monotonic() if self._gui else 0.0
         self._inject()
@@ -252,13 +251,26 @@ class Tabletop:
             uncertainty=self._noise_m,
         )
 
-    def _refuse_unless(self, skill: str, name: str) -> None:
+    def _working(self) -> Engine:
+        """The physics.
+
+        Raises:
+            UsageError: the world is closed.
+        """
+        if self._engine is None:
+            raise UsageError(f"the world {self.name} is closed; make another one")
+        return self._engine
+
+    def _refuse_unless(self, skill: str, name: str, numbers: Sequence[float]) -> None:
+        self._working()
         if self._scenario.skill != skill:
             other = self._scenario.skill
             raise UsageError(f"the robot of {self.name} does not {skill} objects; it can {other} them")
         movable = [body.name for body in self.bodies if body.movable]
         if name not in movable:
             raise UsageError(f"{name!r} cannot be moved in {self.name}; {', '.join(movable)} can")
+        if not numbers or not all(map(math.isfinite, numbers)):
+            raise UsageError(f"{name} cannot be moved to {list(numbers)}; give finite numbers")
 
 
 def _ignore(sample: Sample) -> None:

@@ -133,9 +133,13 @@ def test_wrong_uses_are_refused() -> None:
             made.push("purple", [(0.4, 0.0)])
         with pytest.raises(UsageError, match="does not place objects; it can push them"):
             made.place("red", 0.4, 0.0)
+        for path in [], [(0.4, math.nan)]:
+            with pytest.raises(UsageError, match="give finite numbers"):
+                made.push("red", path)
         made.close()
-        with pytest.raises(UsageError, match="the world push is closed"):
-            made.step()
+        for use in made.step, made.sample, lambda: made.push("red", [(0.4, 0.0)]):
+            with pytest.raises(UsageError, match="the world push is closed"):
+                use()
     with pytest.raises(UsageError, match="no scenario 'chess'; there are push"):
         make_world("chess")
     with pytest.raises(UsageError, match="the noise is -1"):
