@@ -18,7 +18,8 @@ from spatial_replay.logs.mcap_records import DamageError
 BAG_MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 LONGEST_HEAD = 2**20
-_LZ4_RATIO = 256
+_ALWAYS_ALLOWED, _MOST_TIMES_LARGER = 2**26, 1_000
+"""Bytes, and times its own size, that a chunk may decompress to: no recorder's chunk needs more."""
 _SECOND_NS = 1_000_000_000
 # op=, conn=, time= begin with these
 _C, _I, _O, _P, _T = b"ciopt"
@@ -89,8 +90,9 @@ def decompressed(compression: bytes, data: bytes, size: int) -> bytes:
     Raises:
         DamageError: it does not decompress to `size` bytes.
     """
-    if size > LARGEST_CHUNK:
-        raise DamageError(f"the chunk claims to hold {size} bytes")
+    most = max(_ALWAYS_ALLOWED, _MOST_TIMES_LARGER * len(data))
+    if size > LARGEST_CHUNK or (compression != b"none" and size > most):
+        raise DamageError(f"the chunk claims to hold {size} bytes in {len(data)}")
     try:
         match compression:
             case b"none":
@@ -98,8 +100,6 @@ def decompressed(compression: bytes, data: bytes, size: int) -> bytes:
             case b"bz2":
                 content = bz2.BZ2Decompressor().decompress(data, size + 1)
             case b"lz4":
-                if size > _LZ4_RATIO * (len(data) + _LZ4_RATIO):
-                    raise DamageError(f"the chunk claims to hold {size} bytes")
                 content = bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
             case _:
                 raise DamageError(f"the chunk is compressed as {compression!r:.40}; known are none, bz2, lz4")

@@ -9,7 +9,17 @@ from typing import NamedTuple
 
 import pytest
 
-from logs.foreign.bag_files import drive, write_json_mcap, write_ros1, write_ros2
+from logs.foreign.bag_files import (
+    START_NS,
+    TEXT,
+    Sent,
+    drive,
+    text,
+    write_json_mcap,
+    write_mcap,
+    write_ros1,
+    write_ros2,
+)
 from spatial_replay.errors import LogError
 from spatial_replay.logs.foreign.messages import Message
 from spatial_replay.logs.foreign.opening import open_messages
@@ -160,6 +170,20 @@ def test_changed_metadata_are_told_or_make_no_difference(tmp_path: Path) -> None
         )
         messages, told = read(folder, decodes=False)
         assert told or messages == whole
+
+
+def test_little_that_decompresses_to_much_is_refused(tmp_path: Path) -> None:
+    nothing = b" " * 2**27
+    log = write_mcap(tmp_path / "a.mcap", [("/a", "json", "", "", b"")], [("/a", START_NS, nothing)])
+    assert log.stat().st_size < 2**16
+    messages, told = read(log)
+    assert not messages
+    assert "claims to hold" in told[0]
+    bag = write_ros1(tmp_path / "a.bag", [Sent("/a", TEXT, START_NS, text(" " * 2**27))], compression="bz2")
+    assert bag.stat().st_size < 2**16
+    messages, told = read(bag)
+    assert not messages
+    assert "claims to hold" in told[0]
 
 
 @pytest.mark.parametrize("junk", [b"", b"\x00" * 5_000, b"\xff" * 5_000, bytes(range(256)) * 20])
