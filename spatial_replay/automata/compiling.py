@@ -72,6 +72,10 @@ def _compiled(name: str, skeleton: Skeleton, propositions: int, compiler: Compil
                 raise NoAutomatonError(
                     f"{name}: {error}; MONA may still compile it: {mona.INSTALL}"
                 ) from error
+    elif not mona.is_installed():
+        raise NoAutomatonError(
+            f"{name}: MONA is not installed; {mona.INSTALL}, or let this package compile it"
+        )
     try:
         return mona.compiled_by_mona(skeleton, propositions)
     except NoAutomatonError as error:
