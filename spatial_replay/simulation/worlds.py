@@ -47,7 +47,14 @@ def default_specification(name: str) -> Specification:
 def _scenario(name: str) -> Scenario:
     if name not in SCENARIOS:
         raise UsageError(f"there is no scenario {name!r}; there are {', '.join(SCENARIOS)}")
-    module = import_module(f"spatial_replay.simulation.scenarios.{name.replace('-', '_')}")
+    try:
+        module = import_module(f"spatial_replay.simulation.scenarios.{name.replace('-', '_')}")
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.partition(".")[0] != "py_trees":
+            raise
+        raise UsageError(
+            f"the world {name} needs py_trees, which is not installed: pip install 'spatial-replay[sim]'"
+        ) from error
     scenario = module.SCENARIO
     if not isinstance(scenario, Scenario):
         raise TypeError(f"{module.__name__}.SCENARIO is no scenario but {scenario!r}")

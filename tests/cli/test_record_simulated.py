@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -59,6 +60,28 @@ def test_what_cannot_be_simulated_leaves_the_output_alone(
     assert said.out == ""
     assert said.err.startswith("spatial-replay: error: ")
     assert path.read_text() == "kept"
+
+
+@pytest.mark.parametrize(
+    ("scenario", "module", "name"),
+    [("push", "pybullet", "PyBullet"), ("table-setting", "py_trees", "py_trees")],
+)
+def test_without_the_extra_it_says_what_to_install(
+    tmp_path: Path, scenario: str, module: str, name: str
+) -> None:
+    program = f"import sys; sys.modules[{module!r}] = None; from spatial_replay.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", program, "record", scenario, "-o", "run.mcap"],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert name in done.stderr
+    assert "pip install 'spatial-replay[sim]'" in done.stderr
+    assert not (tmp_path / "run.mcap").exists()
 
 
 def test_an_interrupted_simulation_is_a_proper_shorter_log(tmp_path: Path) -> None:
