@@ -73,6 +73,9 @@ def record_script(
 
             world.attach(hear)
             result = world.follow(world.script(), duration_ns)
+            if not log.samples:
+                # the robot had nothing to do, or could do nothing
+                world.step()
         outcome = "stopped in the middle of its motion" if result is None else result.reason
         return SimulatedRun(log.samples, log.seconds, tuple(world.scene.bodies), outcome)
 
