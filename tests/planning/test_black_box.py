@@ -13,6 +13,7 @@ import spatial_replay as sr
 from planning.kinematics import BLOCKS, block
 from planning.plans import PUSH, record_plan_of
 from spatial_replay.errors import LogError, UsageError
+from spatial_replay.logs.messages.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.source import open_source
 from spatial_replay.planning.black_box import GRADIENT_MAP, PATH
 from spatial_replay.planning.redo import redo_decisions
@@ -118,6 +119,16 @@ def test_everything_of_a_decision_has_the_time_of_its_sample(tmp_path):
     }
     assert times == {step.time_ns for step in steps if step.candidates}
     assert times <= {int(time) for time in sr.read_trace(tmp_path / "run.mcap").times_ns}
+
+
+def test_the_planner_and_the_log_agree_on_where_the_automaton_is(tmp_path):
+    steps = record_plan_of(tmp_path / "run.mcap", slips=1)
+    logged = payloads(tmp_path / "run.mcap", "/spatial/automaton", AutomatonState)
+    states = {message.time_ns: tuple(message.states) for message in logged}
+    assert [states[step.time_ns] for step in steps] == [step.states for step in steps]
+    told = read_decisions(tmp_path / "run.mcap").decisions
+    after = [(states[each.outcome.end_ns], tuple(each.outcome.states)) for each in told[:-1]]
+    assert all(one == other for one, other in after)
 
 
 def test_a_log_without_decisions_has_none_to_make_again(tmp_path):
