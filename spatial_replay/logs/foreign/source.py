@@ -72,7 +72,7 @@ class ForeignSource:
         if not as_recorded:
             columns = without_jumps(columns, self.name)
         for piece in in_pieces(columns):
-            yield from blocks.of(assembler.add(piece.messages()), piece)
+            yield from blocks.of(assembler.add(piece), piece)
             if assembler.is_finished:
                 break
         yield from blocks.of(assembler.finish(), MessageColumns(), last=True)
