@@ -8,6 +8,8 @@ of that sample and, in obligations, of the next.
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 from spatial_replay.automata.diagrams import NO, YES, Diagrams, copied
 from spatial_replay.automata.machine import Machine
 from spatial_replay.automata.skeleton import FALSE, TRUE, Skeleton
@@ -19,21 +21,41 @@ MAX_STATES = 1000
 MAX_DECISIONS = 150_000
 """How many nodes the decision diagrams may have."""
 
+_MOST_CHAINED = 250
+"""With more obligations from unrolled windows, diagrams that relate them would nest too deeply."""
 
-def progressed(skeleton: Skeleton, propositions: int) -> Machine:
+
+def progressed(skeleton: Skeleton, propositions: int, *, related: bool | None = None) -> Machine:
     """The automaton of a skeleton over so many propositions.
+
+    Args:
+        related: whether states leave out obligations that follow from others: with deadlines, that may take
+            far fewer states, but larger diagrams. By default, only if it does not go without.
 
     Raises:
         NoAutomatonError: it would take more than `MAX_STATES` or `MAX_DECISIONS`.
     """
+    if related is None:
+        if not 0 < len(skeleton.chains) <= _MOST_CHAINED:
+            related = False
+        else:
+            with suppress(NoAutomatonError):
+                return progressed(skeleton, propositions, related=False)
+            related = True
     try:
-        return _Progression(skeleton, propositions).machine()
+        return _Progression(skeleton, propositions, related=related).machine()
     except RecursionError:
         raise NoAutomatonError("the automaton takes decisions that are nested too deeply") from None
 
 
 class _Progression:
-    def __init__(self, skeleton: Skeleton, propositions: int) -> None:
+    """One attempt.
+
+    Where obligations from one unrolled window are *related*, states do not differ by those that follow from
+    others: a sooner deadline implies a later one. That takes larger diagrams, and often far fewer states.
+    """
+
+    def __init__(self, skeleton: Skeleton, propositions: int, *, related: bool) -> None:
         self._skeleton = skeleton
         self._propositions = propositions
         self._diagrams = Diagrams(MAX_DECISIONS)
@@ -41,12 +63,14 @@ class _Progression:
         self._asked: list[tuple[int, bool]] = []
         self._now: dict[int, int] = {FALSE: NO, TRUE: YES}
         self._next: dict[int, int] = {NO: NO, YES: YES}
+        self._consistent = self._consequences() if related else YES
 
     def machine(self) -> Machine:
         states: dict[int, int] = {}
         waiting: list[int] = []
 
         def number(node: int) -> int:
+            node = self._diagrams.both(node, self._consistent)
             if node not in states:
                 if len(waiting) == MAX_STATES:
                     raise NoAutomatonError(f"the automaton takes more than {MAX_STATES} states")
@@ -60,6 +84,20 @@ class _Progression:
         # the list grows as moves lead to states that are new
         moves = tuple(copy(self._after(node)) for node in waiting)
         return Machine(result, moves, tuple(map(self._accepts, waiting)), start)
+
+    def _consequences(self) -> int:
+        """What always holds between obligations from one unrolled window."""
+        chains = self._skeleton.chains
+        diagrams, result = self._diagrams, YES
+        for shorter, strong in chains:
+            # one after the other, which keeps diagrams small
+            self._obligation(shorter, strong)
+        for (shorter, strong), longer in reversed(chains.items()):
+            if (longer, strong) in self._obligations:
+                pair = self._obligation(shorter, strong), self._obligation(longer, strong)
+                sooner, later = pair if strong else pair[::-1]
+                result = diagrams.both(result, diagrams.choose(sooner, later, YES))
+        return result
 
     def _read(self, number: int) -> int:
         """What a subformula says of this sample and, in obligations, of the next."""

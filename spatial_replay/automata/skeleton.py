@@ -38,6 +38,8 @@ class Skeleton:
     Attributes:
         nodes: by number.
         root: the number of the whole formula.
+        chains: for a subformula over a bounded window, the same over a window longer by one sample; with it,
+            whether it is an until, from which the longer one follows, or a release, which follows from that.
     """
 
     def __init__(self, formula: Formula, propositions: Propositions, source: Source | None = None) -> None:
@@ -54,6 +56,7 @@ class Skeleton:
         self._numbers: dict[Node, int] = {}
         self._propositions = propositions
         self._source = source
+        self.chains: dict[tuple[int, bool], int] = {}
         self._known: dict[tuple[int, bool], int] = {}
         self._unrolled: Temporal | None = None
         self._node("false"), self._node("true")
@@ -127,7 +130,8 @@ class Skeleton:
         else:
             result = right
             for _ in range(upper - lower):
-                result = free(right, hold(left, self._next(result, strong)))
+                shorter, result = result, free(right, hold(left, self._next(result, strong)))
+                self.chains.setdefault((shorter, strong), result)
         for _ in range(lower):
             result = hold(left, self._next(result, strong))
         return result

@@ -113,6 +113,11 @@ def test_a_bound_of_many_samples_is_unrolled() -> None:
     assert len(machine_of("F[0, 300] a ovlp b").states) == 303
 
 
+def test_deadlines_of_many_samples_take_a_state_for_each() -> None:
+    # not one for each set of deadlines that are still to be met
+    assert len(machine_of("G (a ovlp b -> F[0, 100] c ovlp d)").states) == 102
+
+
 def test_too_many_propositions_are_told() -> None:
     text = " and ".join(f"(F p{number} >= 0)" for number in range(65))
     with pytest.raises(NoAutomatonError, match="65 propositions, an automaton at most 64"):

@@ -47,11 +47,11 @@ def test_any_number_of_processes_compile_at_once() -> None:
 def test_mona_takes_over_where_this_package_reaches_its_limits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # 10^3 states for how long each has been waited for, and a trap
-    text = " and ".join(f"(G ((p{number} >= 0) -> F[0, 9] q{number} >= 0))" for number in range(3))
+    # 11^3 states for how long each has been waited for, and a trap
+    text = " and ".join(f"(G ((p{number} >= 0) -> F[0, 10] q{number} >= 0))" for number in range(3))
     with pytest.raises(NoAutomatonError, match="more than 1000 states"):
         automaton(parse_specification(text), compiler="own")
-    assert len(automaton(parse_specification(text)).states) == 1001
+    assert len(automaton(parse_specification(text)).states) == 1332
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(NoAutomatonError, match="apt-get install mona"):
         automaton(parse_specification(text))

@@ -160,7 +160,7 @@ def about_automata(path: Path) -> dict[str, str]:
 
 def test_a_replay_takes_over_what_was_compiled_before(tmp_path: Path) -> None:
     # only MONA compiles this one; told apart from what that gives by being wrong: it accepts everything
-    waits = " and ".join(f"(G (battery >= 0.{n} -> F[0, 9] battery >= 0.{n}5))" for n in range(1, 4))
+    waits = " and ".join(f"(G (battery >= 0.{n} -> F[0, 10] battery >= 0.{n}5))" for n in range(1, 4))
     spec = parse_specification(f"spec done = {waits}", filename="done.spatial")
     propositions = tuple(Propositions(spec.results[0].formula).all)
     wrong = Automaton("done", propositions, frozenset({0}), (~0,), ())
