@@ -15,6 +15,7 @@ from spatial_replay.planning.maps import (
     gradient_map,
     proposition_maps,
 )
+from spatial_replay.planning.poses import centre_of
 from spatial_replay.planning.workspace import Grid, Workspace
 
 CUP = sr.TrackedObject(sr.Footprint.box(0, 0, 1, 1))
@@ -127,8 +128,28 @@ def test_an_object_that_is_not_there_cannot_be_moved():
         ((0, 0, 1, 1, 0.0), "cell_size"),
         ((0, 0, 1e9, 1e9, 0.1), "cells"),
         ((0, 0, math.inf, 1, 0.1), "finite"),
+        ((0, 0, 1, 1, math.inf), "cell_size"),
     ],
 )
 def test_grids_that_cannot_be_are_refused(numbers, message):
     with pytest.raises(UsageError, match=message):
         Grid.over(*numbers)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"yaws": (math.nan,)}, "finite"),
+        ({"base": (math.inf, 0.0)}, "finite"),
+        ({"nearest": 2.0, "farthest": 1.0}, "farther than 2.0"),
+    ],
+)
+def test_workspaces_that_cannot_be_are_refused(options, message):
+    with pytest.raises(UsageError, match=message):
+        Workspace(GRID, **options)
+
+
+def test_the_centre_of_points_is_their_mean():
+    points = sr.Footprint.union([sr.Footprint.disc(0, 0, 0), sr.Footprint.disc(4, 2, 0)])
+    assert centre_of(points) == (2.0, 1.0)
+    assert centre_of(sr.Footprint.union([points, sr.Footprint.disc(1, 1, 1)])) == (1.0, 1.0)

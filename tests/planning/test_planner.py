@@ -129,6 +129,29 @@ def test_it_waits_for_what_is_not_seen():
     assert one.next_step().kind == "execute"
 
 
+def test_it_holds_on_to_what_was_satisfied_but_for_what_was_not_seen():
+    one = planner("G (cup leftof plate)")
+    for time_ns, seen in enumerate([THINGS, {"plate": THINGS["plate"]}, THINGS]):
+        one.observe(sr.Sample(time_ns, seen))
+    step = one.next_step()
+    assert step.kind == "hold"
+    assert "unless it was violated" in step.reason
+    assert not one.is_accepting
+
+
+def test_where_everything_was_tried_nothing_is_left():
+    settings = Settings(Workspace(Grid.over(2.0, 4.5, 3.0, 5.5, 1.0)), movable=("cup",), attempts=9)
+    steps, _ = run(planner("F (cup leftof plate and cup dist plate <= 1)", settings), THINGS, stuck={"cup"})
+    assert [step.kind for step in steps] == ["execute", "no path"]
+    assert "it was tried wherever it would hold" in steps[-1].pruned[0][1]
+
+
+def test_what_nobody_can_move_is_not_planned_for():
+    settings = Settings(TABLE.workspace, movable=("fork",))
+    steps, _ = run(planner("F (cup leftof plate and cup above plate)", settings), THINGS)
+    assert steps[0].pruned == (((0, 1), "no object that can be moved matters to it"),)
+
+
 def test_equal_samples_give_equal_steps():
     first, second = (run(planner(PUSHING, PUSH), BLOCKS)[0] for _ in range(2))
     assert [step.target for step in first] == [step.target for step in second]
