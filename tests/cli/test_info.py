@@ -198,3 +198,16 @@ def test_a_damaged_bag_is_told(data_folder: Path, tmp_path: Path, capsys: pytest
     assert "damaged" in said.out
     assert run(["info", str(cut), "--suggest-mapping"]) == 3
     assert parse_mapping(capsys.readouterr().out).topics
+
+
+def test_the_layout_kept_in_a_log_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    annotated = tmp_path / "annotated.mcap"
+    run_replay(PiecewiseSource(recorded_run(), 12), [parse_specification(SPECIFICATION)], output=annotated)
+    assert run(["info", str(annotated), "--layout"]) == 0
+    assert "3D!scene" in json.loads(capsys.readouterr().out)["configById"]
+
+
+def test_a_log_without_a_layout_says_how_to_get_one(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["info", str(log), "--layout"]) == 2
+    assert "run.jsonl holds no layout" in capsys.readouterr().err
+    assert run(["info", str(log), "--layout", "--json"]) == 2
