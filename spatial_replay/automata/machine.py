@@ -49,7 +49,7 @@ def least(machine: Machine) -> Machine:
 
 def _classes(machine: Machine) -> list[int]:
     """For each state the number of its class: which runs from it on are accepted, the empty one included."""
-    classes = [int(each) for each in machine.accepting]
+    classes = _told_apart(machine)
     count = len(set(classes))
     while True:
         copy = _relabelled(machine, Diagrams(), classes)
@@ -59,6 +59,40 @@ def _classes(machine: Machine) -> list[int]:
         if len(numbers) == count:
             return classes
         count = len(numbers)
+
+
+def _told_apart(machine: Machine) -> list[int]:
+    """For each state a number, equal for all states of a class, and other ones where that is soon seen.
+
+    That is how far it is to acceptance and rejection, and to where either is for good. Along a chain of
+    states, refining classes step by step would take as many steps as the chain is long.
+    """
+    before: list[list[int]] = [[] for _ in machine.moves]
+    for state, node in enumerate(machine.moves):
+        for target in leaves_of(machine.diagrams, node):
+            before[target].append(state)
+    columns = []
+    for accepts in (False, True):
+        goal = [state for state, accepting in enumerate(machine.accepting) if accepting == accepts]
+        distances = _distances(before, goal)
+        out_of_reach = [state for state, distance in enumerate(distances) if distance < 0]
+        columns += [distances, _distances(before, out_of_reach)]
+    numbers: dict[tuple[int, ...], int] = {}
+    return [numbers.setdefault(row, len(numbers)) for row in zip(*columns, strict=True)]
+
+
+def _distances(before: list[list[int]], goal: list[int]) -> list[int]:
+    """For each state how many samples it takes at least to a goal; -1 where none leads there."""
+    distances = [-1] * len(before)
+    for state in goal:
+        distances[state] = 0
+    waiting = list(goal)
+    for state in waiting:
+        for source in before[state]:
+            if distances[source] < 0:
+                distances[source] = distances[state] + 1
+                waiting.append(source)
+    return distances
 
 
 def _first(moves: list[int], accepting: list[bool], start: int) -> int:
