@@ -36,8 +36,8 @@ def contacts(batch: FootprintBatch, first: Operand, second: Operand, *, is_protr
         batch.top,
         np.ascontiguousarray(first.rows),
         np.ascontiguousarray(second.rows),
-        first.enlargement,
-        second.enlargement,
+        float(first.enlargement),
+        float(second.enlargement),
         is_protrusion,
         found,
     )

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
+from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.contacts import contacts
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.geometry.measure import Operand
 from spatial_replay.logs.sink import MemorySink
 from spatial_replay.recording.recording import Recording
 from spatial_replay.spec import object_names, signal_names
@@ -37,6 +42,9 @@ def warm_up(files: Sequence[Specification]) -> None:
     # nothing is known: what may be takes code of its own
     recording.add(Trace.from_samples([Sample(10**10, {})]))
     recording.end()
+    # what draws an arrow at a violation, of which these samples may have none
+    shapes = FootprintBatch.from_footprints([Footprint.box(x, 0, x + 1, 1) for x in range(2)])
+    contacts(shapes, *(Operand(np.array([[row]])) for row in range(2)), is_protrusion=False)
 
 
 def _tracked(kind: int, x: float) -> TrackedObject:
