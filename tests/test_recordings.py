@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from spatial_replay.cli.application import run as run_in_process
 from spatial_replay.logs.source import read_trace
 from spatial_replay.monitor.evaluation import evaluate
 from spatial_replay.monitor.verdict import Verdict
@@ -16,13 +17,20 @@ from spatial_replay.spec.specification import load_specification
 
 ROOT = Path(__file__).resolve().parent.parent
 RECORDINGS = ROOT / "recordings"
-EXPECTED = json.loads((RECORDINGS / "table.expected.json").read_text(encoding="utf-8"))
+EXPECTED = {
+    file: (document["log"], results)
+    for document in (
+        json.loads(path.read_text(encoding="utf-8")) for path in RECORDINGS.glob("*.expected.json")
+    )
+    for file, results in document["specifications"].items()
+}
 
 
-@pytest.mark.parametrize("name", sorted(EXPECTED["specifications"]))
+@pytest.mark.parametrize("name", sorted(EXPECTED))
 def test_every_result_is_as_expected(name):
-    evaluation = evaluate(load_specification(RECORDINGS / name), read_trace(RECORDINGS / EXPECTED["log"]))
-    assert EXPECTED["specifications"][name] == {
+    log, results = EXPECTED[name]
+    evaluation = evaluate(load_specification(RECORDINGS / name), read_trace(RECORDINGS / log))
+    assert results == {
         result.name: {
             "verdict": result.verdict,
             "robustness": pytest.approx(result.robustness, abs=1e-6),
@@ -32,10 +40,11 @@ def test_every_result_is_as_expected(name):
     }
 
 
-def test_the_edit_turns_the_verdict():
-    trace = read_trace(RECORDINGS / "table.jsonl")
-    original = evaluate(load_specification(RECORDINGS / "table.spatial"), trace)
-    edited = evaluate(load_specification(RECORDINGS / "table_edited.spatial"), trace)
+@pytest.mark.parametrize(("name", "log"), [("table", "table.jsonl"), ("push", "push.mcap")])
+def test_the_edit_turns_the_verdict(name, log):
+    trace = read_trace(RECORDINGS / log)
+    original = evaluate(load_specification(RECORDINGS / f"{name}.spatial"), trace)
+    edited = evaluate(load_specification(RECORDINGS / f"{name}_edited.spatial"), trace)
     assert (original.verdict, edited.verdict) == (Verdict.SATISFIED, Verdict.VIOLATED)
 
 
@@ -43,6 +52,15 @@ def test_an_object_comes_into_view_late():
     first = next(iter(read_trace(RECORDINGS / "table.jsonl").samples()))
     assert "milk" not in first.objects
     assert "milk" in read_trace(RECORDINGS / "table.jsonl").names
+
+
+def test_the_planned_push_tells_its_decisions(capsys):
+    log = str(RECORDINGS / "push.mcap")
+    assert run_in_process(["info", log, "--decisions"]) == 0
+    told = capsys.readouterr().out
+    # all at once is given up; then two pushes
+    assert "3 decisions for 'push', 2 motions, 1 edge given up" in told
+    assert told.index("push red at") < told.index("push green at")
 
 
 def test_the_script_makes_the_files_that_are_there():
