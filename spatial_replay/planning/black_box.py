@@ -15,24 +15,20 @@ from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.logs.block import Channel, Messages
 from spatial_replay.logs.merging import merge
 from spatial_replay.logs.messages.PlanDecision_pb2 import PlanDecision
-from spatial_replay.logs.topics import protobuf_channel
+from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_DECISION, PLAN_PATH, protobuf_channel
 from spatial_replay.planning.messages import decision_message, map_message, outcome_message, path_message
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.poses import centre_of
 from spatial_replay.planning.step import Outcome, Step
 from spatial_replay.trace.sample import Sample
 
-DECISION: Final = "/plan/decision"
-GRADIENT_MAP: Final = "/plan/gradient_map"
-PATH: Final = "/plan/path"
-
 PLAN_METADATA: Final = "spatial_replay_plan"
 """The metadata record with what decisions depend on besides samples: settings, and which specification."""
 
 _CHANNELS: Final = (
-    protobuf_channel(DECISION, PlanDecision),
+    protobuf_channel(PLAN_DECISION, PlanDecision),
     protobuf_channel(GRADIENT_MAP, GridMessage),
-    protobuf_channel(PATH, SceneUpdate),
+    protobuf_channel(PLAN_PATH, SceneUpdate),
 )
 
 

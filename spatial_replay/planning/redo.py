@@ -12,15 +12,15 @@ from spatial_replay.logs.block import Messages
 from spatial_replay.logs.messages.PlanDecision_pb2 import PlanDecision
 from spatial_replay.logs.reading import read_blocks
 from spatial_replay.logs.source import Source
-from spatial_replay.logs.topics import RECORDED_PREFIX
-from spatial_replay.planning.black_box import DECISION, GRADIENT_MAP, PATH, PLAN_METADATA, BlackBox
+from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_DECISION, PLAN_PATH, RECORDED_PREFIX
+from spatial_replay.planning.black_box import PLAN_METADATA, BlackBox
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings_text import settings_from_text
 from spatial_replay.planning.step import Outcome
 from spatial_replay.spec import parse_specification
 from spatial_replay.trace.sample import Sample
 
-_TOPICS = (DECISION, GRADIENT_MAP, PATH)
+_TOPICS = (PLAN_DECISION, GRADIENT_MAP, PLAN_PATH)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +126,7 @@ class _Check:
         if not ready or self._differences:
             return
         made: dict[str, list[bytes]] = {topic: [] for topic in _TOPICS}
-        for payload in recorded[DECISION]:
+        for payload in recorded[PLAN_DECISION]:
             try:
                 messages = self._made_again(payload)
             except (SpatialReplayError, DecodeError) as error:
@@ -159,7 +159,7 @@ class _Check:
 
 def _difference(topic: str, recorded: bytes, made: bytes) -> str:
     """Which fields of two decisions differ."""
-    if topic != DECISION:
+    if topic != PLAN_DECISION:
         return ""
     one, other = PlanDecision.FromString(recorded), PlanDecision.FromString(made)
     fields = [

@@ -11,7 +11,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.logs.mcap_reader import McapSource
 from spatial_replay.logs.messages.PlanDecision_pb2 import PlanDecision
 from spatial_replay.logs.source import open_source
-from spatial_replay.planning.black_box import DECISION
+from spatial_replay.logs.topics import PLAN_DECISION
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,13 +38,13 @@ def read_decisions(log: Path) -> Told:
     decisions: dict[int, PlanDecision] = {}
     faults: list[str] = []
     if isinstance(source, McapSource):
-        for payloads, lost in source.iter_payloads(DECISION):
+        for payloads, lost in source.iter_payloads(PLAN_DECISION):
             faults += lost
             for payload in payloads:
                 try:
                     decision = PlanDecision.FromString(payload)
                 except DecodeError as error:
-                    faults.append(f"{source.name}: a message on {DECISION} cannot be read: {error}")
+                    faults.append(f"{source.name}: a message on {PLAN_DECISION} cannot be read: {error}")
                     continue
                 # the one with the outcome comes later and says everything that the first one does
                 decisions[decision.number] = decision

@@ -37,5 +37,5 @@ def interrupted(
         while not is_at_work() and process.poll() is None:
             time.sleep(0.01)
         process.send_signal(number)
-        _, said = process.communicate(timeout=60)
+        _, said = process.communicate(timeout=300)
     return process.returncode, said.strip()

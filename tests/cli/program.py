@@ -27,7 +27,7 @@ def run_program(*arguments: str, cwd: Path, **variables: str) -> subprocess.Comp
         capture_output=True,
         text=True,
         check=False,
-        timeout=60,
+        timeout=300,
     )
 
 

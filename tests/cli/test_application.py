@@ -102,7 +102,7 @@ def test_an_interrupt_ends_with_code_130_and_one_line(tmp_path: Path) -> None:
     # opening waits until the program reads, so the signal meets it at work
     with process, endless.open("w"):
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=60)
+        _, said = process.communicate(timeout=300)
     assert process.returncode == 130
     assert said.strip() == "spatial-replay: error: interrupted"
 

@@ -48,13 +48,15 @@ def test_what_a_monitor_refuses():
     with pytest.raises(UsageError, match="no semantics 'stl'"):
         Monitor(parse_specification("p >= 0"), semantics="stl")
     monitor = Monitor(parse_specification("spec low = p >= 0"), start_ns=SECOND)
-    with pytest.raises(UsageError, match=r"no node is named 'low'; there are none yet"):
+    with pytest.raises(UsageError, match=r"'low' has no numbers yet; the monitor's start"):
         monitor.update(at(0, p=1)).node("low")
     monitor.update(at(2, p=1))
     with pytest.raises(UsageError, match=r"no node is named 'high'; there are low"):
         monitor.update(at(3, p=1)).node("high")
     with pytest.raises(TraceError, match="give samples in the order of their times"):
         monitor.update(at(3, p=1))
+    with pytest.raises(UsageError, match="start_ns is 1.5; give integer nanoseconds"):
+        Monitor(parse_specification("p >= 0"), start_ns=1.5)
 
 
 def test_nothing_is_kept_per_sample():

@@ -15,7 +15,7 @@ from planning.plans import PUSH, record_plan_of
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.logs.messages.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.source import open_source
-from spatial_replay.planning.black_box import GRADIENT_MAP, PATH
+from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_PATH
 from spatial_replay.planning.redo import redo_decisions
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.settings_text import settings_from_text, text_from_settings
@@ -103,7 +103,7 @@ def test_maps_lie_over_the_scene(tmp_path):
 
 def test_a_path_is_drawn_and_then_the_way_that_was_travelled(tmp_path):
     steps = record_plan_of(tmp_path / "run.mcap")
-    planned, travelled, *_, last = payloads(tmp_path / "run.mcap", PATH, SceneUpdate)
+    planned, travelled, *_, last = payloads(tmp_path / "run.mcap", PLAN_PATH, SceneUpdate)
     points = [(point.x, point.y) for point in planned.entities[0].lines[0].points]
     assert points == list(steps[0].target.waypoints)
     assert len(planned.entities) == 1
