@@ -55,7 +55,7 @@ def test_what_a_monitor_refuses():
         monitor.update(at(3, p=1)).node("high")
     with pytest.raises(TraceError, match="give samples in the order of their times"):
         monitor.update(at(3, p=1))
-    with pytest.raises(UsageError, match="start_ns is 1.5; give integer nanoseconds"):
+    with pytest.raises(UsageError, match=r"start_ns is 1\.5; give integer nanoseconds"):
         Monitor(parse_specification("p >= 0"), start_ns=1.5)
 
 
