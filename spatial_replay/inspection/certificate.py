@@ -11,9 +11,11 @@ import json
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spatial_replay import __version__
 from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.inspection.hashing import Hashing
 from spatial_replay.logs.block import Messages
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
@@ -23,14 +25,15 @@ from spatial_replay.trace.trace import ABSENT, Trace
 class SampleHash:
     """SHA-256 of samples: of every column of every object and signal, and these by name."""
 
-    def __init__(self) -> None:
+    def __init__(self, hashing: Hashing | None = None) -> None:
+        self._hashing = hashing or Hashing()
         self._times = hashlib.sha256()
         self._objects: dict[str, list[hashlib._Hash]] = {}
         self._signals: dict[str, hashlib._Hash] = {}
 
     def add(self, trace: Trace) -> None:
         """Take in the next samples."""
-        self._times.update(_integers(trace.times_ns))
+        self._hashing.update(self._times, _integers(trace.times_ns))
         classes = np.array([list(hashlib.sha256(_text(name)).digest()) for name in trace.classes], np.uint8)
         for name, rows in zip(trace.names, trace.rows.T, strict=True):
             seen = np.flatnonzero(rows != ABSENT)
@@ -48,18 +51,20 @@ class SampleHash:
                 _floats(shapes.top),
                 _floats(trace.yaw[observations]),
                 _floats(trace.uncertainty[observations]),
-                classes[trace.class_code[observations]].tobytes(),
+                classes[trace.class_code[observations]],
             )
             hashes = self._objects.setdefault(name, [hashlib.sha256() for _ in columns])
             for hashed, column in zip(hashes, columns, strict=True):
-                hashed.update(column)
+                self._hashing.update(hashed, column)
         for name, values in trace.signals.items():
             known = np.flatnonzero(~np.isnan(values))
             if len(known):
                 hashed = self._signals.setdefault(name, hashlib.sha256())
-                hashed.update(np.rec.fromarrays([trace.times_ns[known], values[known]]).tobytes())
+                pairs = np.rec.fromarrays([trace.times_ns[known], values[known]])
+                self._hashing.update(hashed, pairs.tobytes())
 
     def hexdigest(self) -> str:
+        self._hashing.finish()
         total = hashlib.sha256(self._times.digest())
         for name in sorted(self._objects):
             total.update(_text(name))
@@ -73,7 +78,8 @@ class SampleHash:
 class MessageHash:
     """SHA-256 of messages in their order: topic, time and bytes of each."""
 
-    def __init__(self) -> None:
+    def __init__(self, hashing: Hashing | None = None) -> None:
+        self._hashing = hashing or Hashing()
         # a hash for each column, so that many messages are taken in at once, however they are cut
         self._topics, self._times = hashlib.sha256(), hashlib.sha256()
         self._lengths, self._payloads = hashlib.sha256(), hashlib.sha256()
@@ -86,12 +92,14 @@ class MessageHash:
         for number, channel in messages.channels.items():
             topics[number] = np.frombuffer(hashlib.sha256(_text(channel.topic)).digest(), np.uint8)
         lengths = np.fromiter(map(len, messages.payloads), np.int64, len(messages))
-        self._topics.update(topics[messages.channel].tobytes())
-        self._times.update(_integers(messages.log_time_ns))
-        self._lengths.update(_integers(lengths))
-        self._payloads.update(b"".join(messages.payloads))
+        update = self._hashing.update
+        update(self._topics, topics[messages.channel])
+        update(self._times, _integers(messages.log_time_ns))
+        update(self._lengths, _integers(lengths))
+        update(self._payloads, b"".join(messages.payloads))
 
     def hexdigest(self) -> str:
+        self._hashing.finish()
         total = hashlib.sha256()
         for column in (self._topics, self._times, self._lengths, self._payloads):
             total.update(column.digest())
@@ -101,15 +109,17 @@ class MessageHash:
 class ResultHash:
     """SHA-256 of results: of each one's numbers as little-endian bytes, sample by sample, node by node."""
 
-    def __init__(self, names: Sequence[tuple[str, str | None]]) -> None:
+    def __init__(self, names: Sequence[tuple[str, str | None]], hashing: Hashing | None = None) -> None:
+        self._hashing = hashing or Hashing()
         self._names = names
         self._hashes = [hashlib.sha256() for _ in names]
 
     def add(self, index: int, series: Floats) -> None:
         """Take in the next numbers, (N, 4, T), of result `index`."""
-        self._hashes[index].update(_floats(series.transpose(2, 0, 1)))
+        self._hashing.update(self._hashes[index], _floats(series.transpose(2, 0, 1)))
 
     def hexdigest(self) -> str:
+        self._hashing.finish()
         total = hashlib.sha256()
         for (name, object), hashed in zip(self._names, self._hashes, strict=True):
             total.update(_text(name) + _text(object) + hashed.digest())
@@ -145,15 +155,18 @@ def certificate(
     }
 
 
-def _integers(values: Integers) -> bytes:
-    return np.ascontiguousarray(values, "<i8").tobytes()
+def _integers(values: Integers) -> NDArray[np.generic]:
+    """A little-endian copy."""
+    return np.array(values, "<i8", order="C")
 
 
-def _floats(values: Floats) -> bytes:
-    """Little-endian bytes; every NaN as the same one."""
+def _floats(values: Floats) -> NDArray[np.generic]:
+    """A little-endian copy; every NaN is the same one."""
     copy = np.array(values, "<f8", order="C")
-    copy[np.isnan(copy)] = np.nan
-    return copy.tobytes()
+    unknown = np.isnan(copy)
+    if unknown.any():
+        copy[unknown] = np.nan
+    return copy
 
 
 def _text(text: str | None) -> bytes:

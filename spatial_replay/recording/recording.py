@@ -20,6 +20,7 @@ from spatial_replay.inspection.certificate import (
     certificate,
     described,
 )
+from spatial_replay.inspection.hashing import Hashing
 from spatial_replay.logs.block import Messages
 from spatial_replay.logs.merging import merge
 from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates
@@ -62,8 +63,9 @@ class Recording:
         )
         self._samples = 0
         self._topics: set[str] = set()
-        self._sample_hash, self._message_hash = SampleHash(), MessageHash()
-        self._result_hash = ResultHash([(tree.name, tree.object) for tree in self._evaluation.trees])
+        hashing = Hashing()
+        self._sample_hash, self._message_hash = SampleHash(hashing), MessageHash(hashing)
+        self._result_hash = ResultHash([(tree.name, tree.object) for tree in self._evaluation.trees], hashing)
         sink.add_metadata(METADATA, _metadata(files, about or {}))
         if self._evaluation.trees:
             sink.add_metadata(AUTOMATA, self._evaluation.automata_metadata())

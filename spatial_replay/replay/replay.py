@@ -16,6 +16,7 @@ from spatial_replay.inspection.annotation import (
     specification_attachments,
 )
 from spatial_replay.inspection.certificate import MessageHash, ResultHash, SampleHash, certificate
+from spatial_replay.inspection.hashing import Hashing
 from spatial_replay.logs.block import Block, Messages
 from spatial_replay.logs.merging import merge, select
 from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates
@@ -140,8 +141,9 @@ class Replay:
         self.trees = self._evaluation.trees
         self._keep_series, self._keep_leaves = keep_series, keep_leaves
         self._kept: list[list[Stretch]] = [[] for _ in self.trees]
-        self._sample_hash, self._message_hash = SampleHash(), MessageHash()
-        self._result_hash = ResultHash([(tree.name, tree.object) for tree in self.trees])
+        hashing = Hashing()
+        self._sample_hash, self._message_hash = SampleHash(hashing), MessageHash(hashing)
+        self._result_hash = ResultHash([(tree.name, tree.object) for tree in self.trees], hashing)
         self._faults: list[str] = []
         self._remarks: list[str] = []
         self._topics: set[str] = set()
