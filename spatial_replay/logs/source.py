@@ -17,7 +17,7 @@ from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.block import BLOCK_SAMPLES, Block
 from spatial_replay.logs.commonroad import is_scenario, iter_scenario
 from spatial_replay.logs.csv_tracks import COLUMNS, iter_csv
-from spatial_replay.logs.faults import FaultList
+from spatial_replay.logs.faults import FaultList, count_of
 from spatial_replay.logs.lines import open_text
 from spatial_replay.logs.mcap_reader import McapSource, holds_samples
 from spatial_replay.logs.mcap_records import MAGIC
@@ -204,7 +204,8 @@ def read_trace(
     traces = [replace(block.trace, remarks=block.remarks) for block in source.iter_blocks()]
     trace = Trace.concatenate(traces)
     if trace.faults and not allow_damage:
-        more = f"\n… and {len(trace.faults) - 1} more" if len(trace.faults) > 1 else ""
+        others = count_of(trace.faults) - 1
+        more = f"\n… and {others} more" if others else ""
         raise LogError(f"{trace.faults[0]}{more}; allow_damage=True reads the rest")
     return trace
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from spatial_replay.errors import LogError, MissingFileError
+from spatial_replay.logs.faults import FaultList
 from spatial_replay.logs.foreign.mcap_log import McapLog
 from spatial_replay.logs.foreign.messages import Decoder, Message, MessageReader, Topic
 from spatial_replay.logs.foreign.opening import open_messages
@@ -103,6 +104,8 @@ def survey(
         if not whole and counter.knows_enough:
             break
     found = candidates(topics, counter.examples)
+    faults = FaultList()
+    reader.move_faults(faults)
     return Survey(
         name=reader.name,
         kind=reader.kind,
@@ -110,7 +113,7 @@ def survey(
         end_ns=counter.end_ns,
         topics=tuple(TopicSurvey(each.topic, counter.counts[each.topic.name], each.entry) for each in found),
         mapping=suggest_mapping(reader.name, topics, counter.examples, counter.first_ns),
-        faults=reader.take_faults(),
+        faults=faults.take(last=True),
         remarks=(*reader.take_remarks(), *counter.remarks),
     )
 

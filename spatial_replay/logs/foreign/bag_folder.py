@@ -28,6 +28,7 @@ from spatial_replay.logs.foreign.sqlite_tables import SQLITE_MAGIC
 from spatial_replay.logs.foreign.topic_table import topics_named
 from spatial_replay.logs.foreign.unpacking import ZSTD_MAGIC, temporary_folder, unpack_file, unpacked
 from spatial_replay.logs.mcap_records import MAGIC
+from spatial_replay.trace.times import LATEST_NS
 
 METADATA_FILE = "metadata.yaml"
 _ENDINGS = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
@@ -100,7 +101,13 @@ class BagFolder:
         if declared is None:
             return named
         absent = [
-            Topic(name, declared.types[name], "cdr", count, unreadable="it is in none of the bag's files")
+            Topic(
+                name,
+                declared.types[name],
+                "cdr",
+                count,
+                unreadable=f"topic {name!r} is in none of the bag's files",
+            )
             for name, count in declared.counts.items()
             if name not in {topic.name for topic in found}
         ]
@@ -125,6 +132,12 @@ class BagFolder:
         """See `MessageReader.take_faults`."""
         return tuple(fault for each in self._told() for fault in each.take_faults()) + self._faults.take()
 
+    def move_faults(self, other: FaultList) -> None:
+        """See `MessageReader.move_faults`."""
+        for each in self._told():
+            each.move_faults(other)
+        self._faults.move_to(other)
+
     def take_remarks(self) -> tuple[str, ...]:
         """See `MessageReader.take_remarks`."""
         return tuple(remark for each in self._told() for remark in each.take_remarks()) + self._remarks.take()
@@ -144,6 +157,8 @@ class BagFolder:
         as_recorded: bool = False,
     ) -> Columns:
         """See `ColumnReader.iter_columns`."""
+        if end_ns is not None and end_ns > LATEST_NS:
+            end_ns = None
         reads = [
             partial(self._read, number, file, topics, start_ns, end_ns, as_recorded)
             for number, file in enumerate(self._files)

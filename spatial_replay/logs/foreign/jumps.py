@@ -6,6 +6,7 @@ Read in the order of time, the two passes over the same time would look like one
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -25,24 +26,30 @@ def without_jumps(columns: Columns, name: str) -> Columns:
             before others that were recorded earlier.
     """
     # logs put together topic by topic are in order all the same, so each topic counts by itself
-    whole, topics = _Recorded(), dict[str, _Recorded]()
-    by_topic = False
+    topics = dict[str, _Recorded]()
     for each in columns:
-        by_topic = by_topic or whole.first_jump(each.log_time_ns, each.place) is not None
-        if by_topic:
-            names = np.array(each.topics)
-            for topic in sorted(set(each.topics)):
-                rows = np.flatnonzero(names == topic)
-                recorded = topics.setdefault(topic, _Recorded())
-                jump = recorded.first_jump(each.log_time_ns[rows], each.place[rows])
-                if jump is not None:
-                    raise LogError(
-                        f"{name}: time jumps back: the message on {topic!r} logged at"
-                        f" {each.log_time_ns[rows[jump]]} ns was recorded before others that were logged more"
-                        " than a second earlier; on_time_jump='split' (--on-time-jump split) ends the log"
-                        " where it jumps"
-                    )
+        for topic, rows in _rows_by_topic(each.topics):
+            recorded = topics.setdefault(topic, _Recorded())
+            jump = recorded.first_jump(each.log_time_ns[rows], each.place[rows])
+            if jump is not None:
+                raise LogError(
+                    f"{name}: time jumps back: the message on {topic!r} logged at"
+                    f" {each.log_time_ns[rows][jump]} ns was recorded before others that were logged more"
+                    " than a second earlier; on_time_jump='split' (--on-time-jump split) ends the log"
+                    " where it jumps"
+                )
         yield each
+
+
+def _rows_by_topic(topics: Sequence[str]) -> Iterator[tuple[str, Integers | slice]]:
+    names = sorted(set(topics))
+    if len(names) == 1:
+        yield names[0], slice(None)
+        return
+    number = {name: code for code, name in enumerate(names)}
+    codes = np.fromiter(map(number.__getitem__, topics), np.int64, len(topics))
+    rows = np.split(np.argsort(codes, kind="stable"), np.cumsum(np.bincount(codes))[:-1])
+    yield from zip(names, rows, strict=True)
 
 
 class _Recorded:

@@ -38,6 +38,7 @@ class McapLog:
         self._path = path
         self._faults = FaultList()
         self._remarks = FaultList()
+        self._walked = 0
 
     @property
     def name(self) -> str:
@@ -54,9 +55,14 @@ class McapLog:
         directory, channels = self._contents
         statistics = directory.statistics
         counts = statistics.channel_message_counts if statistics else None
-        if statistics and sum(statistics.channel_message_counts.values()) != statistics.message_count:
+        if statistics and not counts and statistics.message_count:
             # counts of channels are optional
             counts = None
+        if statistics and counts and sum(counts.values()) != statistics.message_count:
+            self._faults.add(
+                f"{self.name}: its statistics contradict themselves: {statistics.message_count} messages,"
+                f" and {sum(counts.values())} on its channels"
+            )
         return topics_named(
             _topic(channel, None if counts is None else counts.get(number, 0))
             for number, channel in sorted(channels.items())
@@ -82,6 +88,10 @@ class McapLog:
         """See `MessageReader.take_faults`."""
         return self._faults.take()
 
+    def move_faults(self, other: FaultList) -> None:
+        """See `MessageReader.move_faults`."""
+        self._faults.move_to(other)
+
     def take_remarks(self) -> tuple[str, ...]:
         """See `MessageReader.take_remarks`."""
         return self._remarks.take()
@@ -101,7 +111,7 @@ class McapLog:
         as_recorded: bool = False,
     ) -> Columns:
         """See `ColumnReader.iter_columns`."""
-        first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else end_ns
+        first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else min(end_ns, LATEST_NS + 1)
         directory, channels = self._contents
         wanted = {number: channel.topic for number, channel in channels.items() if channel.topic in topics}
         places = [
@@ -114,6 +124,7 @@ class McapLog:
         if not as_recorded:
             places.sort(key=lambda ranked: ranked[1].start_ns)
         with self._path.open("rb") as stream:
+            self._walked = 0
             stretches = (self._messages(stream, *ranked, wanted, first, last) for ranked in places)
             columns = (
                 stretches if as_recorded else in_order([place.start_ns for _, place in places], stretches)
@@ -124,6 +135,13 @@ class McapLog:
             counted = CountedTopics({each.name: each.count for each in self._topics if each.name in topics})
             yield from counted.counted(columns)
             counted.compare(self.name, self._faults)
+            statistics = directory.statistics
+            total = statistics.message_count if statistics else self._walked
+            is_total_only = statistics is not None and not statistics.channel_message_counts
+            if is_total_only and len(places) == len(directory.chunks) and total != self._walked:
+                self._faults.add(
+                    f"{self.name}: it declares {total} messages in all; {self._walked} could be read"
+                )
 
     def _messages(
         self, stream: BinaryIO, rank: int, place: ChunkPlace, wanted: dict[int, str], first: int, last: int
@@ -139,6 +157,7 @@ class McapLog:
         is_message = (heads.opcode == Opcode.MESSAGE) & (heads.end - heads.begin >= _MESSAGE_FIELDS)
         if breaks_off:
             self._fault(place, f"a record breaks off; of the {span}, {is_message.sum()} could be read")
+        self._walked += int(is_message.sum())
         beyond = is_message & (heads.log_time > LATEST_NS)
         if beyond.any():
             self._fault(place, f"{beyond.sum()} of the {span} have a time beyond 2**63 - 1 ns")

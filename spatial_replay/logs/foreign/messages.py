@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 from spatial_replay.logs.block import Schema
+from spatial_replay.logs.faults import FaultList
 
 Decoder = Callable[[bytes], object]
 """A payload to an object with fields: attributes of ROS and protobuf messages, keys of a JSON object."""
@@ -88,6 +89,9 @@ class MessageReader(Protocol):
 
     def take_faults(self) -> tuple[str, ...]:
         """What was lost since the last call, each with its place, on topics that were asked for."""
+
+    def move_faults(self, other: FaultList) -> None:
+        """Hand over what `take_faults` would give, with the count of what is no longer told one by one."""
 
     def take_remarks(self) -> tuple[str, ...]:
         """What is wrong with the log since the last call without a loss on topics that were asked for."""

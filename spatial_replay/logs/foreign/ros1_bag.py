@@ -87,6 +87,10 @@ class Ros1Bag:
         """See `MessageReader.take_faults`."""
         return self._faults.take()
 
+    def move_faults(self, other: FaultList) -> None:
+        """See `MessageReader.move_faults`."""
+        self._faults.move_to(other)
+
     def take_remarks(self) -> tuple[str, ...]:
         """See `MessageReader.take_remarks`."""
         return self._remarks.take()
@@ -106,7 +110,7 @@ class Ros1Bag:
         as_recorded: bool = False,
     ) -> Columns:
         """See `ColumnReader.iter_columns`."""
-        first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else end_ns
+        first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else min(end_ns, LATEST_NS + 1)
         wanted = {c.number: c for c in self._directory.connections.values() if c.topic in topics}
         chunks = [
             (rank, chunk)

@@ -23,9 +23,12 @@ from spatial_replay.logs.mapping.model import Mapping as TopicsMapping
 from spatial_replay.logs.mapping.plan import Plan
 from spatial_replay.logs.options import OnTimeJump
 from spatial_replay.logs.sink import Attachment
+from spatial_replay.trace.times import FOREVER
 from spatial_replay.trace.trace import Trace
 
 _WAITING_BYTES = 2**26
+_MOST_UNREAD = 20
+"""How many topics that cannot be decoded are told one by one."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,9 @@ class ForeignSource:
 
         Blocks hold the messages of mapped topics, raw.
         """
+        # a window that leaves nothing out is none: what a log declares is compared with all that is read
+        start_ns = start_ns or None
+        end_ns = None if end_ns is None or end_ns >= FOREVER else end_ns
         reader = open_messages(self.path)
         topics = reader.topics()
         plan = self._plan(reader, topics)
@@ -67,6 +73,7 @@ class ForeignSource:
             concave=self.concave,
         )
         blocks = _Blocks(assembler, reader, CopiedMessages(read, _WAITING_BYTES), start_ns, end_ns)
+        blocks.remarks.extend(_unread(self.name, topics, plan))
         as_recorded = self.on_time_jump == "split"
         columns = _columns(reader, plan, start_ns, end_ns, as_recorded=as_recorded)
         if not as_recorded:
@@ -124,6 +131,7 @@ class _Blocks:
         self._copied = copied
         self._window = start_ns or 0, end_ns
         self._faults = FaultList()
+        self.remarks: list[str] = []
         self.any_sample = False
         self.first_fault: str | None = None
 
@@ -136,15 +144,31 @@ class _Blocks:
                 inside &= messages.log_time_ns < end_ns
             messages = messages.take(np.flatnonzero(inside))
         self._copied.add(messages)
-        for fault in chain(trace.faults, self._reader.take_faults(), self._assembler.take_faults()):
+        for fault in trace.faults:
             self._faults.add(fault)
+        self._reader.move_faults(self._faults)
+        self._assembler.move_faults(self._faults)
         faults = self._faults.take(last=last)
         self.any_sample = self.any_sample or len(trace) > 0
         self.first_fault = self.first_fault or next(iter(faults), None)
-        remarks = (*self._reader.take_remarks(), *self._assembler.take_remarks())
+        remarks = (*self.remarks, *self._reader.take_remarks(), *self._assembler.take_remarks())
+        self.remarks = []
         copied = self._copied.take(trace, last=last)
         if len(trace) or len(copied) or faults or remarks:
             yield Block(replace(trace, faults=faults), copied, remarks)
+
+
+def _unread(name: str, topics: Sequence[Topic], plan: Plan) -> list[str]:
+    """Remarks on topics that are not mapped and could not be, with how many messages they have."""
+    unread = [each for each in topics if each.unreadable and each.count != 0 and each.name not in plan.topics]
+    remarks = []
+    for topic in unread[:_MOST_UNREAD]:
+        count = "an unknown number" if topic.count is None else f"{topic.count}"
+        remarks.append(f"{name}: {topic.unreadable}; it is not mapped: messages not read: {count}")
+    if len(unread) > _MOST_UNREAD:
+        more = len(unread) - _MOST_UNREAD
+        remarks.append(f"{name}: of the topics that are not mapped, {more} more cannot be decoded")
+    return remarks
 
 
 def _columns(

@@ -96,6 +96,10 @@ class SqliteBag:
         """See `MessageReader.take_faults`."""
         return self._faults.take()
 
+    def move_faults(self, other: FaultList) -> None:
+        """See `MessageReader.move_faults`."""
+        self._faults.move_to(other)
+
     def take_remarks(self) -> tuple[str, ...]:
         """See `MessageReader.take_remarks`."""
         return self._remarks.take()

@@ -9,18 +9,28 @@ from pathlib import Path
 
 import zstandard
 
-from spatial_replay.errors import LogError
+from spatial_replay.errors import LogError, OutputError
 from spatial_replay.logs.mcap_chunks import LARGEST_CHUNK
+from spatial_replay.logs.output import open_output, output_error
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _PIECE = 2**20
 _MOST_TIMES_LARGER = 1_000
 _ALWAYS_ALLOWED = 2**26
+_LEFT_FREE = 2**26
+"""Bytes of a disk that are never filled."""
 
 
 def temporary_folder(owner: object) -> Path:
-    """A folder that goes away with its owner."""
-    folder = tempfile.mkdtemp(prefix="spatial-replay-")
+    """A folder that goes away with its owner.
+
+    Raises:
+        OutputError: the machine cannot make it.
+    """
+    try:
+        folder = tempfile.mkdtemp(prefix="spatial-replay-")
+    except OSError as error:
+        raise output_error(Path("a temporary folder"), error) from error
     weakref.finalize(owner, shutil.rmtree, folder, ignore_errors=True)
     return Path(folder)
 
@@ -28,7 +38,7 @@ def temporary_folder(owner: object) -> Path:
 def copy_beginning(path: Path, size: int, folder: Path) -> Path:
     """Copy the first `size` bytes of a file into a folder."""
     target = folder / path.name
-    with path.open("rb") as source, target.open("wb") as sink:
+    with path.open("rb") as source, open_output(target) as sink:
         while size > 0 and (piece := source.read(min(size, _PIECE))):
             sink.write(piece)
             size -= len(piece)
@@ -40,18 +50,25 @@ def unpack_file(packed: Path, folder: Path) -> Path:
 
     Raises:
         LogError: it does not decompress, or to something absurdly large.
+        OutputError: the folder has no room for it.
     """
     target = folder / (packed.stem if packed.suffix in (".zstd", ".zst") else packed.name)
     most = packed.stat().st_size * _MOST_TIMES_LARGER + _ALWAYS_ALLOWED
+    room = shutil.disk_usage(folder).free - _LEFT_FREE
     written = 0
     try:
-        with packed.open("rb") as source, target.open("wb") as sink:
+        with packed.open("rb") as source, open_output(target) as sink:
             reader = zstandard.ZstdDecompressor().stream_reader(source, read_across_frames=True)
             while piece := reader.read(_PIECE):
                 written += len(piece)
                 if written > most:
                     raise LogError(
                         f"{packed.name} decompresses to more than {most} bytes; no recorder's file does"
+                    )
+                if written > room:
+                    raise OutputError(
+                        f"{packed.name} decompresses to more than there is room for in {folder.parent};"
+                        " TMPDIR can name a folder with more"
                     )
                 sink.write(piece)
     except zstandard.ZstdError as error:

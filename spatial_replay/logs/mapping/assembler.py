@@ -62,6 +62,10 @@ class Assembler:
         self._start_ns, self._end_ns = start_ns or 0, FOREVER if end_ns is None else end_ns
         self._on_time_jump = on_time_jump
         self._faults = FaultList()
+        for topic, reason in plan.lost:
+            # what is unreadable names its topic itself
+            what = reason.removeprefix(f"topic {topic!r}: ")
+            self._faults.add(f"{name}: {topic}: its transforms cannot be decoded: {what}")
         self._remarks = Remarks(name, plan.mapping)
         self._tree = FrameTree()
         names, classes = Codes(), Codes()
@@ -119,14 +123,24 @@ class Assembler:
         return traces[0] if len(traces) == 1 else Trace.concatenate(traces)
 
     def finish(self) -> Trace:
-        """The samples that are left when the log has ended."""
+        """The samples that are left when the log has ended.
+
+        Raises:
+            UsageError: the mapping fits no message of a topic.
+        """
         trace = self._settle(max(self._newest_ns, self._latest_ns))
+        for channel in self._channels.values():
+            channel.finish()
         self._settled_ns = LATEST_NS
         return trace
 
     def take_faults(self) -> tuple[str, ...]:
         """What was lost since the last call, each with its place."""
         return self._faults.take(last=self._settled_ns == LATEST_NS)
+
+    def move_faults(self, other: FaultList) -> None:
+        """Hand over what `take_faults` would give, with the count of what is no longer told one by one."""
+        self._faults.move_to(other)
 
     def take_remarks(self) -> tuple[str, ...]:
         """What is not as one would wish, without a loss: counts of stale objects, missing transforms.

@@ -208,7 +208,7 @@ def test_a_topic_that_no_file_has_cannot_be_read(tmp_path: Path) -> None:
     metadata = folder / "metadata.yaml"
     metadata.write_text(metadata.read_text().replace("name: /b", "name: /c"))
     topic = topic_of(open_messages(folder), "/c")
-    assert (topic.count, topic.unreadable) == (3, "it is in none of the bag's files")
+    assert (topic.count, topic.unreadable) == (3, "topic '/c' is in none of the bag's files")
 
 
 def test_quality_of_service_never_hides_messages(tmp_path: Path) -> None:
