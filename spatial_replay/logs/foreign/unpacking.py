@@ -18,7 +18,7 @@ _PIECE = 2**20
 _MOST_TIMES_LARGER = 1_000
 _ALWAYS_ALLOWED = 2**26
 _LEFT_FREE = 2**26
-"""Bytes of a disk that are never filled."""
+"""Bytes of a disk that are never filled; of a small one, a tenth."""
 
 
 def temporary_folder(owner: object) -> Path:
@@ -54,7 +54,8 @@ def unpack_file(packed: Path, folder: Path) -> Path:
     """
     target = folder / (packed.stem if packed.suffix in (".zstd", ".zst") else packed.name)
     most = packed.stat().st_size * _MOST_TIMES_LARGER + _ALWAYS_ALLOWED
-    room = shutil.disk_usage(folder).free - _LEFT_FREE
+    free = shutil.disk_usage(folder).free
+    room = free - min(_LEFT_FREE, free // 10)
     written = 0
     try:
         with packed.open("rb") as source, open_output(target) as sink:
