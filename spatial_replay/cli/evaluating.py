@@ -120,9 +120,11 @@ def report_reading(found: Replayed | Recorded) -> None:
     for warning in (*found.faults, *found.remarks):
         say("warning", warning, colour="yellow")
     if found.unreadable:
-        remark = f"{found.unreadable} observations hold a number that is not finite: unknown there"
+        several = found.unreadable != 1
+        counted = f"{found.unreadable} observation{'s' if several else ''}"
+        remark = f"{counted} {'hold' if several else 'holds'} a number that is not finite: unknown there"
         if found.remarks:
-            remark = f"{found.unreadable} observations are unknown: see above, or not finite"
+            remark = f"{counted} {'are' if several else 'is'} unknown: see above, or not finite"
         say("warning", remark, colour="yellow")
 
 

@@ -114,7 +114,7 @@ def survey(
         topics=tuple(TopicSurvey(each.topic, counter.counts[each.topic.name], each.entry) for each in found),
         mapping=suggest_mapping(reader.name, topics, counter.examples, counter.first_ns),
         faults=faults.take(last=True),
-        remarks=(*reader.take_remarks(), *counter.remarks),
+        remarks=(*reader.take_remarks(), *counter.take_remarks()),
     )
 
 
@@ -127,7 +127,9 @@ class _Counter:
         self.first_ns: dict[str, int] = {}
         self.counts = {topic.name: 0 for topic in topics}
         self.examples: dict[str, list[object]] = {}
-        self.remarks: list[str] = []
+        self._remarks: list[str] = []
+        self._undecodable: dict[str, tuple[int, str]] = {}
+        self._looked_at: dict[str, int] = {}
         self._decoders: dict[str, Decoder] = {}
         self._missing = {topic.name for topic in topics if topic.count != 0}
         for topic in topics:
@@ -135,7 +137,7 @@ class _Counter:
                 self._decoders[topic.name] = reader.decoder(topic.name)
                 self.examples[topic.name] = []
             except LogError as error:
-                self.remarks.append(f"topic {topic.name!r}: {error}")
+                self._remarks.append(_of_topic(topic.name, str(error)))
         self._declared = {topic.name: topic.count for topic in topics}
         self._bytes = dict.fromkeys(self._declared, 0)
 
@@ -159,8 +161,21 @@ class _Counter:
         self._bytes[topic] += len(message.payload)
         if self.counts[topic] > 1 and self._bytes[topic] > _EXAMPLE_BYTES:
             return
+        self._looked_at[topic] = self._looked_at.get(topic, 0) + 1
         try:
             self.examples[topic].append(self._decoders[topic](message.payload))
         except LogError as error:
-            if self.counts[topic] == 1:
-                self.remarks.append(f"topic {topic!r}: {error}")
+            count, first = self._undecodable.get(topic, (0, f"{error}, at {message.log_time_ns} ns"))
+            self._undecodable[topic] = count + 1, first
+
+    def take_remarks(self) -> list[str]:
+        """Topics that cannot be decoded, and messages that cannot, of those that were looked at."""
+        return self._remarks + [
+            f"{_of_topic(topic, first)} ({count} of {self._looked_at[topic]} messages looked at)"
+            for topic, (count, first) in self._undecodable.items()
+        ]
+
+
+def _of_topic(name: str, what: str) -> str:
+    start = f"topic {name!r}: "
+    return what if what.startswith(start) else start + what

@@ -82,6 +82,26 @@ def test_messages_that_cannot_be_decoded_are_told(log: Write) -> None:
     assert all("'/list'" in remark for remark in found.remarks)
 
 
+def test_a_later_message_that_cannot_be_decoded_is_told_once(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("any.Thing", "jsonschema", b"{}")
+        channel = writer.register_channel("/a", "json", schema)
+        broken = writer.register_channel("/b", "wire", schema)
+        for number, data in enumerate([b"{}", b"{", b"{}", b"["]):
+            writer.add_message(channel, number, data, number)
+            writer.add_message(broken, number, data, number)
+        writer.finish()
+    reader = messages_in(path)
+    assert reader is not None
+    found = [remark for remark in survey(reader).remarks if "/a" in remark]
+    assert len(found) == 1
+    assert "(2 of 4 messages looked at)" in found[0]
+    assert all(remark.count("topic '/b': ") <= 1 for remark in survey(reader).remarks)
+
+
 def test_logs_that_name_their_objects_need_no_look(tmp_path: Path) -> None:
     tracks = tmp_path / "run.jsonl"
     tracks.write_text('{"time_ns": 0}\n')

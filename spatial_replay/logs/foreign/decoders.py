@@ -15,6 +15,9 @@ from spatial_replay.logs.block import Schema
 from spatial_replay.logs.foreign.messages import Decoder, Topic
 from spatial_replay.logs.foreign.ros_types import ros_decoder, ros_definitions
 
+_MOST_FILES = 1_000
+"""Files that one descriptor set may hold."""
+
 ENCODINGS = ("ros1", "cdr", "protobuf", "json")
 
 
@@ -99,14 +102,27 @@ def _message_class(type_name: str, schema: Schema | None) -> type[Message]:
 
 def _in_order(described: FileDescriptorSet) -> list[FileDescriptorProto]:
     """The files, each after those that it imports."""
-    waiting = {file.name: file for file in described.file}
-    ordered: list[FileDescriptorProto] = []
-    while waiting:
-        ready = [file for file in waiting.values() if not any(name in waiting for name in file.dependency)]
-        if not ready:
-            raise ValueError(f"{next(iter(waiting))!r:.100} imports itself")
-        ordered += [waiting.pop(file.name) for file in ready]
-    return ordered
+    if len(described.file) > _MOST_FILES:
+        raise ValueError(f"it has {len(described.file)} files; at most {_MOST_FILES} are read")
+    files = {file.name: file for file in described.file}
+    missing: dict[str, int] = {}
+    importers: dict[str, list[str]] = {name: [] for name in files}
+    for name, file in files.items():
+        imports = {each for each in file.dependency if each in files}
+        missing[name] = len(imports)
+        for each in imports:
+            importers[each].append(name)
+    ready = [name for name, count in missing.items() if not count]
+    # the list grows while it is walked: a file is ready when the last of its imports is
+    for name in ready:
+        for importer in importers[name]:
+            missing[importer] -= 1
+            if not missing[importer]:
+                ready.append(importer)
+    if len(ready) < len(files):
+        first = next(name for name, count in missing.items() if count)
+        raise ValueError(f"{first!r:.100} imports itself")
+    return [files[name] for name in ready]
 
 
 def _decode_json(payload: bytes) -> object:

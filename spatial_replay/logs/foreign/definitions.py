@@ -16,10 +16,13 @@ from spatial_replay.errors import LogError
 
 Kind: TypeAlias = Literal["scalar", "array", "sequence"]
 
-LONGEST_TEXT = 2**20
-MOST_TYPES = 2_000
-MOST_VALUES = 100_000
-"""Values in one message that its definition alone, not its bytes, may ask for."""
+LONGEST_TEXT = 2**18
+MOST_TYPES = 1_000
+MOST_FIELDS = 4_000
+MOST_VALUES = 4_000
+"""Values in one message that its definition alone, not its bytes, may ask for: each becomes lines of code."""
+MOST_VALUES_IN_ALL = 12_000
+"""The same, over a type and all those that it uses."""
 
 BASE_BYTES: Mapping[str, int] = {
     **dict.fromkeys(("bool", "byte", "char", "octet", "int8", "uint8"), 1),
@@ -88,7 +91,10 @@ def definitions_from_msg(text: str, type_name: str) -> Definitions:
 def iter_sections(text: str, type_name: str) -> Iterator[tuple[str, str]]:
     """Each type's name and text; the first may go without a head line."""
     if len(text) > LONGEST_TEXT:
-        raise LogError(f"the definition of {type_name!r:.100} has {len(text)} characters; 2**20 are read")
+        raise LogError(
+            f"the definition of {type_name!r:.100} has {len(text)} characters;"
+            f" at most {LONGEST_TEXT} are read"
+        )
     for section in _SEPARATOR.split(text):
         head = _HEAD.match(section)
         if head:
@@ -163,6 +169,7 @@ class _Walk:
         self._definitions = definitions
         self._empty_bytes = empty_bytes
         self._measured: dict[str, tuple[int, int]] = {}
+        self._in_all = 0
         self.used: dict[str, tuple[Field, ...]] = {}
 
     def measure(self, name: str, above: tuple[str, ...]) -> tuple[int, int]:
@@ -176,6 +183,8 @@ class _Walk:
         if len(self.used) >= MOST_TYPES:
             raise LogError(f"the definition uses more than {MOST_TYPES} types")
         fields = self._definitions[name]
+        if len(fields) > MOST_FIELDS:
+            raise LogError(f"{name!r:.100} has {len(fields)} fields; at most {MOST_FIELDS} are read")
         self.used[checked_type_name(name)] = fields
         _check_field_names(name, fields)
         values = least = 0
@@ -184,7 +193,13 @@ class _Walk:
             values += field_values
             least += field_least
         if values > MOST_VALUES:
-            raise LogError(f"{name!r} asks for {values} values in a message; {MOST_VALUES} are read")
+            raise LogError(f"{name!r} asks for {values} values in a message; at most {MOST_VALUES} are read")
+        self._in_all += values
+        if self._in_all > MOST_VALUES_IN_ALL:
+            raise LogError(
+                f"{name!r} and the types beside it ask for {self._in_all} values; at most"
+                f" {MOST_VALUES_IN_ALL} are read"
+            )
         self._measured[name] = values, least if fields else self._empty_bytes
         return self._measured[name]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
@@ -9,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Literal
 from spatial_replay.errors import LogError
 from spatial_replay.logs.block import Schema
 from spatial_replay.logs.foreign.definitions import (
-    LONGEST_TEXT,
     Definitions,
     Field,
     Kind,
@@ -32,6 +32,12 @@ _DISTRIBUTIONS = ("jazzy", "kilted", "lyrical", "iron", "humble", "galactic", "f
 _PLAIN = (b"\x00\x01", b"\x00\x00")
 _MOST_AROUND = 7
 """Bytes of a message that hold no field: four before them, and up to three that fill it up."""
+_LONGEST_IDL = 2**17
+_MOST_ANNOTATIONS = 500
+_IDL_ASIDE = re.compile(r'"(?:\\"|[^"])*"|\'(?:[^\'\\\n]|\\.)*\'|//[^\n]*|/\*.*?\*/', re.DOTALL)
+"""Strings and comments, as the parser takes them."""
+_IDL_ANNOTATION = re.compile(r"@[A-Za-z_][\w:]*\s*\(")
+_IDL_NESTED_TYPE = re.compile(r"<[^<>]*<[^<>]*<")
 _KINDS: dict[int, Kind] = {3: "array", 4: "sequence"}
 
 
@@ -164,8 +170,7 @@ def _parsed(type_name: str, schema: Schema) -> Definitions:
 def _from_idl(text: str, type_name: str) -> Definitions:
     from rosbags.typesys import get_types_from_idl
 
-    if len(text) > LONGEST_TEXT or "<<" in text:
-        raise LogError(f"the definition of {type_name!r} is too long, or shifts numbers; such are not read")
+    _check_idl(text, type_name)
     found: dict[str, tuple[Field, ...]] = {}
     try:
         for _, body in iter_sections(text, type_name):
@@ -175,6 +180,27 @@ def _from_idl(text: str, type_name: str) -> Definitions:
     except Exception as error:
         raise LogError(f"the definition of {type_name!r} cannot be read: {_reason(error)}") from None
     return found
+
+
+def _check_idl(text: str, type_name: str) -> None:
+    """That a text in IDL can be parsed in seconds.
+
+    The parser tries nested parentheses in ever more ways, and takes milliseconds for each annotation.
+    """
+    bare = _IDL_ASIDE.sub(" ", text) if len(text) <= _LONGEST_IDL else ""
+    what = None
+    if len(text) > _LONGEST_IDL:
+        what = f"has {len(text)} characters; at most {_LONGEST_IDL} are read"
+    elif "<<" in bare:
+        what = "shifts numbers; such are not read"
+    elif bare.count("(") > len(_IDL_ANNOTATION.findall(bare)):
+        what = "has parentheses outside annotations, or nested ones; such are not read"
+    elif _IDL_NESTED_TYPE.search(bare):
+        what = "nests types deeply; such are not read"
+    elif bare.count("@") > _MOST_ANNOTATIONS:
+        what = f"has {bare.count('@')} annotations; at most {_MOST_ANNOTATIONS} are read"
+    if what is not None:
+        raise LogError(f"the definition of {type_name!r} {what}")
 
 
 def _standards(encoding: RosEncoding, distribution: str | None) -> Iterator[Definitions]:

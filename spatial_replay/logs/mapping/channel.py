@@ -29,6 +29,9 @@ MISFITS = (FieldError, AttributeError, LookupError, TypeError, ValueError, Overf
 """What reading fields of a message raises that is not as the mapping says."""
 
 
+_PATIENCE = 100
+"""Messages of a topic that may be no use before the first that fits; with more, the mapping is to blame."""
+
 _CHUNK = 256
 _CHUNK_BYTES = 2**14
 """Messages decoded at once: few, so that what they hold is let go of before it piles up."""
@@ -90,6 +93,7 @@ class Channel:
         self._time: TimeGetter | None = None
         self._has_time = False
         self._signals: list[Get] | None = None
+        self._unfit: dict[str, tuple[int, str]] = {}
 
     @property
     def is_moving(self) -> bool:
@@ -141,7 +145,7 @@ class Channel:
         """What messages tell of: payloads, or what they hold where the channel `keeps_decoded`.
 
         Raises:
-            UsageError: the mapping does not fit the first message with objects.
+            UsageError: the mapping fits none of many messages.
         """
         parts: list[Part] = []
         values: list[list[float]] = []
@@ -180,9 +184,21 @@ class Channel:
             parts.append(extractor.harvest(chunk, first))
             return None
         except MISFITS:
-            if not extractor.is_bound:
-                self._bind_first(extractor, chunk)
-        found, kept = self._one_by_one(chunk, lambda content: extractor.harvest([content], 0), log_times_ns)
+            pass
+
+        def read(content: object) -> Part:
+            was_bound = extractor.is_bound
+            try:
+                return extractor.harvest([content], 0)
+            except ContentError:
+                # this message alone is to blame
+                raise
+            except MISFITS as error:
+                if not was_bound:
+                    self._turn_down("objects", error)
+                raise
+
+        found, kept = self._one_by_one(chunk, read, log_times_ns)
         # not together: each may be of a form of its own
         parts += [part.shifted(first + place) for place, part in enumerate(found)]
         return kept
@@ -193,21 +209,29 @@ class Channel:
         """Add the signals of a few messages to `values`; those that could be read, and which (None: all).
 
         Raises:
-            UsageError: a signal's path leads nowhere in the first message.
+            UsageError: a signal's path leads nowhere in any of many messages.
         """
         entry = self.planned.mapping
         if entry is None or not entry.signals or not chunk:
             return chunk, None
-        if self._signals is None:
-            self._signals = [self._bind_signal(signal.field, chunk[0]) for signal in entry.signals]
         gets = self._signals
         try:
-            values += [[_number(get(content)) for get in gets] for content in chunk]
-            return chunk, None
+            if gets is not None:
+                values += [[_number(get(content)) for get in gets] for content in chunk]
+                return chunk, None
         except MISFITS:
-            found, kept = self._one_by_one(
-                chunk, lambda content: [_number(get(content)) for get in gets], log_times_ns
-            )
+            pass
+
+        def read(content: object) -> list[float]:
+            if self._signals is None:
+                try:
+                    self._signals = [_bound_signal(signal.field, content) for signal in entry.signals]
+                except FieldError as error:
+                    self._turn_down("signals", error)
+                    raise
+            return [_number(get(content)) for get in self._signals]
+
+        found, kept = self._one_by_one(chunk, read, log_times_ns)
         values += found
         return [chunk[i] for i in kept], kept
 
@@ -233,31 +257,30 @@ class Channel:
             raise self._misfit(_NO_STAMP)
         return self._time.nanoseconds([content])[0]
 
-    def _bind_first(self, extractor: Extractor, contents: list[Any]) -> None:
-        """Find the first message that tells of an object, and say what is wrong if no path fits it."""
-        for content in contents:
-            try:
-                extractor.harvest([content], 0)
-            except ContentError:
-                # this message alone is to blame
-                continue
-            except FieldError as fault:
-                raise self._misfit(str(fault)) from None
-            except MISFITS as fault:
-                raise self._misfit(f"its messages are not as expected: {fault}") from None
-            if extractor.is_bound:
-                return
+    def _turn_down(self, what: str, error: Exception) -> None:
+        """Count a message that the mapping does not fit, before there was one that it fits.
 
-    def _bind_signal(self, text: str, content: object) -> Get:
-        path = Path.of(text)
-        try:
-            check(path, content)
-            _number(walk(path, content))
-        except FieldError as error:
-            raise self._misfit(str(error)) from None
-        except (TypeError, ValueError):
-            raise self._misfit(f"{text}: its value is no number; give the path of one") from None
-        return getter(path, style_of(content))
+        Raises:
+            UsageError: there were many.
+        """
+        count, first = self._unfit.get(what, (0, ""))
+        said = str(error) if isinstance(error, FieldError) else f"its messages are not as expected: {error}"
+        self._unfit[what] = count + 1, first or said
+        if count + 1 >= _PATIENCE:
+            raise self._misfit(first)
+
+    def finish(self) -> None:
+        """Say that there will be no more messages.
+
+        Raises:
+            UsageError: there were some, and the mapping fitted none.
+        """
+        for what, (_, first) in self._unfit.items():
+            is_bound = self._signals is not None
+            if what == "objects":
+                is_bound = self.extractor is None or self.extractor.is_bound
+            if not is_bound:
+                raise self._misfit(first)
 
     def _misfit(self, what: str) -> UsageError:
         return UsageError(f"{self._mapping_name}: topics.{self.name}: {what}")
@@ -276,6 +299,16 @@ class Channel:
             else:
                 kept.append(place)
         return found, kept
+
+
+def _bound_signal(text: str, content: object) -> Get:
+    path = Path.of(text)
+    check(path, content)
+    try:
+        _number(walk(path, content))
+    except (TypeError, ValueError, OverflowError):
+        raise FieldError(f"{text}: its value is no number; give the path of one") from None
+    return getter(path, style_of(content))
 
 
 def _number(value: object) -> float:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from spatial_replay.errors import LogError
+from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mapping.plan import Plan
 
 _MOST_STEPS = 100_000
 """Samples between two messages; more are no log with pauses, but a clock that jumped."""
+
+
+_MOST_AT_ONCE = 1_000_000
+"""Samples among the messages that are taken together: they are in memory at once."""
 
 
 class Instants:
@@ -21,6 +25,7 @@ class Instants:
 
     def __init__(self, plan: Plan, name: str, start_ns: int) -> None:
         self._name = name
+        self._mapping_name = plan.mapping.name
         self._step_ns = plan.mapping.sampling.step_ns
         self._start_ns = start_ns
         self._from_ns: int | None = None
@@ -36,6 +41,7 @@ class Instants:
 
         Raises:
             LogError: there are far too many samples to where the log goes on.
+            UsageError: the step is far too short for how often there are messages.
         """
         if self._step_ns is None:
             times = np.unique(times_ns)
@@ -60,5 +66,11 @@ class Instants:
             raise LogError(
                 f"{self._name}: time jumps forward from {marks[at]} ns to {marks[at + 1]} ns, more than"
                 f" {_MOST_STEPS} samples without a message; take another clock or a longer step"
+            )
+        if stop - first > _MOST_AT_ONCE:
+            raise UsageError(
+                f"{self._mapping_name}: sample.every: a sample each {step_ns} ns makes {stop - first} of them"
+                f" up to {upto_ns} ns, where at most {_MOST_AT_ONCE} fit between messages that are read"
+                " together; give a longer step"
             )
         return np.arange(first, max(first, stop), dtype=np.int64) * step_ns

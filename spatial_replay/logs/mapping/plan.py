@@ -50,6 +50,7 @@ class Plan:
             window is only known when they have been decoded.
         margin_ns: how far beyond the end of a window messages still count.
         planned: how each topic is read, as in `topics`.
+        lost: topics with transforms that cannot be decoded, with the reason.
         sampled_topic: the topic whose messages are sampled; None for samples at each multiple of a step.
     """
 
@@ -59,6 +60,7 @@ class Plan:
     margin_ns: int
     planned: tuple[PlannedTopic, ...] = ()
     sampled_topic: str | None = None
+    lost: tuple[tuple[str, str], ...] = ()
 
     @classmethod
     def of(cls, mapping: Mapping, topics: Sequence[Topic]) -> Plan:
@@ -73,14 +75,15 @@ class Plan:
         mapped = {entry.topic: entry for entry in mapping.topics}
         needs_frames = mapping.fixed_frame is not None
         names = [topic for topic in mapped if topic in known]
-        if needs_frames:
-            names += [
-                topic.name
-                for topic in topics
-                if short_type(topic.type) in TRANSFORM_TYPES
-                and topic.name not in mapped
-                and not topic.unreadable
-            ]
+        transforms = [
+            topic
+            for topic in topics
+            if needs_frames and short_type(topic.type) in TRANSFORM_TYPES and topic.name not in mapped
+        ]
+        names += [topic.name for topic in transforms if topic.unreadable is None]
+        lost = [
+            (topic.name, topic.unreadable) for topic in transforms if topic.unreadable and topic.count != 0
+        ]
         sampled = None if mapping.sampling.step_ns is not None else mapping.sampling.topic or _first(mapping)
         if sampled is not None and sampled not in names:
             names.append(sampled)
@@ -93,6 +96,7 @@ class Plan:
             margin_ns=DISORDER_NS + (HISTORY_NS if waits_for_frames else 0),
             planned=planned,
             sampled_topic=sampled,
+            lost=tuple(lost),
         )
 
     def lookback_ns(self, topic: str) -> int | None:

@@ -54,12 +54,18 @@ class Remarks:
             elif not is_known:
                 reason = f"no transform to {fixed!r} names the frame {frame!r}"
             texts.append(
-                f"{self._name}: {topic}: {count} observations are unknown, the first at {first_ns} ns:"
-                f" {reason}"
+                f"{self._name}: {topic}: {count} observation{'s are' if count != 1 else ' is'} unknown,"
+                f" the first at {first_ns} ns: {reason}"
             )
         texts += self._stale_texts()
         texts += [
-            f"{self._name}: {topic}: {count} things were left out that are no bodies, such as lines and texts"
+            f"{self._name}: {topic}: "
+            + (
+                f"{count} things were left out that are no bodies"
+                if count != 1
+                else "1 thing was left out that is no body"
+            )
+            + ", such as lines and texts"
             for topic, count in sorted(self._skipped.items())
         ]
         if fixed is None and len(self._frames) > 1:

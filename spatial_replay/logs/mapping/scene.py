@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
@@ -18,6 +19,7 @@ from spatial_replay.logs.mapping.plan import Plan
 from spatial_replay.logs.mapping.remarks import Remarks
 from spatial_replay.logs.mapping.seen import EVERYONE, Seen
 from spatial_replay.logs.mapping.timeline import STALE, Events, events_of
+from spatial_replay.trace.times import FOREVER
 from spatial_replay.trace.trace import ABSENT, Trace
 
 TakeFault = Callable[[str, int, str], None]
@@ -48,9 +50,11 @@ class Scene:
         self._events = {name: Events.none() for name in channels}
         self._signals: dict[tuple[str, int], tuple[Integers, Floats]] = {}
         self._owners: dict[int, str] = {}
+        self._window_ns = 0, FOREVER
 
     def settle(self, upto_ns: int, instants: Instants, start_ns: int, end_ns: int) -> Trace:
         """Take in the messages that wait, up to a time; the samples up to then that lie in a window."""
+        self._window_ns = start_ns, end_ns
         sampled: list[Integers] = []
         stored = [self._rows]
         for name, channel in self._channels.items():
@@ -144,6 +148,8 @@ class Scene:
                 for whole, part in zip(found, between, strict=True):
                     whole[chosen] = part
                 missing = chosen[~between.known]
+                # what says nothing of the window is no loss
+                missing = missing[self._matters(channel, clock_ns[missing])]
                 if len(missing):
                     self._remarks.count_missing(
                         channel.name,
@@ -153,6 +159,11 @@ class Scene:
                         is_known=frame in self._tree.names,
                     )
         return found
+
+    def _matters(self, channel: Channel, times_ns: Integers) -> NDArray[np.bool_]:
+        """Whether what a topic says at some times may count in the window."""
+        start_ns, end_ns = self._window_ns
+        return (times_ns < end_ns) & (times_ns >= start_ns - channel.planned.max_age_ns)
 
     def _without_twice_named(
         self, seen: Seen, number: Integers, stored: list[Rows], fault: Callable[[int, str], None]

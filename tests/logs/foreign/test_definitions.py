@@ -121,7 +121,7 @@ HOSTILE = {
     ),
     "nothing but noise": ("\x00\x01", "is no field"),
     "not even text": (b"\xff\xfe", "no text in UTF-8"),
-    "too much text": ("# " + "x" * 2**21, "characters; 2**20 are read"),
+    "too much text": ("# " + "x" * 2**21, "characters; at most 262144 are read"),
 }
 
 

@@ -1,0 +1,70 @@
+"""Messages that a mapping does not fit: the odd one is lost, and the mapping is to blame if it fits none."""
+
+from __future__ import annotations
+
+import pytest
+
+from logs.mapping.feeding import SECOND, Feed, make, pose_stamped
+from spatial_replay.errors import UsageError
+from spatial_replay.logs.foreign.messages import Topic
+from spatial_replay.logs.mapping.assembler import Assembler
+from spatial_replay.logs.mapping.load import parse_mapping
+from spatial_replay.logs.mapping.plan import Plan
+
+HUGE = 10**400
+
+
+@pytest.mark.parametrize("batch", [1, 1000])
+@pytest.mark.parametrize("odd", [{"v": HUGE, "x": 0, "y": 0}, {"v": "fast", "x": 0, "y": 0}, [], {"x": 1}])
+@pytest.mark.parametrize("place", [0, 1, 2])
+@pytest.mark.parametrize("head", ["", "signals: {s: v}", "position: [v, y], signals: {s: v}"])
+def test_an_odd_message_is_a_fault_wherever_it_stands(odd: object, place: int, batch: int, head: str) -> None:
+    messages: list[object] = [{"v": 1.0, "x": 0.0, "y": 0.0}] * 3
+    messages[place] = odd
+    feed = Feed(types={"/a": "any/Thing"})
+    for number, message in enumerate(messages):
+        feed.add("/a", number * SECOND, message)
+    made = make(f"topics: {{/a: {{{head or 'position: [v, y]'}}}}}", feed, batch=batch)
+    assert len(made.faults) == 1
+    assert f"/a at {place * SECOND} ns" in made.faults[0]
+
+
+@pytest.mark.parametrize("count", [1, 5, 500])
+@pytest.mark.parametrize("entry", ["position: [u, y]", "signals: {s: u}", "signals: {s: y}"])
+def test_a_mapping_that_fits_no_message_is_to_blame(count: int, entry: str) -> None:
+    feed = Feed(types={"/a": "any/Thing"})
+    for number in range(count):
+        feed.add("/a", number * SECOND, {"v": 1.0, "y": HUGE})
+    with pytest.raises(UsageError, match=r"test\.yaml: topics\./a: [uy]: "):
+        make(f"topics: {{/a: {{{entry}}}}}", feed)
+
+
+def test_a_step_that_is_far_too_short_is_named() -> None:
+    feed = Feed(types={"/a": "any/Thing"})
+    for number in range(300):
+        feed.add("/a", number * SECOND // 20, {"x": 0.0, "y": 0.0})
+    with pytest.raises(UsageError, match=r"test\.yaml: sample\.every: .*longer step"):
+        make("sample: {every: 1us}\ntopics: {/a: {}}", feed)
+
+
+@pytest.mark.parametrize(("count", "faults"), [(None, 1), (3, 1), (0, 0)])
+def test_transforms_that_cannot_be_decoded_are_a_loss(count: int | None, faults: int) -> None:
+    reason = "topic '/tf': the definition is missing"
+    lost = Topic("/tf", "tf2_msgs/msg/TFMessage", "cdr", count=count, unreadable=reason)
+    topics = [Topic("/p", "geometry_msgs/msg/PoseStamped", "cdr"), lost]
+    for head, expected in (("fixed_frame: map\n", faults), ("", 0)):
+        plan = Plan.of(parse_mapping(head + "topics: {/p: {}}"), topics)
+        assert "/tf" not in plan.topics
+        told = Assembler(plan, Feed().decoder, name="test.bag").take_faults()
+        assert len(told) == expected
+        assert all(each.count("/tf") == 1 and "definition is missing" in each for each in told)
+
+
+def test_remarks_are_about_the_window() -> None:
+    feed = Feed()
+    for number in range(10):
+        frame = "map" if number < 5 else "odom"
+        feed.add("/p", number * SECOND, pose_stamped(1.0, 2.0, frame))
+    text = "fixed_frame: map\ntopics: {/p: {}}"
+    assert "5 observations are unknown" in make(text, feed).remarks[0]
+    assert make(text, feed, end_ns=4 * SECOND).remarks == ()
