@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from spatial_replay.cli.exit_codes import ExitCode
+from spatial_replay.cli.exit_codes import exit_code_from_verdicts
 from spatial_replay.cli.options import output_option, profile_option
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.simulated import SCENARIOS, Simulating, injections_from, simulation_options
@@ -29,7 +29,8 @@ def planning_command(scenario: str) -> click.Command:
 
     The planner decides what the robot moves, step by step, until the specification is satisfied or no path to
     that is left. The log tells what it decided and why. Equal options give an equal log, byte for byte. Needs
-    the extra `sim`. Exits with 0 if the run ends satisfied, else with 1.
+    the extra `sim`. Exits with 0 if the log says satisfied, 1 if violated, 4 if unknown or if the
+    planner waited in vain.
 
     \b
     Examples:
@@ -71,7 +72,9 @@ def planning_command(scenario: str) -> click.Command:
             f"{counted(planned.steps, 'motion')}, {counted(planned.pruned, 'edge')} given up"
         )
         click.echo(f"the planner: {planned.reason}")
-        return ExitCode.SATISFIED if planned.satisfied else ExitCode.VIOLATED
+        click.echo(f"the log: {planned.verdict}")
+        # a run that waited in vain was cut short: that its goal was not reached is no violation
+        return exit_code_from_verdicts(["unknown" if planned.ended == "wait" else planned.verdict])
 
     return command
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
+from spatial_replay.errors import UsageError
 from spatial_replay.monitor.leaf_plans import SampleLeaves
-from spatial_replay.spec.formula import Formula, Outline
+from spatial_replay.spec.formula import Formula, Outline, Specification
 from spatial_replay.trace.sample import Sample
 
 Symbol: TypeAlias = tuple[bool | None, ...]
@@ -31,3 +32,17 @@ class Observer:
         return tuple(
             None if low < 0.0 <= high else low >= 0.0 for low, high in zip(lower, upper, strict=True)
         )
+
+
+def refuse_template(specification: Specification, name: str) -> None:
+    """That a spec is about objects that are known.
+
+    Raises:
+        UsageError: a template, since it stands for objects that only a whole log has.
+    """
+    for spec in specification.specs:
+        if spec.name == name and spec.parameter is not None:
+            raise UsageError(
+                f"{name}({spec.parameter}) in {specification.filename} is a template: it stands for objects "
+                "that are not known before the end; plan for a spec that names its objects"
+            )

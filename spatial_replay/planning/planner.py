@@ -16,7 +16,7 @@ from spatial_replay.planning.maps import (
     proposition_maps,
     refuse_delays,
 )
-from spatial_replay.planning.observing import Observer, Symbol
+from spatial_replay.planning.observing import Observer, Symbol, refuse_template
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.step import Candidate, Consideration, Edge, Guards, Kind, Outcome, Step
 from spatial_replay.planning.targets import find_target
@@ -57,9 +57,11 @@ class Planner:
 
         Raises:
             NoAutomatonError: past operators, bounds in seconds, or too large a formula.
-            UsageError: no such spec, several to choose from, or propositions about earlier samples.
+            UsageError: no such spec, several to choose from, a template, or propositions about earlier
+                samples.
         """
         self.automaton: Automaton = automaton_of(specification, name)
+        refuse_template(specification, self.automaton.name)
         self._settings = settings
         self._regions = specification.regions
         self._formulas = [each.formula for each in self.automaton.propositions]
@@ -95,6 +97,17 @@ class Planner:
     def is_accepting(self) -> bool:
         """Whether the samples observed satisfy the specification, as far as propositions tell."""
         return self._sample is not None and self._states <= self.automaton.accepting
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether they satisfy it unless it was violated for good while not enough was seen.
+
+        No later sample takes that doubt away.
+        """
+        if self._sample is None or self._states.isdisjoint(self.automaton.accepting):
+            return False
+        open_states = self._states - self.automaton.accepting
+        return bool(open_states) and open_states.isdisjoint(self.automaton.can_accept)
 
     def observe(self, sample: Sample) -> None:
         """Take in the next sample.
@@ -137,7 +150,7 @@ class Planner:
         if state is None:
             reason = "no path left: the specification cannot be satisfied any more"
             return self._decided("no path", (), reason)
-        if state in self.automaton.accepting:
+        if self.is_doubtful:
             return self._decided("hold", (), "satisfied, unless it was violated while not enough was seen")
         considered: list[Consideration] = []
         while (way := next(self.automaton.paths(state, self._pruned), None)) is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -11,13 +10,15 @@ from types import MappingProxyType
 
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.inspection.annotation import kept_files
+from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.planning.black_box import PLAN_METADATA, BlackBox
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, Skill
 from spatial_replay.planning.settings_text import text_from_settings
 from spatial_replay.planning.step import Kind, Outcome, Step
 from spatial_replay.planning.workspace import Grid, Workspace
-from spatial_replay.runs.run_log import RunLog, run_log
+from spatial_replay.runs.plan_loop import PlanLoop
+from spatial_replay.runs.run_log import run_log
 from spatial_replay.runs.scripted import run_options
 from spatial_replay.simulation.injection import Injection
 from spatial_replay.simulation.world import World
@@ -25,11 +26,6 @@ from spatial_replay.simulation.worlds import default_specification, make_world
 from spatial_replay.spec import check_names
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
-
-HOLDING_SAMPLES = 30
-"""How long it has to stay satisfied before a run ends."""
-MOST_WAITING_SAMPLES = 150
-"""How long it waits for what it does not see."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +35,9 @@ class PlannedRun:
     Attributes:
         samples: how many samples.
         seconds: from the first to the last.
-        ended: the kind of the last decision: "hold" where the specification is satisfied.
+        ended: the kind of the last decision: "hold" where the specification is satisfied, as far as the
+            planner can tell.
+        verdict: what the log says of the specification, uncertainty of positions included.
         reason: the last decision in words.
         steps: how many motions were executed.
         pruned: how many edges of the automaton were given up.
@@ -49,6 +47,7 @@ class PlannedRun:
     samples: int
     seconds: float
     ended: Kind
+    verdict: Verdict
     reason: str
     steps: int
     pruned: int
@@ -56,8 +55,8 @@ class PlannedRun:
 
     @property
     def satisfied(self) -> bool:
-        """Whether the run ended with the specification satisfied."""
-        return self.ended == "hold"
+        """Whether the run ended with the specification satisfied, for the planner and for the log."""
+        return self.ended == "hold" and self.verdict == Verdict.SATISFIED
 
 
 def record_plan(
@@ -99,7 +98,24 @@ def record_plan(
                 "specification": planner.automaton.name,
             }
             log.add_metadata(PLAN_METADATA, plan)
-            return _Loop(world, BlackBox(planner), log, advance).run()
+            loop = PlanLoop(BlackBox(planner), log, WorldExecutor(world, world.skill), world.step)
+
+            def hear(sample: Sample) -> None:
+                loop.observe(sample)
+                advance(1)
+
+            world.attach(hear)
+            last = loop.run()
+        return PlannedRun(
+            samples=log.samples,
+            seconds=log.seconds,
+            ended=last.kind,
+            verdict=log.verdict,
+            reason=last.reason,
+            steps=loop.executed,
+            pruned=len(last.pruned),
+            planning_s=loop.planning_s,
+        )
 
 
 def _check_names(file: Specification, sample: Sample) -> None:
@@ -135,57 +151,6 @@ class WorldExecutor:
         else:
             done = self._world.place(target.name, target.x, target.y, target.yaw)
         return Outcome(done.succeeded, done.reason)
-
-
-class _Loop:
-    """A run from its first sample to its end."""
-
-    def __init__(self, world: World, box: BlackBox, log: RunLog, advance: Callable[[int], None]) -> None:
-        self._world, self._box, self._log, self._advance = world, box, log, advance
-        self._executor = WorldExecutor(world, box.planner.settings.skill)
-        self._thought_s = 0.0
-        world.attach(self._hear)
-
-    def run(self) -> PlannedRun:
-        self._world.step()
-        executed = waited = 0
-        while True:
-            step = self._decide()
-            if step.kind == "execute":
-                executed, waited = executed + 1, 0
-                outcome = self._executor.execute(step)
-                self._log.write_messages(self._box.conclude(outcome))
-            elif step.kind == "wait" and waited < MOST_WAITING_SAMPLES:
-                waited += 1
-                self._world.step()
-            elif step.kind != "hold" or self._holds():
-                return self._ended(step, executed)
-
-    def _decide(self) -> Step:
-        began = time.perf_counter()
-        step, messages = self._box.decide()
-        self._thought_s += time.perf_counter() - began
-        self._log.write_messages(messages)
-        return step
-
-    def _holds(self) -> bool:
-        """Whether it stays satisfied while the robot holds still."""
-        for _ in range(HOLDING_SAMPLES):
-            self._world.step()
-        return self._box.planner.is_accepting
-
-    def _hear(self, sample: Sample) -> None:
-        self._log.write(sample)
-        began = time.perf_counter()
-        self._box.observe(sample)
-        self._thought_s += time.perf_counter() - began
-        self._advance(1)
-
-    def _ended(self, step: Step, executed: int) -> PlannedRun:
-        samples, seconds = self._log.samples, self._log.seconds
-        return PlannedRun(
-            samples, seconds, step.kind, step.reason, executed, len(step.pruned), self._thought_s
-        )
 
 
 @dataclass(frozen=True, slots=True)

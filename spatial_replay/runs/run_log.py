@@ -10,6 +10,7 @@ from spatial_replay.logs.block import Messages
 from spatial_replay.logs.mcap_writer import LogWriter
 from spatial_replay.logs.merging import merge
 from spatial_replay.logs.output import open_output, refuse_inputs
+from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.recording import Recording
 from spatial_replay.recording.interruption import terminable, uninterrupted
 from spatial_replay.recording.recording import refuse_templates
@@ -45,6 +46,11 @@ class RunLog:
     def seconds(self) -> float:
         """The time from the first sample to the last."""
         return (self._last_ns - self._first_ns) / 1e9
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst verdict of the specifications on what was written; of a log that ended, the final one."""
+        return self._recording.verdict
 
     def write(self, sample: Sample) -> None:
         """Take in the next sample.

@@ -175,6 +175,10 @@ def test_steps_come_in_their_order():
 def test_formulas_that_cannot_be_planned_are_refused():
     with pytest.raises(UsageError, match="looks at earlier samples"):
         planner("F (cup moved[1] cup[-3])")
+    with pytest.raises(UsageError, match=r"t\(o\) in <text> is a template"):
+        planner("spec t(o) = F (o leftof plate)")
+    with pytest.raises(UsageError, match=r"t\(o\) in <text> is a template"):
+        planner("spec a = F (cup leftof plate)\nspec t(o) = F (o leftof plate)", name="t")
 
 
 @pytest.mark.parametrize(

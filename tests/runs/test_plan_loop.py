@@ -1,0 +1,110 @@
+"""A planner in the loop with what executes its steps, without physics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+import spatial_replay as sr
+from planning.kinematics import Table, block
+from spatial_replay.planning.black_box import BlackBox
+from spatial_replay.planning.planner import Planner
+from spatial_replay.planning.settings import Settings
+from spatial_replay.planning.workspace import Grid, Workspace
+from spatial_replay.runs.plan_loop import HOLDING_SAMPLES, MOST_WAITING_SAMPLES, PlanLoop
+from spatial_replay.runs.run_log import run_log
+
+TABLE = Settings(Workspace(Grid.over(0, 0, 10, 10, 0.5), supports=frozenset({"plate"})))
+THINGS = {"cup": block(1, 1, size=1), "fork": block(9, 9, size=1), "plate": block(5, 5, size=3)}
+
+
+@dataclass
+class Camera:
+    """Sees the table, but for what is hidden in a sample.
+
+    Attributes:
+        hides: (number of a sample, name of an object) to whether it is not seen.
+    """
+
+    loop: PlanLoop
+    settings: Settings
+    hides: object
+    seen: int = 0
+
+    def observe(self, sample):
+        objects = {name: each for name, each in sample.objects.items() if not self.hides(self.seen, name)}
+        self.seen += 1
+        self.loop.observe(sr.Sample(sample.time_ns, objects))
+
+
+def run(path, text, hides, things=THINGS, **options):
+    """The last decision, the planner, the loop and the log's verdict."""
+    specification = sr.parse_specification(text)
+    planner = Planner(specification, TABLE)
+    with run_log(path, [specification]) as log:
+        table = Table(dict(things), None, **options)
+        loop = PlanLoop(BlackBox(planner), log, table, table.look)
+        table.planner = Camera(loop, TABLE, hides)
+        last = loop.run()
+    assert log.samples == len(table.samples)
+    return last, planner, loop, log.verdict
+
+
+def test_doubt_that_stays_does_not_keep_a_run_going(tmp_path):
+    text = "(G (fork rightof plate)) and F (cup enclosedin plate)"
+    last, planner, loop, verdict = run(
+        tmp_path / "run.mcap", text, lambda number, name: name == "fork" and number == 1
+    )
+    assert last.kind == "hold"
+    assert "unless it was violated" in last.reason
+    assert planner.is_doubtful
+    assert not planner.is_accepting
+    assert verdict == "unknown"
+    assert loop.executed == 1
+
+
+def test_what_is_never_seen_ends_with_waiting(tmp_path):
+    text = "(G (fork rightof plate)) and F (cup enclosedin plate)"
+    last, _, loop, _ = run(tmp_path / "run.mcap", text, lambda number, name: name == "fork")
+    assert last.kind == "wait"
+    assert loop.executed == 0
+    assert last.number == MOST_WAITING_SAMPLES
+
+
+def test_what_is_satisfied_is_watched_for_a_while(tmp_path):
+    seen = 0
+
+    def counted(number, name):
+        nonlocal seen
+        seen = number + 1
+        return False
+
+    last, planner, _, verdict = run(tmp_path / "run.mcap", "F (cup enclosedin plate)", counted)
+    assert (last.kind, verdict) == ("hold", "satisfied")
+    assert planner.is_accepting
+    assert not planner.is_doubtful
+    assert seen == 1 + 1 + HOLDING_SAMPLES
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize(
+    "text",
+    [
+        "(G (fork rightof plate)) and F (cup enclosedin plate)",
+        "G ((cup leftof plate) -> F (fork enclosedin plate))",
+        "(not (cup enclosedin plate)) U (fork leftof plate)",
+        "F (G (cup enclosedin plate))",
+    ],
+)
+def test_it_ends_whatever_is_not_seen(tmp_path, text, seed):
+    random = np.random.default_rng(seed)
+    last, planner, loop, verdict = run(
+        tmp_path / "run.mcap", text, lambda number, name: number > 0 and random.random() < 0.2, slips=2
+    )
+    motions = TABLE.attempts * len(planner.automaton.transitions)
+    assert loop.executed <= motions
+    assert last.number <= (motions + 1) * (MOST_WAITING_SAMPLES + 2)
+    if verdict == "satisfied":
+        assert last.kind == "hold"
