@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from spatial_replay.automata.diagrams import LEAF, Diagrams, copied
+from spatial_replay.automata.diagrams import LEAF, NO, YES, Diagrams
 from spatial_replay.automata.guards import Covers, Guard, guard_words
-from spatial_replay.automata.machine import Machine, leaves_of
+from spatial_replay.automata.machine import Machine, nodes_of
 from spatial_replay.automata.propositions import Proposition
-from spatial_replay.errors import UsageError
+from spatial_replay.errors import NoAutomatonError, UsageError
+
+MAX_VISITS = 25_000_000
+"""How many decisions are looked at to find all moves, each for every state that it may matter to."""
 
 
 @dataclass(frozen=True)
@@ -61,22 +64,35 @@ class Automaton:
         """All moves, by source and target; the guards of one source exclude each other.
 
         Raises:
-            NoAutomatonError: their guards take too many cubes; never of what `automaton` gives.
+            NoAutomatonError: finding them takes more than `MAX_VISITS`, or their guards too many cubes; never
+                of what `automaton` gives.
         """
         diagrams, moves = self._diagrams()
         covers = Covers(diagrams)
-        whether_to = [_whether_to(diagrams, target) for target in self.states]
+        leading = _Leading(diagrams)
         return tuple(
-            Transition(source, covers.guard(whether_to[target](node)), target)
+            Transition(source, covers.guard(leading.to(target, node)), target)
             for source, node in enumerate(moves)
             for target in self.successors[source]
         )
 
     @cached_property
     def successors(self) -> tuple[tuple[int, ...], ...]:
-        """For each state, those that one sample can lead to."""
+        """For each state, those that one sample can lead to.
+
+        Raises:
+            NoAutomatonError: as `transitions`.
+        """
         diagrams, moves = self._diagrams()
-        return tuple(tuple(sorted(leaves_of(diagrams, node))) for node in moves)
+        found: dict[int, tuple[int, ...]] = {}
+        visits = 0
+        for move in moves:
+            if move not in found:
+                nodes = nodes_of(diagrams, move)
+                visits = _counted(visits, len(nodes))
+                leaves = [diagrams[each].low for each in nodes if diagrams[each].variable == LEAF]
+                found[move] = tuple(sorted(leaves))
+        return tuple(found[move] for move in moves)
 
     @property
     def has_returns(self) -> bool:
@@ -169,7 +185,7 @@ class Automaton:
         """
         self._check_state(state)
         left_out = set(without)
-        distances = self._distances(left_out)
+        distances = self._distances(self.accepting, left_out)
         if state not in distances:
             return
         ways: list[tuple[Transition, ...]] = [()]
@@ -206,14 +222,14 @@ class Automaton:
     def _transitions_by_ends(self) -> dict[tuple[int, int], Transition]:
         return {(each.source, each.target): each for each in self.transitions}
 
-    def _distances(self, without: set[tuple[int, int]]) -> dict[int, int]:
-        """For each state that can reach acceptance, how many samples that takes."""
+    def _distances(self, goal: Collection[int], without: Collection[tuple[int, int]] = ()) -> dict[int, int]:
+        """For each state that can reach a goal, how many samples that takes."""
         before: dict[int, list[int]] = {}
         for source, targets in enumerate(self.successors):
             for target in targets:
                 if (source, target) not in without:
                     before.setdefault(target, []).append(source)
-        distances = dict.fromkeys(sorted(self.accepting), 0)
+        distances = dict.fromkeys(sorted(goal), 0)
         waiting = list(distances)
         for state in waiting:
             for source in before.get(state, ()):
@@ -226,12 +242,7 @@ class Automaton:
         """The states from which the end of a run can be in the goal."""
         if not self.has_returns:
             goal -= {self.initial}
-        found = set(goal)
-        while True:
-            more = {state for state in self.states if not found.isdisjoint(self.successors[state])} - found
-            if not more:
-                return frozenset(found)
-            found |= more
+        return frozenset(self._distances(goal))
 
     def _diagrams(self) -> tuple[Diagrams, list[int]]:
         """The moves as diagrams with states as leaves, and for each state its node."""
@@ -257,9 +268,41 @@ class Automaton:
             raise UsageError(f"no state {state!r}; there are 0 to {len(self.states) - 1}")
 
 
-def _whether_to(diagrams: Diagrams, target: int) -> Callable[[int], int]:
-    """A function from moves to whether they lead to a state."""
-    return copied(diagrams, diagrams, LEAF, lambda leaf: int(diagrams[leaf].low == target))
+class _Leading:
+    """Whether moves lead to a state, as functions of the propositions."""
+
+    def __init__(self, diagrams: Diagrams) -> None:
+        self._diagrams = diagrams
+        self._known: dict[int, dict[int, int]] = {}
+        self._visits = 0
+
+    def to(self, target: int, node: int) -> int:
+        """Where a node leads to a state.
+
+        Raises:
+            NoAutomatonError: that, and what was asked before, takes more than `MAX_VISITS`.
+        """
+        known = self._known.setdefault(target, {})
+        before = len(known)
+        result = self._copied(target, node, known)
+        self._visits = _counted(self._visits, len(known) - before)
+        return result
+
+    def _copied(self, target: int, node: int, known: dict[int, int]) -> int:
+        if node not in known:
+            variable, low, high = self._diagrams[node]
+            if variable == LEAF:
+                known[node] = YES if low == target else NO
+            else:
+                branches = self._copied(target, low, known), self._copied(target, high, known)
+                known[node] = self._diagrams.decide(variable, *branches)
+        return known[node]
+
+
+def _counted(visits: int, more: int) -> int:
+    if visits + more > MAX_VISITS:
+        raise NoAutomatonError(f"finding the automaton's moves takes more than {MAX_VISITS} steps")
+    return visits + more
 
 
 def automaton_of(machine: Machine, name: str, propositions: Sequence[Proposition]) -> Automaton:

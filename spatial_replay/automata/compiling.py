@@ -20,6 +20,9 @@ Compiler: TypeAlias = Literal["own", "mona"]
 MAX_PROPOSITIONS = 64
 """How many propositions an automaton reads at most."""
 
+MAX_ROWS = 200_000
+"""How many states an automaton has at most, and how many decisions."""
+
 
 def automaton(
     specification: Specification, name: str | None = None, *, compiler: Compiler | None = None
@@ -52,6 +55,11 @@ def automaton(
     machine = _compiled(spec.name, skeleton, count, compiler)
     try:
         result = automaton_of(least(machine), spec.name, propositions.all)
+        rows = max(len(result.entries), len(result.decisions))
+        if rows > MAX_ROWS:
+            raise NoAutomatonError(
+                f"the automaton takes {rows} states or decisions, at most {MAX_ROWS} are kept"
+            )
         # once here, so that what is handed out has guards
         result.transitions  # noqa: B018
     except RecursionError:

@@ -18,12 +18,11 @@ def words_text(automaton: Automaton) -> str:
     """States, what they mean, and their moves in words."""
     lines = [f"automaton of {automaton.name}: {size_words(automaton)}"]
     lines += [f"  {each.name} means {each.text}" for each in automaton.propositions if each.name is not None]
-    for state in automaton.states:
+    for state, transitions in enumerate(_by_source(automaton)):
         lines.append(f"  state {state}: {state_words(automaton, state)}")
-        for each in automaton.transitions:
-            if each.source == state:
-                to = "stays" if each.target == state else f"to {each.target}"
-                lines.append(f"    {to} if {automaton.guard_words(each)}")
+        for each in transitions:
+            to = "stays" if each.target == state else f"to {each.target}"
+            lines.append(f"    {to} if {automaton.guard_words(each)}")
     return "\n".join(lines)
 
 
@@ -94,11 +93,9 @@ def hoa_text(automaton: Automaton) -> str:
         'finite-runs: "accepted iff they end in a state of set 0"',
         "--BODY--",
     ]
-    for state in automaton.states:
+    for state, transitions in enumerate(_by_source(automaton)):
         lines.append(f"State: {state} {{0}}" if state in automaton.accepting else f"State: {state}")
-        lines += [
-            f"  [{_hoa_guard(each)}] {each.target}" for each in automaton.transitions if each.source == state
-        ]
+        lines += [f"  [{_hoa_guard(each)}] {each.target}" for each in transitions]
     return "\n".join([*lines, "--END--", ""])
 
 
@@ -132,6 +129,14 @@ def svg_text(automaton: Automaton) -> str:
         reason = done.stderr.decode(errors="replace").strip()[:200]
         raise OutputError(f"Graphviz ended with code {done.returncode}: {reason}")
     return done.stdout.decode()
+
+
+def _by_source(automaton: Automaton) -> list[list[Transition]]:
+    """For each state, the moves from it."""
+    moves: list[list[Transition]] = [[] for _ in automaton.states]
+    for each in automaton.transitions:
+        moves[each.source].append(each)
+    return moves
 
 
 def _hoa_guard(transition: Transition) -> str:

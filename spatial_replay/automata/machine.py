@@ -139,17 +139,19 @@ def _relabelled(
 
 def leaves_of(diagrams: Diagrams, node: int) -> list[int]:
     """The leaves below a node, in the order of the decisions, false before true."""
-    found: dict[int, None] = {}
-    seen: set[int] = set()
+    return [diagrams[each].low for each in nodes_of(diagrams, node) if diagrams[each].variable == LEAF]
+
+
+def nodes_of(diagrams: Diagrams, node: int) -> list[int]:
+    """A node and those below it, in the order of the decisions, false before true."""
+    seen: dict[int, None] = {}
     stack = [node]
     while stack:
         each = stack.pop()
         if each in seen:
             continue
-        seen.add(each)
+        seen[each] = None
         variable, low, high = diagrams[each]
-        if variable == LEAF:
-            found[low] = None
-        else:
+        if variable != LEAF:
             stack += [high, low]
-    return list(found)
+    return list(seen)

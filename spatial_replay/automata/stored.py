@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 
 from spatial_replay.automata.automaton import Automaton
+from spatial_replay.automata.compiling import MAX_PROPOSITIONS, MAX_ROWS
 from spatial_replay.automata.propositions import Propositions
 from spatial_replay.errors import NoAutomatonError
 from spatial_replay.spec.format import format_formula
@@ -14,10 +15,6 @@ from spatial_replay.spec.formula import NamedSpec, Specification
 _VERSION = 1
 _LONGEST = 16 * 2**20
 """Bytes of a file that is read."""
-_MOST = 200_000
-"""Numbers in a list that is read."""
-_MOST_WORK = 25_000_000
-"""States times decisions of an automaton that is read: how long it takes to look at all of it."""
 
 
 def stored_text(automaton: Automaton, specification: Specification, spec: NamedSpec) -> str:
@@ -52,7 +49,7 @@ def automaton_from(data: bytes, specification: Specification, spec: NamedSpec) -
         return None
     entries, accepting = _numbers(stored.get("entries")), _numbers(stored.get("accepting"))
     decisions = _decisions(stored.get("decisions"))
-    if entries is None or accepting is None or decisions is None:
+    if entries is None or accepting is None or decisions is None or len(propositions) > MAX_PROPOSITIONS:
         return None
     automaton = Automaton(spec.name, tuple(propositions), frozenset(accepting), tuple(entries), decisions)
     return automaton if _is_sound(automaton) and _has_guards(automaton) else None
@@ -63,13 +60,13 @@ def _canonical(specification: Specification, spec: NamedSpec) -> str:
 
 
 def _numbers(value: object) -> list[int] | None:
-    if not isinstance(value, list) or len(value) > _MOST or any(type(each) is not int for each in value):
+    if not isinstance(value, list) or len(value) > MAX_ROWS or any(type(each) is not int for each in value):
         return None
     return value
 
 
 def _decisions(value: object) -> tuple[tuple[int, int, int], ...] | None:
-    if not isinstance(value, list) or len(value) > _MOST:
+    if not isinstance(value, list) or len(value) > MAX_ROWS:
         return None
     rows = [_numbers(row) for row in value]
     return tuple((row[0], row[1], row[2]) for row in rows if row is not None and len(row) == 3)
@@ -86,7 +83,7 @@ def _is_sound(automaton: Automaton) -> bool:
 
     rows = automaton.decisions
     return (
-        0 < states * max(1, len(rows)) <= _MOST_WORK
+        states > 0
         and all(0 <= state < states for state in automaton.accepting)
         and all(leads(place, rows, len(rows), -1) for place in automaton.entries)
         and all(

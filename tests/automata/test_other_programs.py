@@ -17,6 +17,7 @@ from laws.strategies_automaton import compiled, formulas_with_automata
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compiling import automaton
 from spatial_replay.automata.drawing import svg_text
+from spatial_replay.automata.stored import automaton_from, stored_text
 from spatial_replay.errors import NoAutomatonError, OutputError, UsageError
 from spatial_replay.spec.specification import parse_specification
 
@@ -109,3 +110,12 @@ def test_what_goes_wrong_in_graphviz_is_told(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     with pytest.raises(OutputError, match="code 2: no fonts"):
         svg_text(automaton(parse_specification("F p >= 0")))
+
+
+@needs_mona
+def test_a_large_automaton_is_read_back() -> None:
+    specification = parse_specification("G ((x >= 0.03) -> F[12, 12] y >= 0)")
+    result = automaton(specification)
+    assert len(result.states) > 4000
+    data = stored_text(result, specification, specification.specs[0]).encode()
+    assert automaton_from(data, specification, specification.specs[0]) == result

@@ -6,7 +6,8 @@ import json
 
 import pytest
 
-from spatial_replay.automata.compiling import automaton
+from automata.golden import FORMULAS
+from spatial_replay.automata.compiling import MAX_ROWS, automaton
 from spatial_replay.automata.stored import automaton_from, stored_text
 from spatial_replay.spec.specification import parse_specification
 
@@ -60,3 +61,15 @@ def test_what_is_no_such_file_is_not_read(data: bytes) -> None:
 )
 def test_a_file_that_was_tampered_with_is_not_read(changed: dict[str, object]) -> None:
     assert read({**STORED, **changed}) is None
+
+
+@pytest.mark.parametrize("text", FORMULAS)
+def test_whatever_compiles_is_read_back(text: str) -> None:
+    specification = parse_specification(text)
+    result = automaton(specification)
+    data = stored_text(result, specification, specification.specs[0]).encode()
+    assert automaton_from(data, specification, specification.specs[0]) == result
+
+
+def test_a_file_of_more_states_than_a_compiler_gives_is_not_read() -> None:
+    assert read({**STORED, "entries": [0] * (MAX_ROWS + 1)}) is None
