@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from functools import cached_property
 from pathlib import Path
 from typing import BinaryIO
@@ -10,13 +10,12 @@ from typing import BinaryIO
 import numpy as np
 from mcap.opcode import Opcode
 
-from spatial_replay.errors import LogError
 from spatial_replay.logs.block import Channel
 from spatial_replay.logs.faults import FaultList
-from spatial_replay.logs.foreign.columns import Columns, MessageColumns, one_by_one, places_in
-from spatial_replay.logs.foreign.decoders import decoder_of
+from spatial_replay.logs.foreign.columns import Columns, MessageColumns, places_in
 from spatial_replay.logs.foreign.definitions import full_type_name
-from spatial_replay.logs.foreign.messages import Decoder, Message, Topic
+from spatial_replay.logs.foreign.messages import Topic
+from spatial_replay.logs.foreign.one_file import OneFile
 from spatial_replay.logs.foreign.ordering import CountedTopics, in_order
 from spatial_replay.logs.foreign.topic_table import is_latched, topics_named
 from spatial_replay.logs.mcap_chunks import ChunkPlace, read_records
@@ -29,20 +28,14 @@ from spatial_replay.trace.times import LATEST_NS
 _MESSAGE_FIELDS = 22
 
 
-class McapLog:
+class McapLog(OneFile):
     """An MCAP log of any encoding, read chunk by chunk; see `MessageReader`."""
 
     kind = "MCAP"
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self._faults = FaultList()
-        self._remarks = FaultList()
+        super().__init__(path)
         self._walked = 0
-
-    @property
-    def name(self) -> str:
-        return self._path.name
 
     @cached_property
     def _contents(self) -> tuple[Directory, dict[int, Channel]]:
@@ -72,35 +65,6 @@ class McapLog:
     def start_ns(self) -> int | None:
         """Log time of the first message."""
         return min((place.start_ns for place in self._contents[0].chunks), default=None)
-
-    def topics(self) -> tuple[Topic, ...]:
-        """See `MessageReader.topics`."""
-        if not self._topics:
-            reason = next(iter(self._faults.take()), "it is empty")
-            raise LogError(f"{self.name} holds no topic: {reason}")
-        return self._topics
-
-    def decoder(self, topic: str) -> Decoder:
-        """See `MessageReader.decoder`."""
-        return decoder_of(next(each for each in self._topics if each.name == topic))
-
-    def take_faults(self) -> tuple[str, ...]:
-        """See `MessageReader.take_faults`."""
-        return self._faults.take()
-
-    def move_faults(self, other: FaultList) -> None:
-        """See `MessageReader.move_faults`."""
-        self._faults.move_to(other)
-
-    def take_remarks(self) -> tuple[str, ...]:
-        """See `MessageReader.take_remarks`."""
-        return self._remarks.take()
-
-    def iter_messages(
-        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
-    ) -> Iterator[Message]:
-        """See `MessageReader.iter_messages`."""
-        return one_by_one(self.iter_columns(topics, start_ns, end_ns))
 
     def iter_columns(
         self,

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from spatial_replay.errors import LogError
-from spatial_replay.logs.faults import FaultList
-from spatial_replay.logs.foreign.columns import Columns, MessageColumns, one_by_one, unnumbered
+from spatial_replay.logs.foreign.columns import Columns, MessageColumns, unnumbered
 from spatial_replay.logs.foreign.decoders import decoder_of
-from spatial_replay.logs.foreign.messages import Decoder, Message, Topic
+from spatial_replay.logs.foreign.messages import Decoder, Topic
+from spatial_replay.logs.foreign.one_file import OneFile
 from spatial_replay.logs.foreign.ordering import CountedTopics
 from spatial_replay.logs.foreign.sqlite_tables import (
     BagTables,
@@ -31,19 +31,10 @@ _ROW_BYTES = 6
 """The least that a message takes in a file."""
 
 
-class SqliteBag:
+class SqliteBag(OneFile):
     """A `.db3` file of a ROS 2 bag; see `MessageReader`."""
 
     kind = "ROS 2 bag"
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._faults = FaultList()
-        self._remarks = FaultList()
-
-    @property
-    def name(self) -> str:
-        return self._path.name
 
     @cached_property
     def _whole(self) -> Path:
@@ -91,24 +82,6 @@ class SqliteBag:
         """See `MessageReader.decoder`."""
         named = next(each for each in self._topics if each.name == topic)
         return decoder_of(named, self._tables.distribution)
-
-    def take_faults(self) -> tuple[str, ...]:
-        """See `MessageReader.take_faults`."""
-        return self._faults.take()
-
-    def move_faults(self, other: FaultList) -> None:
-        """See `MessageReader.move_faults`."""
-        self._faults.move_to(other)
-
-    def take_remarks(self) -> tuple[str, ...]:
-        """See `MessageReader.take_remarks`."""
-        return self._remarks.take()
-
-    def iter_messages(
-        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
-    ) -> Iterator[Message]:
-        """See `MessageReader.iter_messages`."""
-        return one_by_one(self.iter_columns(topics, start_ns, end_ns))
 
     def iter_columns(
         self,
