@@ -416,12 +416,25 @@ class NamedSpec:
     span: Span = field(default_factory=_unspanned, compare=False)
 
 
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """What a `const` statement stands for: a number, or a duration.
+
+    Attributes:
+        value: the number; of a duration, its seconds.
+        duration_ns: None for a number.
+    """
+
+    value: float
+    duration_ns: int | None = None
+
+
 @dataclass(frozen=True)
 class Specification:
     """All specs of one text, parsed: macros, constants and named quantifiers expanded.
 
-    Two specifications are equal when they mean the same: the source text, its file name and the
-    warnings do not count.
+    Two specifications are equal when they mean the same: the source text, its file name, its constants and
+    the warnings do not count.
 
     Attributes:
         specs: every `spec`, in the order of the text.
@@ -429,6 +442,7 @@ class Specification:
         regions: shapes by name.
         groups: declared groups by name.
         relations: names of the relations that were given in Python.
+        constants: by name; formulas have their values already.
         source: the text it was parsed from, without a byte order mark; spans are offsets into it.
         filename: base name of the file it came from, or "<text>".
         warnings: what `check` remarks on.
@@ -439,6 +453,7 @@ class Specification:
     regions: dict[str, Outline] = field(default_factory=dict)
     groups: dict[str, Group] = field(default_factory=dict)
     relations: frozenset[str] = frozenset()
+    constants: dict[str, Constant] = field(default_factory=dict, compare=False)
     source: str = field(default="", compare=False)
     filename: str = field(default="<text>", compare=False)
     warnings: tuple[Diagnostic, ...] = field(default=(), compare=False)

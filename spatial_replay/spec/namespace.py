@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from spatial_replay.errors import UsageError
 from spatial_replay.spec import outline
+from spatial_replay.spec.builder import StatementError, read_number
 from spatial_replay.spec.faults import Faults, nearest_hint
 from spatial_replay.spec.formula import ANY_CLASS, Group, Outline, Span
 from spatial_replay.spec.syntax import (
@@ -37,6 +39,8 @@ KIND_OF: Mapping[type, str] = MappingProxyType(
     }
 )
 
+_DURATION = re.compile(r"-?\d+(\.\d*)?([eE][+-]?\d{1,3})?m?s")
+
 
 def kind_of(statement: Statement) -> str:
     """What a statement defines, with its article."""
@@ -51,11 +55,11 @@ class Namespace:
         definitions: statements by name; of a name given twice, the first.
         regions, groups: the values of those definitions.
         used: names that something refers to.
-        overrides: constants given in Python instead of the file's.
+        overrides: constants given from outside instead of the text's: numbers and, as texts, durations.
     """
 
     faults: Faults
-    overrides: Mapping[str, float]
+    overrides: Mapping[str, float | str]
     definitions: dict[str, Statement] = field(default_factory=dict)
     regions: dict[str, Outline] = field(default_factory=dict)
     groups: dict[str, Group] = field(default_factory=dict)
@@ -92,8 +96,7 @@ class Namespace:
             if name not in consts:
                 hint = nearest_hint(name, consts) or f"its constants are: {', '.join(consts) or 'none'}"
                 raise UsageError(f"constants: the specification has no const {name!r}; {hint}")
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-                raise UsageError(f"constants: {name!r} is {value!r}; give a finite number")
+            _overriding(name, value)
 
     def constant(self, name: str) -> float | Duration | None:
         """The value of a constant; None, and a fault, for one that is defined by way of itself."""
@@ -121,7 +124,7 @@ class Namespace:
     ) -> tuple[float | Duration | None, str | None]:
         """The value of a constant, or the name of the constant that it repeats."""
         if name in self.overrides:
-            return float(self.overrides[name]), None
+            return _overriding(name, self.overrides[name]), None
         if isinstance(statement.value, Name):
             self.used.add(statement.value.text)
             return None, statement.value.text
@@ -210,6 +213,24 @@ class Namespace:
                 self.faults.add(member.span, f"{member.text!r} is listed twice", "leave one out")
             members.setdefault(member.text, member.span)
         return Group(name, members=tuple(members))
+
+
+def _overriding(name: str, value: object) -> float | Duration:
+    """The value given for a constant from outside.
+
+    Raises:
+        UsageError: it is neither a finite number nor the text of a duration.
+    """
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
+        return float(value)
+    if isinstance(value, str) and _DURATION.fullmatch(value):
+        try:
+            return read_number(value, Span(0, 0))
+        except StatementError as fault:
+            raise UsageError(f"constants: {name!r}: {fault.message}; {fault.hint}") from fault
+    raise UsageError(
+        f"constants: {name!r} is {value!r}; give a finite number or, as a text, a duration: '2s', '500ms'"
+    )
 
 
 def class_of(group: OpenGroup) -> str:

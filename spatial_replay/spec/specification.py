@@ -14,12 +14,12 @@ from spatial_replay.errors import MissingFileError, SpecificationError, UsageErr
 from spatial_replay.spec.atoms import parameters_of
 from spatial_replay.spec.elaborate import Elaborator, TooLargeError
 from spatial_replay.spec.faults import Faults, Source, nearest_hint
-from spatial_replay.spec.formula import Diagnostic, Expression, Span, Specification
+from spatial_replay.spec.formula import Constant, Diagnostic, Expression, Span, Specification
 from spatial_replay.spec.lint import past_warnings, reach_warnings, unused_warnings
 from spatial_replay.spec.namespace import Namespace
 from spatial_replay.spec.parser import parse_statements
 from spatial_replay.spec.relations import DEFAULT_PROFILE, PROFILES, RELATION_NAMES, Relation
-from spatial_replay.spec.syntax import BrokenStatement, SpecStatement, Statement, UseStatement
+from spatial_replay.spec.syntax import BrokenStatement, Duration, SpecStatement, Statement, UseStatement
 from spatial_replay.spec.tokens import MAX_TOKENS, is_reserved, tokenize
 
 MAX_LENGTH = 256 * 1024
@@ -35,7 +35,7 @@ def parse_specification(
     filename: str = "<text>",
     profile: str | None = None,
     relations: Mapping[str, Callable[..., Expression]] | None = None,
-    constants: Mapping[str, float] | None = None,
+    constants: Mapping[str, float | str] | None = None,
 ) -> Specification:
     """Parse a specification, or a formula by itself.
 
@@ -44,7 +44,8 @@ def parse_specification(
         filename: named in messages.
         profile: relation profile of a text without a `use` line: "paper" (the default) or "spatial_spec".
         relations: further relations by name, as functions; see `relations`.
-        constants: values to take instead of those of the text's `const` lines.
+        constants: values to take instead of those of the text's `const` lines: numbers and, as texts,
+            durations such as "2s".
 
     Raises:
         SpecificationError: with every fault of the text.
@@ -89,6 +90,7 @@ def parse_specification(
         namespace.regions,
         namespace.groups,
         frozenset(given),
+        {name: _constant(value) for name, value in namespace.constants.items() if value is not None},
         source=text,
         filename=filename,
         warnings=tuple(warnings[:_MAX_WARNINGS]),
@@ -100,7 +102,7 @@ def load_specification(
     *,
     profile: str | None = None,
     relations: Mapping[str, Callable[..., Expression]] | None = None,
-    constants: Mapping[str, float] | None = None,
+    constants: Mapping[str, float | str] | None = None,
 ) -> Specification:
     """Parse a specification file (UTF-8); see `parse_specification`.
 
@@ -151,6 +153,12 @@ def _check_relations(relations: Mapping[str, Relation]) -> None:
         if not callable(relation):
             raise UsageError(f"relations: {name!r} is {relation!r}; give a function")
         parameters_of(name, relation)
+
+
+def _constant(value: float | Duration) -> Constant:
+    if isinstance(value, Duration):
+        return Constant(value.ns / 1e9, value.ns)
+    return Constant(value)
 
 
 def _tokens(text: str, names: frozenset[str], faults: Faults) -> list[Token]:

@@ -15,6 +15,7 @@ from spatial_replay.spec.formula import (
     Atom,
     Boolean,
     Bound,
+    Constant,
     Earlier,
     Enlarged,
     Expression,
@@ -182,6 +183,17 @@ def test_constants_stand_for_numbers_and_durations_and_can_be_replaced() -> None
     assert format_formula(replaced) == expected.format("7")
     with pytest.raises(UsageError, match="did you mean 'far'"):
         parse_specification(text, constants={"fra": 7})
+    slower = parse_specification(text, constants={"wait": "500ms"}).specs[0].formula
+    assert format_formula(slower) == "F[0s, 0.5s] (a[-0.5s] closeto[2.5] b)"
+    for value in ("2", "2 s", "s", "1e400s", "nans", float("nan"), True, None):
+        with pytest.raises(UsageError, match="'wait'"):
+            parse_specification(text, constants={"wait": value})  # type: ignore[dict-item]
+
+
+def test_a_specification_says_what_its_constants_are() -> None:
+    text = "const e = far\nconst far = 2.5\nconst wait = 2s\nspec s = F[0, wait] a closeto[e] b"
+    constants = parse_specification(text, constants={"far": 7}).constants
+    assert constants == {"e": Constant(7.0), "far": Constant(7.0), "wait": Constant(2.0, 2_000_000_000)}
 
 
 def test_relations_can_be_added_in_python() -> None:
