@@ -12,7 +12,7 @@ from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.inspection.palette import LABEL, NEGATIVE
+from spatial_replay.palette import LABEL, NEGATIVE
 
 FRAME: Final = "world"
 

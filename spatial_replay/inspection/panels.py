@@ -10,7 +10,6 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from spatial_replay.inspection.drawing import FRAME
-from spatial_replay.inspection.palette import CURVES, NEGATIVE, POSITIVE, hexadecimal
 from spatial_replay.inspection.specification import ReportedTree, unit_of
 from spatial_replay.logs.topics import (
     AUTOMATON,
@@ -23,6 +22,7 @@ from spatial_replay.logs.topics import (
     SPECIFICATION,
 )
 from spatial_replay.monitor.signal_table import looks_ahead
+from spatial_replay.palette import CURVES, NEGATIVE, POSITIVE, hexadecimal
 from spatial_replay.spec.formula import iter_nodes
 
 _MOST_CURVES: Final = 12

@@ -24,9 +24,9 @@ from spatial_replay.inspection.layout import (
     words_of_region,
     words_of_witness,
 )
-from spatial_replay.inspection.palette import colours
 from spatial_replay.inspection.pointing import Judged, Pointers, pointers
 from spatial_replay.inspection.rings import Form, Rings, extents, rings_of
+from spatial_replay.inspection.shades import colours
 from spatial_replay.logs.wire import payloads_of
 from spatial_replay.monitor.operands import footprint_from_outline
 from spatial_replay.spec.formula import Outline

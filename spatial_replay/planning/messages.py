@@ -17,7 +17,6 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.inspection.drawing import FRAME
-from spatial_replay.inspection.palette import NEUTRAL, POSITIVE
 from spatial_replay.inspection.rings import rings_of
 from spatial_replay.logs.messages.PlanDecision_pb2 import (
     PlanCandidate,
@@ -28,6 +27,7 @@ from spatial_replay.logs.messages.PlanDecision_pb2 import (
     PlanTarget,
     PrunedEdge,
 )
+from spatial_replay.palette import NEUTRAL, POSITIVE
 from spatial_replay.planning.maps import GradientMap
 from spatial_replay.planning.poses import moved_object
 from spatial_replay.planning.step import Candidate, Consideration, Guards, Kind, Outcome, Step, Target

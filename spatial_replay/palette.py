@@ -1,0 +1,22 @@
+"""The colours of robustness: blue where it is positive, vermillion where it is negative, grey where unknown.
+
+Blue and vermillion are told apart with every common colour blindness, and so are their mixtures with grey.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+POSITIVE: Final = (0.0, 0.447, 0.698)
+NEGATIVE: Final = (0.835, 0.369, 0.0)
+NEUTRAL: Final = (0.55, 0.55, 0.55)
+LABEL: Final = (0.95, 0.95, 0.95)
+"""Red, green and blue from 0 to 1."""
+
+CURVES: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c8c8c")
+"""Colours of curves beside each other, also told apart with every common colour blindness (Okabe and Ito)."""
+
+
+def hexadecimal(colour: tuple[float, float, float]) -> str:
+    """A colour as texts name it: "#0072b2"."""
+    return "#" + "".join(f"{round(255.0 * share):02x}" for share in colour)
