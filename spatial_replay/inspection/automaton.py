@@ -87,6 +87,11 @@ class AutomatonRun:
                 payloads[index] = payload
         return payloads
 
+    def pass_over(self, stretch: Stretch) -> None:
+        """Take in the next samples without a message."""
+        if len(stretch.times_ns):
+            self._steps(self._values(stretch))
+
     def _values(self, stretch: Stretch) -> Flags:
         """(P, T): whether each proposition is true in each sample, or unknown."""
         now = stretch.series[list(self.propositions), _NOW]

@@ -10,9 +10,9 @@ from spatial_replay.errors import UsageError
 from spatial_replay.inspection.annotation import (
     AnnotatedEvaluation,
     kept_files,
-    messages_of,
     specification_attachments,
 )
+from spatial_replay.inspection.annotator import messages_of
 from spatial_replay.inspection.certificate import (
     MessageHash,
     ResultHash,

@@ -12,9 +12,9 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.inspection.annotation import (
     AnnotatedEvaluation,
     kept_files,
-    messages_of,
     specification_attachments,
 )
+from spatial_replay.inspection.annotator import messages_of
 from spatial_replay.inspection.certificate import MessageHash, ResultHash, SampleHash, certificate
 from spatial_replay.inspection.hashing import Hashing
 from spatial_replay.logs.block import Block, Messages
