@@ -61,9 +61,9 @@ def draw_curve(ax: Axes, points: Sequence[tuple[float, float]], colour: str) -> 
     ax.add_patch(PathPatch(Path(points, codes), fill=False, edgecolor=colour, linewidth=1.0))
 
 
-def plain(text: str) -> str:
-    """A text that a figure shows as it stands."""
-    return printable(text).replace("$", r"\$")
+def plain(text: str, longest: int = 72) -> str:
+    """A text that a figure shows as it stands, cut after so many characters."""
+    return printable(text, longest).replace("$", r"\$")
 
 
 def _pyplot() -> Any:

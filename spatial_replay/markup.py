@@ -31,10 +31,10 @@ def element(tag: str, *content: str, **attributes: str) -> Html:
     return Html(f"<{tag}{written}>{inner}</{tag}>")
 
 
-def printable(text: str) -> str:
-    """A text without what a page or a figure would not show as it stands, cut where it is long."""
+def printable(text: str, longest: int = _LONGEST) -> str:
+    """A text without what a page or a figure would not show as it stands, cut after so many characters."""
     shown = "".join(character if character.isprintable() else " " for character in text)
-    return shown if len(shown) <= _LONGEST else shown[: _LONGEST - 1] + "…"
+    return shown if len(shown) <= longest else shown[: longest - 1] + "…"
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Html:

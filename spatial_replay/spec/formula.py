@@ -16,7 +16,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Axis: TypeAlias = Literal["x", "y", "z"]
 Side: TypeAlias = Literal["min", "max"]
@@ -462,6 +465,17 @@ class Specification:
     def results(self) -> tuple[NamedSpec, ...]:
         """The specs that no other spec uses: what an evaluation reports on."""
         return tuple(spec for spec in self.specs if spec.is_result)
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the trees of the results; see `draw_specification`."""
+        from spatial_replay.spec.picture import draw_specification
+
+        return draw_specification(self, ax)
+
+    def _repr_html_(self) -> str:
+        from spatial_replay.spec.picture import specification_html
+
+        return specification_html(self)
 
 
 @dataclass(frozen=True, slots=True)
