@@ -25,7 +25,8 @@ from spatial_replay.logs.topics import (
     REPLAYED_PREFIX,
 )
 from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.replay.replay import Replay, Replayed
+from spatial_replay.replay.found import Replayed
+from spatial_replay.replay.replay import Replay
 from spatial_replay.replay.window import Window
 from spatial_replay.spec import load_specification, parse_specification
 from spatial_replay.spec.formula import Specification

@@ -11,7 +11,7 @@ from spatial_replay.inspection.words import sentences_of
 from spatial_replay.monitor.verdict import final_verdict
 from spatial_replay.monitor.witness.atom import Measured
 from spatial_replay.monitor.witness.witness import Witness
-from spatial_replay.replay.replay import Replayed, ReplayedSpec
+from spatial_replay.replay.found import Replayed, ReplayedSpec
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import iter_nodes, operator_of
 

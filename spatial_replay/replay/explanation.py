@@ -14,7 +14,7 @@ from spatial_replay.inspection.words import sentences_of
 from spatial_replay.monitor.evaluation import no_such_node
 from spatial_replay.monitor.verdict import Verdict, online_verdict
 from spatial_replay.replay.document import witness_document
-from spatial_replay.replay.replay import Replayed, ReplayedSpec
+from spatial_replay.replay.found import Replayed, ReplayedSpec
 from spatial_replay.spec.formula import iter_nodes
 
 

@@ -3,101 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from spatial_replay.errors import LogError, SpecificationError, UsageError
-from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.inspection.annotation import (
     AnnotatedEvaluation,
     kept_files,
     specification_attachments,
 )
-from spatial_replay.inspection.annotator import messages_of
 from spatial_replay.inspection.certificate import MessageHash, ResultHash, SampleHash, certificate
 from spatial_replay.inspection.hashing import Hashing
-from spatial_replay.logs.block import Block, Messages
-from spatial_replay.logs.merging import merge, select
-from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.objects import encode_objects
-from spatial_replay.logs.reading import read_blocks
+from spatial_replay.logs.block import Messages
+from spatial_replay.logs.merging import merge
 from spatial_replay.logs.sink import Attachment
-from spatial_replay.logs.source import Source, within
-from spatial_replay.logs.topics import OBJECTS, REPLAYED_PREFIX, protobuf_channel
-from spatial_replay.monitor.inquiry import Inquiry
-from spatial_replay.monitor.instances import Choice, Instance, find_instances
+from spatial_replay.logs.source import Source
+from spatial_replay.logs.topics import REPLAYED_PREFIX
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
-from spatial_replay.monitor.stream import Stretch, join_stretches, look_back
-from spatial_replay.monitor.verdict import Verdict, final_verdict, worst_verdict
+from spatial_replay.monitor.stream import Stretch, join_stretches
 from spatial_replay.monitor.witness.evidence import Evidence
+from spatial_replay.replay.found import Replayed, ReplayedSpec, replayed_spec
+from spatial_replay.replay.selection import Selection
 from spatial_replay.replay.window import Window, first_sample_ns
-from spatial_replay.spec import check_names
-from spatial_replay.spec.formula import Diagnostic, Formula, Specification
-from spatial_replay.trace.trace import Trace, window_of
-
-
-@dataclass(frozen=True, eq=False)
-class ReplayedSpec:
-    """What a replay found for one spec, or one object's instance of a template.
-
-    Attributes:
-        name: the spec's name; with its file's stem before it where two files have a spec of that name.
-        object: the object that a template's parameter stands for, or None.
-        robustness: (N,), each node's value on the whole log.
-        final: (N, 2), lower and upper end of each node for the finished log.
-        first_satisfied_ns: the first sample with a value of at least 0, or None.
-        times_ns, series: every sample's numbers, (T,) and (N, 4, T), if they were asked for.
-        inquiry: answers what the numbers leave open, if that was asked for.
-    """
-
-    name: str
-    object: str | None
-    formula: Formula
-    robustness: Floats
-    final: Floats
-    first_satisfied_ns: int | None
-    times_ns: Integers | None = None
-    series: Floats | None = None
-    inquiry: Inquiry | None = None
-
-    @property
-    def verdict(self) -> Verdict:
-        return final_verdict(*self.final[0].tolist())
-
-
-@dataclass(frozen=True, eq=False)
-class Replayed:
-    """What a replay found.
-
-    Attributes:
-        log: base name of the log.
-        samples: how many samples were evaluated.
-        first_ns: time of the log's first sample, evaluated or not.
-        start_ns, end_ns: times of the first and the last of those evaluated.
-        faults: what was lost while reading, each with its place.
-        remarks: what else the source says of its samples, where nothing was lost.
-        unreadable: how many observations are there and say nothing: a number is not finite, or too old.
-        results: one per spec and object.
-        certificate: hashes of what went in and came out.
-        semantics: what the formulas meant.
-    """
-
-    log: str
-    samples: int
-    first_ns: int
-    start_ns: int
-    end_ns: int
-    faults: tuple[str, ...]
-    remarks: tuple[str, ...]
-    unreadable: int
-    results: tuple[ReplayedSpec, ...]
-    certificate: Mapping[str, str]
-    semantics: Semantics = "ltlf"
-
-    @property
-    def verdict(self) -> Verdict:
-        return worst_verdict(result.verdict for result in self.results)
+from spatial_replay.spec.formula import Specification
+from spatial_replay.trace.trace import Trace
 
 
 class Replay:
@@ -132,9 +60,9 @@ class Replay:
         self._semantics = checked_semantics(semantics, files)
         self._source = source
         self._files = files
-        self._window = window or Window()
         self.files = kept_files(files)
-        self._instances = [self._find_instances(file, each or {}) for file in self.files]
+        self._selection = Selection(source, window or Window(), files)
+        self._instances = [self._selection.instances(file, each or {}) for file in self.files]
         self._evaluation = AnnotatedEvaluation(
             self.files, self._instances, self._semantics, source.attachments
         )
@@ -159,10 +87,11 @@ class Replay:
             annotate: yield messages; without it, nothing.
             layer: leave out the source's own messages.
         """
-        for block, trace in self._iter_blocks():
+        for block, trace in self._selection.iter_blocks():
             stretches = self._evaluation.extend(trace)
-            inside = within(trace, self._window.start_ns, self._window.end_ns)
-            own = self._own_messages(block)
+            inside = self._selection.inside(trace)
+            own = self._selection.own_messages(block, self._encoded)
+            self._encoded += len(self._selection.inside(block.trace))
             self._remarks += block.remarks
             if not layer:
                 self._topics.update(channel.topic for channel in own.channels.values())
@@ -180,12 +109,12 @@ class Replay:
             SpecificationError: names that the log never has.
         """
         if not self._samples:
-            raise self._nothing_to_evaluate()
-        self._check_names()
+            raise self._selection.nothing_to_evaluate(self._faults)
+        self._selection.check_names(self._names, self._signals)
         return Replayed(
             log=self._source.name,
             samples=self._samples,
-            first_ns=first_sample_ns(self._source) if self._window.start_ns else self._times[0],
+            first_ns=first_sample_ns(self._source) if self._selection.window.start_ns else self._times[0],
             start_ns=self._times[0],
             end_ns=self._times[-1],
             faults=tuple(self._faults),
@@ -213,67 +142,6 @@ class Replay:
         """The certificate over what was taken in so far."""
         return certificate(self._sample_hash, self._message_hash, self._files, self._result_hash)
 
-    def _find_instances(self, file: Specification, each: Mapping[str, str]) -> list[Instance]:
-        parameters = {spec.parameter for spec in file.results}
-        own = {parameter: choice for parameter, choice in each.items() if parameter in parameters}
-        choices = [Choice.parse(parameter, choice) for parameter, choice in own.items()]
-        classes: set[str | None] = set()
-        traces = self._iter_with_classes(classes)
-        instances = find_instances(file, own, traces, self._window.start_ns, self._window.end_ns)
-        for choice in choices:
-            self._check_class(choice, classes)
-        return instances
-
-    def _iter_with_classes(self, classes: set[str | None]) -> Iterator[Trace]:
-        """The samples that count; the classes of their objects go to `classes`."""
-        for block, trace in self._iter_blocks():
-            classes.update(block.trace.classes)
-            yield trace
-
-    def _iter_traces(self) -> Iterator[Trace]:
-        """The samples that count."""
-        for _, trace in self._iter_blocks():
-            yield trace
-
-    def _check_class(self, choice: Choice, classes: set[str | None]) -> None:
-        """That some object of the log is of the class that was chosen, if none of those in the window is."""
-        if not any(map(choice.fits, classes)) and not self._window.is_whole:
-            for block in read_blocks(self._source):
-                classes.update(block.trace.classes)
-        if choice.class_name is not None and not any(map(choice.fits, classes)):
-            known = ", ".join(sorted(name for name in classes if name)) or "none"
-            raise UsageError(
-                f"no object of {self._source.name} is of the class {choice.class_name!r}; "
-                f"its classes are: {known}"
-            )
-
-    def _iter_blocks(self) -> Iterator[tuple[Block, Trace]]:
-        """Each block, with the samples that count."""
-        window = self._window
-        looks_back = any(look_back([spec.formula for spec in file.specs]) != (0, 0) for file in self._files)
-        from_start = looks_back or window.every > 1
-        seen = 0
-        for block in read_blocks(self._source, None if from_start else window.start_ns, window.end_ns):
-            trace = block.trace
-            if window.every > 1:
-                chosen = np.arange(-seen % window.every, len(trace), window.every, dtype=np.int64)
-                seen += len(trace)
-                trace = trace.take(chosen)
-            yield block, trace
-
-    def _own_messages(self, block: Block) -> Messages:
-        """The source's messages in the window, and its samples where those are not among its messages."""
-        messages = block.messages
-        begin, end = window_of(messages.log_time_ns, self._window.start_ns, self._window.end_ns)
-        inside = messages if end - begin == len(messages) else select(messages, np.arange(begin, end))
-        if any(channel.topic == OBJECTS for channel in messages.channels.values()):
-            # in the source, messages of one time come in the order of its numbers of channels
-            return merge([inside])
-        trace = within(block.trace, self._window.start_ns, self._window.end_ns)
-        self._encoded += len(trace)
-        first = self._encoded - len(trace)
-        return merge([inside, messages_of(_OBJECTS, trace.times_ns, encode_objects(trace), first)])
-
     def _count(self, trace: Trace, own: Messages, stretches: Sequence[Stretch]) -> None:
         self._faults += trace.faults
         self._names.update(trace.names)
@@ -299,53 +167,13 @@ class Replay:
         for tree, stream, kept, own in zip(
             self.trees, self._evaluation.streams, self._kept, regions, strict=True
         ):
-            stretch = join_stretches(kept) if kept else None
-            inquiry = None
-            if self._keep_leaves and stretch is not None:
-                evidence = Evidence(stream.instance, own, self._iter_traces)
-                inquiry = Inquiry(evidence, stretch.times_ns, stretch.leaves, self._semantics)
-            yield ReplayedSpec(
-                tree.name,
-                tree.object,
-                tree.formula,
-                stream.robustness,
-                stream.final,
-                stream.first_satisfied_ns,
-                None if stretch is None else stretch.times_ns,
-                stretch.series if stretch is not None and self._keep_series else None,
-                inquiry,
+            evidence = Evidence(stream.instance, own, self._selection.iter_traces)
+            yield replayed_spec(
+                tree,
+                stream,
+                evidence,
+                join_stretches(kept) if kept else None,
+                self._semantics,
+                has_series=self._keep_series,
+                has_leaves=self._keep_leaves,
             )
-
-    def _check_names(self) -> None:
-        """That the log has every object and signal that a specification names."""
-        missing = self._missing_names()
-        if missing and not self._window.is_whole:
-            for block in read_blocks(self._source):
-                self._names.update(block.trace.names)
-                self._signals.update(block.trace.signals)
-            missing = self._missing_names()
-        if missing:
-            raise SpecificationError(missing)
-
-    def _missing_names(self) -> list[Diagnostic]:
-        names, signals = sorted(self._names), sorted(self._signals)
-        remarks = [remark for file in self._files for remark in check_names(file, names, signals)]
-        return [remark for remark in remarks if remark.severity == "error"]
-
-    def _nothing_to_evaluate(self) -> LogError | UsageError:
-        name = self._source.name
-        spans = [
-            (int(block.trace.times_ns[0]), int(block.trace.times_ns[-1]))
-            for block in read_blocks(self._source)
-            if len(block.trace)
-        ]
-        if not spans:
-            return LogError("; ".join([f"{name} has no sample", *self._faults[:1]]))
-        first_ns, last_ns = spans[0][0], spans[-1][1]
-        return UsageError(
-            f"{name} has no sample in the window asked for; its samples are from {first_ns} to {last_ns} ns, "
-            f"{(last_ns - first_ns) / 1e9:.3f} s"
-        )
-
-
-_OBJECTS = protobuf_channel(OBJECTS, ObjectStates)
