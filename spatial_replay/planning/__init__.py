@@ -12,7 +12,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from spatial_replay.planning.maps import gradient_map, proposition_maps
+    from spatial_replay.planning.displacement import proposition_maps
+    from spatial_replay.planning.maps import gradient_map
     from spatial_replay.planning.planner import Planner
     from spatial_replay.planning.settings import Settings
     from spatial_replay.planning.step import Candidate, Executor, Outcome, Step, Target
@@ -44,7 +45,7 @@ _HOMES: Mapping[str, str] = MappingProxyType(
         "Target": "spatial_replay.planning.step",
         "Workspace": "spatial_replay.planning.workspace",
         "gradient_map": "spatial_replay.planning.maps",
-        "proposition_maps": "spatial_replay.planning.maps",
+        "proposition_maps": "spatial_replay.planning.displacement",
     }
 )
 

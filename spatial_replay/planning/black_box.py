@@ -72,8 +72,7 @@ class BlackBox:
         decision = decision_message(step, self.planner.automaton.name)
         # the one that is drawn last is what a viewer shows
         candidates = sorted(step.candidates, key=lambda candidate: candidate.is_chosen)
-        grid = self.planner.settings.workspace.grid
-        maps = [map_message(candidate.map, grid, step.time_ns) for candidate in candidates]
+        maps = [map_message(candidate.map, step.time_ns) for candidate in candidates]
         path = path_message(step.target, self._tracked, step.time_ns)
         return step, self._messages(step.time_ns, [decision], maps, [path])
 

@@ -31,7 +31,6 @@ from spatial_replay.palette import NEUTRAL, POSITIVE
 from spatial_replay.planning.maps import GradientMap
 from spatial_replay.planning.poses import moved_object
 from spatial_replay.planning.step import Candidate, Consideration, Guards, Kind, Outcome, Step, Target
-from spatial_replay.planning.workspace import Grid
 
 _KINDS: MappingProxyType[Kind, PlanDecision.Kind.ValueType] = MappingProxyType(
     {
@@ -76,9 +75,9 @@ def outcome_message(
     )
 
 
-def map_message(found: GradientMap, grid: Grid, time_ns: int) -> GridMessage:
+def map_message(found: GradientMap, time_ns: int) -> GridMessage:
     """A gradient map that lies over the scene: a field for each way in which the object is turned."""
-    turns = len(found.turns)
+    turns, grid = len(found.turns), found.grid
     message = GridMessage(
         frame_id=FRAME,
         column_count=grid.columns,

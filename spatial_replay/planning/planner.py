@@ -8,18 +8,12 @@ from dataclasses import replace
 from spatial_replay.automata.automaton import Automaton, Transition
 from spatial_replay.automata.compiling import automaton as automaton_of
 from spatial_replay.errors import TraceError, UsageError
-from spatial_replay.geometry.footprint import TrackedObject
-from spatial_replay.planning.maps import (
-    PropositionMaps,
-    concerns,
-    gradient_map,
-    proposition_maps,
-    refuse_delays,
-)
+from spatial_replay.planning.candidates import Movables, with_choice
+from spatial_replay.planning.edges import consideration_of, why_no_path, worst_state
 from spatial_replay.planning.observing import Observer, Symbol, refuse_template
 from spatial_replay.planning.settings import Settings
-from spatial_replay.planning.step import Candidate, Consideration, Edge, Guards, Kind, Outcome, Step
-from spatial_replay.planning.targets import find_target
+from spatial_replay.planning.step import Consideration, Edge, Kind, Outcome, Step
+from spatial_replay.planning.subjects import refuse_delays
 from spatial_replay.planning.workspace import Workspace
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
@@ -70,7 +64,6 @@ class Planner:
         self._sample: Sample | None = None
         self._observer = Observer(self._formulas, specification.regions)
         self._symbol: Symbol = ()
-        self._maps: dict[str, PropositionMaps] = {}
         self._pruned: dict[Edge, str] = {}
         self._tried: dict[Edge, int] = {}
         self._failed: dict[tuple[Edge, str], tuple[tuple[float, float], ...]] = {}
@@ -123,7 +116,6 @@ class Planner:
         if self._settings is None:
             self._settings = Settings(Workspace.around(sample))
         self._sample = sample
-        self._maps = {}
         self._symbol = self._observer.symbol(sample)
         self._states = self.automaton.step_set(self._states, self._symbol)
 
@@ -146,19 +138,20 @@ class Planner:
             return self._decided("hold", (), "the specification is satisfied: hold")
         if len(self._states) > 1 and None in self._symbol:
             return self._decided("wait", (), f"not enough is seen: {self._unknown()} unknown")
-        state = self._worst_state()
+        state = worst_state(self.automaton, self.states)
         if state is None:
             reason = "no path left: the specification cannot be satisfied any more"
             return self._decided("no path", (), reason)
         if self.is_doubtful:
             return self._decided("hold", (), "satisfied, unless it was violated while not enough was seen")
         considered: list[Consideration] = []
+        movables = Movables(self._formulas, self._regions, self._sample, self.settings)
         while (way := next(self.automaton.paths(state, self._pruned), None)) is not None:
-            considered.append(self._considered(way, self._sample))
+            considered.append(self._considered(way, movables))
             if not considered[-1].pruned:
                 return self._running_step(considered)
             self._pruned[considered[-1].edge] = considered[-1].pruned
-        return self._decided("no path", considered, self._why_no_path(state))
+        return self._decided("no path", considered, why_no_path(self.automaton, state, self._pruned))
 
     def conclude(self, outcome: Outcome) -> None:
         """Say how the execution of the last step went, once its samples were observed.
@@ -176,86 +169,18 @@ class Planner:
             key = (step.aim.edge, step.target.name)
             self._failed[key] = (*self._failed.get(key, ()), (step.target.x, step.target.y))
 
-    def _considered(self, way: tuple[Transition, ...], sample: Sample) -> Consideration:
+    def _considered(self, way: tuple[Transition, ...], movables: Movables) -> Consideration:
         """Look into the first edge of a path: what it takes, and which objects could do it."""
-        first = way[0]
-        edge = (first.source, first.target)
-        progress = self._guards([first])
-        constraints = self._guards(
-            each
-            for each in self.automaton.transitions
-            if each.source == first.source
-            and each.target not in edge
-            and (each.source, each.target) not in self._pruned
-        )
-        consideration = Consideration(
-            (first.source, *(each.target for each in way)), edge, progress, constraints, ()
-        )
+        consideration = consideration_of(self.automaton, way, self._pruned)
+        edge = consideration.edge
         tried = self._tried.get(edge, 0)
         if tried >= self.settings.attempts:
             return replace(consideration, pruned=f"tried {tried} times")
         candidates = [
-            self._candidate(name, consideration, sample) for name in self._movable(progress, sample)
+            movables.candidate(name, consideration, self._failed.get((edge, name), ()))
+            for name in movables.names_for(consideration.progress)
         ]
-        targets = [
-            (self._cost(candidate), number) for number, candidate in enumerate(candidates) if candidate.target
-        ]
-        if not targets:
-            reasons = "; ".join(f"{each.name}: {each.rejected}" for each in candidates)
-            reason = (
-                f"no object can do it ({reasons})" if reasons else "no object that can be moved matters to it"
-            )
-            return replace(consideration, candidates=tuple(candidates), pruned=reason)
-        chosen = min(targets)[1]
-        candidates[chosen] = replace(candidates[chosen], is_chosen=True)
-        return replace(consideration, candidates=tuple(candidates))
-
-    def _cost(self, candidate: Candidate) -> float:
-        """What the candidate with the least of is chosen."""
-        if candidate.target is None:
-            raise UsageError(f"{candidate.name} has no target")
-        pushes = self.settings.skill == "push"
-        return candidate.target.length if pushes else -candidate.target.robustness
-
-    def _candidate(self, name: str, consideration: Consideration, sample: Sample) -> Candidate:
-        tracked = sample.objects[name]
-        if not isinstance(tracked, TrackedObject):
-            raise TraceError(f"object {name!r} is {tracked!r}; give a TrackedObject")
-        if name not in self._maps:
-            self._maps[name] = proposition_maps(
-                self._formulas, self._regions, sample, name, self.settings.workspace
-            )
-        found = gradient_map(
-            self._maps[name],
-            consideration.progress.cubes,
-            consideration.constraints.cubes,
-            self.settings.workspace,
-            self.settings.constraint_margin,
-        )
-        failed = self._failed.get((consideration.edge, name), ())
-        target = find_target(found, tracked, self.settings, failed)
-        if isinstance(target, str):
-            return Candidate(name, found, None, target)
-        return Candidate(name, found, target)
-
-    def _movable(self, progress: Guards, sample: Sample) -> list[str]:
-        """The objects that a progress set is about and that can be moved, in the order of the settings."""
-        about = {number for cube in progress.cubes for number, _ in cube}
-        names = self.settings.movable if self.settings.movable is not None else tuple(sorted(sample.objects))
-        return [
-            name
-            for name in names
-            if name in sample.objects and any(concerns(self._formulas[number], name) for number in about)
-        ]
-
-    def _guards(self, transitions: Iterable[Transition]) -> Guards:
-        cubes = tuple(cube for each in transitions for cube in each.guard)
-        propositions = self.automaton.propositions
-        texts = tuple(
-            " and ".join(propositions[number].literal(value) for number, value in cube) or "true"
-            for cube in cubes
-        )
-        return Guards(cubes, texts)
+        return with_choice(consideration, candidates, self.settings)
 
     def _running_step(self, considered: list[Consideration]) -> Step:
         aim = considered[-1]
@@ -278,27 +203,8 @@ class Planner:
         pruned = tuple(sorted(self._pruned.items()))
         return Step(number, self._sample.time_ns, kind, self.states, tuple(considered), None, pruned, reason)
 
-    def _worst_state(self) -> int | None:
-        """Of the states it can be in, the one farthest from acceptance; None if that is lost from all."""
-        ways = {state: next(self.automaton.paths(state), None) for state in self.states}
-        distances = {state: len(way) for state, way in ways.items() if way is not None}
-        return max(distances, key=lambda state: (distances[state], -state), default=None)
-
     def _unknown(self) -> str:
         """The propositions that the newest sample says nothing about."""
         propositions = self.automaton.propositions
         labels = zip(propositions, self._symbol, strict=True)
         return ", ".join(each.label for each, value in labels if value is None)
-
-    def _why_no_path(self, state: int) -> str:
-        ahead, found = [state], {state}
-        while ahead:
-            after = set(self.automaton.successors[ahead.pop()]) - found
-            found |= after
-            ahead += after
-        edges = "; ".join(
-            f"{source} -> {target}: {reason}"
-            for (source, target), reason in sorted(self._pruned.items())
-            if source in found
-        )
-        return f"no path left: every way from state {state} was given up ({edges})"

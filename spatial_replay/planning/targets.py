@@ -7,11 +7,12 @@ from collections.abc import Collection
 import numpy as np
 
 from spatial_replay.geometry.footprint import TrackedObject
-from spatial_replay.planning.maps import FREE, REASONS, GradientMap
-from spatial_replay.planning.paths import shortest_path
+from spatial_replay.planning.maps import FREE, OUT_OF_REACH, REASONS, GradientMap
+from spatial_replay.planning.paths import Path, shortest_path
 from spatial_replay.planning.poses import centre_of
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.step import Target
+from spatial_replay.planning.workspace import Grid
 
 AVOIDED_CELLS = 2.0
 """How far from a place where an object could not be brought the next try stays, in cells."""
@@ -30,7 +31,7 @@ def find_target(
         tracked: the object as it is.
         failed: places (x, y) where it could not be brought before.
     """
-    good = (found.blocked == FREE) & (found.robustness >= settings.margin) & ~_near(failed, settings)
+    good = (found.blocked == FREE) & (found.robustness >= settings.margin) & ~_near(failed, found.grid)
     if not good.any():
         return _why_nowhere(found, settings, bool(failed))
     if settings.skill == "place":
@@ -42,33 +43,46 @@ def _best_cell(found: GradientMap, good: np.ndarray, tracked: TrackedObject, set
     roomy = good & (found.clearance >= settings.room)
     values = np.where(roomy if roomy.any() else good, found.robustness, -np.inf)
     turn, row, column = (int(index) for index in np.unravel_index(int(np.argmax(values)), values.shape))
-    here, there = centre_of(tracked.footprint), settings.workspace.grid.centre(row, column)
+    here, there = centre_of(tracked.footprint), found.grid.centre(row, column)
     return _target(found, tracked, (turn, row, column), (here, there))
 
 
 def _nearest_cell(
     found: GradientMap, good: np.ndarray, tracked: TrackedObject, settings: Settings
 ) -> Target | str:
-    grid = settings.workspace.grid
-    free = found.blocked[0] == FREE
     here = centre_of(tracked.footprint)
-    cell = grid.cell(*here)
-    start = cell if free[cell] else _way_out(free, cell)
-    path = shortest_path(free, start, good[0])
+    if not found.grid.contains(np.array(here)):
+        return "it lies too far outside the workspace"
+    cell = found.grid.cell(*here)
+    way_in = _way_in(found, cell, settings)
+    if way_in is None:
+        return "no free path leads into reach"
+    row, column = way_in.cells[-1].tolist()
+    path = shortest_path(found.blocked[0] == FREE, (row, column), good[0])
     if path is None:
         return "no free path leads to a good place"
-    row, column = path.cells[-1].tolist()
+    cells = [(row, column) for row, column in (*way_in.cells.tolist(), *path.cells[1:].tolist())]
     # where it is in its own cell, it need not go to that cell's middle first
-    first = 1 if start == cell and len(path.cells) > 1 else 0
-    turns = [grid.centre(*each) for each in path.cells[first:].tolist()]
-    return _target(found, tracked, (0, row, column), (here, *turns))
+    first = 1 if cells[0] == cell and len(cells) > 1 else 0
+    turns = [found.grid.centre(*each) for each in cells[first:]]
+    return _target(found, tracked, (0, *cells[-1]), (here, *turns))
 
 
-def _way_out(free: np.ndarray, cell: tuple[int, int]) -> tuple[int, int]:
-    """The free cell nearest to one that is not: where something has to go that is where it must not be."""
-    cells = np.argwhere(free)
-    away = ((cells - np.array(cell)) ** 2).sum(axis=1)
-    row, column = cells[int(np.argmin(away))].tolist()
+def _way_in(found: GradientMap, cell: tuple[int, int], settings: Settings) -> Path | None:
+    """The way to the first free cell, over cells that are merely out of reach if it starts in such a one.
+
+    From where something must not be at all it goes straight to the nearest cell where it may.
+    """
+    free = found.blocked[0] == FREE
+    is_reached = settings.workspace.within_reach(found.grid)[cell]
+    passable = free if is_reached else free | (found.blocked[0] == OUT_OF_REACH)
+    return shortest_path(passable, cell if passable[cell] else _nearest(passable, cell), free)
+
+
+def _nearest(cells: np.ndarray, cell: tuple[int, int]) -> tuple[int, int]:
+    """Of some cells, the one nearest to another."""
+    places = np.argwhere(cells)
+    row, column = places[int(np.argmin(((places - np.array(cell)) ** 2).sum(axis=1)))].tolist()
     return row, column
 
 
@@ -84,9 +98,8 @@ def _target(
     return Target(found.name, x, y, turn, yaw, waypoints, float(found.robustness[place]))
 
 
-def _near(failed: Collection[tuple[float, float]], settings: Settings) -> np.ndarray:
+def _near(failed: Collection[tuple[float, float]], grid: Grid) -> np.ndarray:
     """(rows, columns): the cells near places that were tried in vain."""
-    grid = settings.workspace.grid
     near = np.zeros(grid.shape, np.bool_)
     centres = grid.centres()
     for place in failed:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +86,28 @@ class Grid:
         x = self.xmin + (column + 0.5) * self.cell_size
         return x, self.ymin + (row + 0.5) * self.cell_size
 
+    def contains(self, points: Floats) -> Booleans:
+        """(…, 2) points → (…): whether each lies in a cell."""
+        cells = (points - np.array([self.xmin, self.ymin])) / self.cell_size
+        inside: Booleans = ((cells >= 0.0) & (cells < np.array([self.columns, self.rows]))).all(axis=-1)
+        return inside
+
+    def reaching(self, x: float, y: float) -> Grid:
+        """This grid with cells added on two sides at most, so that a point lies in it.
+
+        It stays as it is where the point lies in it already, or farther away than it is long.
+        """
+        column = math.floor((x - self.xmin) / self.cell_size)
+        row = math.floor((y - self.ymin) / self.cell_size)
+        left, below = max(-column, 0), max(-row, 0)
+        right, above = max(column + 1 - self.columns, 0), max(row + 1 - self.rows, 0)
+        columns, rows = self.columns + left + right, self.rows + below + above
+        added = max(left, below, right, above)
+        if not added or added > max(self.shape) or columns * rows > MOST_CELLS:
+            return self
+        xmin, ymin = self.xmin - left * self.cell_size, self.ymin - below * self.cell_size
+        return Grid(xmin, ymin, self.cell_size, columns, rows)
+
     def cell(self, x: float, y: float) -> tuple[int, int]:
         """The cell (row, column) that a point lies in; of one outside the grid, the nearest one."""
         column = math.floor((x - self.xmin) / self.cell_size)
@@ -148,12 +169,13 @@ class Workspace:
         (xmin, ymin), (xmax, ymax) = (low - longer / 2).tolist(), (high + longer / 2).tolist()
         return cls(Grid.over(xmin, ymin, xmax, ymax, 2.0 * longer / CELLS_AROUND))
 
-    @cached_property
-    def within_reach(self) -> Booleans:
-        """(rows, columns): whether the robot reaches the middle of each cell."""
-        away = self.grid.centres() - np.array(self.base)
-        distance = np.hypot(away[:, 0], away[:, 1])
-        reached = (distance >= self.nearest) & (distance <= self.farthest)
-        result: Booleans = reached.reshape(self.grid.shape)
-        result.flags.writeable = False
+    def within_reach(self, grid: Grid) -> Booleans:
+        """(rows, columns): whether the robot can put an object into the middle of each cell of a grid.
+
+        What lies outside the workspace's own cells is out of reach.
+        """
+        centres = grid.centres()
+        distance = np.hypot(*(centres - np.array(self.base)).T)
+        reached = (distance >= self.nearest) & (distance <= self.farthest) & self.grid.contains(centres)
+        result: Booleans = reached.reshape(grid.shape)
         return result

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import spatial_replay as sr
-from spatial_replay.planning.maps import proposition_maps
+from spatial_replay.planning.displacement import proposition_maps
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.poses import centre_of, moved_object
 from spatial_replay.planning.settings import Settings

@@ -7,13 +7,13 @@ import pytest
 
 import spatial_replay as sr
 from spatial_replay.errors import UsageError
+from spatial_replay.planning.displacement import proposition_maps
 from spatial_replay.planning.maps import (
     CONSTRAINED,
     FREE,
     OCCUPIED,
     OUT_OF_REACH,
     gradient_map,
-    proposition_maps,
 )
 from spatial_replay.planning.poses import centre_of
 from spatial_replay.planning.workspace import Grid, Workspace

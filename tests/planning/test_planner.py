@@ -1,13 +1,16 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
+import numpy as np
 import pytest
 
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, PUSHING, block, run
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.planning.planner import Planner
+from spatial_replay.planning.poses import moved_object
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.step import Outcome
 from spatial_replay.planning.workspace import Grid, Workspace
@@ -84,6 +87,50 @@ def test_a_step_that_fails_is_tried_elsewhere():
     assert [step.kind for step in steps] == ["execute", "execute", "hold"]
     first, second = (step.target for step in steps[:2])
     assert math.dist((first.x, first.y), (second.x, second.y)) > TABLE.workspace.grid.cell_size
+
+
+def samples_on_the_way(step, objects):
+    """What would be seen while a step's object follows its waypoints."""
+    (name, points) = step.target.name, [np.array(each) for each in step.target.waypoints]
+    places = [a + share * (b - a) for a, b in pairwise(points) for share in np.linspace(0, 1, 20)]
+    moved = (moved_object(objects[name], *place.tolist()) for place in places)
+    return [sr.Sample(time_ns, {**objects, name: each}) for time_ns, each in enumerate(moved)]
+
+
+OUTSIDE = {"cup": block(-3, 5, size=1), "plate": block(8, 5, size=1)}
+NEAR = "F (cup dist plate <= 1)"
+
+
+@pytest.mark.parametrize(
+    ("options", "others", "apart"),
+    [
+        ({}, {"fork": block(-0.5, 5, size=2)}, "G (cup dist fork >= 0)"),
+        (
+            {"obstacles": (sr.Footprint.box(-0.6, 3, -0.4, 7),)},
+            {},
+            "region wall = box(-0.6, 3, -0.4, 7)\nspec apart = G (cup dist wall >= 0)",
+        ),
+        ({"base": (10.0, 5.0), "farthest": 6.0}, {"fork": block(2, 5, size=2)}, "G (cup dist fork >= 0)"),
+    ],
+)
+def test_what_lies_out_of_reach_is_pushed_around_what_stands_in_its_way(options, others, apart):
+    workspace = Workspace(Grid.over(0, 0, 10, 10, 0.5), clearance=0.5, **options)
+    objects = {**OUTSIDE, **others}
+    steps, _ = run(planner(NEAR, Settings(workspace, "push", movable=("cup",))), objects)
+    assert [step.kind for step in steps] == ["execute", "hold"]
+    assert len(steps[0].target.waypoints) > 2
+    trace = sr.Trace.from_samples(samples_on_the_way(steps[0], objects))
+    assert sr.evaluate(sr.parse_specification(apart), trace).verdict == "satisfied"
+
+
+def test_what_no_way_leads_to_is_not_pushed():
+    walls = (sr.Footprint.box(-0.6, -20, -0.4, 30),)
+    workspace = Workspace(Grid.over(0, 0, 10, 10, 0.5), obstacles=walls)
+    steps, _ = run(planner(NEAR, Settings(workspace, "push", movable=("cup",))), OUTSIDE)
+    assert "cup: no free path leads into reach" in steps[0].pruned[0][1]
+    far = {**OUTSIDE, "cup": block(-30, 5, size=1)}
+    steps, _ = run(planner(NEAR, Settings(workspace, "push", movable=("cup",))), far)
+    assert "cup: it lies too far outside the workspace" in steps[0].pruned[0][1]
 
 
 def test_what_cannot_be_moved_is_given_up_with_a_reason():
