@@ -11,6 +11,7 @@ from spatial_replay.inspection.annotation import (
     kept_files,
     specification_attachments,
 )
+from spatial_replay.inspection.automata import KeptAutomaton
 from spatial_replay.inspection.certificate import MessageHash, ResultHash, SampleHash, certificate
 from spatial_replay.inspection.hashing import Hashing
 from spatial_replay.logs.block import Messages
@@ -124,6 +125,11 @@ class Replay:
             certificate=self.certificate(),
             semantics=self._semantics,
         )
+
+    @property
+    def automata(self) -> Sequence[KeptAutomaton]:
+        """The automaton of each of `trees`, or why it has none."""
+        return self._evaluation.automata
 
     def automata_metadata(self) -> Mapping[str, str]:
         """For each spec, how large its automaton is, or why there is none."""
