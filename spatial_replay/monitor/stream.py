@@ -39,6 +39,11 @@ class Stretch:
     series: Floats
     leaves: Floats
 
+    def between(self, start_ns: int, end_ns: int) -> Stretch:
+        """The samples from the first at or after `start_ns` to the last before `end_ns`."""
+        begin, end = window_of(self.times_ns, start_ns, end_ns)
+        return Stretch(self.times_ns[begin:end], self.series[:, :, begin:end], self.leaves[:, :, begin:end])
+
 
 def join_stretches(stretches: Sequence[Stretch]) -> Stretch:
     """One stretch of one or more of the same instance that follow each other."""
