@@ -14,8 +14,7 @@ _LONGEST: Final = 160
 _VERDICT_COLOURS: Final[Mapping[str, tuple[float, float, float]]] = MappingProxyType(
     {"satisfied": POSITIVE, "violated": NEGATIVE}
 )
-_CELL: Final = "text-align:left; padding:0.1em 1em 0.1em 0; vertical-align:top; background:transparent"
-_TREE_CELL: Final = f"{_CELL}; font-family:monospace; white-space:pre"
+_CELL: Final = "text-align:left; padding:0.1em 1em 0.1em 0; vertical-align:baseline; background:transparent"
 
 
 class Html(str):
@@ -38,16 +37,15 @@ def printable(text: str, longest: int = _LONGEST) -> str:
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Html:
-    """A table whose first column keeps spaces, so that a tree stands in it."""
+    """A table."""
     head = element("tr", *(element("th", each, style=_CELL) for each in headings))
-    body = [
-        element(
-            "tr",
-            *(element("td", each, style=_CELL if column else _TREE_CELL) for column, each in enumerate(row)),
-        )
-        for row in rows
-    ]
+    body = [element("tr", *(element("td", each, style=_CELL) for each in row)) for row in rows]
     return element("table", element("thead", head), element("tbody", *body), style="border-collapse:collapse")
+
+
+def code(*content: str) -> Html:
+    """Content in letters of one width, with all of its spaces."""
+    return element("span", *content, style="font-family:ui-monospace,monospace; white-space:pre")
 
 
 def folded(summary: str, *content: str) -> Html:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from reprlib import repr as shortened
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +25,9 @@ from spatial_replay.spec.formula import Diagnostic, Formula, Specification, iter
 from spatial_replay.spec.objects import check_names
 from spatial_replay.trace.times import FOREVER
 from spatial_replay.trace.trace import Trace, window_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +159,17 @@ class SpecResult:
         """
         return self.inquiry.witness(0 if node is None else self.node(node).id)
 
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw it as curves over time; see `draw_result`."""
+        from spatial_replay.monitor.curves import draw_result
+
+        return draw_result(self, ax)
+
+    def _repr_html_(self) -> str:
+        from spatial_replay.monitor.verdict_table import result_html
+
+        return result_html(self)
+
     def __repr__(self) -> str:
         instance = f" for {self.object}" if self.object is not None else ""
         return f"<{self.name}{instance}: {self.verdict}, robustness {self.robustness:.6g}>"
@@ -249,6 +264,17 @@ class Evaluation:
             raise UsageError(f"there is no result{for_object} to explain")
         worst = worst_verdict(result.verdict for result in results)
         return next(result for result in results if result.verdict is worst).witness(node)
+
+    def plot(self, ax: Axes | Sequence[Axes] | None = None) -> tuple[Axes, ...]:
+        """Draw each result as curves over time; see `draw_evaluation`."""
+        from spatial_replay.monitor.curves import draw_evaluation
+
+        return draw_evaluation(self, ax)
+
+    def _repr_html_(self) -> str:
+        from spatial_replay.monitor.verdict_table import evaluation_html
+
+        return evaluation_html(self)
 
     def __repr__(self) -> str:
         return f"<Evaluation: {self.verdict}; {', '.join(map(repr, self.results))}>"

@@ -7,7 +7,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from spatial_replay.figures import INK, new_panel, plain
-from spatial_replay.markup import Html, counted, element, quiet, table
+from spatial_replay.markup import Html, code, counted, element, quiet, table
 from spatial_replay.palette import NEUTRAL
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operands_of
 from spatial_replay.spec.tree import iter_branches, label_of, title_of
@@ -59,7 +59,7 @@ def tree_cell(stem: str, node: Formula) -> Html:
     """A node in a tree, with its name in bold."""
     indented = stem if len(stem) <= 3 * _DEEPEST else "⋯" + stem[-3:]
     name = [] if node.name is None else [element("b", node.name), " = "]
-    return element("span", indented, *name, title_of(node))
+    return code(indented, *name, title_of(node))
 
 
 def _left_out(results: Sequence[NamedSpec], shown: int) -> Html:
