@@ -61,6 +61,7 @@ def test_the_planned_push_tells_its_decisions(capsys):
     # all at once is given up; then two pushes
     assert "3 decisions for 'push', 2 motions, 1 edge given up" in told
     assert told.index("push red at") < told.index("push green at")
+    assert "    green (map 0): rejected, nowhere would it hold" in told
 
 
 def test_the_script_makes_the_files_that_are_there():

@@ -79,10 +79,19 @@ def _edge_lines(edge: PlanEdge, *, is_aim: bool) -> Iterator[str]:
 
 def _candidate(candidate: PlanCandidate) -> str:
     best = "-inf" if math.isinf(candidate.best) else f"{candidate.best:.4g}"
+    name = f"{candidate.object}{_maps(candidate)}"
     if candidate.rejected:
-        return f"{candidate.object}: rejected, {candidate.rejected}"
+        return f"{name}: rejected, {candidate.rejected}"
     mark = "chosen" if candidate.chosen else "possible"
-    return f"{candidate.object}: {mark}, {best} at best; {_way(candidate.target)}"
+    return f"{name}: {mark}, {best} at best; {_way(candidate.target)}"
+
+
+def _maps(candidate: PlanCandidate) -> str:
+    """Which messages on the topic of maps are its own."""
+    numbers = sorted(each.number for each in candidate.maps)
+    if len(numbers) < 2:
+        return "".join(f" (map {number})" for number in numbers)
+    return f" (maps {numbers[0]} to {numbers[-1]})"
 
 
 def _way(target: PlanTarget) -> str:

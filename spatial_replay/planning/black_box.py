@@ -16,7 +16,9 @@ from spatial_replay.logs.block import Channel, Messages
 from spatial_replay.logs.merging import merge
 from spatial_replay.logs.messages.PlanDecision_pb2 import PlanDecision
 from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_DECISION, PLAN_PATH, protobuf_channel
-from spatial_replay.planning.messages import decision_message, map_message, outcome_message, path_message
+from spatial_replay.planning.decision_message import decision_message, outcome_message
+from spatial_replay.planning.map_message import map_message, maps_of
+from spatial_replay.planning.path_message import path_message
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.poses import centre_of
 from spatial_replay.planning.step import Outcome, Step
@@ -25,11 +27,10 @@ from spatial_replay.trace.sample import Sample
 PLAN_METADATA: Final = "spatial_replay_plan"
 """The metadata record with what decisions depend on besides samples: settings, and which specification."""
 
-_CHANNELS: Final = (
-    protobuf_channel(PLAN_DECISION, PlanDecision),
-    protobuf_channel(GRADIENT_MAP, GridMessage),
-    protobuf_channel(PLAN_PATH, SceneUpdate),
-)
+_DECISIONS: Final = protobuf_channel(PLAN_DECISION, PlanDecision)
+_MAPS: Final = protobuf_channel(GRADIENT_MAP, GridMessage)
+_PATHS: Final = protobuf_channel(PLAN_PATH, SceneUpdate)
+_CHANNELS: Final = (_DECISIONS, _MAPS, _PATHS)
 
 
 class BlackBox:
@@ -45,6 +46,7 @@ class BlackBox:
         self._written = dict.fromkeys(_CHANNELS, 0)
         self._sample: Sample | None = None
         self._step: Step | None = None
+        self._decision = PlanDecision()
         self._tracked: TrackedObject | None = None
         self._travelled: list[tuple[float, float]] = []
 
@@ -69,12 +71,10 @@ class BlackBox:
         self._step = step = self.planner.next_step()
         self._tracked = self._object_moved()
         self._travelled = [] if self._tracked is None else [centre_of(self._tracked.footprint)]
-        decision = decision_message(step, self.planner.automaton.name)
-        # the one that is drawn last is what a viewer shows
-        candidates = sorted(step.candidates, key=lambda candidate: candidate.is_chosen)
-        maps = [map_message(candidate.map, step.time_ns) for candidate in candidates]
+        self._decision = decision_message(step, self.planner.automaton.name, self._written[_MAPS])
+        maps = [map_message(turned, step.time_ns) for turned in maps_of(step)]
         path = path_message(step.target, self._tracked, step.time_ns)
-        return step, self._messages(step.time_ns, [decision], maps, [path])
+        return step, self._messages(step.time_ns, [self._decision], maps, [path])
 
     def conclude(self, outcome: Outcome) -> Messages:
         """Say how the last step went; the messages that tell of it.
@@ -86,12 +86,11 @@ class BlackBox:
         if self._step is None or self._sample is None:
             raise UsageError("no step is being executed; decide on one first")
         step, end_ns = self._step, self._sample.time_ns
-        decision = decision_message(step, self.planner.automaton.name)
         told = outcome_message(outcome, end_ns, self.planner.states, self._travelled)
-        decision.outcome.CopyFrom(told)
+        self._decision.outcome.CopyFrom(told)
         path = path_message(step.target, self._tracked, end_ns, self._travelled)
         self._step = None
-        return self._messages(end_ns, [decision], [], [path])
+        return self._messages(end_ns, [self._decision], [], [path])
 
     def _object_moved(self) -> TrackedObject | None:
         """The object that the last step moves, as it is now."""

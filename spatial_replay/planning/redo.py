@@ -14,6 +14,7 @@ from spatial_replay.logs.reading import read_blocks
 from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_DECISION, PLAN_PATH, RECORDED_PREFIX
 from spatial_replay.planning.black_box import PLAN_METADATA, BlackBox
+from spatial_replay.planning.map_message import maps_of
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings_text import settings_from_text
 from spatial_replay.planning.step import Outcome
@@ -29,7 +30,7 @@ class Redone:
 
     Attributes:
         decisions: how many there are in the log.
-        maps: how many gradient maps were computed again, those of edges given up included.
+        maps: how many gradient maps were computed again, one for each way in which an object may be turned.
         differences: what differs from the log, each with its place; none where all is as it was.
         faults: what was lost while reading, each with its place.
     """
@@ -144,7 +145,7 @@ class _Check:
             return self._box.conclude(Outcome(message.outcome.succeeded, message.outcome.reason))
         step, messages = self._box.decide()
         self._decisions += 1
-        self._maps += sum(len(each.candidates) for each in step.considered)
+        self._maps += len(maps_of(step))
         return messages
 
     def _compare(self, time_ns: int, topic: str, recorded: list[bytes], made: list[bytes]) -> None:

@@ -3,11 +3,13 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.Grid_pb2 import Grid as GridMessage
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from mcap.reader import make_reader
 
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, block
@@ -16,7 +18,7 @@ from spatial_replay.errors import LogError, UsageError
 from spatial_replay.logs.messages.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.source import open_source
 from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_PATH
-from spatial_replay.planning.redo import redo_decisions
+from spatial_replay.planning.redo import planner_of, redo_decisions
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.settings_text import settings_from_text, text_from_settings
 from spatial_replay.planning.told import read_decisions
@@ -24,6 +26,8 @@ from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.replay import run_replay
 from spatial_replay.replay.verification import verify_certificate
 from spatial_replay.spec import load_specification
+
+RECORDED = Path(__file__).resolve().parents[2] / "recordings" / "push.mcap"
 
 
 def payloads(path, topic, kind):
@@ -87,18 +91,94 @@ def test_certificates_count_what_was_decided(tmp_path):
     assert verified.differences == ()
 
 
-def test_maps_lie_over_the_scene(tmp_path):
-    steps = record_plan_of(tmp_path / "run.mcap")
-    messages = payloads(tmp_path / "run.mcap", GRADIENT_MAP, GridMessage)
-    assert len(messages) == sum(len(step.candidates) for step in steps)
-    chosen = messages[len(steps[0].candidates) - 1]
-    values = np.frombuffer(chosen.data, "<f4").reshape(-1, chosen.column_count)
-    target, grid = steps[0].target, PUSH.workspace.grid
-    column = math.floor((target.x - chosen.pose.position.x) / chosen.cell_size.x)
-    row = math.floor((target.y - chosen.pose.position.y) / chosen.cell_size.y)
-    assert values.shape == grid.shape
-    assert values[row, column] == np.float32(target.robustness)
-    assert np.isnan(values).any()
+TURNING = Settings(
+    Workspace(Grid.over(0, 0, 8, 6, 0.5), yaws=(0.0, math.pi / 4, math.pi / 2)), attempts=1, margin=0.01
+)
+THINGS = {"cup": block(1, 1, size=1), "fork": block(3, 3, 0.3, size=1)}
+TURNED = "F (fork oriented[0.01] cup and fork rightof cup) and F (fork above cup and fork oriented[0.01] cup)"
+
+
+def values_of(message):
+    """(rows, columns): the numbers of a grid as viewers read them."""
+    (field,) = message.fields
+    assert (field.name, field.offset, field.type) == ("robustness", 0, field.FLOAT32)
+    assert message.cell_stride == 4
+    assert message.row_stride == 4 * message.column_count
+    assert len(message.data) % message.row_stride == 0
+    assert message.frame_id == "world"
+    assert message.cell_size.x == message.cell_size.y > 0
+    return np.frombuffer(message.data, "<f4").reshape(-1, message.column_count)
+
+
+def value_at(message, x, y):
+    column = math.floor((x - message.pose.position.x) / message.cell_size.x)
+    row = math.floor((y - message.pose.position.y) / message.cell_size.y)
+    return values_of(message)[row, column]
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"text": TURNED, "objects": THINGS, "settings": TURNING}], ids=["pushed", "turned"]
+)
+def test_every_map_of_every_edge_is_in_the_log(tmp_path, options):
+    steps = record_plan_of(tmp_path / "run.mcap", **options)
+    maps = payloads(tmp_path / "run.mcap", GRADIENT_MAP, GridMessage)
+    told = read_decisions(tmp_path / "run.mcap").decisions
+    numbers = []
+    for step, decision in zip(steps, told, strict=True):
+        for edge, seen in zip(step.considered, decision.considered, strict=True):
+            for candidate, shown in zip(edge.candidates, seen.candidates, strict=True):
+                assert [each.turn for each in shown.maps] == candidate.map.turns.tolist()
+                for each, values in zip(shown.maps, candidate.map.values, strict=True):
+                    found = values_of(maps[each.number])
+                    np.testing.assert_array_equal(found, values.astype(np.float32))
+                    assert maps[each.number].timestamp.ToNanoseconds() == step.time_ns
+                    numbers.append(each.number)
+    assert sorted(numbers) == list(range(len(maps)))
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"text": TURNED, "objects": THINGS, "settings": TURNING}], ids=["pushed", "turned"]
+)
+def test_the_last_map_of_a_step_is_that_of_what_is_done(tmp_path, options):
+    steps = record_plan_of(tmp_path / "run.mcap", **options)
+    maps = payloads(tmp_path / "run.mcap", GRADIENT_MAP, GridMessage)
+    moves = [step for step in steps if step.target is not None]
+    assert moves
+    for step in moves:
+        *_, last = (each for each in maps if each.timestamp.ToNanoseconds() == step.time_ns)
+        assert value_at(last, step.target.x, step.target.y) == np.float32(step.target.robustness)
+        assert np.isnan(values_of(last)).any()
+
+
+def test_maps_are_counted_on_their_topic(tmp_path):
+    record_plan_of(tmp_path / "run.mcap")
+    with (tmp_path / "run.mcap").open("rb") as stream:
+        messages = list(make_reader(stream).iter_messages([GRADIENT_MAP]))
+    assert [message.sequence for _, _, message in messages] == list(range(len(messages)))
+
+
+def test_where_no_path_is_left_the_maps_say_why(tmp_path):
+    text = "F (cup leftof fork and cup rightof fork)"
+    steps = record_plan_of(tmp_path / "run.mcap", text, THINGS, replace(TURNING, margin=0.1))
+    assert [step.kind for step in steps] == ["no path"]
+    maps = payloads(tmp_path / "run.mcap", GRADIENT_MAP, GridMessage)
+    assert len(maps) == 2 * 3
+    assert not any((values_of(each) >= 0.1).any() for each in maps)
+
+
+def test_the_recorded_push_shows_why_not_all_is_done_at_once():
+    first, *_ = read_decisions(RECORDED).decisions
+    given_up, aim = first.considered
+    maps = payloads(RECORDED, GRADIENT_MAP, GridMessage)
+    needed = planner_of(open_source(RECORDED)).settings.margin
+    assert len(given_up.candidates) == 3
+    for candidate in given_up.candidates:
+        (each,) = candidate.maps
+        assert not (values_of(maps[each.number]) >= needed).any()
+    (chosen,) = (candidate for candidate in aim.candidates if candidate.chosen)
+    value = value_at(maps[chosen.maps[0].number], first.target.x, first.target.y)
+    assert value == np.float32(first.target.robustness)
+    assert value >= needed
 
 
 def test_a_path_is_drawn_and_then_the_way_that_was_travelled(tmp_path):
@@ -117,7 +197,7 @@ def test_everything_of_a_decision_has_the_time_of_its_sample(tmp_path):
         message.timestamp.ToNanoseconds()
         for message in payloads(tmp_path / "run.mcap", GRADIENT_MAP, GridMessage)
     }
-    assert times == {step.time_ns for step in steps if step.candidates}
+    assert times == {step.time_ns for step in steps if step.considered}
     assert times <= {int(time) for time in sr.read_trace(tmp_path / "run.mcap").times_ns}
 
 

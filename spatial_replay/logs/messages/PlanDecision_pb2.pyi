@@ -211,6 +211,7 @@ class PlanCandidate(google.protobuf.message.Message):
     TARGET_FIELD_NUMBER: builtins.int
     REJECTED_FIELD_NUMBER: builtins.int
     CHOSEN_FIELD_NUMBER: builtins.int
+    MAPS_FIELD_NUMBER: builtins.int
     object: builtins.str
     best: builtins.float
     """Greatest robustness of the progress set at a cell that is not blocked; -infinity if all are."""
@@ -224,6 +225,10 @@ class PlanCandidate(google.protobuf.message.Message):
     def target(self) -> global___PlanTarget:
         """Where it would go; absent if it was rejected."""
 
+    @property
+    def maps(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PlanMap]:
+        """Where its gradient map is to be found, by the ways in which it may be turned."""
+
     def __init__(
         self,
         *,
@@ -233,12 +238,40 @@ class PlanCandidate(google.protobuf.message.Message):
         target: global___PlanTarget | None = ...,
         rejected: builtins.str = ...,
         chosen: builtins.bool = ...,
+        maps: collections.abc.Iterable[global___PlanMap] | None = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["_best", b"_best", "best", b"best", "target", b"target"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_best", b"_best", "best", b"best", "chosen", b"chosen", "map_sha256", b"map_sha256", "object", b"object", "rejected", b"rejected", "target", b"target"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["_best", b"_best", "best", b"best", "chosen", b"chosen", "map_sha256", b"map_sha256", "maps", b"maps", "object", b"object", "rejected", b"rejected", "target", b"target"]) -> None: ...
     def WhichOneof(self, oneof_group: typing.Literal["_best", b"_best"]) -> typing.Literal["best"] | None: ...
 
 global___PlanCandidate = PlanCandidate
+
+@typing.final
+class PlanMap(google.protobuf.message.Message):
+    """A gradient map on the topic /plan/gradient_map: of one object, turned in one way."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    NUMBER_FIELD_NUMBER: builtins.int
+    TURN_FIELD_NUMBER: builtins.int
+    number: builtins.int
+    """How many messages of that topic come before it; also its sequence number."""
+    turn: builtins.float
+    """By how much the object is turned, in radians."""
+    def __init__(
+        self,
+        *,
+        number: builtins.int | None = ...,
+        turn: builtins.float | None = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["_number", b"_number", "_turn", b"_turn", "number", b"number", "turn", b"turn"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_number", b"_number", "_turn", b"_turn", "number", b"number", "turn", b"turn"]) -> None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_number", b"_number"]) -> typing.Literal["number"] | None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_turn", b"_turn"]) -> typing.Literal["turn"] | None: ...
+
+global___PlanMap = PlanMap
 
 @typing.final
 class PlanTarget(google.protobuf.message.Message):
