@@ -25,6 +25,9 @@ WITNESS: Final = "witness"
 LABEL_LENGTH: Final = 8
 """Characters of a witness' number, spaces around it included."""
 
+_LABEL_LIFT: Final = 0.01
+"""How far above a region its name stands, by the region's size."""
+
 
 class Layout(NamedTuple):
     """What decides where the numbers of a message stand.
@@ -108,13 +111,16 @@ def words_of_region(region: Region, colour: Floats) -> list[Floats]:
     return [colour] * (len(primitives.lines) + len(primitives.triangles))
 
 
-def words_of_object(form: Form, points: Floats, bottom: Floats, top: Floats, colour: Floats) -> list[Floats]:
+def words_of_object(
+    form: Form, points: Floats, bottom: Floats, top: Floats, colour: Floats, lift: float
+) -> list[Floats]:
     """What a template leaves open in an object, in the order of its primitives' fields.
 
     Args:
         points: (S, P, 2), its rings, one after the other.
         bottom, top: (S,) its height interval, if it has one.
         colour: (S, 3).
+        lift: how far above the top the name stands.
 
     Returns:
         columns (S, n), each of one or more words.
@@ -133,7 +139,7 @@ def words_of_object(form: Form, points: Floats, bottom: Floats, top: Floats, col
                 words += [bottom[:, None], _flat(ring), _raised(ring, top - bottom), colour]
     # half the sum of the ends does not depend on the order in which points are added up
     words.append((points.min(axis=1) + points.max(axis=1)) / 2.0)
-    return words + upper
+    return words + [height + lift for height in upper]
 
 
 def words_of_witness(points: Floats, z: Floats, scale: float, labels: Sequence[str]) -> list[Floats]:
@@ -153,7 +159,7 @@ def words_of_witness(points: Floats, z: Floats, scale: float, labels: Sequence[s
     half = 0.5 * np.arctan2(*(end - begin).T[::-1])
     head = np.minimum(0.5 * length, ARROW_HEAD * scale)
     arrow = [begin, z, np.sin(half), np.cos(half), length - head, head]
-    middle = [(begin + end) / 2.0, z]
+    middle = [(begin + end) / 2.0, z + ARROW_HEAD * scale]
     text = "".join([label.center(LABEL_LENGTH) for label in labels]).encode()
     label = np.frombuffer(text, "<f8")
     return [column.reshape(len(points), -1) for column in (*arrow, *middle, label)]
@@ -164,14 +170,25 @@ def _add_entity(message: SceneUpdate, identifier: str) -> SceneEntity:
 
 
 def _add_region(entity: SceneEntity, region: Region) -> None:
-    """A region's border as it was written, or for a disc its ring, and its convex parts as faces."""
+    """A region's border as it was written, or for a disc its ring, and its convex parts as faces.
+
+    The name stands at its upper edge, where objects inside do not cover it.
+    """
     corners = np.array(region.outline.vertices, np.float64)
     outlines = list(region.rings) if region.outline.is_disc else [corners]
     bottom, top = region.outline.height or (0.0, 0.0)
     sides = None if region.outline.height is None else (bottom, top - bottom)
     everything = np.concatenate(region.rings)
-    x, y = ((everything.min(axis=0) + everything.max(axis=0)) / 2.0).tolist()
-    draw(entity, region.name, outlines, list(region.rings), (x, y), Elevation(top, sides, top))
+    (left, low), (right, high) = everything.min(axis=0).tolist(), everything.max(axis=0).tolist()
+    label = top + _LABEL_LIFT * max(right - left, high - low)
+    draw(
+        entity,
+        region.name,
+        outlines,
+        list(region.rings),
+        ((left + right) / 2.0, high),
+        Elevation(top, sides, label),
+    )
 
 
 def _region_entity(region: Region) -> SceneEntity:

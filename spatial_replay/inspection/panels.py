@@ -29,6 +29,9 @@ _MOST_CURVES: Final = 12
 _MOST_STRIPS: Final = 8
 """More curves, or strips of states, than these nobody tells apart."""
 
+_LEGEND_PIXELS: Final = 150
+"""The width of a legend; beside the curves it hides none."""
+
 Config = dict[str, Any]
 
 
@@ -59,6 +62,8 @@ def scene_panel(camera: Mapping[str, Any], scale: float, topics: Collection[str]
         "followTf": FRAME,
         "topics": {topic: {"visible": True, **how} for topic, how in shown.items() if topic in topics},
         "scene": {"labelScaleFactor": 1},
+        # its axes are a metre long, whatever the scene's size
+        "transforms": {f"frame:{FRAME}": {"visible": False}},
     }
     return Panel("3D!scene", config)
 
@@ -80,12 +85,19 @@ def part_curves(trees: Sequence[ReportedTree]) -> Panel | None:
 
 
 def state_strips(trees: Sequence[ReportedTree], has_states: Sequence[bool]) -> Panel:
-    """The verdict of each result over time and, where it has an automaton, the state of that."""
+    """The verdict of each result over time and, where it has an automaton, the state of that; then the
+    verdicts of the specs that results are made of."""
     strips = []
     for tree, has_state in zip(trees, has_states, strict=True):
         strips.append((f"{_title(tree)}: verdict", node_path(tree, id=0, field="verdict")))
         if has_state:
             strips.append((f"{_title(tree)}: state", f"{AUTOMATON}{_of(tree)}.states[0]"))
+    for tree in trees:
+        strips += [
+            (f"{name} in {_title(tree)}: verdict", node_path(tree, name=name, field="verdict"))
+            for name, ahead in named_parts(tree).items()
+            if ahead
+        ]
     paths = [
         {"enabled": True, "label": label, "timestampMethod": "receiveTime", "value": path}
         for label, path in strips[:_MOST_STRIPS]
@@ -94,8 +106,11 @@ def state_strips(trees: Sequence[ReportedTree], has_states: Sequence[bool]) -> P
 
 
 def node_table(tree: ReportedTree) -> Panel:
-    """The numbers and verdicts of every node of a result, at the time looked at."""
-    return Panel("Table!nodes", {"topicPath": f"{ROBUSTNESS}{_of(tree)}.nodes[:]"})
+    """The numbers and verdicts of every node of a result, at the time looked at.
+
+    Viewers take the newest message of the topic, so that a table finds the last of several results only.
+    """
+    return Panel("Table!nodes", {"topicPath": f"{ROBUSTNESS}{_of(tree)}.nodes"})
 
 
 def event_list() -> Panel:
@@ -145,7 +160,14 @@ def _plot(labelled: Sequence[tuple[str, str]]) -> Config:
         }
         for index, (label, path) in enumerate(labelled)
     ]
-    return {"paths": paths, "isSynced": True, "showLegend": True, "xAxisVal": "timestamp"}
+    return {
+        "paths": paths,
+        "isSynced": True,
+        "showLegend": True,
+        "legendDisplay": "left",
+        "sidebarDimension": _LEGEND_PIXELS,
+        "xAxisVal": "timestamp",
+    }
 
 
 def _of(tree: ReportedTree) -> str:

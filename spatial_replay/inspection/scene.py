@@ -173,7 +173,8 @@ class SceneEncoder:
             rows = cast.observations[samples, column]
             points = cast.rings.points[cast.rings.start[rows][:, None] + np.arange(sum(form.rings))]
             bottom, top = cast.footprints.bottom[rows], cast.footprints.top[rows]
-            columns += words_of_object(form, points, bottom, top, objects[samples, column])
+            colour = objects[samples, column]
+            columns += words_of_object(form, points, bottom, top, colour, _LIFT * scale)
         if layout.witness:
             columns += _words_of_witness(cast.pointers, samples, scale)
         return np.concatenate([np.empty((len(samples), 0)), *columns], axis=1)

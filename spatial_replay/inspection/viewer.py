@@ -32,6 +32,9 @@ from spatial_replay.trace.trace import Trace
 LAYOUT = "layout.json"
 """Name of the attachment; a replay replaces it."""
 
+_MARGIN = 1.5
+"""The height of the picture by the size of what is in it; a panel may be narrower than it is high."""
+
 
 class Extent(NamedTuple):
     """The box that a log's footprints have covered so far, in footprint units."""
@@ -113,10 +116,10 @@ def _said(contents: Contents) -> list[_Weighted]:
     parts = part_curves(trees)
     if parts is not None:
         said.append((parts, 2.0))
-    said.append((state_strips(trees, contents.has_states), 2.0))
+    said.append((state_strips(trees, contents.has_states), 3.0))
     if EVENT_LOG in contents.topics:
         said.append((event_list(), 2.0))
-    return [*said, (node_table(trees[0]), 2.0), (specification_text(), 1.0)]
+    return [*said, (node_table(trees[-1]), 2.0), (specification_text(), 1.0)]
 
 
 def _layout(left: Sequence[_Weighted], right: Sequence[_Weighted]) -> dict[str, Any]:
@@ -156,14 +159,15 @@ def _corners(vertices: Floats) -> tuple[list[float], list[float]]:
 def _camera(extent: Extent | None) -> dict[str, Any]:
     """From straight above, so that the box fits."""
     box = extent or Extent(-1.0, -1.0, 1.0, 1.0)
-    distance = 1.3 * max(box.xmax - box.xmin, box.ymax - box.ymin) or 1.0
+    distance = _MARGIN * max(box.xmax - box.xmin, box.ymax - box.ymin) or 1.0
     return {
         "perspective": False,
         "distance": distance,
         "phi": 0,
         "thetaOffset": 0,
-        "target": [(box.xmin + box.xmax) / 2, (box.ymin + box.ymax) / 2, 0],
-        "targetOffset": [0, 0, 0],
+        # viewers put the target where the followed frame is; what is looked at is the offset from it
+        "target": [0, 0, 0],
+        "targetOffset": [(box.xmin + box.xmax) / 2, (box.ymin + box.ymax) / 2, 0],
         "targetOrientation": [0, 0, 0, 1],
         "fovy": 45,
         "near": distance / 1000,

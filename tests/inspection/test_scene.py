@@ -221,7 +221,7 @@ def test_an_object_with_height_is_a_prism():
     [message] = messages(run({"cup": TrackedObject(BOX, height=(0.5, 2.0))}))
     drawn = entity(message, "object/cup")
     face, sides = drawn.triangles
-    assert drawn.lines[0].pose.position.z == face.pose.position.z == drawn.texts[0].pose.position.z == 2.0
+    assert drawn.lines[0].pose.position.z == face.pose.position.z == 2.0
     assert sides.pose.position.z == 0.5
     assert [point.z for point in sides.points] == [0.0] * 4 + [1.5] * 4
     assert points(sides) == points(face) * 2
@@ -242,6 +242,27 @@ def test_regions_are_in_every_message():
         assert len(corner.lines) == 1
         assert len(corner.triangles) > 1
         assert [each.texts[0].text for each in (goal, shelf, corner)] == ["goal", "shelf", "corner"]
+
+
+def test_names_stand_above_what_they_name():
+    tall = TrackedObject(DISC, height=(0.5, 2.0))
+    shown = messages(run({"a": BOX, "b": tall}), regions=REGIONS)[0]
+    for drawn in shown.entities:
+        assert drawn.texts[0].pose.position.z > max(face.pose.position.z for face in drawn.triangles)
+
+
+def test_the_name_of_a_region_stands_at_its_upper_edge():
+    [message] = messages(run({}), regions=REGIONS)
+    for name, edge in (("goal", (0.5, 1.0)), ("shelf", (2.0, 0.5)), ("corner", (1.0, 2.0))):
+        place = entity(message, f"region/{name}").texts[0].pose.position
+        assert (place.x, place.y) == pytest.approx(edge, abs=1e-3)
+
+
+def test_the_number_of_a_violation_stands_above_its_arrow():
+    [message] = pointed("spec s = G a closeto[1] b", {"a": box_at(0.0), "b": box_at(5.0)})
+    drawn = entity(message, "witness")
+    head = drawn.arrows[0].pose.position.z + drawn.arrows[0].head_diameter / 2.0
+    assert drawn.texts[0].pose.position.z > head
 
 
 def test_flat_objects_lie_above_flat_regions():

@@ -177,7 +177,8 @@ def test_an_instance_of_a_template_has_a_curve_of_its_own(tmp_path):
 
 def test_the_camera_looks_at_everything_from_above(tmp_path):
     camera = layout_of(run(tmp_path, TEXT))["configById"]["3D!scene"]["cameraState"]
-    assert camera["target"] == pytest.approx([5, 1, 0])
+    assert camera["target"] == [0, 0, 0]
+    assert camera["targetOffset"] == pytest.approx([5, 1, 0])
     assert camera["phi"] == 0
     assert camera["distance"] >= 10
 
