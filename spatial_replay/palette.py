@@ -20,3 +20,9 @@ CURVES: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9
 def hexadecimal(colour: tuple[float, float, float]) -> str:
     """A colour as texts name it: "#0072b2"."""
     return "#" + "".join(f"{round(255.0 * share):02x}" for share in colour)
+
+
+def light(colour: tuple[float, float, float]) -> tuple[float, float, float]:
+    """A colour for what dark text stands on: less than a third of it in white."""
+    red, green, blue = (0.7 + 0.3 * share for share in colour)
+    return red, green, blue

@@ -7,6 +7,7 @@ import subprocess
 
 from spatial_replay.automata.automaton import Automaton, Transition
 from spatial_replay.errors import OutputError, UsageError
+from spatial_replay.palette import NEGATIVE, POSITIVE, hexadecimal, light
 
 _DRAWING_S = 120.0
 """How long Graphviz may take."""
@@ -44,10 +45,17 @@ def state_words(automaton: Automaton, state: int) -> str:
     return begins + now
 
 
+def state_colour(automaton: Automaton, state: int) -> str:
+    """What a state is filled with: light blue if it accepts for good, light vermillion if it is a trap."""
+    if state not in automaton.can_reject:
+        return hexadecimal(light(POSITIVE))
+    return "#ffffff" if state in automaton.can_accept else hexadecimal(light(NEGATIVE))
+
+
 def dot_text(automaton: Automaton) -> str:
     """The automaton in the language of Graphviz, with guards in words.
 
-    Accepting states have a double outline; those that accept for good are green, traps are red.
+    Accepting states have a double outline; those that accept for good are blue, traps are vermillion.
     """
     lines = [
         f"digraph {_quoted(automaton.name)} {{",
@@ -59,13 +67,9 @@ def dot_text(automaton: Automaton) -> str:
     ]
     for state in automaton.states:
         shape = "doublecircle" if state in automaton.accepting else "circle"
-        colour = "white"
-        if state not in automaton.can_reject:
-            colour = "palegreen"
-        elif state not in automaton.can_accept:
-            colour = "lightsalmon"
+        colour = state_colour(automaton, state)
         about = _quoted(state_words(automaton, state))
-        lines.append(f"  {state} [shape={shape}, fillcolor={colour}, tooltip={about}];")
+        lines.append(f'  {state} [shape={shape}, fillcolor="{colour}", tooltip={about}];')
     for each in automaton.transitions:
         label = "\\n".join(map(_escaped, _broken(automaton.guard_words(each))))
         lines.append(f'  {each.source} -> {each.target} [label="{label}"];')
@@ -103,6 +107,15 @@ def svg_text(automaton: Automaton) -> str:
     """The automaton drawn by Graphviz.
 
     Raises:
+        UsageError, OutputError: as `graphviz_text`.
+    """
+    return graphviz_text(automaton, "svg")
+
+
+def graphviz_text(automaton: Automaton, form: str) -> str:
+    """What Graphviz makes of the automaton, in one of its formats: "svg", "json0".
+
+    Raises:
         UsageError: Graphviz is not installed.
         OutputError: Graphviz fails, or takes too long.
     """
@@ -114,7 +127,7 @@ def svg_text(automaton: Automaton) -> str:
         )
     try:
         done = subprocess.run(
-            [executable, "-Tsvg"],
+            [executable, f"-T{form}"],
             input=dot_text(automaton).encode(),
             capture_output=True,
             check=False,

@@ -113,7 +113,7 @@ def test_in_words_names_are_explained_and_ends_are_told(done: Automaton) -> None
 def test_for_graphviz() -> None:
     text = dot_text(automaton(parse_specification('spec "a \\"b\\"" = F p >= 0')))
     assert text.splitlines()[0] == 'digraph "a \\"b\\"" {'
-    assert '  1 [shape=doublecircle, fillcolor=palegreen, tooltip="accepting for good"];' in text
+    assert '  1 [shape=doublecircle, fillcolor="#b2d5e8", tooltip="accepting for good"];' in text
     assert '  0 -> 1 [label="p >= 0"];' in text
 
 
