@@ -61,6 +61,13 @@ def draw_curve(ax: Axes, points: Sequence[tuple[float, float]], colour: str) -> 
     ax.add_patch(PathPatch(Path(points, codes), fill=False, edgecolor=colour, linewidth=1.0))
 
 
+def draw_disc(ax: Axes, centre: tuple[float, float], radius: float, colour: str) -> None:
+    """A disc with an outline."""
+    from matplotlib.patches import Circle
+
+    ax.add_patch(Circle(centre, radius, facecolor=colour, edgecolor=INK, linewidth=1.0, zorder=3))
+
+
 def plain(text: str, longest: int = 72) -> str:
     """A text that a figure shows as it stands, cut after so many characters."""
     return printable(text, longest).replace("$", r"\$")

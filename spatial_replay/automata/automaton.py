@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 from spatial_replay.automata.diagrams import LEAF, NO, YES, Diagrams
 from spatial_replay.automata.guards import Covers, Guard, guard_words
 from spatial_replay.automata.machine import Machine, nodes_of
 from spatial_replay.automata.propositions import Proposition
 from spatial_replay.errors import NoAutomatonError, UsageError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 MAX_VISITS = 25_000_000
 """How many decisions are looked at to find all moves, each for every state that it may matter to."""
@@ -205,6 +209,22 @@ class Automaton:
     def guard_words(self, transition: Transition) -> str:
         """What lets a transition be taken, as a sentence of the specification language."""
         return guard_words(transition.guard, self.propositions)
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw it with matplotlib; see `picture.draw_automaton`."""
+        from spatial_replay.automata.picture import draw_automaton
+
+        return draw_automaton(self, ax)
+
+    def _repr_html_(self) -> str:
+        from spatial_replay.automata.picture import automaton_html
+
+        return automaton_html(self)
+
+    def _repr_svg_(self) -> str | None:
+        from spatial_replay.automata.picture import automaton_svg
+
+        return automaton_svg(self)
 
     def to_dot(self) -> str:
         """The automaton in the language of Graphviz; see `drawing.dot_text`."""

@@ -1,0 +1,133 @@
+"""Automata in notebooks: drawn, with short names for long propositions, and in words."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final
+
+from spatial_replay.automata.automaton import Automaton
+from spatial_replay.automata.drawing import graphviz_text, size_words, state_colour, words_text
+from spatial_replay.errors import OutputError, UsageError
+from spatial_replay.figures import INK, draw_curve, draw_disc, new_panel, plain
+from spatial_replay.markup import Html, code, element, folded, quiet
+from spatial_replay.palette import NEUTRAL, hexadecimal
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_LONGEST_LABEL: Final = 12
+"""Characters of a proposition that stands on an arrow as it is."""
+_MOST_STATES: Final = 40
+"""States of an automaton that is drawn without being asked for."""
+_MOST_LINES: Final = 200
+"""Lines in words."""
+_ARROW: Final = hexadecimal(NEUTRAL)
+_INCH: Final = 72.0
+"""Graphviz counts in points."""
+
+
+def automaton_html(automaton: Automaton) -> Html:
+    """Its size; if it is small, also a drawing, if Graphviz is there, and its states and moves in words."""
+    title = element("div", element("b", automaton.name), quiet(f" {size_words(automaton)}"))
+    if len(automaton.states) > _MOST_STATES:
+        return element("div", title, quiet("too large to be drawn here; plot() draws it, to_dot() writes it"))
+    drawing = automaton_svg(automaton)
+    shown = quiet("drawing it takes Graphviz") if drawing is None else Html(drawing)
+    meanings = [element("div", code(line)) for line in _meanings(_abbreviated(automaton))]
+    words = words_text(automaton).split("\n")
+    lines = [element("div", code(line)) for line in words[:_MOST_LINES]]
+    more = [quiet(f"… and {len(words) - _MOST_LINES:,} lines more")] if len(words) > _MOST_LINES else []
+    drawn = element("div", shown, style="overflow-x:auto")
+    return element("div", title, drawn, *meanings, folded("in words", *lines, *more))
+
+
+def automaton_svg(automaton: Automaton) -> str | None:
+    """The automaton drawn by Graphviz; None if it is large or cannot be drawn here."""
+    if len(automaton.states) > _MOST_STATES:
+        return None
+    try:
+        drawing = graphviz_text(_abbreviated(automaton), "svg")
+    except (UsageError, OutputError):
+        return None
+    # what comes before is for files, not for pages
+    return drawing[drawing.index("<svg") :]
+
+
+def draw_automaton(automaton: Automaton, ax: Axes | None = None) -> Axes:
+    """Draw the automaton where Graphviz puts its states and arrows.
+
+    Raises:
+        UsageError: Graphviz or matplotlib is not installed.
+        OutputError: Graphviz fails, or takes too long.
+    """
+    short = _abbreviated(automaton)
+    layout = json.loads(graphviz_text(short, "json0"))
+    width, height = _point(layout["bb"].removeprefix("0,0,"))
+    meanings = _meanings(short)
+    if ax is None:
+        ax = new_panel((max(width / _INCH, 5.0), 0.5 + height / _INCH + 0.2 * len(meanings)))
+    ax.set_axis_off()
+    ax.set_aspect("equal")
+    ax.set_xlim(-2.0, width + 2.0)
+    ax.set_ylim(-2.0, height + 2.0)
+    for edge in layout["edges"]:
+        _draw_edge(ax, edge)
+    for node in layout["objects"]:
+        _draw_state(ax, automaton, node)
+    ax.set_title(plain(f"{automaton.name}: {size_words(automaton)}"), loc="left", fontsize=10)
+    text = "\n".join(plain(line, 100) for line in meanings)
+    ax.annotate(
+        text, (0, 0), (0, -6), xycoords="axes fraction", textcoords="offset points", va="top", fontsize=8.5
+    )
+    return ax
+
+
+def _abbreviated(automaton: Automaton) -> Automaton:
+    """The automaton with short names for propositions that have none and are long."""
+    taken = {each.label for each in automaton.propositions}
+    names = (name for number in range(2 * len(taken) + 1) if (name := f"p{number}") not in taken)
+    return replace(
+        automaton,
+        propositions=tuple(
+            each if len(each.label) <= _LONGEST_LABEL else replace(each, name=next(names))
+            for each in automaton.propositions
+        ),
+    )
+
+
+def _meanings(automaton: Automaton) -> list[str]:
+    return [f"{each.name}: {each.text}" for each in automaton.propositions if each.name is not None]
+
+
+def _draw_state(ax: Axes, automaton: Automaton, node: Mapping[str, Any]) -> None:
+    """A circle with the state's number; without one, the point that leads to the first state."""
+    x, y = _point(node["pos"])
+    radius = float(node["width"]) * _INCH / 2
+    is_state = node["name"].isdecimal()
+    colour = state_colour(automaton, int(node["name"])) if is_state else INK
+    outlines = [radius, radius - 4.0] if is_state and int(node["name"]) in automaton.accepting else [radius]
+    for outline in outlines:
+        draw_disc(ax, (x, y), outline, colour)
+    if is_state:
+        ax.text(x, y, node["name"], ha="center", va="center", fontsize=11, color=INK)
+
+
+def _draw_edge(ax: Axes, edge: Mapping[str, Any]) -> None:
+    """A curve with a head, and the guard beside it."""
+    head, *points = (_point(each.removeprefix("e,")) for each in edge["pos"].split())
+    draw_curve(ax, points, _ARROW)
+    ax.annotate(
+        "", head, points[-1],
+        arrowprops={"arrowstyle": "-|>", "color": _ARROW, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 9},
+    )  # fmt: skip
+    if edge.get("label"):
+        lines = [plain(line) for line in edge["label"].split("\\n")]
+        x, y = _point(edge["lp"])
+        ax.text(x, y, "\n".join(lines), ha="center", va="center", fontsize=8.5)
+
+
+def _point(text: str) -> tuple[float, float]:
+    x, y = map(float, text.split(","))
+    return x, y
