@@ -8,6 +8,7 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.trace.ragged import flat_index, starts_from_counts
 
 ROUND: Final = 32
@@ -55,6 +56,13 @@ def rings_of(footprints: FootprintBatch, point_radius: float) -> Rings:
         points[part_start[parts][:, None] + np.arange(ROUND)] = _rounded(corners, radius)
     form, forms = _forms(footprints, lengths)
     return Rings(part_start[footprints.part_start], points, form, forms)
+
+
+def outlines_of(footprint: Footprint) -> list[Floats]:
+    """The ring (n, 2) of each part of one footprint."""
+    rings = rings_of(FootprintBatch.from_footprints([footprint]), 0.0)
+    ends = np.cumsum(rings.forms[0].rings)[:-1]
+    return np.split(rings.points, ends)
 
 
 def extents(footprints: FootprintBatch) -> Floats:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.inspection.drawing import FRAME
-from spatial_replay.inspection.rings import rings_of
+from spatial_replay.inspection.rings import outlines_of
 from spatial_replay.palette import NEUTRAL, POSITIVE
 from spatial_replay.planning.poses import moved_object
 from spatial_replay.planning.step import Target
@@ -35,7 +34,7 @@ def path_message(
     if target is not None and tracked is not None:
         height = 0.0 if tracked.height is None else tracked.height[1]
         there = moved_object(tracked, target.x, target.y, target.turn)
-        outlines = [(ring, True, POSITIVE) for ring in _outlines(there.footprint)]
+        outlines = [(points, True, POSITIVE) for points in map(_points, outlines_of(there.footprint))]
         lines[_WAY] = [(list(target.waypoints), False, POSITIVE), *outlines]
         if travelled:
             lines[_TRAVELLED] = [(list(travelled), False, NEUTRAL)]
@@ -67,8 +66,5 @@ def _add_line(
     line.color.r, line.color.g, line.color.b, line.color.a = *colour, 1.0
 
 
-def _outlines(footprint: Footprint) -> list[list[tuple[float, float]]]:
-    """The points of each part's outline."""
-    rings = rings_of(FootprintBatch.from_footprints([footprint]), 0.0)
-    ends = np.cumsum(rings.forms[0].rings)[:-1]
-    return [[(x, y) for x, y in ring.tolist()] for ring in np.split(rings.points, ends)]
+def _points(ring: Floats) -> list[tuple[float, float]]:
+    return [(x, y) for x, y in ring.tolist()]
