@@ -13,7 +13,7 @@ from spatial_replay.planning.edges import consideration_of, why_no_path, worst_s
 from spatial_replay.planning.observing import Observer, Symbol, refuse_template
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.step import Consideration, Edge, Kind, Outcome, Step
-from spatial_replay.planning.subjects import refuse_delays
+from spatial_replay.planning.subjects import refuse_delays, refuse_unknown
 from spatial_replay.planning.workspace import Workspace
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
@@ -107,6 +107,8 @@ class Planner:
 
         Raises:
             TraceError: a time that does not come after the last one's.
+            UsageError: at the first sample: the settings name objects to be moved that nobody knows, or there
+                are no settings and no objects.
         """
         if self._sample is not None and sample.time_ns <= self._sample.time_ns:
             raise TraceError(
@@ -115,6 +117,8 @@ class Planner:
             )
         if self._settings is None:
             self._settings = Settings(Workspace.around(sample))
+        if self._sample is None:
+            refuse_unknown(self._settings.movable or (), sample, self._formulas)
         self._sample = sample
         self._symbol = self._observer.symbol(sample)
         self._states = self.automaton.step_set(self._states, self._symbol)

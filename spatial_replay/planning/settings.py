@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from spatial_replay.errors import UsageError
+from spatial_replay.planning.checks import (
+    count_faults,
+    kind_faults,
+    member_faults,
+    number_faults,
+    refuse_faults,
+)
 from spatial_replay.planning.workspace import Workspace
 
 Skill: TypeAlias = Literal["push", "place"]
@@ -30,7 +36,7 @@ class Settings:
         attempts: how often an edge is tried before it is given up, at least 1.
 
     Raises:
-        UsageError: a value that cannot be.
+        UsageError: values that cannot be, all of them told.
     """
 
     workspace: Workspace
@@ -42,14 +48,17 @@ class Settings:
     attempts: int = 3
 
     def __post_init__(self) -> None:
+        refuse_faults(self._faults())
+
+    def _faults(self) -> Iterator[str]:
         if self.skill not in _SKILLS:
-            raise UsageError(f"skill is {self.skill!r}; the skills are {', '.join(_SKILLS)}")
-        for name in ("margin", "constraint_margin", "room"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise UsageError(f"{name} is {getattr(self, name)}; give a number of at least 0")
-        if self.attempts < 1:
-            raise UsageError(f"attempts is {self.attempts}; give 1 or more")
-        if self.skill == "push" and self.workspace.yaws:
-            raise UsageError(
-                "an object that is pushed keeps no orientation; leave `yaws` of the workspace out"
-            )
+            yield f"skill is {self.skill!r}; the skills are {', '.join(_SKILLS)}"
+        faults = kind_faults("workspace", self.workspace, Workspace, "a Workspace")
+        yield from faults
+        if not faults and self.skill == "push" and self.workspace.yaws:
+            yield "an object that is pushed keeps no orientation; leave `yaws` of the workspace out"
+        if self.movable is not None:
+            yield from member_faults("movable", self.movable, tuple, str, "a tuple of names")
+        distances = {name: getattr(self, name) for name in ("margin", "constraint_margin", "room")}
+        yield from number_faults(distances, 0)
+        yield from count_faults({"attempts": self.attempts})

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from spatial_replay.errors import UsageError
+from spatial_replay.planning.checks import refuse_faults
+from spatial_replay.spec.faults import nearest_hint
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Atom, Earlier, Enlarged, Formula, Group, Quantified, Term, TrackedName
 from spatial_replay.spec.terms import base_of, iter_formulas, terms_of
+from spatial_replay.trace.sample import Sample
 
 
 def concerns(formula: Formula, name: str) -> bool:
@@ -48,3 +51,20 @@ def _looks_back(term: Term) -> bool:
     while isinstance(term, Enlarged):
         term = term.term
     return isinstance(term, Earlier)
+
+
+def refuse_unknown(names: Sequence[str], sample: Sample, propositions: Sequence[Formula]) -> None:
+    """That objects are in a sample, or may come later: what propositions are about may.
+
+    Raises:
+        UsageError: with every name that is neither.
+    """
+    faults = []
+    for name in names:
+        if name not in sample.objects and not any(concerns(each, name) for each in propositions):
+            hint = nearest_hint(name, sample.objects)
+            faults.append(
+                f"{name!r} is movable, but neither the specification nor the first sample has it; "
+                f"{hint or 'the sample has: ' + (', '.join(sample.objects) or 'none')}"
+            )
+    refuse_faults(faults)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,6 +12,14 @@ from numpy.typing import NDArray
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.planning.checks import (
+    count_faults,
+    is_number,
+    kind_faults,
+    member_faults,
+    number_faults,
+    refuse_faults,
+)
 from spatial_replay.trace.sample import Sample
 
 Booleans = NDArray[np.bool_]
@@ -42,15 +51,15 @@ class Grid:
     rows: int
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.xmin) and math.isfinite(self.ymin)):
-            raise UsageError(f"a grid from ({self.xmin}, {self.ymin}); give finite numbers")
-        if not (self.cell_size > 0.0 and math.isfinite(self.cell_size)):
-            raise UsageError(f"cell_size is {self.cell_size}; give a number above 0")
-        if self.columns < 1 or self.rows < 1 or self.columns * self.rows > MOST_CELLS:
-            raise UsageError(
-                f"a grid of {self.columns} x {self.rows} cells; give at least 1 along each axis and at most "
-                f"{MOST_CELLS:,} in all"
+        corner = {"xmin": self.xmin, "ymin": self.ymin}
+        faults = number_faults(corner) + count_faults({"columns": self.columns, "rows": self.rows})
+        if not (is_number(self.cell_size) and 0.0 < self.cell_size < math.inf):
+            faults.append(f"cell_size is {self.cell_size!r}; give a finite number above 0")
+        if not faults and self.columns * self.rows > MOST_CELLS:
+            faults.append(
+                f"a grid of {self.columns} x {self.rows} cells; give at most {MOST_CELLS:,} cells in all"
             )
+        refuse_faults(faults)
 
     @classmethod
     def over(cls, xmin: float, ymin: float, xmax: float, ymax: float, cell_size: float) -> Grid:
@@ -64,8 +73,8 @@ class Grid:
             raise UsageError(f"{box} is not finite; give four numbers")
         if not (xmin < xmax and ymin < ymax):
             raise UsageError(f"{box} is empty; give xmin, ymin, xmax, ymax")
-        if not cell_size > 0.0:
-            raise UsageError(f"cell_size is {cell_size}; give a number above 0")
+        if not (is_number(cell_size) and cell_size > 0.0):
+            raise UsageError(f"cell_size is {cell_size!r}; give a number above 0")
         # a box that is a whole number of cells long must not get one more for the last bit of its length
         columns, rows = (math.ceil(length / cell_size - 1e-9) for length in (xmax - xmin, ymax - ymin))
         return cls(xmin, ymin, cell_size, columns, rows)
@@ -130,7 +139,7 @@ class Workspace:
         clearance: how far objects have to stay apart, in footprint units.
 
     Raises:
-        UsageError: angles or distances that are no numbers, or empty ranges.
+        UsageError: values that cannot be, all of them told.
     """
 
     grid: Grid
@@ -143,10 +152,25 @@ class Workspace:
     clearance: float = 0.0
 
     def __post_init__(self) -> None:
-        if not all(map(math.isfinite, (*self.yaws, *self.base, self.nearest, self.clearance))):
-            raise UsageError("yaws, base, nearest and clearance of a workspace must be finite numbers")
-        if not self.nearest <= self.farthest:
-            raise UsageError(f"nothing is farther than {self.nearest} and nearer than {self.farthest}")
+        refuse_faults(self._faults())
+
+    def _faults(self) -> Iterator[str]:
+        yield from kind_faults("grid", self.grid, Grid, "a Grid")
+        yield from kind_faults("yaws", self.yaws, tuple, "a tuple of angles in radians") or number_faults(
+            {f"yaws[{place}]": yaw for place, yaw in enumerate(self.yaws)}
+        )
+        yield from kind_faults("base", self.base, tuple, "(x, y)") or number_faults(
+            dict(zip(("base[0]", "base[1]"), self.base, strict=True))
+        )
+        faults = number_faults({"nearest": self.nearest}, 0)
+        yield from faults
+        if not is_number(self.farthest):
+            yield f"farthest is {self.farthest!r}; give a number, or math.inf"
+        elif not faults and self.farthest < self.nearest:
+            yield f"nothing is farther than {self.nearest} and nearer than {self.farthest}"
+        yield from member_faults("obstacles", self.obstacles, tuple, Footprint, "a tuple of footprints")
+        yield from member_faults("supports", self.supports, frozenset, str, "a frozenset of names")
+        yield from number_faults({"clearance": self.clearance}, 0)
 
     @classmethod
     def around(cls, sample: Sample) -> Workspace:

@@ -129,11 +129,17 @@ def test_an_object_that_is_not_there_cannot_be_moved():
         ((0, 0, 1e9, 1e9, 0.1), "cells"),
         ((0, 0, math.inf, 1, 0.1), "finite"),
         ((0, 0, 1, 1, math.inf), "cell_size"),
+        ((0, 0, 1, 1, "1"), "cell_size is '1'"),
     ],
 )
 def test_grids_that_cannot_be_are_refused(numbers, message):
     with pytest.raises(UsageError, match=message):
         Grid.over(*numbers)
+
+
+def test_a_grid_has_whole_numbers_of_cells():
+    with pytest.raises(UsageError, match=r"columns is 2.5(.|\n)*rows is 0(.|\n)*cell_size is -1"):
+        Grid(0, 0, -1, 2.5, 0)
 
 
 @pytest.mark.parametrize(
@@ -142,11 +148,18 @@ def test_grids_that_cannot_be_are_refused(numbers, message):
         ({"yaws": (math.nan,)}, "finite"),
         ({"base": (math.inf, 0.0)}, "finite"),
         ({"nearest": 2.0, "farthest": 1.0}, "farther than 2.0"),
+        ({"nearest": -1.0, "clearance": "1"}, r"nearest is -1.0(.|\n)*clearance is '1'"),
+        ({"farthest": math.nan}, "farthest is nan"),
+        ({"base": 3.0}, "base is 3.0"),
+        ({"yaws": 0.5}, "yaws is 0.5"),
+        ({"supports": "plate"}, "supports is 'plate'"),
+        ({"obstacles": (1,)}, "obstacles has 1"),
+        ({"grid": (0, 0, 1, 1)}, "grid is"),
     ],
 )
 def test_workspaces_that_cannot_be_are_refused(options, message):
     with pytest.raises(UsageError, match=message):
-        Workspace(GRID, **options)
+        Workspace(**{"grid": GRID, **options})
 
 
 def test_the_centre_of_points_is_their_mean():

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -229,17 +230,32 @@ def test_formulas_that_cannot_be_planned_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "messages"),
     [
-        ({"skill": "throw"}, "skill is 'throw'"),
-        ({"margin": -1.0}, "margin is -1.0"),
-        ({"constraint_margin": math.nan}, "constraint_margin is nan"),
-        ({"attempts": 0}, "attempts is 0"),
+        ({"skill": "throw"}, ["skill is 'throw'"]),
+        ({"margin": -1.0, "attempts": 0}, ["margin is -1.0", "attempts is 0"]),
+        ({"constraint_margin": math.nan, "room": "1"}, ["constraint_margin is nan", "room is '1'"]),
+        ({"attempts": 2.5}, ["attempts is 2.5; give a whole number"]),
+        ({"movable": "cup"}, ["movable is 'cup'; give a tuple of names"]),
+        ({"movable": ("cup", 3)}, ["movable has 3; give a tuple of names"]),
+        ({"workspace": None, "margin": math.inf}, ["workspace is None", "margin is inf"]),
     ],
 )
-def test_settings_that_cannot_be_are_refused(options, message):
-    with pytest.raises(UsageError, match=message):
-        Settings(TABLE.workspace, **options)
+def test_settings_that_cannot_be_are_refused_all_at_once(options, messages):
+    with pytest.raises(UsageError) as raised:
+        Settings(**{"workspace": TABLE.workspace, **options})
+    lines = str(raised.value).splitlines()
+    assert [message in line for line, message in zip(lines, messages, strict=True)] == [True] * len(messages)
+
+
+def test_movable_objects_that_nobody_knows_are_named():
+    one = planner("F (cup enclosedin plate)", replace(TABLE, movable=("cpu", "cup", "spoon", "fork")))
+    with pytest.raises(UsageError) as raised:
+        one.observe(sr.Sample(0, {"fork": THINGS["fork"], "plate": THINGS["plate"]}))
+    first, second = str(raised.value).splitlines()
+    assert first.startswith("'cpu' is movable, but neither")
+    assert second.startswith("'spoon' is movable, but neither")
+    assert second.endswith("the sample has: fork, plate")
 
 
 def test_without_settings_it_plans_around_what_it_sees():
