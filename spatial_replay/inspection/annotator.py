@@ -130,8 +130,7 @@ class Annotator:
         """
         written = {topic for topic, count in self._written.items() if count}
         has_states = [bool(self._written[AUTOMATON]) and run is not None for run in self._runs]
-        scale = self._scene.scale or 1.0
-        return Contents(self._trees, has_states, self._extent, written | set(beside), scale)
+        return Contents(self._trees, has_states, self._extent, written | set(beside))
 
     def _robustness(self, stretches: Sequence[Stretch]) -> Messages:
         """One message per sample and result."""

@@ -22,7 +22,7 @@ from spatial_replay.logs.topics import (
     SPECIFICATION,
 )
 from spatial_replay.monitor.signal_table import looks_ahead
-from spatial_replay.palette import CURVES, NEGATIVE, POSITIVE, hexadecimal
+from spatial_replay.palette import CURVES
 from spatial_replay.spec.formula import iter_nodes
 
 _MOST_CURVES: Final = 12
@@ -42,20 +42,9 @@ class Panel(NamedTuple):
     config: Config
 
 
-def scene_panel(camera: Mapping[str, Any], scale: float, topics: Collection[str]) -> Panel:
-    """The scene from above; under it the planner's map, over it the path.
-
-    Args:
-        scale: robustness at which the colours of the map are full, in footprint units.
-    """
-    colours = {
-        "colorMode": "gradient",
-        "colorField": "robustness",
-        "gradient": [hexadecimal(NEGATIVE), hexadecimal(POSITIVE)],
-        "minValue": -scale,
-        "maxValue": scale,
-    }
-    shown: dict[str, Config] = {SCENE: {}, GRADIENT_MAP: colours, PLAN_PATH: {}}
+def scene_panel(camera: Mapping[str, Any], topics: Collection[str]) -> Panel:
+    """The scene from above; under it the planner's map in the colours that it brings, over it the path."""
+    shown: dict[str, Config] = {SCENE: {}, GRADIENT_MAP: {"colorMode": "rgba-fields"}, PLAN_PATH: {}}
     config = {
         "cameraState": camera,
         "followMode": "follow-none",

@@ -68,14 +68,12 @@ class Contents(NamedTuple):
         has_states: of each, whether the log has the states of its automaton.
         extent: where its footprints are; None if it has none.
         topics: all that have messages.
-        scale: robustness at which colours are full, in footprint units.
     """
 
     trees: Sequence[ReportedTree]
     has_states: Sequence[bool]
     extent: Extent | None
     topics: Collection[str]
-    scale: float
 
 
 def layout_attachment(contents: Contents) -> Attachment:
@@ -103,7 +101,7 @@ _Weighted = tuple[Panel, float]
 
 def _shown(contents: Contents) -> list[_Weighted]:
     """The scene and, of a planner, its words."""
-    scene = scene_panel(_camera(contents.extent), contents.scale, contents.topics)
+    scene = scene_panel(_camera(contents.extent), contents.topics)
     return [(scene, 4.0), *([(decision_words(), 1.0)] if PLAN_DECISION in contents.topics else [])]
 
 

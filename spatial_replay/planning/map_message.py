@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import hashlib
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from foxglove_schemas_protobuf.Grid_pb2 import Grid as GridMessage
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 
 from spatial_replay.inspection.drawing import FRAME
+from spatial_replay.inspection.shades import cell_colours
 from spatial_replay.planning.maps import GradientMap
 from spatial_replay.planning.step import Candidate, Step
 
-FIELD = "robustness"
-"""The only field of a map's cells."""
+CELL: Final = np.dtype([("robustness", "<f4"), ("colour", "u1", (4,))])
+"""A map's cell: its robustness, NaN where it is blocked, and red, green, blue and alpha."""
+
+_COLOURS: Final = ("red", "green", "blue", "alpha")
+_DEPTH: Final = 0.1
+"""How far below the plane a map lies, by the size of its cells: regions are drawn in the plane."""
 
 
 class TurnedMap(NamedTuple):
@@ -43,21 +48,27 @@ def _is_meant(candidate: Candidate, turn: int) -> bool:
 
 
 def map_message(turned: TurnedMap, time_ns: int) -> GridMessage:
-    """A map that lies over the scene: the robustness in each cell, NaN where it is blocked."""
+    """A map that lies under the scene, in its colours; those of blocked cells are clear."""
     found = turned.candidate.map
-    grid = found.grid
+    grid, values = found.grid, found.values[turned.turn]
+    cells = np.empty(values.shape, CELL)
+    cells["robustness"] = values
+    cells["colour"] = cell_colours(values)
     message = GridMessage(
         frame_id=FRAME,
         column_count=grid.columns,
-        row_stride=4 * grid.columns,
-        cell_stride=4,
-        data=np.ascontiguousarray(found.values[turned.turn], "<f4").tobytes(),
+        row_stride=CELL.itemsize * grid.columns,
+        cell_stride=CELL.itemsize,
+        data=cells.tobytes(),
     )
     message.timestamp.FromNanoseconds(time_ns)
     message.pose.position.x, message.pose.position.y = grid.xmin, grid.ymin
+    message.pose.position.z = -_DEPTH * grid.cell_size
     message.pose.orientation.w = 1.0
     message.cell_size.x = message.cell_size.y = grid.cell_size
-    message.fields.add(name=FIELD, offset=0, type=PackedElementField.FLOAT32)
+    message.fields.add(name="robustness", offset=0, type=PackedElementField.FLOAT32)
+    for offset, name in enumerate(_COLOURS, 4):
+        message.fields.add(name=name, offset=offset, type=PackedElementField.UINT8)
     return message
 
 

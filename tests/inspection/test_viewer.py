@@ -141,15 +141,14 @@ def test_a_planned_run_has_its_map_path_and_decision(tmp_path):
     layout = layout_of(annotated)
     shown = layout["configById"]["3D!scene"]["topics"]
     assert set(shown) == {"/spatial/scene", "/plan/gradient_map", "/plan/path"}
-    low, high = (shown["/plan/gradient_map"][end] for end in ("minValue", "maxValue"))
-    assert -low == high > 0
+    assert shown["/plan/gradient_map"]["colorMode"] == "rgba-fields"
     assert layout["configById"]["RawMessages!decision"] == {"topicPath": "/plan/decision.reason"}
     assert panels(layout["layout"]) == set(layout["configById"])
     assert "/plan/" not in json.dumps(layout_of(layer))
 
 
 def test_the_layout_for_a_live_server_has_its_constants():
-    layout = layout_for_live(Contents((), (), None, (), 1.0))
+    layout = layout_for_live(Contents((), (), None, ()))
     assert panels(layout["layout"]) == set(layout["configById"]) == {"3D!scene", "Parameters!constants"}
 
 

@@ -18,6 +18,7 @@ from spatial_replay.errors import LogError, UsageError
 from spatial_replay.logs.messages.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.source import open_source
 from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_PATH
+from spatial_replay.planning.map_message import CELL
 from spatial_replay.planning.redo import planner_of, redo_decisions
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.settings_text import settings_from_text, text_from_settings
@@ -99,15 +100,10 @@ TURNED = "F (fork oriented[0.01] cup and fork rightof cup) and F (fork above cup
 
 
 def values_of(message):
-    """(rows, columns): the numbers of a grid as viewers read them."""
-    (field,) = message.fields
-    assert (field.name, field.offset, field.type) == ("robustness", 0, field.FLOAT32)
-    assert message.cell_stride == 4
-    assert message.row_stride == 4 * message.column_count
-    assert len(message.data) % message.row_stride == 0
-    assert message.frame_id == "world"
-    assert message.cell_size.x == message.cell_size.y > 0
-    return np.frombuffer(message.data, "<f4").reshape(-1, message.column_count)
+    """(rows, columns): the numbers of a grid; blocked cells are clear."""
+    cells = np.frombuffer(message.data, CELL).reshape(-1, message.column_count)
+    assert np.array_equal(cells["colour"][..., 3] == 0, np.isnan(cells["robustness"]))
+    return cells["robustness"]
 
 
 def value_at(message, x, y):
