@@ -18,6 +18,7 @@ COMMANDS: dict[str, str] = {
     "plan": "Plan a run in a simulated world.",
     "record": "Record a run as a log.",
     "replay": "Evaluate specifications over a log.",
+    "report": "Write what a run did as one page.",
     "verify": "Say whether a log is what it says it is.",
 }
 """Name and summary; `spatial_replay/cli/NAME.py` holds the command under its name."""

@@ -51,7 +51,7 @@ def explanations(
         asked = "" if object is None else f" about object {object!r}"
         raise UsageError(f"no result is{asked or ' there'}; objects with a result of their own: {known}")
     found = [
-        _explanation(result, identifier, replayed.first_ns, goes_on)
+        explanation_of(result, identifier, first_ns=replayed.first_ns, goes_on=goes_on)
         for result in results
         for identifier in _nodes_named(result, node)
     ]
@@ -73,7 +73,10 @@ def _nodes_named(result: ReplayedSpec, name: str | None) -> Iterator[int]:
             return
 
 
-def _explanation(result: ReplayedSpec, node: int, first_ns: int, goes_on: bool) -> Explanation:
+def explanation_of(
+    result: ReplayedSpec, node: int = 0, *, first_ns: int, goes_on: bool = False
+) -> Explanation:
+    """Why a node of a result has its verdict; see `explanations`."""
     if result.inquiry is None or result.series is None or result.times_ns is None:
         raise ValueError("series and leaves of the replay were not kept")
     witness = result.inquiry.witness(node)

@@ -1,0 +1,107 @@
+// The automaton of the chosen result: its states with the present one lit, and what leads on from there.
+
+const COLUMN = 110, ROW = 64, RADIUS = 17;
+
+function makeAutomaton(clock) {
+  const place = body("automaton");
+  if (!place) return;
+  const drawing = element("div", {class: "drawing"});
+  const words = element("div", {class: "moves", role: "status"});
+  place.append(drawing, words);
+  let drawn = null;
+  clock.on("result", () => {
+    const result = clock.run.results[clock.result];
+    const automaton = result?.automaton;
+    drawn = automaton ? drawAutomaton(automaton) : null;
+    drawing.replaceChildren(drawn ? drawn.made : element("p", {}, whyNone(result)));
+    words.replaceChildren();
+  });
+  clock.on("time", () => {
+    const result = clock.run.results[clock.result];
+    if (!drawn) return;
+    const sample = placeIn(result, clock.sample);
+    const set = sample === null ? -1 : result.automaton.path[sample];
+    if (set === drawn.set) return;
+    drawn.set = set;
+    const states = set < 0 ? [] : result.automaton.sets[set];
+    light(drawn, states);
+    words.replaceChildren(...describe(result.automaton, states));
+  });
+}
+
+function whyNone(result) {
+  if (!result) return "Nothing was evaluated.";
+  return `${result.title} has no automaton: ${result.no_automaton}`;
+}
+
+function drawAutomaton(automaton) {
+  const place = ({at: [column, row]}) => [column * COLUMN, row * ROW];
+  const places = new Map(automaton.states.map((state) => [state.number, place(state)]));
+  const rows = automaton.states.map((state) => place(state)[1]);
+  const columns = automaton.states.map((state) => place(state)[0]);
+  const low = Math.min(...rows) - 52, high = Math.max(...rows) + 44, wide = Math.max(...columns);
+  const moves = automaton.moves.filter((move) => move.source !== move.target).map((move) => ({
+    ...move,
+    made: svg("path", {class: "move", d: curve(places.get(move.source), places.get(move.target)),
+      "marker-end": "url(#tip)"}, svg("title", {}, move.guard)),
+  }));
+  const states = new Map(automaton.states.map((state) => [state.number, drawState(state, places.get(state.number))]));
+  const [x, y] = places.get(automaton.states[0].number);
+  const made = svg("svg", {
+    viewBox: `-52 ${low} ${wide + 94} ${high - low}`, width: wide + 94, height: high - low, role: "img",
+    "aria-label": `Automaton with ${automaton.summary}`,
+  }, tip(), svg("path", {class: "move", d: `M${x - 46} ${y} H${x - RADIUS - 5}`, "marker-end": "url(#tip)"}),
+  ...moves.map((move) => move.made), ...states.values());
+  return {made, moves, states, set: null};
+}
+
+function tip() {
+  return svg("defs", {}, svg("marker", {id: "tip", viewBox: "0 0 8 8", refX: 7, refY: 4, markerWidth: 7,
+    markerHeight: 7, orient: "auto-start-reverse"}, svg("path", {class: "tip", d: "M0 0 L8 4 L0 8 Z"})));
+}
+
+// From rim to rim; moves over several columns, back, or within a column go around what stands between.
+function curve([x0, y0], [x1, y1]) {
+  const dx = x1 - x0, dy = y1 - y0, length = Math.hypot(dx, dy);
+  const spans = Math.round(dx / COLUMN);
+  let bend = spans === 1 ? 0.06 * length : 0.28 * length;
+  if (spans > 1 && dy !== 0) bend = 0.12 * length;
+  const [nx, ny] = [dy / length, -dx / length];
+  const [cx, cy] = [(x0 + x1) / 2 + bend * nx, (y0 + y1) / 2 + bend * ny];
+  const rim = (x, y, gap) => {
+    const away = Math.hypot(cx - x, cy - y);
+    return `${(x + gap * (cx - x) / away).toFixed(1)} ${(y + gap * (cy - y) / away).toFixed(1)}`;
+  };
+  return `M${rim(x0, y0, RADIUS)} Q${cx.toFixed(1)} ${cy.toFixed(1)} ${rim(x1, y1, RADIUS + 3)}`;
+}
+
+function drawState(state, [x, y]) {
+  const kind = state.won ? "won" : state.lost ? "lost" : "";
+  return svg("g", {class: `state ${kind}`, transform: `translate(${x} ${y})`},
+    svg("title", {}, `state ${state.number}: ${state.about}`),
+    svg("circle", {r: RADIUS}),
+    state.accepting ? svg("circle", {r: RADIUS - 4, class: "inner"}) : null,
+    svg("text", {"text-anchor": "middle", dy: "0.35em"}, String(state.number)));
+}
+
+function light(drawn, states) {
+  for (const [number, made] of drawn.states) made.classList.toggle("here", states.includes(number));
+  for (const move of drawn.moves) move.made.classList.toggle("ahead", states.includes(move.source));
+}
+
+function describe(automaton, states) {
+  if (!states.length) return [element("p", {}, "Before the first sample.")];
+  const parts = [];
+  for (const number of states) {
+    const state = automaton.states.find((each) => each.number === number);
+    if (!state) continue;
+    parts.push(element("p", {}, element("b", {}, `State ${number}`), `: ${state.about}.`));
+    const moves = automaton.moves.filter((move) => move.source === number);
+    parts.push(element("ul", {}, ...moves.map((move) => element("li", {},
+      move.target === number ? "stays if " : `to ${move.target} if `, element("code", {}, move.guard)))));
+  }
+  if (automaton.left_out) parts.push(element("p", {class: "quiet"}, `${automaton.left_out} states are not drawn.`));
+  return states.length > 1
+    ? [element("p", {}, `In one of the states ${states.join(", ")}: what was not seen leaves it open.`), ...parts]
+    : parts;
+}

@@ -1,0 +1,188 @@
+// Robustness over time: the chosen result with the interval of what may still come, and its named parts.
+
+const CHART_HEIGHT = 250;
+
+function makeCurves(clock) {
+  const place = element("div", {class: "curves"});
+  const line = element("div", {class: "cursor"});
+  const legend = element("div", {class: "legend"});
+  const chooser = quantityChooser((quantity) => { shown.quantity = quantity; build(); });
+  body("timeline").append(element("div", {class: "chart-head"}, chooser, legend), place);
+  const shown = {quantity: VALUE, hidden: new Set()};
+  let chart = null, curves = [];
+
+  const build = () => {
+    chart?.destroy();
+    chart = null;
+    const result = clock.run.results[clock.result];
+    curves = result ? curvesOf(clock.run, result, shown.quantity) : [];
+    legend.replaceChildren(...curves.map((curve) => legendEntry(curve, shown, build)));
+    if (!curves.length || !result.samples) return;
+    chart = new uPlot(options(clock, result, curves, shown, place.clientWidth), columns(result, curves), place);
+    chart.over.append(line);
+    scrub(chart.over, clock);
+    showCursor();
+  };
+  const showCursor = () => {
+    if (!chart) return;
+    const result = clock.run.results[clock.result];
+    const at = placeIn(result, clock.sample);
+    const share = shareOf(clock, clock.time);
+    line.hidden = share < 0 || share > 1;
+    line.style.left = `${share * chart.over.clientWidth}px`;
+    for (const curve of curves) {
+      curve.reading.textContent = at === null ? "" : numberText(curve.numbers[at]);
+    }
+  };
+  clock.on("result", build);
+  clock.on("view", () => chart?.setScale("x", {min: clock.view[0], max: clock.view[1]}));
+  clock.on("view", showCursor);
+  clock.on("time", showCursor);
+  window.addEventListener("themechange", build);
+  new ResizeObserver(() => {
+    if (chart && chart.width !== place.clientWidth) build();
+  }).observe(place);
+}
+
+function quantityChooser(choose) {
+  const choice = (label, quantity, title, checked) => element("label", {title}, element("input", {
+    type: "radio", name: "quantity", checked, onchange: () => choose(quantity),
+  }), label);
+  return element("fieldset", {class: "choice"}, element("legend", {class: "hidden"}, "Curves of"),
+    choice("so far", VALUE, "the robustness of the samples so far", true),
+    choice("now", NOW, "the robustness at the sample itself", false));
+}
+
+// What is drawn: the root, and the parts that have a name (so far: those that are asked once).
+function curvesOf(run, result, quantity) {
+  const named = result.nodes.filter((node) => node.parent === null || (node.name && (quantity === NOW || node.asked)));
+  const {curves: colours} = run.palette;
+  return named.slice(0, colours.length + 1).map((node, index) => ({
+    node,
+    numbers: node.series[quantity],
+    name: node.parent === null ? result.title : node.name,
+    colour: index === 0 ? null : colours[index - 1],
+    reading: element("span", {class: "number"}),
+  }));
+}
+
+function legendEntry(curve, shown, build) {
+  const key = curve.node.id;
+  const swatch = element("span", {class: `swatch ${curve.colour ? "" : "root"}`});
+  if (curve.colour) swatch.style.background = curve.colour;
+  return element("button", {
+    type: "button", class: "legend-entry", "aria-pressed": String(!shown.hidden.has(key)),
+    onclick: () => {
+      if (!shown.hidden.delete(key)) shown.hidden.add(key);
+      build();
+    },
+  }, swatch, element("span", {}, curve.name), curve.reading);
+}
+
+function columns(result, curves) {
+  const drawable = (numbers) => Array.from(numbers, (number) => Number.isFinite(number) ? number : null);
+  return [Array.from(result.times), ...curves.map((curve) => drawable(curve.numbers))];
+}
+
+function options(clock, result, curves, shown, width) {
+  const ink = colour("quiet"), grid = colour("grid");
+  const axis = {stroke: ink, grid: {stroke: grid, width: 1}, ticks: {stroke: grid, width: 1, size: 4},
+    font: "12px system-ui, sans-serif"};
+  const root = result.nodes[0];
+  const visible = curves.filter((curve) => !shown.hidden.has(curve.node.id));
+  return {
+    width, height: CHART_HEIGHT, padding: [8, 0, 0, 0],
+    cursor: {show: false}, legend: {show: false},
+    scales: {
+      x: {time: false, min: clock.view[0], max: clock.view[1]},
+      y: {range: () => rangeOf(visible)},
+    },
+    axes: [
+      {...axis, size: 30, values: (_, ticks) => ticks.map((tick) => `${Number(tick.toFixed(6))} s`)},
+      {...axis, size: gutter(), label: unitText(root.unit), labelSize: 18, labelFont: "12px system-ui, sans-serif",
+        values: (_, ticks) => ticks.map(numberText)},
+    ],
+    series: [{}, ...curves.map((curve) => ({
+      label: curve.name, show: !shown.hidden.has(curve.node.id), points: {show: false},
+      width: curve.colour ? 1.5 : 2.5, stroke: curve.colour ?? ((chart) => signGradient(chart)),
+    }))],
+    hooks: {
+      drawClear: [(chart) => {
+        shadeSigns(chart);
+        if (shown.quantity === VALUE && clock.run.settles) drawBand(chart, result, root);
+      }],
+    },
+  };
+}
+
+function unitText(unit) {
+  if (unit === "") return "robustness in footprint units";
+  if (unit === "1") return "robustness, no unit";
+  return unit === "mixed" ? "robustness, several units" : `robustness in ${unit}`;
+}
+
+// Everything finite, and zero, with some air around.
+function rangeOf(curves) {
+  let low = 0, high = 0;
+  for (const {numbers} of curves) {
+    for (const number of numbers) {
+      if (number < low && number > -Infinity) low = number;
+      else if (number > high && number < Infinity) high = number;
+    }
+  }
+  const air = 0.08 * (high - low) || 1;
+  return [low - air, high + air];
+}
+
+function zeroOf(chart) {
+  const {top, height} = chart.bbox;
+  return Math.min(Math.max(chart.valToPos(0, "y", true), top), top + height);
+}
+
+function shadeSigns(chart) {
+  const {left, top, width, height} = chart.bbox, zero = zeroOf(chart), context = chart.ctx;
+  context.save();
+  context.globalAlpha = 0.06;
+  context.fillStyle = colour("positive");
+  context.fillRect(left, top, width, zero - top);
+  context.fillStyle = colour("negative");
+  context.fillRect(left, zero, width, top + height - zero);
+  context.globalAlpha = 1;
+  context.fillStyle = colour("quiet");
+  context.fillRect(left, zero - 0.5, width, 1);
+  context.restore();
+}
+
+// Blue above zero, vermillion below.
+function signGradient(chart) {
+  const {top, height} = chart.bbox;
+  const share = Math.min(Math.max((zeroOf(chart) - top) / (height || 1), 0), 1);
+  const gradient = chart.ctx.createLinearGradient(0, top, 0, top + height);
+  gradient.addColorStop(share, colour("positive-line"));
+  gradient.addColorStop(share, colour("negative-line"));
+  return gradient;
+}
+
+// Between which numbers the value may still end, column by column of the screen.
+function drawBand(chart, result, node) {
+  const {left, top, width, height} = chart.bbox, context = chart.ctx, {times} = result;
+  const lower = node.series[LOWER], upper = node.series[UPPER];
+  const {min, max} = chart.scales.x;
+  const row = (number) => Math.min(Math.max(chart.valToPos(number, "y", true), top), top + height);
+  context.save();
+  context.fillStyle = colour("band");
+  let place = indexAt(times, min);
+  for (let x = 0; x < width; x++) {
+    const until = min + (max - min) * (x + 1) / width;
+    let low = lower[place], high = upper[place];
+    while (place + 1 < times.length && times[place + 1] <= until) {
+      place += 1;
+      low = Math.min(low, lower[place]);
+      high = Math.max(high, upper[place]);
+    }
+    if (until < times[0] || min + (max - min) * x / width > times[times.length - 1]) continue;
+    const from = high === Infinity ? top : row(high), to = low === -Infinity ? top + height : row(low);
+    context.fillRect(left + x, from, 1, to - from);
+  }
+  context.restore();
+}

@@ -1,0 +1,86 @@
+// What a planner decided: what it aimed at, tried, rejected and chose, with its maps, and how it went.
+
+function makeDecisions(clock) {
+  const place = body("decisions");
+  if (!place) return;
+  const cards = clock.run.decisions.map((decision) => makeDecision(clock, decision));
+  place.append(element("ol", {class: "cards"}, ...cards));
+  let here = null;
+  clock.on("time", () => {
+    const now = clock.run.decisions.indexOf(decisionAt(clock.run, clock.time));
+    if (now === here) return;
+    if (here !== null && here >= 0) cards[here].removeAttribute("aria-current");
+    here = now;
+    if (now >= 0) cards[now].setAttribute("aria-current", "true");
+  });
+}
+
+function makeDecision(clock, decision) {
+  const title = element("button", {type: "button", class: "decision-title", onclick: () => {
+    clock.pause();
+    clock.seek(decision.time);
+  }}, element("b", {}, `Decision ${decision.number}`), ` at ${secondsText(decision.time)}, `,
+  `state ${decision.states.join(", ")}: ${inShort(decision)}`);
+  const tried = decision.edges.map((edge, number) => makeEdge(clock, decision, edge, number));
+  const unnamed = decision.maps.filter((map) => map.edge === null);
+  return element("li", {class: "card"}, title, element("p", {}, sentence(decision.reason)),
+    decision.outcome ? element("p", {}, outcomeWords(decision.outcome)) : null,
+    tried.length ? element("details", {}, element("summary", {}, "What was looked into"), ...tried,
+      unnamed.length ? maps(clock, unnamed) : null) : null);
+}
+
+function inShort({kind, target}) {
+  if (kind === "execute" && target) return `move ${target.object} to ${target.words}`;
+  return {hold: "nothing to do", wait: "wait to see more", "no path": "no way is left"}[kind] ?? kind;
+}
+
+function outcomeWords(outcome) {
+  const how = outcome.succeeded ? "Done" : "Failed";
+  return `${how} at ${secondsText(outcome.time)}, in state ${outcome.states.join(", ")}: ${sentence(outcome.reason)}`;
+}
+
+function sentence(text) {
+  return text && !/[.!?…]$/.test(text) ? `${text}.` : text;
+}
+
+function makeEdge(clock, decision, edge, number) {
+  const guards = (texts) => texts.map((text) => element("li", {}, element("code", {}, text)));
+  const mine = decision.maps.filter((map) => map.edge === number);
+  return element("section", {class: "edge"},
+    element("h3", {}, `${edge.aim ? "Aimed at" : "Looked into"} ${edge.path.slice(0, 2).join(" → ")}`,
+      element("span", {class: "quiet"}, ` on the path ${edge.path.join(" → ")}`)),
+    element("p", {class: "quiet"}, edge.progress.length > 1 ? "To reach one of" : "To reach"),
+    element("ul", {}, ...guards(edge.progress)),
+    edge.constraints.length ? element("p", {class: "quiet"}, "Never on the way") : null,
+    edge.constraints.length ? element("ul", {}, ...guards(edge.constraints)) : null,
+    element("table", {}, element("tbody", {}, ...edge.candidates.map(candidateRow))),
+    mine.length ? maps(clock, mine) : null,
+    edge.pruned ? element("p", {class: "pruned"}, `Given up: ${sentence(edge.pruned)}`) : null);
+}
+
+function candidateRow(candidate) {
+  const why = candidate.rejected || `to ${candidate.target.words}, robustness ${candidate.target.robustness}`;
+  const standing = {chosen: "satisfied", possible: "holding", rejected: "violated"}[candidate.standing];
+  return element("tr", {}, element("td", {}, mark(standing), candidate.standing),
+    element("th", {scope: "row"}, candidate.object),
+    element("td", {}, `${why}; at best ${candidate.best}`));
+}
+
+function maps(clock, list) {
+  return element("div", {class: "maps"}, ...list.map((map) => makeMap(clock, map)));
+}
+
+function makeMap(clock, map) {
+  const {made, redraw} = canvas(`Gradient map of ${map.object || "a candidate"}`, (context, width, height) => {
+    const at = projection(map.low, map.high, width, height, 1);
+    drawMap(context, clock.run, map, at);
+    if (!map.target) return;
+    drawWay(context, map.target.way, at, {colour: colour("ink"), width: 1.5, dash: [3, 4]});
+    drawTarget(context, map.target.at, at);
+  });
+  made.style.aspectRatio = String((map.high[0] - map.low[0]) / (map.high[1] - map.low[1]));
+  window.addEventListener("themechange", redraw);
+  return element("figure", {}, made,
+    element("figcaption", {}, map.object || "a candidate", map.chosen ? ", chosen" : "",
+      `: ± ${numberText(map.scale)}`));
+}

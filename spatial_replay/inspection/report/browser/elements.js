@@ -1,0 +1,67 @@
+// Elements of the page. All text goes in as text, never as HTML.
+
+const SVG = "http://www.w3.org/2000/svg";
+
+function element(tag, attributes = {}, ...content) {
+  return filled(document.createElement(tag), attributes, content);
+}
+
+function svg(tag, attributes = {}, ...content) {
+  return filled(document.createElementNS(SVG, tag), attributes, content);
+}
+
+function filled(made, attributes, content) {
+  for (const [name, value] of Object.entries(attributes)) {
+    if (value === null || value === undefined || value === false) continue;
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else made.setAttribute(name, value === true ? "" : value);
+  }
+  made.append(...content.filter((each) => each !== null && each !== undefined));
+  return made;
+}
+
+function body(name) {
+  return document.getElementById(`${name}-body`);
+}
+
+// A sentence whose parts between backquotes are code.
+function withCode(sentence) {
+  return sentence.split("`").map((part, number) => number % 2 ? element("code", {}, part) : part);
+}
+
+function secondsText(seconds) {
+  return `${seconds.toFixed(3)} s`;
+}
+
+function numberText(number) {
+  if (Number.isNaN(number)) return "?";
+  if (!Number.isFinite(number)) return number > 0 ? "∞" : "−∞";
+  if (number === 0) return "0";
+  const size = Math.abs(number);
+  const text = size >= 1e5 || size < 1e-4 ? size.toExponential(2) : String(Number(size.toPrecision(4)));
+  return number < 0 ? `−${text}` : text;
+}
+
+function colour(name) {
+  return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+}
+
+// A canvas that is as sharp as the screen, with units of CSS pixels; draws again whenever its size changes.
+function canvas(label, draw) {
+  const made = element("canvas", {role: "img", "aria-label": label});
+  const redraw = () => {
+    const {clientWidth: width, clientHeight: height} = made;
+    if (!width || !height) return;
+    const ratio = window.devicePixelRatio || 1;
+    if (made.width !== Math.round(width * ratio) || made.height !== Math.round(height * ratio)) {
+      made.width = Math.round(width * ratio);
+      made.height = Math.round(height * ratio);
+    }
+    const context = made.getContext("2d");
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    context.clearRect(0, 0, width, height);
+    draw(context, width, height);
+  };
+  new ResizeObserver(redraw).observe(made);
+  return {made, redraw};
+}

@@ -1,0 +1,212 @@
+"""Messages of a planner → its decisions as the page tells them, with their maps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from foxglove_schemas_protobuf.Grid_pb2 import Grid
+from google.protobuf.message import DecodeError
+
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.inspection.report.packing import Packing, singles
+from spatial_replay.inspection.words import number_text
+from spatial_replay.logs.messages.PlanDecision_pb2 import (
+    PlanCandidate,
+    PlanDecision,
+    PlanEdge,
+    PlanGuard,
+    PlanTarget,
+)
+
+MOST_CELLS: Final = 1_500_000
+"""How many cells the maps of a page have at most, all together."""
+_MOST_GUARDS: Final = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What a log tells of decisions.
+
+    Attributes:
+        decisions: in order, each with its outcome if it has one.
+        maps: by the time of the decision, in the order of the log.
+    """
+
+    decisions: tuple[PlanDecision, ...]
+    maps: Mapping[int, tuple[Grid, ...]]
+
+
+class PlanMaker:
+    """Takes decisions and maps from messages as they come."""
+
+    def __init__(self) -> None:
+        self._decisions: dict[int, PlanDecision] = {}
+        self._maps: dict[int, list[Grid]] = {}
+
+    def add_decision(self, payload: bytes) -> None:
+        """Take in a decision; one that cannot be read tells nothing."""
+        try:
+            decision = PlanDecision.FromString(payload)
+        except DecodeError:
+            return
+        # the one with the outcome comes later and says everything that the first one does
+        self._decisions[decision.number] = decision
+
+    def add_map(self, payload: bytes) -> None:
+        """Take in a gradient map; one that cannot be read is none."""
+        try:
+            grid = Grid.FromString(payload)
+        except DecodeError:
+            return
+        self._maps.setdefault(grid.timestamp.ToNanoseconds(), []).append(grid)
+
+    def plan(self) -> Plan:
+        """What was taken so far."""
+        decisions = tuple(self._decisions[number] for number in sorted(self._decisions))
+        return Plan(decisions, {time_ns: tuple(grids) for time_ns, grids in self._maps.items()})
+
+
+class _Drawn(NamedTuple):
+    """A gradient map as numbers: (rows, columns), NaN where blocked, and where its corners lie."""
+
+    values: Floats
+    low: tuple[float, float]
+    high: tuple[float, float]
+
+
+def plan_value(plan: Plan, first_ns: int, packing: Packing) -> Mapping[str, Any]:
+    """The decisions as the page reads them."""
+    decisions: list[Mapping[str, Any]] = []
+    cells = left_out = 0
+    for decision in plan.decisions:
+        maps: list[Mapping[str, Any] | None] = []
+        for drawn in map(_drawn, plan.maps.get(decision.time_ns, ())):
+            if drawn is None or cells + drawn.values.size > MOST_CELLS:
+                left_out += drawn is not None
+                maps.append(None)
+                continue
+            cells += drawn.values.size
+            maps.append(_map_value(drawn, packing))
+        decisions.append(_decision_value(decision, maps, first_ns, packing))
+    return {"decisions": decisions, "maps_left_out": left_out}
+
+
+def _drawn(grid: Grid) -> _Drawn | None:
+    """A map's first field; None of a message whose sizes do not fit together."""
+    columns, cell, row = grid.column_count, grid.cell_stride, grid.row_stride
+    rows = len(grid.data) // row if row else 0
+    if not rows or not grid.fields or cell * columns > row or grid.fields[0].offset + 4 > cell:
+        return None
+    numbers = np.ndarray((rows, columns), "<f4", grid.data, grid.fields[0].offset, (row, cell))
+    x, y = grid.pose.position.x, grid.pose.position.y
+    high = x + columns * grid.cell_size.x, y + rows * grid.cell_size.y
+    return _Drawn(numbers.astype(np.float64), (x, y), high)
+
+
+def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
+    known = drawn.values[np.isfinite(drawn.values)]
+    return {
+        "columns": drawn.values.shape[1],
+        "low": drawn.low,
+        "high": drawn.high,
+        "scale": float(np.abs(known).max()) if len(known) else 0.0,
+        "values": packing.add(singles(drawn.values), "f4"),
+    }
+
+
+def _decision_value(
+    decision: PlanDecision, maps: Sequence[Mapping[str, Any] | None], first_ns: int, packing: Packing
+) -> Mapping[str, Any]:
+    value: dict[str, Any] = {
+        "number": decision.number,
+        "time": (decision.time_ns - first_ns) / 1e9,
+        "specification": decision.specification,
+        "kind": decision.Kind.Name(decision.kind).removeprefix("KIND_").lower().replace("_", " "),
+        "states": list(decision.states),
+        "reason": decision.reason,
+        "edges": [
+            _edge_value(edge, decision.HasField("target") and edge is decision.considered[-1])
+            for edge in decision.considered
+        ],
+        "maps": _named_maps(decision, maps),
+        "target": _target_value(decision.target) if decision.HasField("target") else None,
+        "outcome": None,
+    }
+    if decision.HasField("outcome"):
+        outcome = decision.outcome
+        value["outcome"] = {
+            "time": (outcome.end_ns - first_ns) / 1e9,
+            "succeeded": outcome.succeeded,
+            "reason": outcome.reason,
+            "states": list(outcome.states),
+            "travelled": packing.add(np.array(outcome.travelled), "f8"),
+        }
+    return value
+
+
+def _edge_value(edge: PlanEdge, is_aim: bool) -> Mapping[str, Any]:
+    return {
+        "path": list(edge.path),
+        "aim": is_aim,
+        "progress": _guard_texts(edge.progress),
+        "constraints": _guard_texts(edge.constraints),
+        "candidates": [_candidate_value(candidate) for candidate in edge.candidates],
+        "pruned": edge.pruned.split(" (", 1)[0],
+    }
+
+
+def _guard_texts(guards: Sequence[PlanGuard]) -> list[str]:
+    more = [f"and {len(guards) - _MOST_GUARDS} more"] if len(guards) > _MOST_GUARDS else []
+    return [guard.text for guard in guards[:_MOST_GUARDS]] + more
+
+
+def _candidate_value(candidate: PlanCandidate) -> Mapping[str, Any]:
+    return {
+        "object": candidate.object,
+        "best": "nowhere free" if math.isinf(candidate.best) else number_text(candidate.best),
+        "standing": "rejected" if candidate.rejected else "chosen" if candidate.chosen else "possible",
+        "rejected": candidate.rejected,
+        "target": _target_value(candidate.target) if candidate.HasField("target") else None,
+    }
+
+
+def _target_value(target: PlanTarget) -> Mapping[str, Any]:
+    turned = f", turned by {math.degrees(target.turn):.3g}°" if target.turn else ""
+    return {
+        "object": target.object,
+        "at": [target.x, target.y],
+        "words": f"({target.x:.4g}, {target.y:.4g}){turned}",
+        "robustness": number_text(target.robustness),
+        "way": list(target.waypoints),
+    }
+
+
+def _named_maps(decision: PlanDecision, maps: Sequence[Mapping[str, Any] | None]) -> list[Mapping[str, Any]]:
+    """The maps, each with the edge and the candidate that it is of, as far as that can be told."""
+    owners = [
+        (number, candidate)
+        for number, edge in enumerate(decision.considered)
+        for candidate in sorted(edge.candidates, key=lambda each: each.chosen)
+    ]
+    owners = owners[len(owners) - len(maps) :] if len(owners) >= len(maps) else []
+    named: list[Mapping[str, Any]] = []
+    for index, value in enumerate(maps):
+        if value is None:
+            continue
+        edge, candidate = owners[index] if owners else (None, None)
+        named.append(
+            {
+                **value,
+                "edge": edge,
+                "object": candidate.object if candidate is not None else "",
+                "chosen": candidate is not None and candidate.chosen,
+                "target": None
+                if candidate is None or not candidate.HasField("target")
+                else _target_value(candidate.target),
+            }
+        )
+    return named

@@ -1,0 +1,128 @@
+"""Replays that write a report: one page with what a run did, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from spatial_replay.inspection.report.collecting import Collector
+from spatial_replay.inspection.report.contents import Report, ReportedResult
+from spatial_replay.inspection.report.page import page
+from spatial_replay.logs.output import replacing
+from spatial_replay.logs.source import Source
+from spatial_replay.monitor.semantics import Semantics
+from spatial_replay.monitor.verdict import Verdict
+from spatial_replay.replay.annotated import check_parameters
+from spatial_replay.replay.explanation import explanation_of
+from spatial_replay.replay.found import Replayed, ReplayedSpec
+from spatial_replay.replay.replay import Replay
+from spatial_replay.replay.window import Window
+from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.relations import RELATION_NAMES
+
+MOST_EXPLAINED = 24
+"""How many verdicts are explained: those of the worst results."""
+
+
+def write_report(
+    source: Source,
+    files: Sequence[Specification],
+    output: Path,
+    *,
+    window: Window | None = None,
+    each: Mapping[str, str] | None = None,
+    semantics: Semantics = "ltlf",
+    inputs: Sequence[Path] = (),
+    advance: Callable[[int], None] = lambda samples: None,
+) -> Replayed:
+    """Evaluate specifications over a source and write what was found as one HTML page.
+
+    The page needs no other file and no network. Equal sources, specifications and options give an equal page.
+
+    Args:
+        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
+        semantics: "ltlf", or "paper": Def. 16 of the paper to the letter.
+        inputs: files that the output must not be.
+        advance: told how many more samples are done.
+
+    Raises:
+        UsageError: an option that cannot work, no sample in the window, the output is an input.
+        SpecificationError: names that the log never has.
+        LogError: no sample in the log.
+        OutputError: the output cannot be written.
+    """
+    check_parameters(files, each or {})
+    replay = Replay(
+        source, files, window=window, each=each, semantics=semantics, keep_series=True, keep_leaves=True
+    )
+    with replacing(output, inputs) as stream:
+        collector = Collector()
+        for messages, samples in replay.iter_messages(annotate=True):
+            collector.add(messages)
+            advance(samples)
+        replayed = replay.result()
+        stream.write(page(_report(replay, replayed, collector)))
+    return replayed
+
+
+def _report(replay: Replay, replayed: Replayed, collector: Collector) -> Report:
+    return Report(
+        log=replayed.log,
+        samples=replayed.samples,
+        first_ns=replayed.first_ns,
+        start_ns=replayed.start_ns,
+        end_ns=replayed.end_ns,
+        faults=replayed.faults,
+        remarks=replayed.remarks,
+        unreadable=replayed.unreadable,
+        semantics=replayed.semantics,
+        certificate=replayed.certificate,
+        files=tuple(replay.files),
+        results=tuple(_results(replay, replayed, collector)),
+        film=collector.film,
+        happenings=collector.happenings,
+        plan=collector.plan,
+    )
+
+
+def _results(replay: Replay, replayed: Replayed, collector: Collector) -> Sequence[ReportedResult]:
+    explained = _explained(replayed)
+    results = []
+    for index, (result, tree, kept) in enumerate(
+        zip(replayed.results, replay.trees, replay.automata, strict=True)
+    ):
+        sentences = explanation_of(result, first_ns=replayed.first_ns).sentences if index in explained else ()
+        results.append(
+            ReportedResult(
+                name=result.name,
+                object=result.object,
+                formula=result.formula,
+                relations=RELATION_NAMES | replay.files[tree.file].relations,
+                verdict=result.verdict,
+                robustness=result.robustness,
+                final=result.final,
+                first_satisfied_ns=result.first_satisfied_ns,
+                times_ns=np.empty(0, np.int64) if result.times_ns is None else result.times_ns,
+                series=np.empty((len(result.robustness), 4, 0)) if result.series is None else result.series,
+                sentences=sentences,
+                automaton=kept.automaton,
+                no_automaton=kept.reason,
+                path=collector.path(tree.name, tree.object),
+            )
+        )
+    return results
+
+
+def _explained(replayed: Replayed) -> frozenset[int]:
+    """Which results are explained; under the paper's semantics none can be."""
+    if replayed.semantics != "ltlf":
+        return frozenset()
+    worst_first = sorted(range(len(replayed.results)), key=lambda index: _severity(replayed.results[index]))
+    return frozenset(worst_first[:MOST_EXPLAINED])
+
+
+def _severity(result: ReplayedSpec) -> int:
+    order = (Verdict.VIOLATED, Verdict.UNKNOWN)
+    return order.index(result.verdict) if result.verdict in order else len(order)
