@@ -9,6 +9,7 @@ import click
 
 from spatial_replay.automata.compiling import automaton
 from spatial_replay.automata.drawing import dot_text, hoa_text, size_words, svg_text, words_text
+from spatial_replay.cli.options import refuse_several
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.logs.output import replacing
 from spatial_replay.spec.formula import Specification
@@ -46,9 +47,7 @@ def show_automata(
         raise UsageError(
             f"{file}: write an automaton to a file that ends in .dot, .hoa or .svg, or in words to -"
         )
-    if name is None and len(specification.results) > 1:
-        names = ", ".join(spec.name for spec in specification.results)
-        raise UsageError(f"{specification.filename} has several results; choose one with --of: {names}")
+    refuse_several(specification, name)
     chosen = automaton(specification, name)
     text = written[path.suffix](chosen)
     with replacing(path, inputs) as stream:

@@ -6,9 +6,14 @@ import os
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
-from typing import Any, Literal, TypedDict, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypedDict, TypeVar
 
 import click
+
+from spatial_replay.errors import UsageError
+
+if TYPE_CHECKING:
+    from spatial_replay.spec.formula import Specification
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -34,6 +39,18 @@ profile_option = click.option(
     type=click.Choice(["paper", "spatial_spec"]),
     help="Relation profile of files without a `use` line.  [default: paper]",
 )
+
+
+def refuse_several(specification: Specification, of: str | None) -> None:
+    """That it is clear which result of a specification is meant.
+
+    Raises:
+        UsageError: it has several, and none was chosen.
+    """
+    if of is None and len(specification.results) > 1:
+        names = ", ".join(spec.name for spec in specification.results)
+        raise UsageError(f"{specification.filename} has several results; choose one with --of: {names}")
+
 
 _READING = (
     click.option(

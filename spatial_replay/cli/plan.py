@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from spatial_replay.cli.exit_codes import exit_code_from_verdicts
-from spatial_replay.cli.options import output_option, profile_option
+from spatial_replay.cli.options import output_option, profile_option, refuse_several
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.simulated import SCENARIOS, Simulating, injections_from, simulation_options
 from spatial_replay.cli.verdicts import counted
@@ -29,13 +29,14 @@ def planning_command(scenario: str) -> click.Command:
 
     The planner decides what the robot moves, step by step, until the specification is satisfied or no path to
     that is left. The log tells what it decided and why. Equal options give an equal log, byte for byte. Needs
-    the extra `sim`. Exits with 0 if the log says satisfied, 1 if violated, 4 if unknown or if the
-    planner waited in vain.
+    the extra `sim`. Exits with 0 if the log says that what was planned for is satisfied, 1 if it is
+    violated, 4 if that is unknown or the planner waited in vain.
 
     \b
     Examples:
       spatial-replay plan {scenario} -o run.mcap --seed 3
       spatial-replay plan {scenario} -o run.mcap --spec edited.spatial
+      spatial-replay plan {scenario} -o run.mcap --spec several.spatial --of one
       spatial-replay info run.mcap --decisions
     """
 
@@ -45,21 +46,27 @@ def planning_command(scenario: str) -> click.Command:
         "--spec",
         metavar="SPEC",
         type=click.Path(path_type=Path),
-        help="Plan for this specification instead of the scenario's own; a file with one result.",
+        help="Plan for this specification instead of the scenario's own.",
     )
+    @click.option("--of", metavar="NAME", help="What to plan for, where SPEC has several results.")
     @profile_option
     @simulation_options
-    def command(output: Path, spec: Path | None, profile: str | None, simulating: Simulating) -> int:
+    def command(
+        output: Path, spec: Path | None, of: str | None, profile: str | None, simulating: Simulating
+    ) -> int:
         # the simulator and the numerical libraries load when there is work for them
         from spatial_replay.runs.planned import record_plan
         from spatial_replay.spec import load_specification
 
         file = None if spec is None else load_specification(spec, profile=profile)
+        if file is not None:
+            refuse_several(file, of)
         with progress("samples") as advance:
             planned = record_plan(
                 scenario,
                 output,
                 file,
+                name=of,
                 seed=simulating["seed"],
                 noise_m=simulating["noise"],
                 injections=injections_from(simulating["inject"]),
@@ -72,7 +79,7 @@ def planning_command(scenario: str) -> click.Command:
             f"{counted(planned.steps, 'motion')}, {counted(planned.pruned, 'edge')} given up"
         )
         click.echo(f"the planner: {planned.reason}")
-        click.echo(f"the log: {planned.verdict}")
+        click.echo(f"the log: {planned.name} is {planned.verdict}")
         # a run that waited in vain was cut short: that its goal was not reached is no violation
         return exit_code_from_verdicts(["unknown" if planned.ended == "wait" else planned.verdict])
 

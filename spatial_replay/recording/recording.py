@@ -35,7 +35,7 @@ from spatial_replay.logs.topics import (
     protobuf_channel,
 )
 from spatial_replay.monitor.instances import find_instances
-from spatial_replay.monitor.verdict import Verdict, worst_verdict
+from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.times import FOREVER
 from spatial_replay.trace.trace import Trace
@@ -79,9 +79,10 @@ class Recording:
         return self._samples
 
     @property
-    def verdict(self) -> Verdict:
-        """The worst verdict of the results if the log ends here; satisfied if there are none."""
-        return worst_verdict(stream.verdict for stream in self._evaluation.streams)
+    def verdicts(self) -> Mapping[str, Verdict]:
+        """The verdict of each result, by its name, if the log ends here."""
+        reported = zip(self._evaluation.trees, self._evaluation.streams, strict=True)
+        return {tree.name: stream.verdict for tree, stream in reported}
 
     def add(self, trace: Trace, beside: Messages | None = None) -> None:
         """Take in the next samples.

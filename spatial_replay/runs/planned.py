@@ -37,7 +37,8 @@ class PlannedRun:
         seconds: from the first to the last.
         ended: the kind of the last decision: "hold" where the specification is satisfied, as far as the
             planner can tell.
-        verdict: what the log says of the specification, uncertainty of positions included.
+        name: of the spec that was planned for.
+        verdict: what the log says of that, uncertainty of positions included.
         reason: the last decision in words.
         steps: how many motions were executed.
         pruned: how many edges of the automaton were given up.
@@ -47,6 +48,7 @@ class PlannedRun:
     samples: int
     seconds: float
     ended: Kind
+    name: str
     verdict: Verdict
     reason: str
     steps: int
@@ -64,6 +66,7 @@ def record_plan(
     output: Path,
     file: Specification | None = None,
     *,
+    name: str | None = None,
     seed: int = 0,
     noise_m: float = 0.0,
     injections: Sequence[Injection] = (),
@@ -74,22 +77,25 @@ def record_plan(
     """Let a planner satisfy a specification in a scenario's world; equal arguments give equal bytes.
 
     Args:
-        file: what to plan for, with one result; None takes the scenario's own.
+        file: what to plan for; None takes the scenario's own.
+        name: which of its results to plan for; without it, the only one. All are evaluated.
         inputs: files that the output must not be.
         advance: told how many more samples are done.
 
     Raises:
         NoAutomatonError: a specification without an automaton.
         SpecificationError: names that the world does not have.
-        UsageError: no such scenario, no simulator, a specification that cannot be planned for.
+        UsageError: no such scenario, no simulator, no such result, several to choose from, one that cannot be
+            planned for.
         OutputError: the output cannot be written.
     """
     (kept,) = kept_files([default_specification(scenario) if file is None else file])
+    _refuse_missing(kept, name)
     options = run_options(seed=seed, noise_m=noise_m, injections=injections)
     about = {"source": scenario, "seed": str(seed), "options": options, "planned": "true"}
     # a world or a planner that cannot be made leaves the output alone
     with closing(make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, gui=gui)) as world:
-        planner = Planner(kept, settings_for(world))
+        planner = Planner(kept, settings_for(world), name=name)
         _check_names(kept, world.sample())
         with run_log(output, [kept], about, inputs) as log:
             plan = {
@@ -110,12 +116,24 @@ def record_plan(
             samples=log.samples,
             seconds=log.seconds,
             ended=last.kind,
-            verdict=log.verdict,
+            name=planner.automaton.name,
+            verdict=log.verdicts[planner.automaton.name],
             reason=last.reason,
             steps=loop.executed,
             pruned=len(last.pruned),
             planning_s=loop.planning_s,
         )
+
+
+def _refuse_missing(file: Specification, name: str | None) -> None:
+    """That a file has a result.
+
+    Raises:
+        UsageError: it has none of that name.
+    """
+    results = [spec.name for spec in file.results]
+    if name is not None and name not in results:
+        raise UsageError(f"{file.filename} has no result {name!r}; its results are: {', '.join(results)}")
 
 
 def _check_names(file: Specification, sample: Sample) -> None:

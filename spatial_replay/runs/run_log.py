@@ -48,9 +48,9 @@ class RunLog:
         return (self._last_ns - self._first_ns) / 1e9
 
     @property
-    def verdict(self) -> Verdict:
-        """The worst verdict of the specifications on what was written; of a log that ended, the final one."""
-        return self._recording.verdict
+    def verdicts(self) -> Mapping[str, Verdict]:
+        """The verdict of each result, by its name, on what was written; the final one once the log ended."""
+        return self._recording.verdicts
 
     def write(self, sample: Sample) -> None:
         """Take in the next sample.

@@ -49,7 +49,7 @@ def run(path, text, hides, things=THINGS, **options):
         table.planner = Camera(loop, TABLE, hides)
         last = loop.run()
     assert log.samples == len(table.samples)
-    return last, planner, loop, log.verdict
+    return last, planner, loop, log.verdicts["spec"]
 
 
 def test_doubt_that_stays_does_not_keep_a_run_going(tmp_path):

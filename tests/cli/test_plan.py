@@ -1,0 +1,75 @@
+"""`spatial-replay plan`: exit codes, and what is said."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from spatial_replay.cli.application import run
+from spatial_replay.planning.told import read_decisions
+
+SATISFIED = "spec calm = F (green leftof red)\n"
+IMPOSSIBLE = "spec torn = F (red leftof blue and red rightof blue)\n"
+
+
+@pytest.fixture(autouse=True)
+def _simulator() -> None:
+    pytest.importorskip("pybullet", reason="PyBullet is not installed; it has wheels for Python 3.11")
+
+
+def plan(folder: Path, text: str, *options: str) -> int:
+    """`plan push` for a specification, into `run.mcap`."""
+    (folder / "task.spatial").write_text(text, encoding="utf-8")
+    output = folder / "run.mcap"
+    return run(["plan", "push", "-o", str(output), "--spec", str(folder / "task.spatial"), *options])
+
+
+def test_what_is_satisfied_exits_with_0(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert plan(tmp_path, SATISFIED) == 0
+    said = capsys.readouterr().out
+    assert "0 motions, 0 edges given up" in said
+    assert "the planner: the specification is satisfied: hold\nthe log: calm is satisfied\n" in said
+
+
+def test_where_no_path_is_left_it_exits_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert plan(tmp_path, IMPOSSIBLE) == 1
+    said = capsys.readouterr().out
+    assert "the planner: no path left: every way from state 0 was given up (0 -> 1: no object can" in said
+    assert said.endswith("the log: torn is violated\n")
+
+
+def test_what_is_too_uncertain_exits_with_4(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert plan(tmp_path, SATISFIED, "--noise", "0.1") == 4
+    assert "the planner: the specification is satisfied: hold\nthe log: calm is unknown\n" in (
+        capsys.readouterr().out
+    )
+
+
+def test_of_several_results_one_is_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert plan(tmp_path, IMPOSSIBLE + SATISFIED) == 2
+    assert "task.spatial has several results; choose one with --of: torn, calm" in capsys.readouterr().err
+    assert not (tmp_path / "run.mcap").exists()
+    assert plan(tmp_path, IMPOSSIBLE + SATISFIED, "--of", "calm") == 0
+    assert read_decisions(tmp_path / "run.mcap").decisions[0].specification == "calm"
+    assert run(["verify", str(tmp_path / "run.mcap"), "--decisions"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "message"),
+    [
+        (SATISFIED, ["--of", "clam"], "task.spatial has no result 'clam'; its results are: calm"),
+        ("spec calm = G O (green leftof red)\n", [], "past operators"),
+        ("spec calm = F (pink leftof red)\n", [], "never has the object 'pink'"),
+        ("spec calm = F (\n", [], "task.spatial:1"),
+        (SATISFIED, ["--inject", "drop@1s"], "drop"),
+    ],
+)
+def test_what_cannot_be_planned_for_exits_with_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, options: list[str], message: str
+) -> None:
+    assert plan(tmp_path, text, *options) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert message in said.err
+    assert not (tmp_path / "run.mcap").exists()
