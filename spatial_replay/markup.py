@@ -9,7 +9,7 @@ from typing import Final
 
 from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
 
-_LONGEST: Final = 160
+_LONGEST: Final = 300
 """Characters after which a text is cut."""
 _VERDICT_COLOURS: Final[Mapping[str, tuple[float, float, float]]] = MappingProxyType(
     {"satisfied": POSITIVE, "violated": NEGATIVE}

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from spatial_replay.planning.displacement import proposition_maps
-    from spatial_replay.planning.maps import gradient_map
+    from spatial_replay.planning.logged_step import LoggedStep, read_steps
+    from spatial_replay.planning.maps import GradientMap, gradient_map
     from spatial_replay.planning.planner import Planner
     from spatial_replay.planning.settings import Settings
     from spatial_replay.planning.step import Candidate, Executor, Outcome, Step, Target
@@ -22,7 +23,9 @@ if TYPE_CHECKING:
 __all__ = [
     "Candidate",
     "Executor",
+    "GradientMap",
     "Grid",
+    "LoggedStep",
     "Outcome",
     "Planner",
     "Settings",
@@ -31,13 +34,16 @@ __all__ = [
     "Workspace",
     "gradient_map",
     "proposition_maps",
+    "read_steps",
 ]
 
 _HOMES: Mapping[str, str] = MappingProxyType(
     {
         "Candidate": "spatial_replay.planning.step",
         "Executor": "spatial_replay.planning.step",
+        "GradientMap": "spatial_replay.planning.maps",
         "Grid": "spatial_replay.planning.workspace",
+        "LoggedStep": "spatial_replay.planning.logged_step",
         "Outcome": "spatial_replay.planning.step",
         "Planner": "spatial_replay.planning.planner",
         "Settings": "spatial_replay.planning.settings",
@@ -46,6 +52,7 @@ _HOMES: Mapping[str, str] = MappingProxyType(
         "Workspace": "spatial_replay.planning.workspace",
         "gradient_map": "spatial_replay.planning.maps",
         "proposition_maps": "spatial_replay.planning.displacement",
+        "read_steps": "spatial_replay.planning.logged_step",
     }
 )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,12 @@ from numpy.typing import NDArray
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.planning.displacement import PropositionMaps
 from spatial_replay.planning.workspace import Grid, Workspace
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from spatial_replay.planning.step import Target
+    from spatial_replay.trace.sample import Sample
 
 Cube: TypeAlias = tuple[tuple[int, bool], ...]
 """A conjunction of propositions, by number, each to hold or not to; the empty one always holds."""
@@ -56,6 +62,24 @@ class GradientMap:
         """The greatest robustness at a free cell; -inf where there is none."""
         free = self.blocked == FREE
         return float(self.robustness[free].max()) if free.any() else -np.inf
+
+    def plot(
+        self,
+        ax: Axes | None = None,
+        *,
+        turn: int | None = None,
+        sample: Sample | None = None,
+        target: Target | None = None,
+    ) -> Axes:
+        """Draw it, with the objects of a sample and the way to a target over it; see `draw_map`."""
+        from spatial_replay.planning.map_picture import draw_map
+
+        return draw_map(self, ax, turn=turn, sample=sample, target=target)
+
+    def _repr_html_(self) -> str:
+        from spatial_replay.planning.map_picture import map_html
+
+        return map_html(self)
 
 
 def gradient_map(

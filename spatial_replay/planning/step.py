@@ -5,9 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias
 
 from spatial_replay.planning.maps import Cubes, GradientMap
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from spatial_replay.trace.sample import Sample
 
 Kind: TypeAlias = Literal["execute", "hold", "wait", "no path"]
 """What is to be done: move an object; nothing, for the specification is satisfied; nothing yet, for too
@@ -144,6 +149,17 @@ class Step:
     def candidates(self) -> tuple[Candidate, ...]:
         """Every object that was considered for the edge aimed at."""
         return self.aim.candidates if self.aim is not None else ()
+
+    def plot(self, sample: Sample | None = None) -> tuple[Axes, ...]:
+        """Draw the maps that it rests on, with the objects of a sample over them; see `draw_step`."""
+        from spatial_replay.planning.step_picture import draw_step
+
+        return draw_step(self, sample)
+
+    def _repr_html_(self) -> str:
+        from spatial_replay.planning.step_picture import step_html
+
+        return step_html(self)
 
 
 _NOTHING = Guards((), ())

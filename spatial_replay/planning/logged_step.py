@@ -1,0 +1,111 @@
+"""The steps of a planned run as values, made again from its log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from spatial_replay.errors import LogError
+from spatial_replay.logs.messages.PlanDecision_pb2 import PlanDecision
+from spatial_replay.logs.reading import read_blocks
+from spatial_replay.logs.source import Source, open_source
+from spatial_replay.markup import element
+from spatial_replay.planning.planner import Planner
+from spatial_replay.planning.redo import planner_of
+from spatial_replay.planning.step import Outcome, Step
+from spatial_replay.planning.step_picture import draw_step, step_html
+from spatial_replay.planning.told import read_decisions
+from spatial_replay.trace.sample import Sample
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoggedStep:
+    """A step that a log tells of.
+
+    Attributes:
+        step: the decision, with all maps that it rests on.
+        sample: what it was made on.
+        outcome: how its execution went; None where nothing was to be moved, or the log ends before.
+        end_ns: when it ended, if it did.
+        travelled: points (x, y) that the object went through.
+    """
+
+    step: Step
+    sample: Sample
+    outcome: Outcome | None
+    end_ns: int | None
+    travelled: tuple[tuple[float, float], ...]
+
+    def plot(self) -> tuple[Axes, ...]:
+        """Draw the maps with the objects as they were; see `draw_step`."""
+        return draw_step(self.step, self.sample)
+
+    def _repr_html_(self) -> str:
+        parts = [step_html(self.step)]
+        if self.outcome is not None and self.end_ns is not None:
+            how = "done" if self.outcome.succeeded else "failed"
+            parts.append(
+                element("div", element("b", how), f" at {self.end_ns / 1e9:.3f} s: {self.outcome.reason}")
+            )
+        return element("div", *parts)
+
+
+def read_steps(log: str | PathLike[str]) -> tuple[LoggedStep, ...]:
+    """Every step of a planned run, in order, each made again from the samples before it.
+
+    Raises:
+        UsageError: the log holds no plan.
+        MissingFileError, LogError: the log cannot be read, or tells of other decisions.
+    """
+    path = Path(log)
+    source = open_source(path)
+    run = _Run(source.name, planner_of(source), _iter_samples(source))
+    return tuple([run.step(decision) for decision in read_decisions(path).decisions])
+
+
+class _Run:
+    """A run that a planner watches again."""
+
+    def __init__(self, name: str, planner: Planner, samples: Iterator[Sample]) -> None:
+        self._name = name
+        self._planner = planner
+        self._samples = samples
+        self._sample: Sample | None = None
+
+    def step(self, decision: PlanDecision) -> LoggedStep:
+        """The next step; afterwards the run is where its execution ended."""
+        sample = self._observe_until(decision.time_ns)
+        step = self._planner.next_step()
+        if (step.number, step.reason) != (decision.number, decision.reason):
+            raise LogError(
+                f"{self._name} tells of decision {decision.number}: {decision.reason!r}; made again it is "
+                f"{step.reason!r}; `spatial-replay verify --decisions` says what differs"
+            )
+        if not decision.HasField("outcome"):
+            return LoggedStep(step, sample, None, None, ())
+        told = decision.outcome
+        outcome = Outcome(told.succeeded, told.reason)
+        self._observe_until(told.end_ns)
+        self._planner.conclude(outcome)
+        travelled = tuple(zip(told.travelled[::2], told.travelled[1::2], strict=True))
+        return LoggedStep(step, sample, outcome, told.end_ns, travelled)
+
+    def _observe_until(self, time_ns: int) -> Sample:
+        """Watch up to the sample of a time."""
+        while self._sample is None or self._sample.time_ns < time_ns:
+            self._sample = next(self._samples, None)
+            if self._sample is None:
+                raise LogError(f"{self._name} has lost the sample at {time_ns} ns, on which a decision rests")
+            self._planner.observe(self._sample)
+        return self._sample
+
+
+def _iter_samples(source: Source) -> Iterator[Sample]:
+    for block in read_blocks(source):
+        yield from block.trace.samples()
