@@ -46,7 +46,11 @@ _OPTIONS = (
         multiple=True,
         help="What goes wrong: drop@7s, slip@7s, or slip for the whole run; repeat it for several.",
     ),
-    click.option("--gui", is_flag=True, help="Show the world in a window, no faster than real time."),
+    click.option(
+        "--gui",
+        is_flag=True,
+        help="Show the world in a window, no faster than real time. Needs a display.",
+    ),
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -41,9 +42,8 @@ class Engine:
 
     def __init__(self, *, gui: bool = False) -> None:
         self._bullet = bullet = _load()
-        if gui and not os.environ.get("DISPLAY"):
-            # the simulator would end the process
-            raise UsageError("there is no display to show the world on (DISPLAY is not set); run without gui")
+        if gui:
+            _refuse_no_display()
         self._client: int = bullet.connect(bullet.GUI if gui else bullet.DIRECT)
         if self._client < 0:
             raise UsageError("the simulator could not be started; run without gui if it shows a window")
@@ -197,6 +197,26 @@ def _load() -> ModuleType:
         ) from error
     module: ModuleType = pybullet
     return module
+
+
+def _refuse_no_display() -> None:
+    """That there is a display to open a window on; without one, the simulator would end the process.
+
+    Raises:
+        UsageError: there is none.
+    """
+    name = os.environ.get("DISPLAY")
+    if not name:
+        raise UsageError("there is no display to show the world on (DISPLAY is not set); run without gui")
+    try:
+        x11 = ctypes.CDLL("libX11.so.6")
+    except OSError as error:
+        raise UsageError("windows need libX11, which is not installed; run without gui") from error
+    x11.XOpenDisplay.restype = ctypes.c_void_p
+    display = x11.XOpenDisplay(None)
+    if display is None:
+        raise UsageError(f"the display {name} cannot be opened (DISPLAY); correct it, or run without gui")
+    x11.XCloseDisplay(ctypes.c_void_p(display))
 
 
 @contextmanager

@@ -73,3 +73,15 @@ def test_what_cannot_be_planned_for_exits_with_2(
     assert said.out == ""
     assert message in said.err
     assert not (tmp_path / "run.mcap").exists()
+
+
+@pytest.mark.parametrize("display", ["", ":987", "nowhere:0"])
+def test_without_a_display_no_window_is_opened(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, display: str
+) -> None:
+    monkeypatch.setenv("DISPLAY", display)
+    assert plan(tmp_path, SATISFIED, "--gui") == 2
+    said = capsys.readouterr().err
+    assert "DISPLAY" in said
+    assert "run without gui" in said
+    assert not (tmp_path / "run.mcap").exists()
