@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 from spatial_replay.errors import LogError
 from spatial_replay.logs.block import Block
 from spatial_replay.logs.source import Source
 
 
-def read_blocks(source: Source, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+def read_blocks(
+    source: Source, start_ns: int | None = None, end_ns: int | None = None
+) -> Generator[Block, None, None]:
     """The blocks of a source, as `Source.iter_blocks` gives them.
 
     Raises:
@@ -20,6 +23,22 @@ def read_blocks(source: Source, start_ns: int | None = None, end_ns: int | None 
     except OSError as error:
         reason = error.strerror or error
         raise LogError(f"{source.name} could not be read: {reason}; copy it to another disk") from error
+
+
+def read_ahead(blocks: Generator[Block, None, None]) -> Iterator[Block]:
+    """The same blocks, each read on a thread of its own while the one before is worked on.
+
+    Most of reading leaves the interpreter to others, so that on two cores it costs a replay little time.
+    """
+    with ThreadPoolExecutor(1, "reading") as thread:
+        try:
+            waiting = thread.submit(next, blocks, None)
+            while (block := waiting.result()) is not None:
+                waiting = thread.submit(next, blocks, None)
+                yield block
+        finally:
+            # where it was read: a database is closed by the thread that opened it
+            thread.submit(blocks.close).result()
 
 
 def reading_options(source: Source) -> dict[str, object]:

@@ -13,7 +13,7 @@ from spatial_replay.logs.block import Block, Messages
 from spatial_replay.logs.merging import merge, select
 from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.objects import encode_objects
-from spatial_replay.logs.reading import read_blocks
+from spatial_replay.logs.reading import read_ahead, read_blocks
 from spatial_replay.logs.source import Source, within
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
 from spatial_replay.monitor.instances import Choice, Instance, find_instances
@@ -42,7 +42,8 @@ class Selection:
         looks_back = any(look_back([spec.formula for spec in file.specs]) != (0, 0) for file in self.files)
         from_start = looks_back or window.every > 1
         seen = 0
-        for block in read_blocks(self.source, None if from_start else window.start_ns, window.end_ns):
+        blocks = read_blocks(self.source, None if from_start else window.start_ns, window.end_ns)
+        for block in read_ahead(blocks):
             trace = block.trace
             if window.every > 1:
                 chosen = np.arange(-seen % window.every, len(trace), window.every, dtype=np.int64)
