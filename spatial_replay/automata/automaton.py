@@ -7,31 +7,21 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from spatial_replay.automata.diagrams import LEAF, NO, YES, Diagrams
-from spatial_replay.automata.guards import Covers, Guard, guard_words
-from spatial_replay.automata.machine import Machine, nodes_of
+from spatial_replay.automata.diagrams import LEAF
+from spatial_replay.automata.guards import guard_words
+from spatial_replay.automata.machine import Machine
+from spatial_replay.automata.moves import Moves, Transition, moves_of, successors_of, transitions_of
 from spatial_replay.automata.propositions import Proposition
-from spatial_replay.errors import NoAutomatonError, UsageError
+from spatial_replay.errors import UsageError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MAX_VISITS = 25_000_000
-"""How many decisions are looked at to find all moves, each for every state that it may matter to."""
+MAX_PROPOSITIONS = 64
+"""How many propositions an automaton reads at most."""
 
-
-@dataclass(frozen=True)
-class Transition:
-    """A move from one state to another.
-
-    Attributes:
-        guard: cubes of literals (proposition's number, whether it is true), of which one has to hold; no cube
-            and no literal of one can be left out.
-    """
-
-    source: int
-    guard: Guard
-    target: int
+MAX_ROWS = 200_000
+"""How many states an automaton has at most, and how many decisions."""
 
 
 @dataclass(frozen=True)
@@ -71,14 +61,7 @@ class Automaton:
             NoAutomatonError: finding them takes more than `MAX_VISITS`, or their guards too many cubes; never
                 of what `automaton` gives.
         """
-        diagrams, moves = self._diagrams()
-        covers = Covers(diagrams)
-        leading = _Leading(diagrams)
-        return tuple(
-            Transition(source, covers.guard(leading.to(target, node)), target)
-            for source, node in enumerate(moves)
-            for target in self.successors[source]
-        )
+        return transitions_of(self._moves, self.successors)
 
     @cached_property
     def successors(self) -> tuple[tuple[int, ...], ...]:
@@ -87,16 +70,7 @@ class Automaton:
         Raises:
             NoAutomatonError: as `transitions`.
         """
-        diagrams, moves = self._diagrams()
-        found: dict[int, tuple[int, ...]] = {}
-        visits = 0
-        for move in moves:
-            if move not in found:
-                nodes = nodes_of(diagrams, move)
-                visits = _counted(visits, len(nodes))
-                leaves = [diagrams[each].low for each in nodes if diagrams[each].variable == LEAF]
-                found[move] = tuple(sorted(leaves))
-        return tuple(found[move] for move in moves)
+        return successors_of(self._moves)
 
     @property
     def has_returns(self) -> bool:
@@ -242,6 +216,10 @@ class Automaton:
     def _transitions_by_ends(self) -> dict[tuple[int, int], Transition]:
         return {(each.source, each.target): each for each in self.transitions}
 
+    @property
+    def _moves(self) -> Moves:
+        return moves_of(self.entries, self.decisions)
+
     def _distances(self, goal: Collection[int], without: Collection[tuple[int, int]] = ()) -> dict[int, int]:
         """For each state that can reach a goal, how many samples that takes."""
         before: dict[int, list[int]] = {}
@@ -264,18 +242,6 @@ class Automaton:
             goal -= {self.initial}
         return frozenset(self._distances(goal))
 
-    def _diagrams(self) -> tuple[Diagrams, list[int]]:
-        """The moves as diagrams with states as leaves, and for each state its node."""
-        diagrams = Diagrams()
-        nodes: list[int] = []
-
-        def node(place: int) -> int:
-            return diagrams.leaf(~place) if place < 0 else nodes[place]
-
-        for proposition, low, high in self.decisions:
-            nodes.append(diagrams.decide(proposition, node(low), node(high)))
-        return diagrams, [node(place) for place in self.entries]
-
     def _check(self, state: int, symbol: Sequence[object]) -> None:
         self._check_state(state)
         if len(symbol) != len(self.propositions):
@@ -286,43 +252,6 @@ class Automaton:
     def _check_state(self, state: int) -> None:
         if state not in self.states:
             raise UsageError(f"no state {state!r}; there are 0 to {len(self.states) - 1}")
-
-
-class _Leading:
-    """Whether moves lead to a state, as functions of the propositions."""
-
-    def __init__(self, diagrams: Diagrams) -> None:
-        self._diagrams = diagrams
-        self._known: dict[int, dict[int, int]] = {}
-        self._visits = 0
-
-    def to(self, target: int, node: int) -> int:
-        """Where a node leads to a state.
-
-        Raises:
-            NoAutomatonError: that, and what was asked before, takes more than `MAX_VISITS`.
-        """
-        known = self._known.setdefault(target, {})
-        before = len(known)
-        result = self._copied(target, node, known)
-        self._visits = _counted(self._visits, len(known) - before)
-        return result
-
-    def _copied(self, target: int, node: int, known: dict[int, int]) -> int:
-        if node not in known:
-            variable, low, high = self._diagrams[node]
-            if variable == LEAF:
-                known[node] = YES if low == target else NO
-            else:
-                branches = self._copied(target, low, known), self._copied(target, high, known)
-                known[node] = self._diagrams.decide(variable, *branches)
-        return known[node]
-
-
-def _counted(visits: int, more: int) -> int:
-    if visits + more > MAX_VISITS:
-        raise NoAutomatonError(f"finding the automaton's moves takes more than {MAX_VISITS} steps")
-    return visits + more
 
 
 def automaton_of(machine: Machine, name: str, propositions: Sequence[Proposition]) -> Automaton:

@@ -2,30 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from types import MappingProxyType
 from typing import Literal, TypeAlias, get_args
 
-from spatial_replay.automata import mona
-from spatial_replay.automata.automaton import Automaton, automaton_of
+from spatial_replay.automata.automaton import MAX_PROPOSITIONS, MAX_ROWS, Automaton, automaton_of
 from spatial_replay.automata.machine import Machine, least
+from spatial_replay.automata.mona import compiled_by_mona
+from spatial_replay.automata.obstacles import too_large
 from spatial_replay.automata.progression import progressed
 from spatial_replay.automata.propositions import Propositions
 from spatial_replay.automata.skeleton import Skeleton
+from spatial_replay.automata.stored import automaton_from
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.spec.faults import Source, nearest_hint
 from spatial_replay.spec.formula import NamedSpec, Specification
+from spatial_replay.spec.specification import require_specification
 
 Compiler: TypeAlias = Literal["own", "mona"]
 """Who compiles: this package, or MONA."""
 
-MAX_PROPOSITIONS = 64
-"""How many propositions an automaton reads at most."""
-
-MAX_ROWS = 200_000
-"""How many states an automaton has at most, and how many decisions."""
+_NAMES: MappingProxyType[Compiler, str] = MappingProxyType({"own": "this package", "mona": "MONA"})
 
 
 def automaton(
-    specification: Specification, name: str | None = None, *, compiler: Compiler | None = None
+    specification: Specification,
+    name: str | None = None,
+    *,
+    compiler: Compiler | None = None,
+    stored: Iterable[bytes] = (),
 ) -> Automaton:
     """The automaton of a spec: which runs satisfy it, sample by sample.
 
@@ -35,11 +40,13 @@ def automaton(
         name: which spec of the file; without it, its only result.
         compiler: "own" or "mona"; both give equal automata. Without it, that of this package, and where that
             reaches its limits, MONA.
+        stored: automata as files; one of this spec is taken rather than asking MONA.
 
     Raises:
         NoAutomatonError: past operators, bounds in seconds, or too large.
-        UsageError: no such spec, several to choose from, no such compiler.
+        UsageError: no specification, no such spec, several to choose from, no such compiler.
     """
+    require_specification(specification)
     if compiler is not None and compiler not in get_args(Compiler):
         raise UsageError(f"no compiler {compiler!r}; there are 'own' and 'mona'")
     spec = _chosen(specification, name)
@@ -48,46 +55,48 @@ def automaton(
     skeleton = Skeleton(spec.formula, propositions, source)
     count = len(propositions.all)
     if count > MAX_PROPOSITIONS:
-        raise NoAutomatonError(
-            f"{spec.name} has {count} propositions, an automaton at most {MAX_PROPOSITIONS}; "
-            "it is evaluated all the same; for automata, split it into several specs"
-        )
-    machine = _compiled(spec.name, skeleton, count, compiler)
+        reason = f"it has {count} propositions, an automaton at most {MAX_PROPOSITIONS}"
+        raise too_large(spec, source, [reason])
+    reasons = []
+    for each in get_args(Compiler) if compiler is None else (compiler,):
+        if each == "mona" and (before := _stored(stored, specification, spec)) is not None:
+            return before
+        try:
+            machine = (
+                progressed(skeleton, count) if each == "own" else compiled_by_mona(spec.formula, propositions)
+            )
+        except NoAutomatonError as error:
+            reasons.append(f"{_NAMES[each]}: {error}")
+            continue
+        return _value(machine, spec, propositions, source)
+    raise too_large(spec, source, reasons)
+
+
+def _stored(stored: Iterable[bytes], specification: Specification, spec: NamedSpec) -> Automaton | None:
+    read = (automaton_from(data, specification, spec) for data in stored)
+    return next((each for each in read if each is not None), None)
+
+
+def _value(machine: Machine, spec: NamedSpec, propositions: Propositions, source: Source | None) -> Automaton:
+    """The automaton that is kept of what a compiler gave.
+
+    Raises:
+        NoAutomatonError: it is too large to be kept.
+    """
     try:
         result = automaton_of(least(machine), spec.name, propositions.all)
         rows = max(len(result.entries), len(result.decisions))
         if rows > MAX_ROWS:
-            raise NoAutomatonError(
-                f"the automaton takes {rows} states or decisions, at most {MAX_ROWS} are kept"
+            raise too_large(
+                spec, source, [f"it takes {rows} states or decisions, at most {MAX_ROWS} are kept"]
             )
         # once here, so that what is handed out has guards
         result.transitions  # noqa: B018
     except RecursionError:
-        raise NoAutomatonError(f"{spec.name}: the automaton's decisions are nested too deeply") from None
+        raise too_large(spec, source, ["its decisions are nested too deeply"]) from None
     except NoAutomatonError as error:
-        raise NoAutomatonError(f"{spec.name}: {error}; split it into several specs") from error
+        raise too_large(spec, source, [str(error)]) from error
     return result
-
-
-def _compiled(name: str, skeleton: Skeleton, propositions: int, compiler: Compiler | None) -> Machine:
-    if compiler != "mona":
-        try:
-            return progressed(skeleton, propositions)
-        except NoAutomatonError as error:
-            if compiler == "own":
-                raise NoAutomatonError(f"{name}: {error}; split it into several specs") from error
-            if not mona.is_installed():
-                raise NoAutomatonError(
-                    f"{name}: {error}; MONA may still compile it: {mona.INSTALL}"
-                ) from error
-    elif not mona.is_installed():
-        raise NoAutomatonError(
-            f"{name}: MONA is not installed; {mona.INSTALL}, or let this package compile it"
-        )
-    try:
-        return mona.compiled_by_mona(skeleton, propositions)
-    except NoAutomatonError as error:
-        raise NoAutomatonError(f"{name}: {error}; split it into several specs") from error
 
 
 def _chosen(specification: Specification, name: str | None) -> NamedSpec:

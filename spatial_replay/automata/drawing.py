@@ -5,7 +5,8 @@ from __future__ import annotations
 import shutil
 import subprocess
 
-from spatial_replay.automata.automaton import Automaton, Transition
+from spatial_replay.automata.automaton import Automaton
+from spatial_replay.automata.moves import Transition
 from spatial_replay.errors import OutputError, UsageError
 from spatial_replay.palette import NEGATIVE, POSITIVE, hexadecimal, light
 

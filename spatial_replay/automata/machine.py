@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from spatial_replay.automata.diagrams import LEAF, Diagrams, copied
@@ -48,51 +48,61 @@ def least(machine: Machine) -> Machine:
 
 
 def _classes(machine: Machine) -> list[int]:
-    """For each state the number of its class: which runs from it on are accepted, the empty one included."""
-    classes = _told_apart(machine)
-    count = len(set(classes))
-    while True:
-        copy = _relabelled(machine, Diagrams(), classes)
-        numbers: dict[tuple[int, int], int] = {}
-        signatures = list(zip(classes, map(copy, machine.moves), strict=True))
-        classes = [numbers.setdefault(signature, len(numbers)) for signature in signatures]
-        if len(numbers) == count:
-            return classes
-        count = len(numbers)
+    """For each state the number of its class: which runs from it on are accepted, the empty one included.
 
-
-def _told_apart(machine: Machine) -> list[int]:
-    """For each state a number, equal for all states of a class, and other ones where that is soon seen.
-
-    That is how far it is to acceptance and rejection, and to where either is for good. Along a chain of
-    states, refining classes step by step would take as many steps as the chain is long.
+    Classes are split until the moves of all members lead to the same ones. The largest part of a class keeps
+    its number, so that few states have to be looked at again (Hopcroft, 1971).
     """
+    classes = [int(accepts) for accepts in machine.accepting]
+    # the members of each class, by where their moves lead to
+    parts: list[dict[int, set[int]]] = [{}, {}]
+    leading: dict[int, int] = {}
+    before = _before(machine)
+    diagrams = Diagrams()
+    unsure: Collection[int] = range(len(classes))
+    while unsure:
+        copy = _relabelled(machine, diagrams, classes)
+        for state in unsure:
+            own = parts[classes[state]]
+            if state in leading:
+                _take(own, leading[state], state)
+            leading[state] = copy(machine.moves[state])
+            own.setdefault(leading[state], set()).add(state)
+        moved = _split(parts, classes, dict.fromkeys(classes[state] for state in unsure))
+        unsure = dict.fromkeys(source for state in moved for source in before[state])
+    numbers: dict[int, int] = {}
+    return [numbers.setdefault(each, len(numbers)) for each in classes]
+
+
+def _take(parts: dict[int, set[int]], node: int, state: int) -> None:
+    """Take a state out of its part of a class."""
+    parts[node].remove(state)
+    if not parts[node]:
+        del parts[node]
+
+
+def _split(parts: list[dict[int, set[int]]], classes: list[int], touched: Iterable[int]) -> list[int]:
+    """Make all parts of some classes but the largest classes of their own; gives the states in these."""
+    moved: list[int] = []
+    for number in touched:
+        own = parts[number]
+        largest = max(own, key=lambda node: len(own[node]))
+        for node in [each for each in own if each != largest]:
+            members = own.pop(node)
+            for state in members:
+                classes[state] = len(parts)
+            parts.append({node: members})
+            moved += sorted(members)
+    return moved
+
+
+def _before(machine: Machine) -> list[list[int]]:
+    """For each state those from which a sample can lead to it."""
     before: list[list[int]] = [[] for _ in machine.moves]
     for state, node in enumerate(machine.moves):
         for target in leaves_of(machine.diagrams, node):
             before[target].append(state)
-    columns = []
-    for accepts in (False, True):
-        goal = [state for state, accepting in enumerate(machine.accepting) if accepting == accepts]
-        distances = _distances(before, goal)
-        out_of_reach = [state for state, distance in enumerate(distances) if distance < 0]
-        columns += [distances, _distances(before, out_of_reach)]
-    numbers: dict[tuple[int, ...], int] = {}
-    return [numbers.setdefault(row, len(numbers)) for row in zip(*columns, strict=True)]
-
-
-def _distances(before: list[list[int]], goal: list[int]) -> list[int]:
-    """For each state how many samples it takes at least to a goal; -1 where none leads there."""
-    distances = [-1] * len(before)
-    for state in goal:
-        distances[state] = 0
-    waiting = list(goal)
-    for state in waiting:
-        for source in before[state]:
-            if distances[source] < 0:
-                distances[source] = distances[state] + 1
-                waiting.append(source)
-    return distances
+    return before
 
 
 def _first(moves: list[int], accepting: list[bool], start: int) -> int:

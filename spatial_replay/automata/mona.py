@@ -1,4 +1,4 @@
-"""The compiler by others: formulas as programs for MONA, which runs as a process of its own."""
+"""The compiler by others: MONA, which runs as a process of its own."""
 
 from __future__ import annotations
 
@@ -7,16 +7,15 @@ import resource
 import shutil
 import subprocess
 from contextlib import suppress
-from functools import cache
 from threading import Timer
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from spatial_replay.automata.diagrams import Diagrams
 from spatial_replay.automata.machine import Machine
-from spatial_replay.automata.skeleton import Skeleton
+from spatial_replay.automata.mona_program import mona_program
+from spatial_replay.automata.propositions import Propositions
 from spatial_replay.errors import NoAutomatonError
-
-INSTALL = "apt-get install mona"
+from spatial_replay.spec.formula import Formula
 
 _TIMEOUT_S = 10.0
 _MAX_MEMORY = 4 * 2**30
@@ -25,10 +24,8 @@ _MAX_OUTPUT = 32 * 2**20
 """Bytes that are read of what MONA prints."""
 _MAX_MOVES = 100_000
 """Moves that are taken of an automaton."""
-_MAX_TEXT = 200_000
-"""Characters of a formula as a text."""
-_MAX_DEPTH = 60
-"""How deep a formula may nest: the translation into MONA's language recurses."""
+_MAX_PROGRAM = 1_000_000
+"""Characters of a program that are given to MONA."""
 
 _HEADER = re.compile(r"DFA for formula with free variables:(.*)")
 _ACCEPTING = re.compile(r"Accepting states:([ \d]*)")
@@ -36,73 +33,26 @@ _COUNT = re.compile(r"Automaton has (\d+) states?")
 _MOVE = re.compile(r"State (\d+): ([01X]*) -> state (\d+)")
 
 
-def is_installed() -> bool:
-    """Whether there is a MONA to run."""
-    return shutil.which("mona") is not None
-
-
-def compiled_by_mona(skeleton: Skeleton, propositions: int) -> Machine:
-    """The automaton of a skeleton over so many propositions.
+def compiled_by_mona(formula: Formula, propositions: Propositions) -> Machine:
+    """The automaton of a formula without past operators.
 
     Raises:
         NoAutomatonError: MONA is not installed, fails or takes too long; a formula too large for it.
     """
-    return _machine(_output(_program(_text(skeleton))), propositions)
+    return machine_of(mona_program(formula, propositions), len(propositions.all))
 
 
-def _text(skeleton: Skeleton) -> str:
-    """The formula as others write LTLf, every operand in brackets."""
-    texts: list[str] = []
-    depths: list[int] = []
-    for kind, first, second in skeleton.nodes:
-        if kind == "literal":
-            texts.append(f"p{first}" if second else f"!(p{first})")
-            depths.append(1)
-            continue
-        if kind in ("true", "false"):
-            texts.append(kind)
-            depths.append(1)
-            continue
-        operands = [first] if kind in ("X", "WX") else [first, second]
-        depths.append(1 + max(depths[each] for each in operands))
-        written = [texts[each] for each in operands]
-        if depths[-1] > _MAX_DEPTH or sum(map(len, written)) > _MAX_TEXT:
-            raise NoAutomatonError("the formula is too large for MONA, with its bounds unrolled into steps")
-        texts.append(_written(kind, written))
-    return texts[skeleton.root]
+def machine_of(program: str, propositions: int) -> Machine:
+    """The automaton of a program about the sets `P0`, `P1` and so on, one for each proposition.
 
-
-def _written(kind: str, operands: list[str]) -> str:
-    match kind, operands:
-        case "U", ["true", operand]:
-            return f"F({operand})"
-        case "R", ["false", operand]:
-            return f"G({operand})"
-        case _, [operand]:
-            return f"{kind}({operand})"
-    operator = {"and": "&", "or": "|"}.get(kind, kind)
-    return f"({operands[0]}) {operator} ({operands[1]})"
-
-
-class _Parser(Protocol):
-    def __call__(self, text: str) -> object: ...
-
-
-@cache
-def _parser() -> _Parser:
-    from ltlf2dfa.parser.ltlf import LTLfParser
-
-    parser: _Parser = LTLfParser()
-    return parser
-
-
-def _program(text: str) -> str:
-    """The formula in MONA's language."""
-    from ltlf2dfa.base import MonaProgram
-
-    program: str = MonaProgram(_parser()(text)).mona_program()
-    # its first line repeats the formula in a comment
-    return program.partition("\n")[2]
+    Raises:
+        NoAutomatonError: as `compiled_by_mona`.
+    """
+    if len(program) > _MAX_PROGRAM:
+        raise NoAutomatonError(
+            f"its program has {len(program)} characters, at most {_MAX_PROGRAM} are given to it"
+        )
+    return _machine(_output(program), propositions)
 
 
 def _output(program: str) -> str:
@@ -112,7 +62,7 @@ def _output(program: str) -> str:
     """
     executable = shutil.which("mona")
     if executable is None:
-        raise NoAutomatonError(f"MONA is not installed; {INSTALL}")
+        raise NoAutomatonError("it is not installed, and may still compile it: apt-get install mona")
     command = [executable, "-q", "-u", "-w", "/dev/stdin"]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
@@ -128,12 +78,12 @@ def _output(program: str) -> str:
             timer.cancel()
             process.kill()
     if len(printed) > _MAX_OUTPUT:
-        raise NoAutomatonError("the automaton is larger than what is read of MONA's output")
+        raise NoAutomatonError(f"it printed more than {_MAX_OUTPUT} bytes")
     if process.returncode == -9:
-        raise NoAutomatonError(f"MONA was ended after {_TIMEOUT_S:g} s or for lack of memory")
+        raise NoAutomatonError(f"it was ended after {_TIMEOUT_S:g} s or for lack of memory")
     if process.returncode != 0:
         last = printed.decode("ascii", "replace").strip().splitlines()[-1:]
-        raise NoAutomatonError(f"MONA ended with code {process.returncode}: {''.join(last)[:200]}")
+        raise NoAutomatonError(f"it ended with code {process.returncode}: {''.join(last)[:200]}")
     return printed.decode("ascii", "replace")
 
 
@@ -164,7 +114,7 @@ def _machine(printed: str, propositions: int) -> Machine:
     """The automaton that MONA printed; its state 0 only leads to the one in which a run begins."""
     header, accepting, count = (pattern.search(printed) for pattern in (_HEADER, _ACCEPTING, _COUNT))
     if header is None or accepting is None or count is None:
-        raise NoAutomatonError(f"MONA printed no automaton: {printed.strip()[:200]!r}")
+        raise NoAutomatonError(f"it printed no automaton: {printed.strip()[:200]!r}")
     order = [int(name.removeprefix("P")) for name in header[1].split()]
     states = int(count[1])
     found = _MOVE.findall(printed)
@@ -177,7 +127,7 @@ def _machine(printed: str, propositions: int) -> Machine:
             letters[number] = letter
         cubes[int(state)].append(_Cube("".join(letters), int(target)))
     if not all(cubes):
-        raise NoAutomatonError("MONA printed an automaton without moves from some state")
+        raise NoAutomatonError("it printed an automaton without moves from some state")
     diagrams = Diagrams()
     moves = tuple(_node(diagrams, each, 0) for each in cubes)
     first = cubes[0][0].target
@@ -192,5 +142,5 @@ def _node(diagrams: Diagrams, cubes: list[_Cube], variable: int) -> int:
         return diagrams.leaf(target)
     low, high = ([cube for cube in cubes if cube.symbol[variable] != other] for other in ("1", "0"))
     if not low or not high:
-        raise NoAutomatonError(f"MONA printed moves that leave {symbol!r} open")
+        raise NoAutomatonError(f"it printed moves that leave {symbol!r} open")
     return diagrams.decide(variable, _node(diagrams, low, variable + 1), _node(diagrams, high, variable + 1))

@@ -8,69 +8,47 @@ of that sample and, in obligations, of the next.
 
 from __future__ import annotations
 
-from contextlib import suppress
-
 from spatial_replay.automata.diagrams import NO, YES, Diagrams, copied
 from spatial_replay.automata.machine import Machine
+from spatial_replay.automata.obligations import Obligations
 from spatial_replay.automata.skeleton import FALSE, TRUE, Skeleton
 from spatial_replay.errors import NoAutomatonError
 
-MAX_STATES = 1000
+MAX_STATES = 5000
 """How many states are followed at most, before equivalent ones are joined."""
 
 MAX_DECISIONS = 150_000
 """How many nodes the decision diagrams may have."""
 
-_MOST_CHAINED = 250
-"""With more obligations from unrolled windows, diagrams that relate them would nest too deeply."""
 
-
-def progressed(skeleton: Skeleton, propositions: int, *, related: bool | None = None) -> Machine:
+def progressed(skeleton: Skeleton, propositions: int) -> Machine:
     """The automaton of a skeleton over so many propositions.
-
-    Args:
-        related: whether states leave out obligations that follow from others: with deadlines, that may take
-            far fewer states, but larger diagrams. By default, only if it does not go without.
 
     Raises:
         NoAutomatonError: it would take more than `MAX_STATES` or `MAX_DECISIONS`.
     """
-    if related is None:
-        if not 0 < len(skeleton.chains) <= _MOST_CHAINED:
-            related = False
-        else:
-            with suppress(NoAutomatonError):
-                return progressed(skeleton, propositions, related=False)
-            related = True
     try:
-        return _Progression(skeleton, propositions, related=related).machine()
+        return _Progression(skeleton, propositions).machine()
     except RecursionError:
         raise NoAutomatonError("the automaton takes decisions that are nested too deeply") from None
 
 
 class _Progression:
-    """One attempt.
+    """The states of a skeleton, as they are found."""
 
-    Where obligations from one unrolled window are *related*, states do not differ by those that follow from
-    others: a sooner deadline implies a later one. That takes larger diagrams, and often far fewer states.
-    """
-
-    def __init__(self, skeleton: Skeleton, propositions: int, *, related: bool) -> None:
+    def __init__(self, skeleton: Skeleton, propositions: int) -> None:
         self._skeleton = skeleton
         self._propositions = propositions
         self._diagrams = Diagrams(MAX_DECISIONS)
-        self._obligations: dict[tuple[int, bool], int] = {}
-        self._asked: list[tuple[int, bool]] = []
+        self._obligations = Obligations(self._diagrams, propositions, skeleton.chains)
         self._now: dict[int, int] = {FALSE: NO, TRUE: YES}
         self._next: dict[int, int] = {NO: NO, YES: YES}
-        self._consistent = self._consequences() if related else YES
 
     def machine(self) -> Machine:
         states: dict[int, int] = {}
         waiting: list[int] = []
 
         def number(node: int) -> int:
-            node = self._diagrams.both(node, self._consistent)
             if node not in states:
                 if len(waiting) == MAX_STATES:
                     raise NoAutomatonError(f"the automaton takes more than {MAX_STATES} states")
@@ -84,20 +62,6 @@ class _Progression:
         # the list grows as moves lead to states that are new
         moves = tuple(copy(self._after(node)) for node in waiting)
         return Machine(result, moves, tuple(map(self._accepts, waiting)), start)
-
-    def _consequences(self) -> int:
-        """What always holds between obligations from one unrolled window."""
-        chains = self._skeleton.chains
-        diagrams, result = self._diagrams, YES
-        for shorter, strong in chains:
-            # one after the other, which keeps diagrams small
-            self._obligation(shorter, strong)
-        for (shorter, strong), longer in reversed(chains.items()):
-            if (longer, strong) in self._obligations:
-                pair = self._obligation(shorter, strong), self._obligation(longer, strong)
-                sooner, later = pair if strong else pair[::-1]
-                result = diagrams.both(result, diagrams.choose(sooner, later, YES))
-        return result
 
     def _read(self, number: int) -> int:
         """What a subformula says of this sample and, in obligations, of the next."""
@@ -117,34 +81,31 @@ class _Progression:
             case "or":
                 return diagrams.either(self._read(first), self._read(second))
             case "X" | "WX":
-                return self._obligation(first, kind == "X")
+                return self._obligations.diagram((first, kind == "X"))
             case "U":
-                later = diagrams.both(self._read(first), self._obligation(number, True))
+                later = diagrams.both(self._read(first), self._obligations.diagram((number, True)))
                 return diagrams.either(self._read(second), later)
             case "R":
-                later = diagrams.either(self._read(first), self._obligation(number, False))
+                later = diagrams.either(self._read(first), self._obligations.diagram((number, False)))
                 return diagrams.both(self._read(second), later)
         raise ValueError(kind)
-
-    def _obligation(self, number: int, strong: bool) -> int:
-        """That a subformula holds in the next sample; unless `strong`, only if there is one."""
-        key = (number, strong)
-        if key not in self._obligations:
-            self._obligations[key] = self._propositions + len(self._asked)
-            self._asked.append(key)
-        return self._diagrams.variable(self._obligations[key])
 
     def _after(self, node: int) -> int:
         """What is left of a state after a sample: the states, under decisions on propositions."""
         if node not in self._next:
-            variable, low, high = self._diagrams[node]
-            obliged = self._read(self._asked[variable - self._propositions][0])
-            self._next[node] = self._diagrams.choose(obliged, self._after(high), self._after(low))
+            chain = self._obligations.chain(self._diagrams[node].variable)
+            *cases, (_, rest) = self._obligations.cases(chain, node)
+            result = self._after(rest)
+            for below, rest in reversed(cases):
+                obliged = self._read(chain.members[below - 1])
+                result = self._diagrams.choose(obliged, self._after(rest), result)
+            self._next[node] = result
         return self._next[node]
 
     def _accepts(self, node: int) -> bool:
         """Whether nothing is left to hold if the run has ended."""
         while node not in (NO, YES):
             variable, low, high = self._diagrams[node]
-            node = low if self._asked[variable - self._propositions][1] else high
+            # of strong obligations none is met then, of weak ones each
+            node = high if self._obligations.chain(variable).strong else low
         return node == YES

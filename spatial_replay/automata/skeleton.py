@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
+from spatial_replay.automata.obstacles import obstacle, refuse_operators, written
 from spatial_replay.automata.propositions import Propositions, is_spatial
 from spatial_replay.errors import NoAutomatonError
 from spatial_replay.spec.faults import Source
-from spatial_replay.spec.format import format_bound
-from spatial_replay.spec.formula import PAST_OPERATORS, Boolean, Bound, Formula, Temporal, Truth, iter_nodes
+from spatial_replay.spec.formula import Boolean, Bound, Formula, Temporal, Truth
 
-MAX_NODES = 4000
+MAX_NODES = 10_000
 """How many subformulas a skeleton has at most, once its bounds are unrolled."""
 
 Kind = Literal["false", "true", "literal", "and", "or", "X", "WX", "U", "R"]
@@ -51,7 +51,7 @@ class Skeleton:
         Raises:
             NoAutomatonError: past operators, bounds in seconds, more than `MAX_NODES` subformulas.
         """
-        _refuse(formula, source)
+        refuse_operators(formula, source)
         self.nodes: list[Node] = []
         self._numbers: dict[Node, int] = {}
         self._propositions = propositions
@@ -131,7 +131,8 @@ class Skeleton:
             result = right
             for _ in range(upper - lower):
                 shorter, result = result, free(right, hold(left, self._next(result, strong)))
-                self.chains.setdefault((shorter, strong), result)
+                if result != shorter:
+                    self.chains.setdefault((shorter, strong), result)
         for _ in range(lower):
             result = hold(left, self._next(result, strong))
         return result
@@ -164,48 +165,7 @@ class Skeleton:
         return self._numbers[node]
 
     def _too_large(self) -> NoAutomatonError:
-        what, place = "the formula", self._unrolled
-        if place is not None and place.bound is not None:
-            what = f"`{place.operator}{format_bound(place.bound)}`"
-        return NoAutomatonError(
-            _at(
-                self._source,
-                place,
-                f"with {what} unrolled into steps, there are more than {MAX_NODES} subformulas",
-                "it is evaluated all the same; for an automaton, write smaller bounds",
-            )
-        )
-
-
-def _refuse(formula: Formula, source: Source | None) -> None:
-    """That no operator looks back or counts seconds.
-
-    Raises:
-        NoAutomatonError: with every operator that does.
-    """
-    faults = []
-    for _, _, node in iter_nodes(formula):
-        if not isinstance(node, Temporal):
-            continue
-        if node.operator in PAST_OPERATORS:
-            message = f"`{node.operator}` looks back: there is no automaton for past operators"
-            faults.append(_at(source, node, message, "it is evaluated all the same"))
-        elif node.bound is not None and _counts_seconds(node.bound):
-            written = node.operator + format_bound(node.bound)
-            message = f"`{written}` counts seconds, an automaton counts samples"
-            hint = "it is evaluated all the same; for an automaton, bound it in samples"
-            faults.append(_at(source, node, message, hint))
-    if faults:
-        raise NoAutomatonError("\n".join(dict.fromkeys(faults)))
-
-
-def _counts_seconds(bound: Bound) -> bool:
-    """Whether the bound depends on times: not if it is only this sample, or all from this one on."""
-    return bound.unit == "ns" and (bound.lower > 0 or bound.upper not in (0, None))
-
-
-def _at(source: Source | None, node: Formula | None, message: str, hint: str) -> str:
-    """A message with the place of a node."""
-    if source is None or node is None:
-        return f"{message}; {hint}"
-    return str(source.diagnostic("error", node.span, message, hint))
+        place = self._unrolled
+        what = "the formula" if place is None else f"`{written(place)}`"
+        message = f"with {what} unrolled into steps, there are more than {MAX_NODES} subformulas"
+        return obstacle(self._source, place, message, "for an automaton, write smaller bounds")

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 
-from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.compiling import MAX_PROPOSITIONS, MAX_ROWS
+from spatial_replay.automata.automaton import MAX_PROPOSITIONS, MAX_ROWS, Automaton
 from spatial_replay.automata.propositions import Propositions
 from spatial_replay.errors import NoAutomatonError
 from spatial_replay.spec.format import format_formula

@@ -23,6 +23,7 @@ from spatial_replay.spec.faults import nearest_hint
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Diagnostic, Formula, Specification, iter_nodes, operator_of
 from spatial_replay.spec.objects import check_names
+from spatial_replay.spec.specification import require_specification
 from spatial_replay.trace.times import FOREVER
 from spatial_replay.trace.trace import Trace, window_of
 
@@ -332,16 +333,6 @@ def evaluate(
         evidence = Evidence(own.instance, specification.regions, lambda: [trace])
         results.append(_result(own, stretch, Inquiry(evidence, stretch.times_ns, stretch.leaves, semantics)))
     return Evaluation(tuple(results), semantics, specification, trace.names, tuple(trace.signals))
-
-
-def require_specification(value: object) -> None:
-    """
-    Raises:
-        UsageError: for anything else than a specification.
-    """
-    if not isinstance(value, Specification):
-        remedy = "give a Specification, from parse_specification(text) or load_specification(path)"
-        raise UsageError(f"specification is {shortened(value)}; {remedy}")
 
 
 def require_time(value: object, name: str) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 
-from spatial_replay.automata.automaton import Automaton, Transition
+from spatial_replay.automata.automaton import Automaton
+from spatial_replay.automata.moves import Transition
 from spatial_replay.planning.step import Consideration, Edge, Guards
 
 

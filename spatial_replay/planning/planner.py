@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from spatial_replay.automata.automaton import Automaton, Transition
+from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compiling import automaton as automaton_of
+from spatial_replay.automata.moves import Transition
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.planning.candidates import Movables, with_choice
 from spatial_replay.planning.edges import consideration_of, why_no_path, worst_state

@@ -132,6 +132,16 @@ def load_specification(
     )
 
 
+def require_specification(value: object) -> None:
+    """
+    Raises:
+        UsageError: for anything else than a specification.
+    """
+    if not isinstance(value, Specification):
+        remedy = "give a Specification, from parse_specification(text) or load_specification(path)"
+        raise UsageError(f"specification is {shortened(value)}; {remedy}")
+
+
 def _require_text(value: object) -> None:
     if not isinstance(value, str):
         remedy = "give the text as a str; load_specification(path) reads a file"

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from spatial_replay.automata.automaton import Automaton, Transition
+from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compiling import automaton
 from spatial_replay.automata.drawing import dot_text, hoa_text, words_text
+from spatial_replay.automata.moves import Transition
 from spatial_replay.errors import UsageError
 from spatial_replay.spec.specification import parse_specification
 

@@ -102,25 +102,53 @@ def test_seconds_that_bound_nothing_are_no_obstacle() -> None:
     assert machine_of("G[0s, 0s] a ovlp b").accepting == machine_of("G[0, 0] a ovlp b").accepting
 
 
-@pytest.mark.parametrize("bound", ["[0, 4000]", "[5000, inf]", "[999999999, 9999999999]"])
+@pytest.mark.parametrize("bound", ["[0, 9999]", "[10000, inf]", "[999999999, 9999999999]"])
 def test_a_bound_of_too_many_samples_is_told(bound: str) -> None:
-    with pytest.raises(NoAutomatonError, match="unrolled into steps, there are more than 4000") as raised:
+    with pytest.raises(NoAutomatonError, match="unrolled into steps, there are more than 10000") as raised:
         machine_of(f"G{bound} a ovlp b")
     assert "task.spatial:1:1" in str(raised.value)
 
 
 def test_a_bound_of_many_samples_is_unrolled() -> None:
-    assert len(machine_of("F[0, 300] a ovlp b").states) == 303
+    assert len(machine_of("F[0, 4000] a ovlp b").states) == 4003
+    assert len(machine_of("(a ovlp b) U[0, 1000] (c ovlp d)").states) == 1003
 
 
-def test_deadlines_of_many_samples_take_a_state_for_each() -> None:
+@pytest.mark.parametrize("samples", [100, 249, 1000])
+def test_deadlines_of_many_samples_take_a_state_for_each(samples: int) -> None:
     # not one for each set of deadlines that are still to be met
-    assert len(machine_of("G (a ovlp b -> F[0, 100] c ovlp d)").states) == 102
+    assert len(machine_of(f"G (a ovlp b -> F[0, {samples}] c ovlp d)").states) == samples + 2
+
+
+def test_steps_within_one_another_are_followed() -> None:
+    assert len(machine_of(f"{'X ' * 90} a ovlp b").states) == 93
+
+
+def test_what_is_too_large_is_told_with_its_widest_window_and_every_reason() -> None:
+    text = "spec done = F (a ovlp b and F[0, 9] c ovlp d)\nspec slow = G (a ovlp b -> F[20, 20] c ovlp d)"
+    with pytest.raises(NoAutomatonError) as raised:
+        automaton(parse_specification(text, filename="task.spatial"), "slow", compiler="own")
+    assert str(raised.value).splitlines() == [
+        "task.spatial:2:28: error: `F[20, 20]` makes the automaton of slow too large: this package: the "
+        "automaton takes more than 5000 states",
+        "  spec slow = G (a ovlp b -> F[20, 20] c ovlp d)",
+        "                             ^^^^^^^^^^^^^^^^^^",
+        "  it is evaluated all the same; for an automaton, write smaller bounds, or split it into several "
+        "specs",
+    ]
+
+
+@pytest.mark.parametrize("value", ["F a ovlp b", None, b"F a ovlp b"])
+def test_what_is_no_specification_is_told(value: object) -> None:
+    with pytest.raises(
+        UsageError, match=r"specification is .*; give a Specification, from parse_specification"
+    ):
+        automaton(value)  # type: ignore[arg-type]
 
 
 def test_too_many_propositions_are_told() -> None:
     text = " and ".join(f"(F p{number} >= 0)" for number in range(65))
-    with pytest.raises(NoAutomatonError, match="65 propositions, an automaton at most 64"):
+    with pytest.raises(NoAutomatonError, match=r"`and` makes .* 65 propositions, an automaton at most 64"):
         machine_of(text)
 
 

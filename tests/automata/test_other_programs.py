@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 
 from automata.golden import FORMULAS
+from automata.ltlf import automaton_by_ltlf2dfa
 from laws.strategies_automaton import compiled, formulas_with_automata
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compiling import automaton
@@ -32,6 +33,13 @@ def test_both_compilers_give_one_automaton(formula) -> None:
     assert compiled(formula, "own") == compiled(formula, "mona")
 
 
+@needs_mona
+@pytest.mark.parametrize("text", [text for text in FORMULAS if "12]" not in text and "11]" not in text])
+def test_an_automaton_is_that_of_another_translation(text: str) -> None:
+    specification = parse_specification(text)
+    assert automaton(specification, compiler="mona") == automaton_by_ltlf2dfa(specification.specs[0])
+
+
 def _through_mona(text: str) -> Automaton:
     return automaton(parse_specification(text), compiler="mona")
 
@@ -48,14 +56,14 @@ def test_any_number_of_processes_compile_at_once() -> None:
 def test_mona_takes_over_where_this_package_reaches_its_limits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # 11^3 states for how long each has been waited for, and a trap
-    text = " and ".join(f"(G ((p{number} >= 0) -> F[0, 10] q{number} >= 0))" for number in range(3))
-    with pytest.raises(NoAutomatonError, match="more than 1000 states"):
-        automaton(parse_specification(text), compiler="own")
-    assert len(automaton(parse_specification(text)).states) == 1332
+    # whether it was so in each of the last 13 samples, and a trap
+    specification = parse_specification("G ((p >= 0) -> F[13, 13] q >= 0)")
+    with pytest.raises(NoAutomatonError, match="more than 5000 states"):
+        automaton(specification, compiler="own")
+    assert len(automaton(specification).states) == 2**13 + 1
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(NoAutomatonError, match="apt-get install mona"):
-        automaton(parse_specification(text))
+    with pytest.raises(NoAutomatonError, match=r"more than 5000 states; MONA: .*apt-get install mona"):
+        automaton(specification)
 
 
 def _program(folder: Path, name: str, script: str) -> None:
@@ -86,7 +94,9 @@ def test_what_goes_wrong_in_mona_is_told(
 def test_an_automaton_that_is_too_large_is_told() -> None:
     # 2^11 sets of what has been seen already
     text = " and ".join(f"(F p{number} >= 0)" for number in range(11))
-    with pytest.raises(NoAutomatonError, match="states and more than 100000 moves"):
+    with pytest.raises(NoAutomatonError, match=r"MONA: .* states and more than 100000 moves"):
+        automaton(parse_specification(text), compiler="mona")
+    with pytest.raises(NoAutomatonError, match=r"177147 transitions, at most 100000 are kept"):
         automaton(parse_specification(text))
 
 

@@ -11,12 +11,8 @@ from hypothesis import strategies as st
 from laws.reference import Prefix
 from laws.strategies_automaton import compiled, formulas_and_symbols, formulas_with_automata
 from laws.strategies_monitor import leaf_runs
-from spatial_replay.automata.automaton import Automaton, automaton_of
+from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compiling import automaton
-from spatial_replay.automata.machine import least
-from spatial_replay.automata.progression import progressed
-from spatial_replay.automata.propositions import Propositions
-from spatial_replay.automata.skeleton import Skeleton
 from spatial_replay.automata.stepping import Table
 from spatial_replay.automata.stored import automaton_from, stored_text
 from spatial_replay.spec.formula import NamedSpec, Specification
@@ -99,19 +95,6 @@ def test_no_literal_of_a_guard_can_be_left_out(formula):
                 wider = {number: value for number, value in cube if (number, value) != literal}
                 symbol = [wider.get(number) for number in range(len(machine.propositions))]
                 assert machine.step_set([each.source], symbol) != {each.target}
-
-
-@given(formulas_with_automata)
-def test_leaving_out_what_follows_changes_nothing(formula):
-    propositions = Propositions(formula)
-    skeleton = Skeleton(formula, propositions)
-    one, other = (
-        automaton_of(
-            least(progressed(skeleton, len(propositions.all), related=related)), "s", propositions.all
-        )
-        for related in (False, True)
-    )
-    assert one == other
 
 
 @given(formulas_with_automata)
