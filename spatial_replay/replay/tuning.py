@@ -19,6 +19,7 @@ from spatial_replay.monitor.stream import Stretch
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.replay.found import Replayed, ReplayedSpec, replayed_spec
+from spatial_replay.replay.own_messages import OwnMessages
 from spatial_replay.replay.selection import Selection
 from spatial_replay.replay.window import Window, first_sample_ns
 from spatial_replay.spec import parse_specification
@@ -39,6 +40,8 @@ class Tuning:
     Attributes:
         constants: those of the specifications, as they are written, by the names to change them by.
         trace: every sample that counts, those that are only looked back at included.
+        inside: those in the window.
+        own: the messages of the log itself.
         faults, remarks: what was lost while reading, and what else the source says.
     """
 
@@ -68,11 +71,13 @@ class Tuning:
         self._files = tuple(files)
         selection = Selection(source, window or Window(), self._files)
         self.window = selection.window
+        self.own = OwnMessages(selection)
         traces: list[Trace] = []
         remarks: list[str] = []
         for block, trace in selection.iter_blocks():
             traces.append(trace)
             remarks += block.remarks
+            self.own.add(block)
             advance(len(trace))
         self.trace = Trace.concatenate(traces)
         self.faults, self.remarks = tuple(self.trace.faults), tuple(dict.fromkeys(remarks))
@@ -89,6 +94,19 @@ class Tuning:
         """The log's name."""
         return self._source.name
 
+    def specifications(self, changed: Mapping[str, float | str]) -> list[Specification]:
+        """The specifications with other values for some constants, as `evaluate` takes them.
+
+        Raises:
+            UsageError: no such constant, a value of another kind.
+            SpecificationError: a specification that means nothing with these values.
+        """
+        values = [dict[str, float | str]() for _ in self._files]
+        for name, value in changed.items():
+            file, own = self._place(name, value)
+            values[file][own] = value
+        return [_with_constants(file, own) for file, own in zip(self._files, values, strict=True)]
+
     def evaluate(self, changed: Mapping[str, float | str] | None = None) -> Tuned:
         """The specifications over all samples, with other values for some constants.
 
@@ -99,11 +117,7 @@ class Tuning:
             UsageError: no such constant, a value of another kind, more numbers than are held at once.
             SpecificationError: a specification that means nothing with these values.
         """
-        values = [dict[str, float | str]() for _ in self._files]
-        for name, value in (changed or {}).items():
-            file, own = self._place(name, value)
-            values[file][own] = value
-        files = [_with_constants(file, own) for file, own in zip(self._files, values, strict=True)]
+        files = self.specifications(changed or {})
         held = Selection(MemorySource(self.trace, self.name), replace(self.window, every=1), files)
         kept = kept_files(files)
         instances = [held.instances(file, self._each) for file in kept]
