@@ -18,6 +18,9 @@ EVENT_LOG = "/spatial/log"
 DERIVED = frozenset({SCENE, SPECIFICATION, ROBUSTNESS, AUTOMATON, EVENTS, EVENT_LOG})
 """Topics computed from the samples and a specification: a replay replaces them."""
 
+CURVES = "/spatial/curves"
+"""What a live server says of the whole log; no file has it."""
+
 PLAN_DECISION = "/plan/decision"
 GRADIENT_MAP = "/plan/gradient_map"
 PLAN_PATH = "/plan/path"
