@@ -16,6 +16,7 @@ from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, Skill
 from spatial_replay.planning.settings_text import text_from_settings
 from spatial_replay.planning.step import Kind, Outcome, Step
+from spatial_replay.planning.warm_up import warm_up
 from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.runs.plan_loop import PlanLoop
 from spatial_replay.runs.run_log import run_log
@@ -93,6 +94,7 @@ def record_plan(
     _refuse_missing(kept, name)
     options = run_options(seed=seed, noise_m=noise_m, injections=injections)
     about = {"source": scenario, "seed": str(seed), "options": options, "planned": "true"}
+    warm_up()
     # a world or a planner that cannot be made leaves the output alone
     with closing(make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, gui=gui)) as world:
         planner = Planner(kept, settings_for(world), name=name)
