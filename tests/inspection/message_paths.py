@@ -39,10 +39,19 @@ def split(path: str) -> tuple[str, list[re.Match[str]]]:
 def values(log: Path, path: str) -> list[Any]:
     """What a path finds in a log, message after message."""
     topic, parts = split(path)
+    return [value for message in _decoded(log, topic) for value in _follow([message], parts)]
+
+
+def newest(log: Path, path: str) -> list[Any]:
+    """What a path finds in the last message of its topic."""
+    topic, parts = split(path)
+    return list(_follow(_decoded(log, topic)[-1:], parts))
+
+
+def _decoded(log: Path, topic: str) -> list[Any]:
     with log.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        decoded = reader.iter_decoded_messages(topics=[topic])
-        return [value for each in decoded for value in _follow([each.decoded_message], parts)]
+        return [each.decoded_message for each in reader.iter_decoded_messages(topics=[topic])]
 
 
 def _follow(items: list[Any], parts: list[re.Match[str]]) -> Iterator[Any]:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
 import spatial_replay as sr
+from inspection.layouts import layout_of, panels, paths_of
 from inspection.message_paths import split, values
 from spatial_replay.inspection.viewer import Contents, layout_for_live
 from spatial_replay.logs.source import MemorySource, open_source
@@ -29,31 +28,6 @@ def run(tmp_path: Path, text: str, **options: object) -> Path:
     files = [sr.parse_specification(text)]
     run_replay(MemorySource.from_samples(samples), files, output=output, **options)
     return output
-
-
-def layout_of(log: Path) -> dict:
-    with log.open("rb") as stream:
-        found = [each for each in make_reader(stream).iter_attachments() if each.name == "layout.json"]
-    assert len(found) == 1
-    return json.loads(found[0].data)
-
-
-def panels(tree: object) -> set[str]:
-    return {tree} if isinstance(tree, str) else panels(tree["first"]) | panels(tree["second"])
-
-
-def paths_of(config: Any) -> Iterator[str]:
-    """Every message path, and every topic, in a layout."""
-    if isinstance(config, str):
-        if config.startswith("/"):
-            yield config
-    elif isinstance(config, dict):
-        for key, value in config.items():
-            yield from paths_of(key)
-            yield from paths_of(value)
-    elif isinstance(config, list):
-        for value in config:
-            yield from paths_of(value)
 
 
 def check_layout(log: Path) -> dict:
