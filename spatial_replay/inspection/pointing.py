@@ -121,7 +121,10 @@ def pointers(judged: Sequence[Judged], trace: Trace, samples: Integers) -> Point
 
 
 def _worst(evaluated: Sequence[Evaluated], times_ns: Integers) -> tuple[Integers, Integers, Floats]:
-    """(S,) the worst of all concerns in each sample: of which result, which one, how bad it is."""
+    """(S,) the worst of all concerns in each sample: of which result, which one, how bad it is.
+
+    What is violated without a number, as when there is nobody to satisfy it, is passed over.
+    """
     result, concern = np.full(len(times_ns), -1, np.int64), np.full(len(times_ns), -1, np.int64)
     worst = np.full(len(times_ns), np.inf)
     for index, own in enumerate(evaluated):
@@ -131,7 +134,7 @@ def _worst(evaluated: Sequence[Evaluated], times_ns: Integers) -> tuple[Integers
         is_evaluated = own.times_ns[at] == times_ns
         for number, one in enumerate(own.concerns):
             now = one.sign * own.series[one.node, 1, at]
-            is_worse = is_evaluated & (now < worst)
+            is_worse = is_evaluated & (now < worst) & (now > -np.inf)
             result[is_worse], concern[is_worse], worst[is_worse] = index, number, now[is_worse]
     return result, concern, worst
 

@@ -431,6 +431,12 @@ def test_an_open_quantifier_and_a_look_back_have_no_arrow():
         assert "witness" not in {each.id for each in message.entities}
 
 
+def test_a_group_with_nobody_in_it_hides_no_arrow():
+    drink = 'group drinks = class "drink"\nspec s = F (exists o in drinks: o closeto[1] a)\n'
+    [message] = pointed(drink + "spec t = G a closeto[1] b", {"a": box_at(0.0), "b": box_at(3.0)})
+    assert arrow(message)[2] == "-1"
+
+
 def test_how_a_run_is_cut_moves_no_arrow():
     samples = [
         {"a": TrackedObject(box_at(0.0), height=(0.0, 2.0)), "b": box_at(x)} if x else {"b": box_at(1.0)}
