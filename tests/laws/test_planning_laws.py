@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 from hypothesis import given, settings
@@ -190,3 +191,28 @@ def test_a_target_is_free_and_holds_as_well_as_it_says(specification, options, s
     planner.observe(sr.Sample(1, {**scene, step.target.name: moved}))
     if options.margin > 0.0:
         assert planner.states == (step.considered[-1].edge[1],)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["a leftof b", "a dist c <= 1", "a above b and a above c"]))
+@settings(max_examples=60)
+def test_what_is_pushed_touches_nothing_on_its_way(seed, goal):
+    random = np.random.default_rng(seed)
+    workspace = Workspace(Grid(-6.0, -6.0, 0.5, 24, 24), farthest=7.0, clearance=0.25)
+    shape = sr.TrackedObject(sr.Footprint.box(0, 0, 1, 1))
+    scene = {name: moved_object(shape, *random.uniform(-5, 5, 2)) for name in ("b", "c")}
+    scene["a"] = moved_object(shape, *random.uniform(-10, 10, 2))
+    planner = Planner(sr.parse_specification(f"F ({goal})"), Settings(workspace, "push", movable=("a",)))
+    planner.observe(sr.Sample(0, scene))
+    step = planner.next_step()
+    if step.target is None:
+        return
+    clear = sr.Monitor(sr.parse_specification("a dist b > 0.25 and a dist c > 0.25"))
+    turns = [np.array(point) for point in step.target.waypoints[1:]]
+    cells = [
+        begin + share * (end - begin)
+        for begin, end in pairwise([*turns[:1], *turns])
+        for share in np.linspace(0.0, 1.0, 1 + round(2 * float(abs(end - begin).max())))
+    ]
+    for time_ns, place in enumerate(cells):
+        there = sr.Sample(time_ns, {**scene, "a": moved_object(shape, *place)})
+        assert clear.update(there).node("spec").now > 0.0
