@@ -44,16 +44,19 @@ class AnnotatedEvaluation:
         instances: Sequence[Sequence[Instance]],
         semantics: Semantics = "ltlf",
         compiled_before: Callable[[], Sequence[Attachment]] = list,
+        known: Sequence[KeptAutomaton] = (),
     ) -> None:
         """Start before the first sample.
 
         Args:
             instances: what to evaluate of each file.
             compiled_before: gives the attachments of a log; automata among them need no MONA.
+            known: automata of specs of these files, which are not compiled again.
         """
         self._files = files
         self._semantics = semantics
         self._compiled_before = compiled_before
+        self._known = known
         begin = partial(instance_evaluation, semantics=semantics)
         self._evaluations = [
             EvaluationStream(own, file.regions, begin) for own, file in zip(instances, files, strict=True)
@@ -88,7 +91,7 @@ class AnnotatedEvaluation:
     @cached_property
     def automata(self) -> Sequence[KeptAutomaton]:
         """Of each tree; compiled when first asked for, since not every evaluation is written down."""
-        return automata_of(self._files, self.trees, self._semantics, self._compiled_before())
+        return automata_of(self._files, self.trees, self._semantics, self._compiled_before(), self._known)
 
     def annotator(self, scene: SceneState | None = None) -> Annotator:
         """Who writes what is to be said of the samples, from the first on.

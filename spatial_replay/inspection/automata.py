@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compiling import automaton
 from spatial_replay.automata.drawing import size_words
-from spatial_replay.automata.stored import automaton_from, stored_text
+from spatial_replay.automata.stored import stored_text
 from spatial_replay.errors import NoAutomatonError
 from spatial_replay.inspection.specification import ReportedTree
 from spatial_replay.logs.sink import Attachment
@@ -50,14 +50,16 @@ def automata_of(
     trees: Sequence[ReportedTree],
     semantics: Semantics,
     compiled_before: Sequence[Attachment] = (),
+    known: Sequence[KeptAutomaton] = (),
 ) -> list[KeptAutomaton]:
     """The automaton of each tree's spec, one for each of `trees`; instances of a template share theirs.
 
     Args:
         compiled_before: attachments of a log; an automaton among them is taken where it would take MONA.
+        known: automata of specs of these files, which are not compiled again.
     """
     stored = [each.data for each in compiled_before if _is_stored(each)]
-    found: dict[int, KeptAutomaton] = {}
+    found = {id(each.spec.formula): each for each in known}
     for tree in trees:
         if id(tree.formula) not in found:
             file = files[tree.file]
@@ -103,14 +105,6 @@ def _kept(
     if semantics != "ltlf":
         return KeptAutomaton(name, file, spec, None, "an automaton is of the semantics ltlf")
     try:
-        # rather than read what a log claims, where that takes no other program
-        return KeptAutomaton(name, file, spec, automaton(file, spec.name, compiler="own"))
-    except NoAutomatonError:
-        for data in stored:
-            before = automaton_from(data, file, spec)
-            if before is not None:
-                return KeptAutomaton(name, file, spec, before)
-    try:
-        return KeptAutomaton(name, file, spec, automaton(file, spec.name))
+        return KeptAutomaton(name, file, spec, automaton(file, spec.name, stored=stored))
     except NoAutomatonError as error:
         return KeptAutomaton(name, file, spec, None, str(error))

@@ -99,7 +99,7 @@ class Recorder:
             self._writer = LogWriter(self._stream, clock=time.monotonic)
             self._recording = Recording(self._writer, files, about)
             self._flush()
-            warm_up(files)
+            warm_up(self._recording.files, self._recording.automata)
         except BaseException:
             with suppress(OutputError):
                 self._stream.close()

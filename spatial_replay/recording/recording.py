@@ -13,6 +13,7 @@ from spatial_replay.inspection.annotation import (
     specification_attachments,
 )
 from spatial_replay.inspection.annotator import messages_of
+from spatial_replay.inspection.automata import KeptAutomaton
 from spatial_replay.inspection.certificate import (
     MessageHash,
     ResultHash,
@@ -45,13 +46,18 @@ class Recording:
     """Writes samples to a sink as they come, in stretches of any length."""
 
     def __init__(
-        self, sink: Sink, files: Sequence[Specification] = (), about: Mapping[str, str] | None = None
+        self,
+        sink: Sink,
+        files: Sequence[Specification] = (),
+        about: Mapping[str, str] | None = None,
+        known: Sequence[KeptAutomaton] = (),
     ) -> None:
         """Write what comes before the first sample: metadata and specifications.
 
         Args:
             files: specifications to evaluate and write beside the samples.
             about: what else the metadata says: where the samples come from, a seed.
+            known: automata of specs of these files, which are not compiled again.
 
         Raises:
             UsageError: a template, since it stands for objects that are not known yet.
@@ -60,7 +66,7 @@ class Recording:
         self._files = files = kept_files(files)
         self._sink = sink
         self._evaluation = AnnotatedEvaluation(
-            files, [find_instances(file, {}, (), 0, FOREVER) for file in files]
+            files, [find_instances(file, {}, (), 0, FOREVER) for file in files], known=known
         )
         self._samples = 0
         self._topics: set[str] = set()
@@ -77,6 +83,16 @@ class Recording:
     def __len__(self) -> int:
         """How many samples were taken in."""
         return self._samples
+
+    @property
+    def files(self) -> Sequence[Specification]:
+        """The specifications, as the log keeps them."""
+        return self._files
+
+    @property
+    def automata(self) -> Sequence[KeptAutomaton]:
+        """One for each result, or why it has none."""
+        return self._evaluation.automata
 
     @property
     def verdicts(self) -> Mapping[str, Verdict]:

@@ -10,6 +10,7 @@ from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.contacts import contacts
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.geometry.measure import Operand
+from spatial_replay.inspection.automata import KeptAutomaton
 from spatial_replay.logs.sink import MemorySink
 from spatial_replay.recording.recording import Recording
 from spatial_replay.spec import object_names, signal_names
@@ -18,12 +19,15 @@ from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
 
-def warm_up(files: Sequence[Specification]) -> None:
+def warm_up(files: Sequence[Specification], automata: Sequence[KeptAutomaton]) -> None:
     """Record some samples into nothing, as the specifications will have it done.
 
     With nothing in the compiler's cache this takes many seconds, otherwise a fraction of one.
+
+    Args:
+        automata: those of the specifications.
     """
-    recording = Recording(MemorySink(), files)
+    recording = Recording(MemorySink(), files, known=automata)
     objects = ["object", *(name for file in files for name in object_names(file))]
     signals = {name: 0.0 for file in files for name in signal_names(file)}
     samples = [

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
+from spatial_replay.automata.automaton import Automaton
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.inspection.annotation import kept_files
+from spatial_replay.inspection.automata import KeptAutomaton
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.planning.black_box import PLAN_METADATA, BlackBox
 from spatial_replay.planning.planner import Planner
@@ -97,9 +99,9 @@ def record_plan(
     warm_up()
     # a world or a planner that cannot be made leaves the output alone
     with closing(make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, gui=gui)) as world:
-        planner = Planner(kept, settings_for(world), name=name)
         _check_names(kept, world.sample())
-        with run_log(output, [kept], about, inputs) as log:
+        planner = Planner(kept, settings_for(world), name=name)
+        with run_log(output, [kept], about, inputs, _known(kept, planner.automaton)) as log:
             plan = {
                 "settings": text_from_settings(planner.settings),
                 "file": kept.filename,
@@ -136,6 +138,15 @@ def _refuse_missing(file: Specification, name: str | None) -> None:
     results = [spec.name for spec in file.results]
     if name is not None and name not in results:
         raise UsageError(f"{file.filename} has no result {name!r}; its results are: {', '.join(results)}")
+
+
+def _known(file: Specification, automaton: Automaton) -> list[KeptAutomaton]:
+    """The automaton that is planned with, as a log keeps it."""
+    return [
+        KeptAutomaton(spec.name, file, spec, automaton)
+        for spec in file.results
+        if spec.name == automaton.name
+    ]
 
 
 def _check_names(file: Specification, sample: Sample) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from spatial_replay.inspection.automata import KeptAutomaton
 from spatial_replay.logs.block import Messages
 from spatial_replay.logs.mcap_writer import LogWriter
 from spatial_replay.logs.merging import merge
@@ -117,6 +118,7 @@ def run_log(
     files: Sequence[Specification] = (),
     about: Mapping[str, str] | None = None,
     inputs: Sequence[Path] = (),
+    known: Sequence[KeptAutomaton] = (),
 ) -> Iterator[RunLog]:
     """Open the log of a run, in place under its final name, and close it properly however the run ends.
 
@@ -126,6 +128,7 @@ def run_log(
         files: specifications to evaluate and write beside the samples.
         about: what else the metadata says: the scenario, a seed.
         inputs: files that the output must not be.
+        known: automata of specs of these files, which are not compiled again.
 
     Raises:
         UsageError: the output is an input, or a specification cannot be recorded.
@@ -136,7 +139,7 @@ def run_log(
     with terminable(), open_output(output) as stream:
         with uninterrupted():
             writer = LogWriter(stream)
-            log = RunLog(writer, Recording(writer, files, about))
+            log = RunLog(writer, Recording(writer, files, about, known))
         interrupted = True
         try:
             yield log

@@ -20,7 +20,9 @@ from spatial_replay.automata.compiling import automaton
 from spatial_replay.automata.drawing import svg_text
 from spatial_replay.automata.stored import automaton_from, stored_text
 from spatial_replay.errors import NoAutomatonError, OutputError, UsageError
+from spatial_replay.recording import Recorder
 from spatial_replay.spec.specification import parse_specification
+from spatial_replay.trace.sample import Sample
 
 needs_mona = pytest.mark.skipif(shutil.which("mona") is None, reason="MONA is not installed")
 needs_graphviz = pytest.mark.skipif(shutil.which("dot") is None, reason="Graphviz is not installed")
@@ -88,6 +90,15 @@ def test_what_goes_wrong_in_mona_is_told(
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     with pytest.raises(NoAutomatonError, match=told):
         _through_mona("F p >= 0")
+
+
+def test_a_recording_compiles_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _program(tmp_path, "mona", f"cat >/dev/null; echo asked >>{tmp_path}/asked; exit 3")
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    specification = parse_specification("G ((p >= 0) -> F[13, 13] q >= 0)")
+    with Recorder(tmp_path / "run.mcap", specifications=[specification]) as recorder:
+        recorder.write(Sample(0, {}, {"p": 0.0, "q": 0.0}))
+    assert (tmp_path / "asked").read_text() == "asked\n"
 
 
 @needs_mona

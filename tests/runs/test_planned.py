@@ -63,6 +63,10 @@ def test_names_that_the_world_does_not_have_are_refused(tmp_path: Path) -> None:
     with pytest.raises(sr.SpecificationError, match="never has the object 'pink'"):
         record_plan("push", tmp_path / "run.mcap", sr.parse_specification("F (pink leftof red)"))
     assert not (tmp_path / "run.mcap").exists()
+    # before anything else about the specification, such as how long its automaton takes
+    too_large = sr.parse_specification("G (pink leftof red -> F[30, 30] (red leftof blue))")
+    with pytest.raises(sr.SpecificationError, match="never has the object 'pink'"):
+        record_plan("push", tmp_path / "run.mcap", too_large)
 
 
 def test_a_bun_is_placed_on_a_plate(tmp_path: Path) -> None:
