@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -46,3 +47,14 @@ def data_folder() -> Path:
     if not folder or not Path(folder).is_dir():
         pytest.skip("SPATIAL_REPLAY_DATA names no folder of recordings")
     return Path(folder)
+
+
+@pytest.fixture
+def figures() -> Iterator[None]:
+    """Figures are drawn into memory, and gone after the test."""
+    import matplotlib
+    from matplotlib import pyplot
+
+    matplotlib.use("Agg")
+    yield
+    pyplot.close("all")

@@ -1,0 +1,31 @@
+"""What holds for the pages of notebooks, whatever they show."""
+
+from __future__ import annotations
+
+from xml.etree import ElementTree
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import spatial_replay as sr
+from laws.strategies_spec import specification_texts
+from pages import shown
+from spatial_replay.markup import element, printable
+from spatial_replay.spec.tree import iter_branches, label_of
+
+
+@given(st.text())
+def test_any_text_is_shown_as_text(text):
+    page = ElementTree.fromstring(element("p", text))
+    assert page.text in (None, printable(text))
+    assert len(page) == 0
+
+
+@settings(max_examples=50)
+@given(specification_texts())
+def test_a_page_shows_every_node_of_a_small_specification(text):
+    specification = sr.parse_specification(text)
+    page = shown(specification)
+    for spec in specification.results:
+        for _, _, node in iter_branches(spec.formula):
+            assert label_of(node) in page

@@ -1,0 +1,148 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import spatial_replay as sr
+from pages import shown
+from planning.kinematics import BLOCKS, PUSHING, block, run
+from planning.plans import PUSH, record_plan_of
+from spatial_replay.errors import LogError, UsageError
+from spatial_replay.planning import (
+    Grid,
+    Planner,
+    Settings,
+    Workspace,
+    gradient_map,
+    proposition_maps,
+    read_steps,
+)
+from spatial_replay.planning.maps import FREE
+
+SAMPLE = sr.Sample(
+    0, {"cup": block(1, 1, size=1), "mat": block(6, 6, size=4), "<jug>": sr.Footprint.disc(1, 6, 1)}
+)
+REACHED = Workspace(Grid.over(0, 0, 10, 10, 0.5), base=(5.0, 5.0), farthest=6.0, supports=frozenset({"mat"}))
+ON_THE_MAT = sr.parse_specification("cup enclosedin mat").specs[0].formula
+
+
+@pytest.fixture(scope="module")
+def run_log(tmp_path_factory):
+    path = tmp_path_factory.mktemp("plan") / "run.mcap"
+    return path, record_plan_of(path)
+
+
+def mat_map(workspace=REACHED):
+    maps = proposition_maps([ON_THE_MAT], {}, SAMPLE, "cup", workspace)
+    return gradient_map(maps, (((0, True),),), (), workspace)
+
+
+def test_a_page_of_a_map_counts_its_cells():
+    found = mat_map()
+    text = shown(found)
+    assert "gradient map of cup" in text
+    assert f"{int((found.blocked == FREE).sum())}free" in text
+    assert "an obstacle is there" in text
+    assert "out of reach" in text
+
+
+@pytest.mark.usefixtures("figures")
+def test_a_map_is_drawn_where_it_belongs():
+    found = mat_map()
+    ax = found.plot(sample=SAMPLE)
+    (image,) = ax.images
+    assert image.get_extent() == [0, 10, 0, 10]
+    np.testing.assert_array_equal(image.get_array().filled(np.nan), found.values[0])
+    assert {text.get_text() for text in ax.texts} == {"cup", "mat", "<jug>"}
+    said = {text.get_text() for text in ax.get_legend().get_texts()}
+    assert said == {"an obstacle is there", "out of reach"}
+
+
+@pytest.mark.usefixtures("figures")
+def test_the_colours_of_a_map_are_the_same_distance_from_zero():
+    (image,) = mat_map().plot().images
+    least, greatest = image.get_clim()
+    assert least == -greatest
+    assert image.to_rgba(greatest)[2] > image.to_rgba(greatest)[0]
+    assert image.to_rgba(least)[0] > image.to_rgba(least)[2]
+
+
+@pytest.mark.usefixtures("figures")
+def test_of_several_orientations_the_one_meant_is_drawn():
+    workspace = Workspace(Grid.over(0, 0, 10, 10, 0.5), yaws=(0.0, 0.785), supports=frozenset({"mat"}))
+    found = mat_map(workspace)
+    drawn = found.plot().images[0].get_array().filled(np.nan)
+    np.testing.assert_array_equal(drawn, found.values[0])
+    other = found.plot(turn=1).images[0].get_array().filled(np.nan)
+    np.testing.assert_array_equal(other, found.values[1])
+
+
+@pytest.mark.usefixtures("figures")
+def test_a_map_without_a_free_cell_is_drawn_too():
+    found = mat_map(Workspace(Grid.over(0, 0, 10, 10, 0.5), farthest=0.1))
+    found.plot().figure.canvas.draw()
+    assert "no free cell" in shown(found)
+
+
+@pytest.mark.usefixtures("figures")
+def test_a_step_draws_a_map_for_each_object_and_edge():
+    (step, *_), table = run(Planner(sr.parse_specification(PUSHING), PUSH), BLOCKS)
+    axes = step.plot(table.samples[0])
+    assert len(axes) == sum(len(edge.candidates) for edge in step.considered)
+    chosen = [ax for ax in axes if "chosen" in ax.get_title(loc="left")]
+    assert len(chosen) == 1
+    assert [text.get_text() for text in chosen[0].texts] == list(BLOCKS)
+    axes[0].figure.canvas.draw()
+
+
+def test_a_page_of_a_step_tells_what_was_decided():
+    (step, *_), _ = run(Planner(sr.parse_specification(PUSHING), PUSH), BLOCKS)
+    text = shown(step)
+    for word in ("step 0: execute", step.reason[:60], "given up: no object can do it", "chosen"):
+        assert word in text
+
+
+@pytest.mark.usefixtures("figures")
+def test_a_step_without_maps_draws_none():
+    steps, _ = run(Planner(sr.parse_specification(PUSHING), PUSH), BLOCKS)
+    assert steps[-1].plot() == ()
+
+
+def test_the_steps_of_a_log_are_those_of_the_run(run_log):
+    path, steps = run_log
+    logged = read_steps(path)
+    assert [each.step.reason for each in logged] == [step.reason for step in steps]
+    for each, step in zip(logged, steps, strict=True):
+        assert each.step.target == step.target
+        for one, other in zip(each.step.candidates, step.candidates, strict=True):
+            np.testing.assert_array_equal(one.map.values, other.map.values)
+
+
+def test_the_steps_of_a_log_tell_how_it_went(run_log):
+    first, *_, last = read_steps(run_log[0])
+    assert first.sample.time_ns == first.step.time_ns
+    assert first.outcome.succeeded
+    assert first.end_ns > first.step.time_ns
+    assert len(first.travelled) > 1
+    assert (last.step.kind, last.outcome, last.travelled) == ("hold", None, ())
+    assert "done at" in shown(first)
+
+
+@pytest.mark.usefixtures("figures")
+def test_a_logged_step_is_drawn_with_the_objects_as_they_were(run_log):
+    first, *_ = read_steps(run_log[0])
+    assert [text.get_text() for text in first.plot()[0].texts] == list(first.sample.objects)
+
+
+def test_a_log_without_a_plan_has_no_steps(tmp_path):
+    with sr.Recorder(tmp_path / "run.mcap") as recorder:
+        recorder.write(SAMPLE)
+    with pytest.raises(UsageError, match="holds no decisions"):
+        read_steps(tmp_path / "run.mcap")
+
+
+def test_a_log_of_other_decisions_is_refused(tmp_path):
+    told = Settings(PUSH.workspace, "push", margin=0.02, constraint_margin=0.005)
+    record_plan_of(tmp_path / "run.mcap", told=told)
+    with pytest.raises(LogError, match="verify --decisions"):
+        read_steps(tmp_path / "run.mcap")

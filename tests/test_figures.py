@@ -1,0 +1,42 @@
+"""Figures where their library is, and where it is not."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+WITHOUT = "import sys; sys.modules['matplotlib'] = None\n"
+
+
+def outcome(program):
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False, text=True)
+    return done.returncode, done.stderr
+
+
+def test_without_the_library_an_error_says_what_to_install():
+    program = "import spatial_replay as sr\nsr.parse_specification('F a ovlp b').plot()"
+    code, said = outcome(WITHOUT + program)
+    assert code != 0
+    assert "UsageError" in said
+    assert "pip install 'spatial-replay[notebook]'" in said
+
+
+def test_without_the_library_pages_are_shown():
+    program = "import spatial_replay as sr\nsr.parse_specification('F a ovlp b')._repr_html_()"
+    assert outcome(WITHOUT + program) == (0, "")
+
+
+@pytest.mark.parametrize(
+    "used",
+    [
+        "spatial_replay.automata.automaton",
+        "spatial_replay.monitor.evaluation",
+        "spatial_replay.planning.planner",
+        "spatial_replay.spec.specification",
+    ],
+)
+def test_the_library_loads_when_something_is_drawn(used):
+    program = f"import sys, {used}\nsys.exit('matplotlib' in sys.modules)"
+    assert outcome(program) == (0, "")
