@@ -49,7 +49,7 @@ def automaton(
     require_specification(specification)
     if compiler is not None and compiler not in get_args(Compiler):
         raise UsageError(f"no compiler {compiler!r}; there are 'own' and 'mona'")
-    spec = _chosen(specification, name)
+    spec = chosen_spec(specification, name)
     source = Source.of(specification.source, specification.filename) if specification.source else None
     propositions = Propositions(spec.formula)
     skeleton = Skeleton(spec.formula, propositions, source)
@@ -99,7 +99,12 @@ def _value(machine: Machine, spec: NamedSpec, propositions: Propositions, source
     return result
 
 
-def _chosen(specification: Specification, name: str | None) -> NamedSpec:
+def chosen_spec(specification: Specification, name: str | None) -> NamedSpec:
+    """The spec of a file that has a name; without one, its only result.
+
+    Raises:
+        UsageError: no such spec, several to choose from.
+    """
     known = {spec.name: spec for spec in specification.specs}
     if name is None:
         if len(specification.results) != 1:

@@ -54,6 +54,12 @@ def check(
     if log is None and reading["mapping"] is not None:
         raise UsageError("--mapping is about a log to compare with; add --log LOG")
     parsed = load_specification(specification, profile=profile)
+    inputs = [specification] if log is None else [specification, log]
+    if dfa is not None:
+        # a mere check does without what compiles and writes
+        from spatial_replay.cli.automata import refuse_automata
+
+        refuse_automata(parsed, of, dfa, inputs)
     remarks = [*parsed.warnings, *(_compared_with_log(parsed, log, reading) if log is not None else ())]
     faults = [remark for remark in remarks if remark.severity == "error"]
     for remark in remarks:
@@ -63,10 +69,9 @@ def check(
         raise SpecificationError(faults)
     click.echo(_json_of(parsed, remarks) if as_json else _text_of(parsed))
     if dfa is not None:
-        # a mere check does without what compiles and writes
         from spatial_replay.cli.automata import show_automata
 
-        show_automata(parsed, of, dfa, [specification, *([] if log is None else [log])], quiet=as_json)
+        show_automata(parsed, of, dfa, inputs, quiet=as_json)
 
 
 def _compared_with_log(specification: Specification, log: Path, reading: Reading) -> tuple[Diagnostic, ...]:

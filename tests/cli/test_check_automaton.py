@@ -51,7 +51,10 @@ def test_json_stays_whole_beside_a_file(specification: Path, capsys: pytest.Capt
 
 def test_other_files_are_refused(specification: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["check", str(specification), "--dfa", "done.png"]) == 2
-    assert "ends in .dot, .hoa or .svg" in capsys.readouterr().err
+    captured = capsys.readouterr()
+    assert "ends in .dot, .hoa or .svg" in captured.err
+    # before the tree, which is not what was asked for
+    assert not captured.out
     same = specification.rename(specification.with_suffix(".dot"))
     assert run(["check", str(same), "--dfa", str(same)]) == 2
     assert parse_specification(same.read_text()).results
@@ -66,6 +69,11 @@ def test_one_of_several_results_is_chosen(tmp_path: Path, capsys: pytest.Capture
     assert output.read_text().startswith('digraph "reach"')
     assert run(["check", str(path), "--of", "reach"]) == 2
     capsys.readouterr()
+    for file in (str(output), "-"):
+        assert run(["check", str(path), "--dfa", file, "--of", "raech"]) == 2
+        captured = capsys.readouterr()
+        assert "did you mean 'reach'" in captured.err
+        assert not captured.out
     # those that have one are shown all the same
     assert run(["check", str(path), "--dfa", "-"]) == 2
     captured = capsys.readouterr()
