@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.errors import SpecificationError, UsageError
@@ -15,16 +14,15 @@ from spatial_replay.inspection.automata import KeptAutomaton
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.planning.black_box import PLAN_METADATA, BlackBox
 from spatial_replay.planning.planner import Planner
-from spatial_replay.planning.settings import Settings, Skill
 from spatial_replay.planning.settings_text import text_from_settings
-from spatial_replay.planning.step import Kind, Outcome, Step
+from spatial_replay.planning.step import Kind
 from spatial_replay.planning.warm_up import warm_up
-from spatial_replay.planning.workspace import Grid, Workspace
+from spatial_replay.runs.care import settings_for
+from spatial_replay.runs.executor import WorldExecutor
 from spatial_replay.runs.plan_loop import PlanLoop
 from spatial_replay.runs.run_log import run_log
 from spatial_replay.runs.scripted import run_options
 from spatial_replay.simulation.injection import Injection
-from spatial_replay.simulation.world import World
 from spatial_replay.simulation.worlds import default_specification, make_world
 from spatial_replay.spec import check_names
 from spatial_replay.spec.formula import Specification
@@ -159,71 +157,3 @@ def _check_names(file: Specification, sample: Sample) -> None:
     missing = [remark for remark in remarks if remark.severity == "error"]
     if missing:
         raise SpecificationError(missing)
-
-
-class WorldExecutor:
-    """The robot of a simulated world as an `Executor`."""
-
-    def __init__(self, world: World, skill: Skill) -> None:
-        self._world = world
-        self._skill = skill
-
-    def execute(self, step: Step) -> Outcome:
-        """See `Executor`.
-
-        Raises:
-            UsageError: the step moves nothing.
-        """
-        target = step.target
-        if target is None:
-            raise UsageError(f"step {step.number} ({step.kind}) moves nothing")
-        if self._skill == "push":
-            done = self._world.push(target.name, target.waypoints[1:] or target.waypoints)
-        else:
-            done = self._world.place(target.name, target.x, target.y, target.yaw)
-        return Outcome(done.succeeded, done.reason)
-
-
-@dataclass(frozen=True, slots=True)
-class _Care:
-    """How finely and carefully is planned for a skill, in metres."""
-
-    cell_size: float
-    margin: float
-    constraint_margin: float
-    clearance: float
-    room: float
-
-
-_CARE: MappingProxyType[Skill, _Care] = MappingProxyType(
-    {
-        # a block that is pushed ends up within a centimetre of where it should
-        "push": _Care(cell_size=0.005, margin=0.012, constraint_margin=0.008, clearance=0.0, room=0.0),
-        # fingers need room beside what they hold, and the hand above that beside taller things
-        "place": _Care(cell_size=0.02, margin=0.01, constraint_margin=0.01, clearance=0.02, room=0.09),
-    }
-)
-
-
-def settings_for(world: World) -> Settings:
-    """How to plan in a world."""
-    bodies, space = world.bodies, world.workspace
-    skill: Skill = world.skill
-    care = _CARE[skill]
-    workspace = Workspace(
-        Grid.over(space.xmin, space.ymin, space.xmax, space.ymax, care.cell_size),
-        yaws=space.yaws,
-        nearest=space.nearest,
-        farthest=space.farthest,
-        obstacles=tuple(world.obstacles),
-        supports=frozenset(body.name for body in bodies if body.support),
-        clearance=care.clearance,
-    )
-    return Settings(
-        workspace,
-        skill,
-        movable=tuple(body.name for body in bodies if body.movable),
-        margin=care.margin,
-        constraint_margin=care.constraint_margin,
-        room=care.room,
-    )
