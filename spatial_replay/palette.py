@@ -16,6 +16,8 @@ LABEL: Final = (0.95, 0.95, 0.95)
 CURVES: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c8c8c")
 """Colours of curves beside each other, also told apart with every common colour blindness (Okabe and Ito)."""
 
+_LIGHTER: Final = 0.4
+
 
 def hexadecimal(colour: tuple[float, float, float]) -> str:
     """A colour as texts name it: "#0072b2"."""
@@ -26,3 +28,10 @@ def light(colour: tuple[float, float, float]) -> tuple[float, float, float]:
     """A colour for what dark text stands on: less than a third of it in white."""
     red, green, blue = (0.7 + 0.3 * share for share in colour)
     return red, green, blue
+
+
+def lighter(colour: str) -> str:
+    """A colour as texts name it, mixed with white: one that stays a colour where viewers darken it."""
+    shares = (int(colour[begin : begin + 2], 16) / 255.0 for begin in (1, 3, 5))
+    red, green, blue = (share + _LIGHTER * (1.0 - share) for share in shares)
+    return hexadecimal((red, green, blue))

@@ -19,9 +19,12 @@ FRAME: Final = "world"
 ARROW_HEAD: Final = 0.15
 """The length of an arrow's head by the size of the objects in a scene; of a short arrow it is half."""
 
+OBJECT_OPACITY: Final = 0.55
+REGION_OPACITY: Final = 0.3
+"""Of faces; objects stand out from the regions that they lie in."""
+
 _LINE_PIXELS: Final = 2.0
 _LABEL_PIXELS: Final = 14.0
-_FILL_OPACITY: Final = 0.55
 _NAN: Final = float("nan")
 
 
@@ -46,6 +49,7 @@ def draw(
     faces: list[Floats],
     anchor: tuple[float, float],
     elevation: Elevation,
+    opacity: float,
 ) -> None:
     """Add outlines, filled faces and the label to an entity; every colour but the label's is to be filled in.
 
@@ -54,16 +58,17 @@ def draw(
     Args:
         outlines, faces: rings (n, 2); a face is convex.
         anchor: where the label stands.
+        opacity: of the faces.
     """
     for ring in outlines:
         _add_outline(entity, ring, elevation.fill)
     for ring in faces:
         if len(ring) > 2:
-            _add_face(entity, ring, elevation.fill)
+            _add_face(entity, ring, elevation.fill, opacity)
     if elevation.sides is not None:
         for ring in outlines:
             if len(ring) > 1:
-                _add_sides(entity, ring, *elevation.sides)
+                _add_sides(entity, ring, *elevation.sides, opacity)
     label = entity.texts.add(
         billboard=True,
         font_size=_LABEL_PIXELS,
@@ -102,16 +107,16 @@ def _add_outline(entity: SceneEntity, ring: Floats, z: float) -> None:
     line.color.r, line.color.g, line.color.b, line.color.a = _NAN, _NAN, _NAN, 1.0
 
 
-def _add_face(entity: SceneEntity, ring: Floats, z: float) -> None:
+def _add_face(entity: SceneEntity, ring: Floats, z: float, opacity: float) -> None:
     face = entity.triangles.add(pose=_lying_at(z))
     for x, y in ring.tolist():
         face.points.add(x=x, y=y)
     for corner in range(1, len(ring) - 1):
         face.indices.extend((0, corner, corner + 1))
-    face.color.r, face.color.g, face.color.b, face.color.a = _NAN, _NAN, _NAN, _FILL_OPACITY
+    face.color.r, face.color.g, face.color.b, face.color.a = _NAN, _NAN, _NAN, opacity
 
 
-def _add_sides(entity: SceneEntity, ring: Floats, bottom: float, height: float) -> None:
+def _add_sides(entity: SceneEntity, ring: Floats, bottom: float, height: float, opacity: float) -> None:
     sides = entity.triangles.add(pose=_lying_at(bottom))
     for x, y in ring.tolist():
         sides.points.add(x=x, y=y)
@@ -121,7 +126,7 @@ def _add_sides(entity: SceneEntity, ring: Floats, bottom: float, height: float) 
     for low in range(count):
         following = (low + 1) % count
         sides.indices.extend((low, following, count + low, following, count + following, count + low))
-    sides.color.r, sides.color.g, sides.color.b, sides.color.a = _NAN, _NAN, _NAN, _FILL_OPACITY
+    sides.color.r, sides.color.g, sides.color.b, sides.color.a = _NAN, _NAN, _NAN, opacity
 
 
 def _lying_at(z: float) -> Pose:

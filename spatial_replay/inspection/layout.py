@@ -13,7 +13,15 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.inspection.drawing import ARROW_HEAD, FRAME, Elevation, draw, point_at
+from spatial_replay.inspection.drawing import (
+    ARROW_HEAD,
+    FRAME,
+    OBJECT_OPACITY,
+    REGION_OPACITY,
+    Elevation,
+    draw,
+    point_at,
+)
 from spatial_replay.inspection.rings import Form
 from spatial_replay.logs.wire import Bytes, Template
 from spatial_replay.spec.formula import Outline
@@ -188,6 +196,7 @@ def _add_region(entity: SceneEntity, region: Region) -> None:
         list(region.rings),
         ((left + right) / 2.0, high),
         Elevation(top, sides, label),
+        REGION_OPACITY,
     )
 
 
@@ -202,7 +211,7 @@ def _add_object(entity: SceneEntity, name: str, form: Form, lift: float) -> None
     elevation = Elevation(lift, None, 2.0 * lift)
     if form.has_height:
         elevation = Elevation(np.nan, (np.nan, np.nan), np.nan)
-    draw(entity, name, rings, rings, (np.nan, np.nan), elevation)
+    draw(entity, name, rings, rings, (np.nan, np.nan), elevation, OBJECT_OPACITY)
 
 
 def _split(points: Floats, lengths: tuple[int, ...]) -> list[Floats]:

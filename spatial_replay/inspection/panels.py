@@ -22,7 +22,7 @@ from spatial_replay.logs.topics import (
     SPECIFICATION,
 )
 from spatial_replay.monitor.signal_table import looks_ahead
-from spatial_replay.palette import CURVES
+from spatial_replay.palette import CURVES, lighter
 from spatial_replay.spec.formula import iter_nodes
 
 _MOST_CURVES: Final = 12
@@ -141,7 +141,8 @@ def named_parts(tree: ReportedTree) -> dict[str, bool]:
 def _plot(labelled: Sequence[tuple[str, str]]) -> Config:
     paths = [
         {
-            "color": CURVES[index % len(CURVES)],
+            # samples are dots of this colour darkened, and cover the curve where they are many
+            "color": lighter(CURVES[index % len(CURVES)]),
             "enabled": True,
             "label": label,
             "timestampMethod": "receiveTime",

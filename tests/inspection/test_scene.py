@@ -265,6 +265,14 @@ def test_the_number_of_a_violation_stands_above_its_arrow():
     assert drawn.texts[0].pose.position.z > head
 
 
+def test_objects_stand_out_from_the_regions_that_they_lie_in():
+    [message] = messages(run({"a": BOX}), regions=REGIONS)
+    of_object, of_region = (
+        entity(message, each).triangles[0].color.a for each in ("object/a", "region/goal")
+    )
+    assert of_object > of_region > 0.0
+
+
 def test_flat_objects_lie_above_flat_regions():
     [message] = messages(run({"a": BOX}), regions=REGIONS)
     assert entity(message, "object/a").triangles[0].pose.position.z > 0.0
