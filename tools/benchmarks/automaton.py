@@ -7,16 +7,18 @@ from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 import spatial_replay as sr
+from spatial_replay.simulation.worlds import default_specification
 
 RESPONSES = " and ".join(f"(G ((a{n} >= 0) -> F b{n} >= 0))" for n in range(4))
 """Four requests, each of which is to be answered: 16 states, 256 transitions."""
 
-PLACINGS = " and ".join(
-    [*(f"(F item{n} enclosedin place{n})" for n in range(5)), "(G not (hand ovlp person))"]
-)
-"""Five items to be placed while a person keeps clear: 33 states, 276 transitions with that of the trap."""
+PICK_PLACE = default_specification("pick-place").source
+"""The paper's pick-and-place: 32 states, 243 transitions."""
 
-TASKS = {"4 responses": RESPONSES, "5 placings": PLACINGS}
+DEADLINE = "G ((a >= 0) -> F[0, 1000] b >= 0)"
+"""A request that is to be answered within 1000 samples: 1002 states, which MONA does not find."""
+
+TASKS = {"4 responses": RESPONSES, "pick-place": PICK_PLACE}
 LIMIT_S = 0.05
 
 
@@ -35,6 +37,8 @@ def bench_automaton(measure: Any) -> None:
             # the library's own way to an automaton, on another machine
             reference_s=23.0 if text is RESPONSES else None,
         )
+    deadline = sr.parse_specification(DEADLINE)
+    measure("deadline in 1000 samples, own", lambda _: sr.automaton(deadline, compiler="own"))
 
 
 def bench_automata_at_once(measure: Any) -> None:
