@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from spatial_replay.inspection.report.collecting import Collector
-from spatial_replay.inspection.report.contents import Report, ReportedResult
+from spatial_replay.inspection.report.contents import Report, ReportedResult, worst_results
 from spatial_replay.inspection.report.page import page
 from spatial_replay.logs.output import replacing
 from spatial_replay.logs.source import Source
 from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.replay.annotated import check_parameters
 from spatial_replay.replay.explanation import explanation_of
 from spatial_replay.replay.found import Replayed, ReplayedSpec
@@ -21,9 +20,6 @@ from spatial_replay.replay.replay import Replay
 from spatial_replay.replay.window import Window
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.relations import RELATION_NAMES
-
-MOST_EXPLAINED = 24
-"""How many verdicts are explained: those of the worst results."""
 
 
 def write_report(
@@ -87,42 +83,35 @@ def _report(replay: Replay, replayed: Replayed, collector: Collector) -> Report:
     )
 
 
-def _results(replay: Replay, replayed: Replayed, collector: Collector) -> Sequence[ReportedResult]:
+def _results(replay: Replay, replayed: Replayed, collector: Collector) -> Iterator[ReportedResult]:
     explained = _explained(replayed)
-    results = []
-    for index, (result, tree, kept) in enumerate(
-        zip(replayed.results, replay.trees, replay.automata, strict=True)
-    ):
-        sentences = explanation_of(result, first_ns=replayed.first_ns).sentences if index in explained else ()
-        results.append(
-            ReportedResult(
-                name=result.name,
-                object=result.object,
-                formula=result.formula,
-                relations=RELATION_NAMES | replay.files[tree.file].relations,
-                verdict=result.verdict,
-                robustness=result.robustness,
-                final=result.final,
-                first_satisfied_ns=result.first_satisfied_ns,
-                times_ns=np.empty(0, np.int64) if result.times_ns is None else result.times_ns,
-                series=np.empty((len(result.robustness), 4, 0)) if result.series is None else result.series,
-                sentences=sentences,
-                automaton=kept.automaton,
-                no_automaton=kept.reason,
-                path=collector.path(tree.name, tree.object),
-            )
+    for index, result in enumerate(replayed.results):
+        tree, kept = replay.trees[index], replay.automata[index]
+        unseen = np.empty((len(result.robustness), 4, 0))
+        yield ReportedResult(
+            name=result.name,
+            object=result.object,
+            formula=result.formula,
+            relations=RELATION_NAMES | replay.files[tree.file].relations,
+            verdict=result.verdict,
+            robustness=result.robustness,
+            final=result.final,
+            first_satisfied_ns=result.first_satisfied_ns,
+            times_ns=np.empty(0, np.int64) if result.times_ns is None else result.times_ns,
+            series=unseen if result.series is None else result.series,
+            sentences=_sentences(result, replayed.first_ns) if index in explained else (),
+            automaton=kept.automaton,
+            no_automaton=kept.reason,
+            path=collector.path(tree.name, tree.object),
         )
-    return results
 
 
 def _explained(replayed: Replayed) -> frozenset[int]:
     """Which results are explained; under the paper's semantics none can be."""
     if replayed.semantics != "ltlf":
         return frozenset()
-    worst_first = sorted(range(len(replayed.results)), key=lambda index: _severity(replayed.results[index]))
-    return frozenset(worst_first[:MOST_EXPLAINED])
+    return frozenset(worst_results([result.verdict for result in replayed.results]))
 
 
-def _severity(result: ReplayedSpec) -> int:
-    order = (Verdict.VIOLATED, Verdict.UNKNOWN)
-    return order.index(result.verdict) if result.verdict in order else len(order)
+def _sentences(result: ReplayedSpec, first_ns: int) -> tuple[str, ...]:
+    return explanation_of(result, first_ns=first_ns).sentences

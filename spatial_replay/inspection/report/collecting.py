@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Final
+from typing import Final, NamedTuple
 
 from spatial_replay.inspection.report.decisions import Plan, PlanMaker
 from spatial_replay.inspection.report.film import Film, FilmMaker
@@ -13,6 +13,13 @@ from spatial_replay.inspection.report.states import StatePath, StatePathMaker
 from spatial_replay.logs.block import Messages
 from spatial_replay.logs.messages.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.topics import AUTOMATON, EVENTS, GRADIENT_MAP, PLAN_DECISION, SCENE
+
+
+class Taken(NamedTuple):
+    """Where a message stands in its topic: its time, and its sequence number."""
+
+    time_ns: int
+    sequence: int
 
 
 class Collector:
@@ -27,12 +34,11 @@ class Collector:
     def add(self, messages: Messages) -> None:
         """Take in the next messages."""
         topics = {number: channel.topic for number, channel in messages.channels.items()}
-        for number, time_ns, payload in zip(
-            messages.channel.tolist(), messages.log_time_ns.tolist(), messages.payloads, strict=True
-        ):
+        for index, number in enumerate(messages.channel.tolist()):
             take = _TAKERS.get(topics[number])
             if take is not None:
-                take(self, time_ns, payload)
+                taken = Taken(int(messages.log_time_ns[index]), int(messages.sequence[index]))
+                take(self, taken, messages.payloads[index])
 
     @property
     def film(self) -> Film:
@@ -50,24 +56,24 @@ class Collector:
         """Where the automaton of a result was; nowhere if it has none."""
         return self._paths.get((name, object or ""), StatePathMaker()).path()
 
-    def _take_scene(self, time_ns: int, payload: bytes) -> None:
-        self._film.add(time_ns, payload)
+    def _take_scene(self, taken: Taken, payload: bytes) -> None:
+        self._film.add(taken.time_ns, payload)
 
-    def _take_event(self, time_ns: int, payload: bytes) -> None:
-        self._happenings.append(happening_of(time_ns, payload))
+    def _take_event(self, _: Taken, payload: bytes) -> None:
+        self._happenings.append(happening_of(payload))
 
-    def _take_state(self, _: int, payload: bytes) -> None:
+    def _take_state(self, _: Taken, payload: bytes) -> None:
         message = AutomatonState.FromString(payload)
         self._paths.setdefault((message.specification, message.object), StatePathMaker()).add(message)
 
-    def _take_decision(self, _: int, payload: bytes) -> None:
+    def _take_decision(self, _: Taken, payload: bytes) -> None:
         self._plan.add_decision(payload)
 
-    def _take_map(self, _: int, payload: bytes) -> None:
-        self._plan.add_map(payload)
+    def _take_map(self, taken: Taken, payload: bytes) -> None:
+        self._plan.add_map(taken.sequence, payload)
 
 
-_TAKERS: Final[Mapping[str, Callable[[Collector, int, bytes], None]]] = MappingProxyType(
+_TAKERS: Final[Mapping[str, Callable[[Collector, Taken, bytes], None]]] = MappingProxyType(
     {
         SCENE: Collector._take_scene,
         EVENTS: Collector._take_event,

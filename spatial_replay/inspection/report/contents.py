@@ -32,7 +32,7 @@ from spatial_replay.spec.formula import Formula, Specification
 MOST_VALUES: Final = 4_000_000
 """How many numbers of nodes at samples a page holds; of a longer run it keeps fewer samples."""
 MOST_DRAWN: Final = 24
-"""How many results a page has trees and curves of: the worst ones; it has the verdicts of all."""
+"""How many results a page explains and has trees and curves of: the worst; it has the verdicts of all."""
 _FEWEST_SAMPLES: Final = 200
 
 
@@ -113,9 +113,15 @@ class Report:
     @property
     def drawn(self) -> tuple[ReportedResult, ...]:
         """The results that have a tree and curves on the page, in order: the worst if they are too many."""
-        severity = {Verdict.VIOLATED: 0, Verdict.UNKNOWN: 1}
-        order = sorted(range(len(self.results)), key=lambda n: severity.get(self.results[n].verdict, 2))
-        return tuple(self.results[number] for number in sorted(order[:MOST_DRAWN]))
+        chosen = worst_results([result.verdict for result in self.results])
+        return tuple(self.results[number] for number in chosen)
+
+
+def worst_results(verdicts: Sequence[Verdict]) -> list[int]:
+    """Which results are looked into, in order: `MOST_DRAWN` of them at most, violated before unknown ones."""
+    severity = {Verdict.VIOLATED: 0, Verdict.UNKNOWN: 1}
+    ordered = sorted(range(len(verdicts)), key=lambda number: severity.get(verdicts[number], 2))
+    return sorted(ordered[:MOST_DRAWN])
 
 
 @dataclass(frozen=True)
@@ -206,7 +212,9 @@ def _omissions(report: Report, samples: int, kept: int, maps: int) -> Sequence[s
     if report.film.stride > 1:
         said.append(f"The scene has every {_ordinal(report.film.stride)} message of /spatial/scene.")
     if len(report.results) > MOST_DRAWN:
-        said.append(f"Trees and curves are of {MOST_DRAWN} of {len(report.results):,} results, the worst.")
+        said.append(
+            f"Explanations, trees and curves are of the worst {MOST_DRAWN} of {len(report.results):,} results."
+        )
     if any(len(result.robustness) > MOST_NODES for result in report.drawn):
         said.append(f"Of trees with more than {MOST_NODES} nodes the uppermost {MOST_NODES} are shown.")
     if len(report.happenings) > MOST_EVENTS:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -33,11 +33,11 @@ class Plan:
 
     Attributes:
         decisions: in order, each with its outcome if it has one.
-        maps: by the time of the decision, in the order of the log.
+        maps: by the number by which decisions name them, in the order of the log.
     """
 
     decisions: tuple[PlanDecision, ...]
-    maps: Mapping[int, tuple[Grid, ...]]
+    maps: Mapping[int, Grid]
 
 
 class PlanMaker:
@@ -45,7 +45,7 @@ class PlanMaker:
 
     def __init__(self) -> None:
         self._decisions: dict[int, PlanDecision] = {}
-        self._maps: dict[int, list[Grid]] = {}
+        self._maps: dict[int, Grid] = {}
 
     def add_decision(self, payload: bytes) -> None:
         """Take in a decision; one that cannot be read tells nothing."""
@@ -56,18 +56,24 @@ class PlanMaker:
         # the one with the outcome comes later and says everything that the first one does
         self._decisions[decision.number] = decision
 
-    def add_map(self, payload: bytes) -> None:
+    def add_map(self, number: int, payload: bytes) -> None:
         """Take in a gradient map; one that cannot be read is none."""
         try:
-            grid = Grid.FromString(payload)
+            self._maps[number] = Grid.FromString(payload)
         except DecodeError:
             return
-        self._maps.setdefault(grid.timestamp.ToNanoseconds(), []).append(grid)
 
     def plan(self) -> Plan:
         """What was taken so far."""
-        decisions = tuple(self._decisions[number] for number in sorted(self._decisions))
-        return Plan(decisions, {time_ns: tuple(grids) for time_ns, grids in self._maps.items()})
+        return Plan(tuple(self._decisions[number] for number in sorted(self._decisions)), dict(self._maps))
+
+
+class _Owner(NamedTuple):
+    """Whose map one is: the edge by its place among those considered, and how far the object is turned."""
+
+    edge: int
+    candidate: PlanCandidate
+    turn: float
 
 
 class _Drawn(NamedTuple):
@@ -79,47 +85,81 @@ class _Drawn(NamedTuple):
 
 
 def plan_value(plan: Plan, first_ns: int, packing: Packing) -> Mapping[str, Any]:
-    """The decisions as the page reads them."""
+    """The decisions as the page reads them, and how many maps there was no room for."""
     decisions: list[Mapping[str, Any]] = []
     cells = left_out = 0
     for decision in plan.decisions:
-        maps: list[Mapping[str, Any] | None] = []
-        for drawn in map(_drawn, plan.maps.get(decision.time_ns, ())):
-            if drawn is None or cells + drawn.values.size > MOST_CELLS:
-                left_out += drawn is not None
-                maps.append(None)
+        maps: list[Mapping[str, Any]] = []
+        for owner, grid in _maps_of(plan, decision):
+            drawn = _drawn(grid)
+            if drawn is None:
+                continue
+            if cells + drawn.values.size > MOST_CELLS:
+                left_out += 1
                 continue
             cells += drawn.values.size
-            maps.append(_map_value(drawn, packing))
+            maps.append(_map_value(drawn, owner, packing))
         decisions.append(_decision_value(decision, maps, first_ns, packing))
     return {"decisions": decisions, "maps_left_out": left_out}
 
 
+def _maps_of(plan: Plan, decision: PlanDecision) -> Iterator[tuple[_Owner | None, Grid]]:
+    """The maps that a decision rests on; of a log that does not say whose they are, those of its time."""
+    owners = {
+        named.number: _Owner(edge, candidate, named.turn)
+        for edge, considered in enumerate(decision.considered)
+        for candidate in considered.candidates
+        for named in candidate.maps
+    }
+    if owners:
+        yield from ((owners[number], plan.maps[number]) for number in sorted(owners) if number in plan.maps)
+        return
+    for _, grid in sorted(plan.maps.items()):
+        if grid.timestamp.ToNanoseconds() == decision.time_ns:
+            yield None, grid
+
+
 def _drawn(grid: Grid) -> _Drawn | None:
-    """A map's first field; None of a message whose sizes do not fit together."""
+    """A map's robustness; None of a message whose sizes do not fit together."""
     columns, cell, row = grid.column_count, grid.cell_stride, grid.row_stride
     rows = len(grid.data) // row if row else 0
-    if not rows or not grid.fields or cell * columns > row or grid.fields[0].offset + 4 > cell:
+    offset = next((field.offset for field in grid.fields if field.name.startswith("robustness")), cell)
+    if not rows or not columns or cell * columns > row or offset + 4 > cell:
         return None
-    numbers = np.ndarray((rows, columns), "<f4", grid.data, grid.fields[0].offset, (row, cell))
+    numbers = np.ndarray((rows, columns), "<f4", grid.data, offset, (row, cell))
     x, y = grid.pose.position.x, grid.pose.position.y
     high = x + columns * grid.cell_size.x, y + rows * grid.cell_size.y
     return _Drawn(numbers.astype(np.float64), (x, y), high)
 
 
-def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
+def _map_value(drawn: _Drawn, owner: _Owner | None, packing: Packing) -> Mapping[str, Any]:
     known = drawn.values[np.isfinite(drawn.values)]
-    return {
+    value: dict[str, Any] = {
         "columns": drawn.values.shape[1],
         "low": drawn.low,
         "high": drawn.high,
-        "scale": float(np.abs(known).max()) if len(known) else 0.0,
+        "scale": float(np.abs(known).max(initial=0.0)),
         "values": packing.add(singles(drawn.values), "f4"),
+        "edge": None,
+        "title": "",
+        "chosen": False,
+        "target": None,
+    }
+    if owner is None:
+        return value
+    candidate = owner.candidate
+    has_target = candidate.HasField("target") and candidate.target.turn == owner.turn
+    turned = f", turned by {math.degrees(owner.turn):.3g}°" if len(candidate.maps) > 1 else ""
+    return value | {
+        "edge": owner.edge,
+        "title": f"{candidate.object}{turned}",
+        "chosen": candidate.chosen and has_target,
+        "target": _target_value(candidate.target) if has_target else None,
     }
 
 
 def _decision_value(
-    decision: PlanDecision, maps: Sequence[Mapping[str, Any] | None], first_ns: int, packing: Packing
+    decision: PlanDecision, maps: Sequence[Mapping[str, Any]], first_ns: int, packing: Packing
 ) -> Mapping[str, Any]:
     value: dict[str, Any] = {
         "number": decision.number,
@@ -132,7 +172,7 @@ def _decision_value(
             _edge_value(edge, decision.HasField("target") and edge is decision.considered[-1])
             for edge in decision.considered
         ],
-        "maps": _named_maps(decision, maps),
+        "maps": maps,
         "target": _target_value(decision.target) if decision.HasField("target") else None,
         "outcome": None,
     }
@@ -183,30 +223,3 @@ def _target_value(target: PlanTarget) -> Mapping[str, Any]:
         "robustness": number_text(target.robustness),
         "way": list(target.waypoints),
     }
-
-
-def _named_maps(decision: PlanDecision, maps: Sequence[Mapping[str, Any] | None]) -> list[Mapping[str, Any]]:
-    """The maps, each with the edge and the candidate that it is of, as far as that can be told."""
-    owners = [
-        (number, candidate)
-        for number, edge in enumerate(decision.considered)
-        for candidate in sorted(edge.candidates, key=lambda each: each.chosen)
-    ]
-    owners = owners[len(owners) - len(maps) :] if len(owners) >= len(maps) else []
-    named: list[Mapping[str, Any]] = []
-    for index, value in enumerate(maps):
-        if value is None:
-            continue
-        edge, candidate = owners[index] if owners else (None, None)
-        named.append(
-            {
-                **value,
-                "edge": edge,
-                "object": candidate.object if candidate is not None else "",
-                "chosen": candidate is not None and candidate.chosen,
-                "target": None
-                if candidate is None or not candidate.HasField("target")
-                else _target_value(candidate.target),
-            }
-        )
-    return named

@@ -16,20 +16,18 @@ class Happening(NamedTuple):
 
     Attributes:
         start_ns: the first sample of what began.
-        confirmed_ns: the sample with which it was sure.
         facts: what the event says, by key.
     """
 
     start_ns: int
-    confirmed_ns: int
     facts: Mapping[str, str]
 
 
-def happening_of(time_ns: int, payload: bytes) -> Happening:
+def happening_of(payload: bytes) -> Happening:
     """A message of /spatial/events."""
     event = Event.FromString(payload)
     facts = {each.key: each.value for each in event.metadata}
-    return Happening(event.start_time.ToNanoseconds(), time_ns, facts)
+    return Happening(event.start_time.ToNanoseconds(), facts)
 
 
 def happening_values(happenings: Sequence[Happening], first_ns: int) -> list[Mapping[str, Any]]:

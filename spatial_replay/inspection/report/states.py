@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -88,40 +88,58 @@ def _shown_states(automaton: Automaton, path: StatePath) -> list[int]:
 
 
 def _places(automaton: Automaton, shown: Sequence[int]) -> Mapping[int, tuple[int, float]]:
-    """Column and row of each state: columns by distance from the start, rows so that moves cross little."""
-    layers = _layers(automaton, shown)
-    rows = {state: float(row) for layer in layers for row, state in enumerate(layer)}
+    """Column and row of each state: columns as moves lead on, rows so that moves cross little."""
+    kept = set(shown)
+    successors = {state: [each for each in automaton.successors[state] if each in kept] for state in shown}
+    column = _columns(successors, automaton.initial)
+    layers = [[state for state in shown if column[state] == each] for each in range(max(column.values()) + 1)]
+    row = {state: height for layer in layers for state, height in _heights(layer)}
     for _ in range(_SWEEPS):
         for layer in layers[1:]:
-            aims = {state: _middle(rows, _sources(automaton, state, rows)) for state in layer}
-            layer.sort(key=lambda state: (aims[state] if aims[state] is not None else rows[state], state))
-            rows |= {state: row - (len(layer) - 1) / 2.0 for row, state in enumerate(layer)}
-    return {
-        state: (column, row - (len(layer) - 1) / 2.0)
-        for column, layer in enumerate(layers)
-        for row, state in enumerate(layer)
-    }
+            aims = {state: _middle(row, successors, state) for state in layer}
+            layer.sort(key=lambda state: (aims[state], state))
+            row |= dict(_heights(layer))
+    return {state: (column[state], row[state]) for state in shown}
 
 
-def _layers(automaton: Automaton, shown: Sequence[int]) -> list[list[int]]:
-    left = set(shown)
-    layers: list[list[int]] = []
-    layer = [automaton.initial]
-    while layer:
-        layers.append(layer)
-        left -= set(layer)
-        layer = sorted({target for state in layer for target in automaton.successors[state]} & left)
-    # states whose predecessors are left out
-    return [*layers, sorted(left)] if left else layers
+def _columns(successors: Mapping[int, Sequence[int]], initial: int) -> Mapping[int, int]:
+    """For each state, how many moves it takes at most to get there, without those that lead back."""
+    ended: list[int] = []
+    on_way: set[int] = set()
+    back: set[tuple[int, int]] = set()
+    for root in [initial, *successors]:
+        stack = [] if root in ended else [(root, iter(successors[root]))]
+        on_way.update(state for state, _ in stack)
+        while stack:
+            state, targets = stack[-1]
+            target = next(targets, None)
+            if target is None:
+                stack.pop()
+                on_way.discard(state)
+                ended.append(state)
+            elif target in on_way:
+                back.add((state, target))
+            elif target not in ended:
+                on_way.add(target)
+                stack.append((target, iter(successors[target])))
+    column = dict.fromkeys(successors, 0)
+    for state in reversed(ended):
+        for target in successors[state]:
+            if (state, target) not in back:
+                column[target] = max(column[target], column[state] + 1)
+    return column
 
 
-def _sources(automaton: Automaton, state: int, rows: Mapping[int, float]) -> list[int]:
-    return [each for each in rows if each != state and state in automaton.successors[each]]
+def _heights(layer: Sequence[int]) -> Iterator[tuple[int, float]]:
+    """The states of a column, one below the other around the middle."""
+    for place, state in enumerate(layer):
+        yield state, place - (len(layer) - 1) / 2.0
 
 
-def _middle(rows: Mapping[int, float], states: Iterable[int]) -> float | None:
-    found = [rows[state] for state in states]
-    return sum(found) / len(found) if found else None
+def _middle(row: Mapping[int, float], successors: Mapping[int, Sequence[int]], state: int) -> float:
+    """The mean row of the states that lead to one, or its own."""
+    found = [row[each] for each, targets in successors.items() if each != state and state in targets]
+    return sum(found) / len(found) if found else row[state]
 
 
 def _cut(text: str) -> str:

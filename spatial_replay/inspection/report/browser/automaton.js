@@ -1,19 +1,21 @@
 // The automaton of the chosen result: its states with the present one lit, and what leads on from there.
 
-const COLUMN = 110, ROW = 64, RADIUS = 17;
+const COLUMN = 96, ROW = 60, RADIUS = 17;
+// how far a move swings out at most, twice
+const HIGHEST = 84;
 
 function makeAutomaton(clock) {
   const place = body("automaton");
   if (!place) return;
   const drawing = element("div", {class: "drawing"});
-  const words = element("div", {class: "moves", role: "status"});
+  const words = element("div", {class: "moves"});
   place.append(drawing, words);
   let drawn = null;
   clock.on("result", () => {
     const result = clock.run.results[clock.result];
     const automaton = result?.automaton;
     drawn = automaton ? drawAutomaton(automaton) : null;
-    drawing.replaceChildren(drawn ? drawn.made : element("p", {}, whyNone(result)));
+    drawing.replaceChildren(...(drawn ? [drawn.made] : whyNone(result)));
     words.replaceChildren();
   });
   clock.on("time", () => {
@@ -25,13 +27,14 @@ function makeAutomaton(clock) {
     drawn.set = set;
     const states = set < 0 ? [] : result.automaton.sets[set];
     light(drawn, states);
+    if (states.length) keepInView(drawing, drawn.states.get(states[0]));
     words.replaceChildren(...describe(result.automaton, states));
   });
 }
 
 function whyNone(result) {
-  if (!result) return "Nothing was evaluated.";
-  return `${result.title} has no automaton: ${result.no_automaton}`;
+  if (!result) return ["Nothing was evaluated."];
+  return [element("p", {}, `${result.title} has no automaton.`), element("pre", {}, result.no_automaton)];
 }
 
 function drawAutomaton(automaton) {
@@ -50,22 +53,22 @@ function drawAutomaton(automaton) {
   const made = svg("svg", {
     viewBox: `-52 ${low} ${wide + 94} ${high - low}`, width: wide + 94, height: high - low, role: "img",
     "aria-label": `Automaton with ${automaton.summary}`,
-  }, tip(), svg("path", {class: "move", d: `M${x - 46} ${y} H${x - RADIUS - 5}`, "marker-end": "url(#tip)"}),
+  }, svg("defs", {}, tip("tip"), tip("tip-ahead")), svg("path", {class: "move", d: `M${x - 46} ${y} H${x - RADIUS - 5}`, "marker-end": "url(#tip)"}),
   ...moves.map((move) => move.made), ...states.values());
   return {made, moves, states, set: null};
 }
 
-function tip() {
-  return svg("defs", {}, svg("marker", {id: "tip", viewBox: "0 0 8 8", refX: 7, refY: 4, markerWidth: 7,
-    markerHeight: 7, orient: "auto-start-reverse"}, svg("path", {class: "tip", d: "M0 0 L8 4 L0 8 Z"})));
+function tip(id) {
+  return svg("marker", {id, viewBox: "0 0 8 8", refX: 7, refY: 4, markerUnits: "userSpaceOnUse", markerWidth: 9,
+    markerHeight: 9, orient: "auto"}, svg("path", {class: "tip", d: "M0 0 L8 4 L0 8 Z"}));
 }
 
 // From rim to rim; moves over several columns, back, or within a column go around what stands between.
 function curve([x0, y0], [x1, y1]) {
   const dx = x1 - x0, dy = y1 - y0, length = Math.hypot(dx, dy);
   const spans = Math.round(dx / COLUMN);
-  let bend = spans === 1 ? 0.06 * length : 0.28 * length;
-  if (spans > 1 && dy !== 0) bend = 0.12 * length;
+  const share = spans === 1 ? 0.06 : spans > 1 && dy !== 0 ? 0.12 : 0.28;
+  const bend = Math.min(share * length, HIGHEST);
   const [nx, ny] = [dy / length, -dx / length];
   const [cx, cy] = [(x0 + x1) / 2 + bend * nx, (y0 + y1) / 2 + bend * ny];
   const rim = (x, y, gap) => {
@@ -87,6 +90,15 @@ function drawState(state, [x, y]) {
 function light(drawn, states) {
   for (const [number, made] of drawn.states) made.classList.toggle("here", states.includes(number));
   for (const move of drawn.moves) move.made.classList.toggle("ahead", states.includes(move.source));
+}
+
+// Scrolls a wide drawing sideways, so that a state shows.
+function keepInView(drawing, state) {
+  if (!state || drawing.scrollWidth <= drawing.clientWidth) return;
+  const box = state.getBoundingClientRect(), frame = drawing.getBoundingClientRect();
+  if (box.left < frame.left || box.right > frame.right) {
+    drawing.scrollLeft += (box.left + box.right - frame.left - frame.right) / 2;
+  }
 }
 
 function describe(automaton, states) {

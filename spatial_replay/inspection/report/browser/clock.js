@@ -109,13 +109,15 @@ function keepInAddress(clock) {
   const given = new URLSearchParams(location.hash.slice(1));
   if (given.has("r")) clock.choose(Number(given.get("r")));
   if (given.has("t") && Number.isFinite(Number(given.get("t")))) clock.seek(Number(given.get("t")));
-  let waiting = null;
+  let waiting = null, before = [clock.time, clock.result];
   const write = () => {
     waiting = null;
     const result = clock.result ? `&r=${clock.result}` : "";
     history.replaceState(null, "", `#t=${Number(clock.time.toFixed(6))}${result}`);
   };
   const later = () => {
+    if (before[0] === clock.time && before[1] === clock.result) return;
+    before = [clock.time, clock.result];
     if (waiting !== null) clearTimeout(waiting);
     waiting = setTimeout(write, 200);
   };

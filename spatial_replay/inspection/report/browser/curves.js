@@ -1,9 +1,10 @@
 // Robustness over time: the chosen result with the interval of what may still come, and its named parts.
 
 const CHART_HEIGHT = 250;
+const AXIS_LABEL = 18;
 
 function makeCurves(clock) {
-  const place = element("div", {class: "curves"});
+  const place = element("div", {class: "curves", role: "group", "aria-label": "Robustness over time"});
   const line = element("div", {class: "cursor"});
   const legend = element("div", {class: "legend"});
   const chooser = quantityChooser((quantity) => { shown.quantity = quantity; build(); });
@@ -29,9 +30,9 @@ function makeCurves(clock) {
     const at = placeIn(result, clock.sample);
     const share = shareOf(clock, clock.time);
     line.hidden = share < 0 || share > 1;
-    line.style.left = `${share * chart.over.clientWidth}px`;
+    line.style.left = `${100 * share}%`;
     for (const curve of curves) {
-      curve.reading.textContent = at === null ? "" : numberText(curve.numbers[at]);
+      curve.reading.textContent = at === null ? "" : numberText(curve.numbers[Math.min(at, result.samples - 1)]);
     }
   };
   clock.on("result", build);
@@ -99,7 +100,7 @@ function options(clock, result, curves, shown, width) {
     },
     axes: [
       {...axis, size: 30, values: (_, ticks) => ticks.map((tick) => `${Number(tick.toFixed(6))} s`)},
-      {...axis, size: gutter(), label: unitText(root.unit), labelSize: 18, labelFont: "12px system-ui, sans-serif",
+      {...axis, size: gutter() - AXIS_LABEL, label: unitText(root.unit), labelSize: AXIS_LABEL, labelFont: "12px system-ui, sans-serif",
         values: (_, ticks) => ticks.map(numberText)},
     ],
     series: [{}, ...curves.map((curve) => ({

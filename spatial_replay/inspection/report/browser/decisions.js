@@ -23,10 +23,19 @@ function makeDecision(clock, decision) {
   `state ${decision.states.join(", ")}: ${inShort(decision)}`);
   const tried = decision.edges.map((edge, number) => makeEdge(clock, decision, edge, number));
   const unnamed = decision.maps.filter((map) => map.edge === null);
-  return element("li", {class: "card"}, title, element("p", {}, sentence(decision.reason)),
-    decision.outcome ? element("p", {}, outcomeWords(decision.outcome)) : null,
-    tried.length ? element("details", {}, element("summary", {}, "What was looked into"), ...tried,
+  const meant = decision.target ? decision.maps.at(-1) : null;
+  const said = element("div", {}, title, element("p", {}, sentence(decision.reason)),
+    decision.outcome ? element("p", {}, outcomeWords(decision.outcome)) : null);
+  return element("li", {class: "card"},
+    element("div", {class: "said"}, said, meant ? makeMap(clock, meant) : null),
+    tried.length ? element("details", {}, element("summary", {}, lookedInto(decision)), ...tried,
       unnamed.length ? maps(clock, unnamed) : null) : null);
+}
+
+function lookedInto({edges, maps: drawn}) {
+  const count = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
+  const candidates = edges.reduce((sum, edge) => sum + edge.candidates.length, 0);
+  return `Looked into ${count(edges.length, "edge")}, ${count(candidates, "candidate")}, ${count(drawn.length, "map")}`;
 }
 
 function inShort({kind, target}) {
@@ -59,11 +68,13 @@ function makeEdge(clock, decision, edge, number) {
 }
 
 function candidateRow(candidate) {
-  const why = candidate.rejected || `to ${candidate.target.words}, robustness ${candidate.target.robustness}`;
+  const {target} = candidate;
+  const way = target ? `to ${target.words}, robustness ${target.robustness}, ` : "";
+  const why = candidate.rejected || `${way}at best ${candidate.best}`;
   const standing = {chosen: "satisfied", possible: "holding", rejected: "violated"}[candidate.standing];
   return element("tr", {}, element("td", {}, mark(standing), candidate.standing),
     element("th", {scope: "row"}, candidate.object),
-    element("td", {}, `${why}; at best ${candidate.best}`));
+    element("td", {}, why));
 }
 
 function maps(clock, list) {
@@ -71,7 +82,7 @@ function maps(clock, list) {
 }
 
 function makeMap(clock, map) {
-  const {made, redraw} = canvas(`Gradient map of ${map.object || "a candidate"}`, (context, width, height) => {
+  const {made, redraw} = canvas(`Gradient map of ${map.title || "a candidate"}`, (context, width, height) => {
     const at = projection(map.low, map.high, width, height, 1);
     drawMap(context, clock.run, map, at);
     if (!map.target) return;
@@ -81,6 +92,6 @@ function makeMap(clock, map) {
   made.style.aspectRatio = String((map.high[0] - map.low[0]) / (map.high[1] - map.low[1]));
   window.addEventListener("themechange", redraw);
   return element("figure", {}, made,
-    element("figcaption", {}, map.object || "a candidate", map.chosen ? ", chosen" : "",
-      `: ± ${numberText(map.scale)}`));
+    element("figcaption", {}, map.title || "a candidate", map.chosen ? ", chosen" : "",
+      `: up to ±${numberText(map.scale)}`));
 }

@@ -39,7 +39,7 @@ function numberText(number) {
   if (number === 0) return "0";
   const size = Math.abs(number);
   const text = size >= 1e5 || size < 1e-4 ? size.toExponential(2) : String(Number(size.toPrecision(4)));
-  return number < 0 ? `−${text}` : text;
+  return `${number < 0 ? "−" : ""}${text.replace("-", "−")}`;
 }
 
 function colour(name) {

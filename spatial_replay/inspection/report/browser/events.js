@@ -18,9 +18,10 @@ function makeEvents(clock) {
   });
   const list = element("ol", {class: "list"}, ...rows.map((row) => element("li", {}, row)));
   place.append(list);
+  const starts = events.map((event) => event.time);
   let here = null;
   clock.on("time", () => {
-    const now = events[0].time <= clock.time + 1e-9 ? indexAt(events.map((event) => event.time), clock.time) : -1;
+    const now = starts[0] <= clock.time + 1e-9 ? indexAt(starts, clock.time) : -1;
     if (now === here) return;
     if (here !== null && here >= 0) rows[here].removeAttribute("aria-current");
     here = now;
@@ -32,7 +33,7 @@ function makeEvents(clock) {
 
 // Scrolls a list, and nothing around it, so that one of its rows shows.
 function keepInSight(list, row) {
-  const top = row.offsetTop - list.offsetTop;
+  const top = row.offsetTop;
   if (top < list.scrollTop) list.scrollTop = top;
   else if (top + row.offsetHeight > list.scrollTop + list.clientHeight) {
     list.scrollTop = top + row.offsetHeight - list.clientHeight;

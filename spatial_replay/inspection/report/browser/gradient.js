@@ -1,5 +1,8 @@
 // Gradient maps: where an object would do how well, as pictures.
 
+// How far the colour of the slightest robustness is from grey, and how much of a map's colours covers the page.
+const LEAST = 0.4, OPACITY = 0.6;
+
 // The picture of a map, a pixel for each cell, lowest row at the bottom; what is blocked stays clear.
 function pictureOf(run, map) {
   map.picture ??= painted(run, map);
@@ -14,15 +17,16 @@ function painted(run, map) {
   made.height = rows;
   const context = made.getContext("2d");
   const image = context.createImageData(map.columns, rows);
-  const good = rgb(run.palette.positive), bad = rgb(run.palette.negative);
+  const good = rgb(run.palette.positive), bad = rgb(run.palette.negative), grey = rgb(run.palette.neutral);
   for (let row = 0; row < rows; row++) {
     for (let column = 0; column < map.columns; column++) {
       const number = values[row * map.columns + column];
       if (Number.isNaN(number)) continue;
       const place = 4 * ((rows - 1 - row) * map.columns + column);
-      const share = map.scale > 0 ? Math.min(Math.abs(number) / map.scale, 1) : 0;
-      image.data.set(number >= 0 ? good : bad, place);
-      image.data[place + 3] = 45 + 190 * share;
+      const share = LEAST + (1 - LEAST) * (map.scale > 0 ? Math.min(Math.abs(number) / map.scale, 1) : 0);
+      const hue = number >= 0 ? good : bad;
+      for (let part = 0; part < 3; part++) image.data[place + part] = grey[part] + share * (hue[part] - grey[part]);
+      image.data[place + 3] = 255;
     }
   }
   context.putImageData(image, 0, 0);
@@ -48,12 +52,17 @@ function drawMap(context, run, map, at) {
   const left = at.x(map.low[0]), top = at.y(map.high[1]);
   const width = at.x(map.high[0]) - left, height = at.y(map.low[1]) - top;
   hatch(context, left, top, width, height);
+  context.save();
   context.imageSmoothingEnabled = false;
-  context.fillStyle = colour("panel");
+  context.globalCompositeOperation = "destination-out";
   context.drawImage(pictureOf(run, map), left, top, width, height);
+  context.globalCompositeOperation = "source-over";
+  context.globalAlpha = OPACITY;
+  context.drawImage(pictureOf(run, map), left, top, width, height);
+  context.restore();
 }
 
-// Oblique lines, which show through where a map is clear.
+// Oblique lines, which stay where a map is clear.
 function hatch(context, left, top, width, height) {
   context.save();
   context.beginPath();

@@ -8,12 +8,12 @@ function gutter() {
 function makeLanes(clock) {
   const place = element("div", {class: "lanes"});
   const cursor = element("div", {class: "cursor"});
-  const film = element("div", {class: "film"}, cursor);
-  body("timeline").append(place);
+  const over = element("div", {class: "over"}, cursor);
+  body("timeline").append(place, laneKey());
   let lanes = [];
   clock.on("result", () => {
     lanes = clock.run.results.flatMap((result, number) => lanesOf(clock, result, number));
-    place.replaceChildren(...lanes.map((lane) => lane.made), film);
+    place.replaceChildren(...lanes.map((lane) => lane.made), over);
     for (const lane of lanes) lane.redraw();
   });
   clock.on("view", () => lanes.forEach((lane) => lane.redraw()));
@@ -27,6 +27,20 @@ function makeLanes(clock) {
   clock.on("view", moveCursor);
   clock.on("result", moveCursor);
   window.addEventListener("themechange", () => lanes.forEach((lane) => lane.redraw()));
+}
+
+// What the heights and shades of lanes mean.
+function laneKey() {
+  const shown = ["violated", "failing", "holding", "satisfied", "unknown"];
+  return element("p", {class: "key"}, ...shown.map((standing) => {
+    const block = element("i", {class: "block"});
+    block.style.height = `${HEIGHTS[standing] * 0.75}rem`;
+    block.style.opacity = OPACITIES[standing];
+    block.style.background = `var(--${STANDINGS[standing].colour})`;
+    const {words} = STANDINGS[standing];
+    const isFinal = standing === "violated" || standing === "satisfied";
+    return element("span", {}, block, isFinal ? `${words}, whatever comes` : words);
+  }));
 }
 
 function shareOf(clock, time) {

@@ -3,6 +3,7 @@
 function makePage(run) {
   const clock = new Clock(run);
   makeTransport(clock, run.events);
+  linkVerdicts(clock);
   makeScene(clock);
   makeTree(clock);
   makeLanes(clock);

@@ -47,10 +47,10 @@ function readResult(result, numbers, times) {
   return {...result, nodes, automaton, times: times.subarray(first, first + samples)};
 }
 
-// Where a sample of the page is among those of a result: null before its first and after its last.
+// Where a sample of the page is among those of a result: null before its first, `result.samples` after its last.
 function placeIn(result, sample) {
   const place = sample - result.first;
-  return place >= 0 && place < result.samples ? place : null;
+  return place < 0 || !result.samples ? null : Math.min(place, result.samples);
 }
 
 // The last index whose time is not later; 0 before the first.

@@ -16,10 +16,11 @@ function makeScene(clock) {
   });
   made.className = "stage";
   made.style.aspectRatio = String(aspectOf(film));
-  const caption = element("p", {class: "caption", role: "status"});
+  const caption = element("p", {class: "caption"});
   const hasMaps = clock.run.decisions.some((decision) => decision.maps.length);
   place.append(made, element("div", {class: "scene-foot"}, caption, element("span", {class: "choice"},
-    layerBox("names", "labels", layers, redraw), hasMaps ? layerBox("map", "map", layers, redraw) : null)));
+    layerBox("names", "labels", layers, redraw), hasMaps ? layerBox("map", "map", layers, redraw) : null)),
+  sceneKey());
   let before = null;
   const show = () => {
     const frame = indexAt(film.times, clock.time);
@@ -28,10 +29,23 @@ function makeScene(clock) {
     before = [frame, decision];
     redraw();
     const pointed = film.witness.get(frame);
-    caption.textContent = pointed ? `worst now: ${pointed.label.replace("-", "−")}` : "nothing is violated now";
+    caption.textContent = pointed
+      ? `the arrow: what is violated most now, by ${pointed.label.replace("-", "")}` : "nothing is violated now";
   };
   clock.on("time", show);
   window.addEventListener("themechange", redraw);
+}
+
+// What the colours mean.
+function sceneKey() {
+  const entry = (name, words) => {
+    const block = element("i", {class: "block"});
+    block.style.height = "0.625rem";
+    block.style.background = `var(--${name})`;
+    return element("span", {}, block, words);
+  };
+  return element("p", {class: "key"}, entry("positive", "all that is asked of it holds now"),
+    entry("negative", "something does not"), entry("neutral", "nothing is asked, or unknown"));
 }
 
 function layerBox(label, name, layers, redraw) {
@@ -51,10 +65,13 @@ function readFilm(run) {
   const points = coordinates(numbers(film.witness.points));
   const witness = new Map(Array.from(frames, (frame, index) => [
     frame, {ends: points.subarray(4 * index, 4 * index + 4), label: film.witness.labels[index]}]));
+  const maps = run.decisions.flatMap((decision) => decision.maps);
+  const least = (axis) => Math.min(film.low[axis], ...maps.map((map) => map.low[axis]));
+  const greatest = (axis) => Math.max(film.high[axis], ...maps.map((map) => map.high[axis]));
   return {
     times: numbers(film.times),
-    low: film.low,
-    high: film.high,
+    low: [least(0), least(1)],
+    high: [greatest(0), greatest(1)],
     witness,
     entities: film.entities.map((entity) => readEntity(entity, numbers, coordinates)),
   };
@@ -88,7 +105,7 @@ function drawScene(context, clock, film, layers, width, height) {
   const frame = indexAt(film.times, clock.time);
   const at = projection(film.low, film.high, width, height, 18);
   const decision = decisionAt(clock.run, clock.time);
-  const map = decision?.maps.find((each) => each.chosen);
+  const map = decision?.maps.at(-1);
   if (layers.map && map) drawMap(context, clock.run, map, at);
   const labels = [];
   for (const entity of film.entities) drawEntity(context, entity, frame, at, labels);

@@ -12,10 +12,11 @@ const STANDINGS = {
 // A node that is asked at the first sample alone stands as its value on the samples so far, and, once they are
 // all there, as its verdict; one below a temporal operator stands as it does at the sample.
 function standingOf(run, result, node, place) {
-  if (place === null) return "absent";
+  const last = result.samples - 1;
+  if (place === null || (place > last && !node.asked)) return "absent";
   const [value, now, lower, upper] = node.series;
   if (!node.asked) return signOf(now[place]);
-  if (place === result.samples - 1) return node.verdict;
+  if (place >= last) return node.verdict;
   if (run.settles && lower[place] >= 0) return "satisfied";
   if (run.settles && upper[place] < 0) return "violated";
   return signOf(value[place]);
@@ -38,7 +39,7 @@ function stretchesOf(run, result, node) {
     from = place;
     standing = after;
   }
-  if (samples) stretches.push([times[from], times[samples - 1], standing]);
+  if (samples) stretches.push([times[from], run.times[run.times.length - 1], standing]);
   return stretches;
 }
 

@@ -23,9 +23,9 @@ function makeTree(clock) {
     const result = clock.run.results[clock.result];
     if (!result) return;
     const sample = placeIn(result, clock.sample);
-    const last = sample === result.samples - 1;
-    title.textContent = `${result.title} at ${secondsText(clock.time)}${last ? ", where the run ends" : ""}`;
-    for (const row of rows) showRow(row, clock.run, result, sample, last);
+    const isLast = sample !== null && sample >= result.samples - 1;
+    title.textContent = `${result.title} at ${secondsText(clock.time)}${isLast ? ", when all is seen" : ""}`;
+    for (const row of rows) showRow(row, clock.run, result, sample, isLast);
   });
 }
 
@@ -62,12 +62,17 @@ function showRow(row, run, result, place, isLast) {
     setMark(row.sign, standing);
     row.words.textContent = ` ${STANDINGS[standing].words} `;
   }
-  showNumber(row.now, place === null ? NaN : node.series[NOW][place], place === null);
+  const isSeen = place !== null && place < result.samples;
+  showNumber(row.now, isSeen ? node.series[NOW][place] : NaN, !isSeen);
   const hasValue = node.asked && place !== null;
-  showNumber(row.soFar, hasValue ? node.series[VALUE][place] : NaN, !hasValue);
-  if (hasValue && isLast) row.soFar.textContent = node.value || "?";
-  row.soFar.title = hasValue && run.settles
-    ? `between ${numberText(node.series[LOWER][place])} and ${numberText(node.series[UPPER][place])}` : "";
+  const at = Math.min(place ?? 0, result.samples - 1);
+  showNumber(row.soFar, hasValue ? node.series[VALUE][at] : NaN, !hasValue);
+  if (hasValue && isLast) row.soFar.title = node.value;
+  else row.soFar.title = hasValue && run.settles ? intervalText(node.series[LOWER][at], node.series[UPPER][at]) : "";
+}
+
+function intervalText(lower, upper) {
+  return `between ${numberText(lower)} and ${numberText(upper)}, whatever comes`;
 }
 
 function showNumber(made, number, isEmpty) {

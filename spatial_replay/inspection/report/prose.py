@@ -1,0 +1,143 @@
+"""What a page says before any script runs: what it is about, verdicts and why, panels to be filled."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from html import escape
+from typing import Final
+
+from spatial_replay import __version__
+from spatial_replay.inspection.report.contents import Report, ReportedResult
+from spatial_replay.inspection.words import time_text
+from spatial_replay.markup import Html, counted, element
+
+_UNFOLDED: Final = 6
+"""How many explanations are unfolded: the first ones."""
+_WITHOUT_SCRIPTS: Final = "Without scripts this page shows verdicts and explanations alone."
+
+
+def header(report: Report, omissions: Sequence[str]) -> Html:
+    """Which run this is, and what a reader has to know before the verdicts.
+
+    Args:
+        omissions: what the page leaves out for the sake of its size.
+    """
+    title = element("div", element("h1", text(report.log)), _chip(report.verdict), **{"class": "title"})
+    return element(
+        "header",
+        element("a", "Skip to the run", **{"class": "skip", "href": "#main"}),
+        title,
+        element("p", text(" · ".join(_about(report))), **{"class": "about"}),
+        *_notices(report, omissions),
+        element("noscript", element("p", _WITHOUT_SCRIPTS, **{"class": "notice"})),
+        **{"class": "top"},
+    )
+
+
+def panels(report: Report) -> Html:
+    """The verdicts, and a place for everything that is drawn."""
+    sections = [
+        _panel("verdicts", "Verdicts", *_verdicts(report)),
+        _panel("scene", "Scene"),
+        _panel("tree", "Specification"),
+        _panel("timeline", "Over time"),
+    ]
+    if any(result.automaton is not None for result in report.drawn):
+        sections.append(_panel("automaton", "Automaton"))
+    sections.append(_panel("events", "Events"))
+    if report.plan.decisions:
+        sections.append(_panel("decisions", "Decisions"))
+    return element("main", *sections, id="main")
+
+
+def footer(report: Report) -> Html:
+    """The texts of the specifications, and the certificate."""
+    texts = [
+        element("details", element("summary", text(file.filename)), element("pre", text(file.source)))
+        for file in report.files
+    ]
+    hashes = [
+        element("div", element("dt", text(key)), element("dd", text(value)))
+        for key, value in report.certificate.items()
+    ]
+    certificate = element("details", element("summary", "Certificate"), element("dl", *hashes))
+    return element("footer", *texts, certificate, **{"class": "foot"})
+
+
+def text(words: str) -> Html:
+    """A text of any length, escaped."""
+    return Html(escape(words))
+
+
+def _about(report: Report) -> Iterator[str]:
+    yield ", ".join(file.filename for file in report.files)
+    start, end = (time_text(time_ns, report.first_ns) for time_ns in (report.start_ns, report.end_ns))
+    yield f"{start} to {end}" if report.start_ns != report.first_ns else end
+    yield counted(report.samples, "sample")
+    yield f"semantics {report.semantics}"
+    yield f"spatial-replay {__version__}"
+
+
+def _notices(report: Report, omissions: Sequence[str]) -> Iterator[Html]:
+    if report.faults:
+        what = "The log is damaged: verdicts are over what could be read."
+        yield _notice("alert", what, report.faults)
+    if report.unreadable:
+        verb = "holds" if report.unreadable == 1 else "hold"
+        what = f"{counted(report.unreadable, 'observation')} {verb} no finite number: unknown there."
+        yield _notice("note", what, report.remarks)
+    elif report.remarks:
+        yield _notice("note", "The log says of its samples:", report.remarks)
+    if omissions:
+        yield _notice("note", "The run is large, and the page leaves something out:", omissions)
+
+
+def _notice(role: str, what: str, details: Sequence[str]) -> Html:
+    listed = element("ul", *(element("li", text(each)) for each in details)) if details else Html("")
+    return element("div", element("strong", what), listed, role=role, **{"class": f"notice {role}"})
+
+
+def _panel(name: str, title: str, *content: Html) -> Html:
+    heading = element("h2", title, id=f"{name}-title")
+    body = element("div", *content, id=f"{name}-body")
+    return element(
+        "section", heading, body, id=name, **{"class": "panel", "aria-labelledby": f"{name}-title"}
+    )
+
+
+def _verdicts(report: Report) -> Iterator[Html]:
+    if not report.results:
+        yield element("p", "No object was there for a template to stand for.")
+    places = {id(result): place for place, result in enumerate(report.drawn)}
+    for number, result in enumerate(report.results):
+        # which result the page shows when something in the verdict is chosen
+        drawn = {"data-result": str(places[id(result)])} if id(result) in places else {}
+        unfolded = {"open": ""} if result.sentences and number < _UNFOLDED else {}
+        attributes = {"class": "verdict", **drawn, **unfolded}
+        sentences = [element("p", *_with_code(sentence)) for sentence in result.sentences]
+        yield element(
+            "details" if sentences else "div", _summary(result, report.first_ns), *sentences, **attributes
+        )
+
+
+def _summary(result: ReportedResult, first_ns: int) -> Html:
+    numbers = f"robustness {result.robustness_text or 'not determined'}"
+    if result.first_satisfied_ns is not None:
+        numbers += f", first satisfied at {time_text(result.first_satisfied_ns, first_ns)}"
+    return element(
+        "summary" if result.sentences else "div",
+        _chip(result.verdict),
+        element("span", text(result.title), **{"class": "name"}),
+        element("span", text(numbers), **{"class": "numbers"}),
+        **{"class": "summary"},
+    )
+
+
+def _with_code(sentence: str) -> Iterator[Html]:
+    """A sentence whose parts between backquotes are code."""
+    for number, part in enumerate(sentence.split("`")):
+        yield element("code", text(part)) if number % 2 else text(part)
+
+
+def _chip(verdict: str) -> Html:
+    return element("span", verdict, **{"class": f"chip is-{verdict}"})
