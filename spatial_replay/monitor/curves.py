@@ -86,8 +86,9 @@ def draw_result(result: SpecResult, ax: Axes | None = None) -> Axes:
         seconds, np.clip(lower, low, high), np.clip(upper, low, high),
         color=curves[0].colour, alpha=0.15, linewidth=0,
     )  # fmt: skip
-    for number, curve in reversed(list(enumerate(curves))):
-        ax.plot(seconds, curve.values, color=curve.colour, linewidth=1.2 if number else 2.4)
+    for number, curve in enumerate(curves):
+        # the result's own shows below a part's where both are the same
+        ax.plot(seconds, curve.values, color=curve.colour, linewidth=1.2 if number else 3.0)
     _name_curves(ax, curves)
     ax.set_title(_title(result), loc="left", fontsize=10)
     ax.set_xlabel("time from the first sample in s; shaded: what the robustness can still become")
