@@ -19,6 +19,7 @@ COMMANDS: dict[str, str] = {
     "record": "Record a run as a log.",
     "replay": "Evaluate specifications over a log.",
     "report": "Write what a run did as one page.",
+    "serve": "Look at a replay in a viewer, and change constants there.",
     "verify": "Say whether a log is what it says it is.",
 }
 """Name and summary; `spatial_replay/cli/NAME.py` holds the command under its name."""

@@ -11,7 +11,7 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.inspection.specification import ReportedTree
 from spatial_replay.logs.block import Channel
 from spatial_replay.logs.messages.Curves_pb2 import Curves, NodeCurves, SpecificationCurves
-from spatial_replay.logs.topics import CURVES, protobuf_channel
+from spatial_replay.logs.topics import CURVES_TOPIC, protobuf_channel
 from spatial_replay.monitor.signal_table import looks_ahead
 from spatial_replay.monitor.stream import Stretch
 from spatial_replay.monitor.verdict import final_verdict
@@ -56,9 +56,9 @@ class Thinning:
         self._starts = np.linspace(0, count, most // 2, endpoint=False).astype(np.int64)
         self._ends = np.append(self._starts[1:], count) - 1
 
-    def seconds(self) -> Floats:
-        """The times of the points, from the first sample on."""
-        seconds = (self._times_ns - self._times_ns[0]) / 1e9
+    def seconds(self, first_ns: int) -> Floats:
+        """The times of the points, counted from a first one."""
+        seconds = (self._times_ns - first_ns) / 1e9
         return self._paired(seconds[self._starts], seconds[self._ends]) if self._is_needed else seconds
 
     def points(self, times_ns: Integers, numbers: Floats) -> Floats:
@@ -82,16 +82,19 @@ class Thinning:
         return np.column_stack([first, second]).reshape(-1)
 
 
-def encode_curves(times_ns: Integers, results: Sequence[CurvedResult]) -> bytes:
+def encode_curves(times_ns: Integers, results: Sequence[CurvedResult], first_ns: int) -> bytes:
     """The message that shows all of a log at once.
 
     Args:
         times_ns: (T,) int64, of all samples, at least one.
+        first_ns: the time that seconds count from.
     """
     curves = 2 * sum(len(curved_nodes(result.tree.formula)) for result in results)
     most = min(MOST_POINTS, max(_FEWEST_POINTS, _MOST_NUMBERS // max(curves, 1)))
     thinning = Thinning(times_ns, most)
-    message = Curves(time=thinning.seconds(), specifications=[_result(each, thinning) for each in results])
+    message = Curves(
+        time=thinning.seconds(first_ns), specifications=[_result(each, thinning) for each in results]
+    )
     return message.SerializeToString(deterministic=True)
 
 
@@ -127,4 +130,4 @@ def _result(result: CurvedResult, thinning: Thinning) -> SpecificationCurves:
     )
 
 
-CURVES_CHANNEL: Final[Channel] = protobuf_channel(CURVES, Curves)
+CURVES_CHANNEL: Final[Channel] = protobuf_channel(CURVES_TOPIC, Curves)

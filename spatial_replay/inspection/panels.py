@@ -9,10 +9,12 @@ import json
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
+from spatial_replay.inspection.curves import curved_nodes
 from spatial_replay.inspection.drawing import FRAME
 from spatial_replay.inspection.specification import ReportedTree, unit_of
 from spatial_replay.logs.topics import (
     AUTOMATON,
+    CURVES_TOPIC,
     EVENT_LOG,
     GRADIENT_MAP,
     PLAN_DECISION,
@@ -23,7 +25,7 @@ from spatial_replay.logs.topics import (
 )
 from spatial_replay.monitor.signal_table import looks_ahead
 from spatial_replay.palette import CURVES, lighter
-from spatial_replay.spec.formula import iter_nodes
+from spatial_replay.spec.formula import Formula, iter_nodes
 
 _MOST_CURVES: Final = 12
 _MOST_STRIPS: Final = 8
@@ -71,6 +73,20 @@ def part_curves(trees: Sequence[ReportedTree]) -> Panel | None:
         for name, ahead in named_parts(tree).items()
     ]
     return Panel("Plot!parts", _plot(paths[:_MOST_CURVES])) if paths else None
+
+
+def whole_curves(trees: Sequence[ReportedTree]) -> Panel:
+    """The value of each result, then what it is made of, over the whole log, from the newest message."""
+    labelled = [(_label(tree), f"{_curves_path(tree, 0)}.value[:]") for tree in trees]
+    labelled += [
+        (f"{node.name} in {_title(tree)}", f"{_curves_path(tree, identifier)}.{_shown_number(node)}[:]")
+        for tree in trees
+        for identifier, node in curved_nodes(tree.formula).items()
+        if identifier
+    ]
+    times = {"enabled": True, "value": f"{CURVES_TOPIC}.time[:]"}
+    whole = {"xAxisVal": "currentCustom", "xAxisPath": times, "isSynced": False}
+    return Panel("Plot!whole", {**_plot(labelled[:_MOST_CURVES]), **whole})
 
 
 def state_strips(trees: Sequence[ReportedTree], has_states: Sequence[bool]) -> Panel:
@@ -158,6 +174,15 @@ def _plot(labelled: Sequence[tuple[str, str]]) -> Config:
         "sidebarDimension": _LEGEND_PIXELS,
         "xAxisVal": "timestamp",
     }
+
+
+def _curves_path(tree: ReportedTree, identifier: int) -> str:
+    which = f"{{name=={_quoted(tree.name)}}}{{object=={_quoted(tree.object or '')}}}"
+    return f"{CURVES_TOPIC}.specifications[:]{which}.nodes[:]{{id=={identifier}}}"
+
+
+def _shown_number(node: Formula) -> str:
+    return "value" if looks_ahead(node) else "now"
 
 
 def _of(tree: ReportedTree) -> str:

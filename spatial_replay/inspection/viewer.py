@@ -23,6 +23,7 @@ from spatial_replay.inspection.panels import (
     scene_panel,
     specification_text,
     state_strips,
+    whole_curves,
 )
 from spatial_replay.inspection.specification import ReportedTree
 from spatial_replay.logs.sink import Attachment
@@ -78,8 +79,12 @@ class Contents(NamedTuple):
 
 def layout_attachment(contents: Contents) -> Attachment:
     """The layout of a log as a file to be kept in it (see `viewer_layout`)."""
-    text = json.dumps(viewer_layout(contents), indent=1, sort_keys=True, ensure_ascii=False)
-    return Attachment(LAYOUT, "application/json", text.encode())
+    return _attachment(viewer_layout(contents))
+
+
+def live_layout_attachment(contents: Contents) -> Attachment:
+    """The layout for a server that replays a log as a file (see `layout_for_live`)."""
+    return _attachment(layout_for_live(contents))
 
 
 def viewer_layout(contents: Contents) -> dict[str, Any]:
@@ -91,8 +96,13 @@ def viewer_layout(contents: Contents) -> dict[str, Any]:
 
 
 def layout_for_live(contents: Contents) -> dict[str, Any]:
-    """The layout for a server that replays a log: the same, and the constants that it lets one change."""
-    return _layout([*_shown(contents), (constants(), 1.0)], _said(contents))
+    """The layout for a server that replays a log: the same, with the curves of the whole log at any time, and
+    the constants that it lets one change."""
+    said = _said(contents)
+    if said:
+        # what was played so far is part of the whole
+        said[:1] = [(whole_curves(contents.trees), 3.0)]
+    return _layout([*_shown(contents), (constants(), 1.0)], said)
 
 
 _Weighted = tuple[Panel, float]
@@ -118,6 +128,11 @@ def _said(contents: Contents) -> list[_Weighted]:
     if EVENT_LOG in contents.topics:
         said.append((event_list(), 2.0))
     return [*said, (node_table(trees[-1]), 2.0), (specification_text(), 1.0)]
+
+
+def _attachment(layout: dict[str, Any]) -> Attachment:
+    text = json.dumps(layout, indent=1, sort_keys=True, ensure_ascii=False)
+    return Attachment(LAYOUT, "application/json", text.encode())
 
 
 def _layout(left: Sequence[_Weighted], right: Sequence[_Weighted]) -> dict[str, Any]:

@@ -18,7 +18,7 @@ EVENT_LOG = "/spatial/log"
 DERIVED = frozenset({SCENE, SPECIFICATION, ROBUSTNESS, AUTOMATON, EVENTS, EVENT_LOG})
 """Topics computed from the samples and a specification: a replay replaces them."""
 
-CURVES = "/spatial/curves"
+CURVES_TOPIC = "/spatial/curves"
 """What a live server says of the whole log; no file has it."""
 
 PLAN_DECISION = "/plan/decision"

@@ -26,6 +26,7 @@ class Playback:
     scene: a viewer may still show what is gone, which is deleted then, and it is drawn anew at once.
 
     Attributes:
+        tuned: what an evaluation says; another one of the same log may take its place before a `seek`.
         start_ns, end_ns: the first and the last time that there is something at.
         time_ns: up to where messages were taken, that included.
     """
@@ -37,21 +38,16 @@ class Playback:
         self.start_ns = min(int(times_ns[0]), own.start_ns) if has_own else int(times_ns[0])
         self.end_ns = max(int(times_ns[-1]), own.end_ns)
         self.time_ns = self.start_ns
-        self._tuned = tuned
+        self.tuned = tuned
         self._times_ns = times_ns
         self._annotator = tuned.annotator()
         self._reading = Reading(own, self.start_ns)
         self._next = 0
 
     @property
-    def tuned(self) -> Tuned:
-        """What the messages say."""
-        return self._tuned
-
-    @property
     def channels(self) -> tuple[Channel, ...]:
         """Those of the log's own messages."""
-        return self._tuned.tuning.own.channels
+        return self.tuned.tuning.own.channels
 
     def seek(self, time_ns: int) -> Messages:
         """Go to a time: what stands there, and what is at that time.
@@ -65,10 +61,10 @@ class Playback:
         self.time_ns = min(max(time_ns, self.start_ns), self.end_ns)
         self._next = int(np.searchsorted(self._times_ns, self.time_ns, side="right"))
         shown = max(self._next - 1, 0)
-        self._annotator = self._tuned.annotator(replace(self._annotator.scene, written_ns=None))
-        told = merge(self._annotator.pass_over(*self._tuned.part(0, shown)))
+        self._annotator = self.tuned.annotator(replace(self._annotator.scene, written_ns=None))
+        told = merge(self._annotator.pass_over(*self.tuned.part(0, shown)))
         last = select(told, np.arange(max(0, len(told) - _MOST_EVENTS), len(told)))
-        derived = self._annotator.messages(*self._tuned.part(shown, self._next))
+        derived = self._annotator.messages(*self.tuned.part(shown, self._next))
         return merge([last, *derived, *self._seek_own(int(self._times_ns[shown]))])
 
     def advance_to(self, time_ns: int) -> Messages:
@@ -80,17 +76,8 @@ class Playback:
         self.time_ns = min(max(time_ns, self.time_ns), self.end_ns)
         begin = self._next
         self._next = int(np.searchsorted(self._times_ns, self.time_ns, side="right"))
-        derived = self._annotator.messages(*self._tuned.part(begin, self._next))
+        derived = self._annotator.messages(*self.tuned.part(begin, self._next))
         return merge([*derived, self._reading.take_before(self.time_ns + 1)])
-
-    def show(self, tuned: Tuned) -> Messages:
-        """Go on with other numbers for the same log: what stands at the present time.
-
-        Raises:
-            LogError: the log cannot be read any more.
-        """
-        self._tuned = tuned
-        return self.seek(self.time_ns)
 
     def reach_ns(self, samples: int) -> int:
         """The time of the sample that comes so many after the last one taken, or the end."""
@@ -99,7 +86,7 @@ class Playback:
 
     def _seek_own(self, sample_ns: int) -> list[Messages]:
         """The log's own messages that stand at the present time, and those at that time."""
-        own = self._tuned.tuning.own
+        own = self.tuned.tuning.own
         since_ns = max(min(self.time_ns - _STANDS_NS, sample_ns), self.start_ns)
         self._reading = Reading(own, since_ns)
         before = [own.newest_before(since_ns), self._reading.take_before(self.time_ns)]

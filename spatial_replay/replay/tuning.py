@@ -12,7 +12,10 @@ from typing import Final
 from spatial_replay.errors import UsageError
 from spatial_replay.inspection.annotation import AnnotatedEvaluation, kept_files
 from spatial_replay.inspection.annotator import Annotator
+from spatial_replay.inspection.curves import CurvedResult, encode_curves
 from spatial_replay.inspection.scene import SceneState
+from spatial_replay.inspection.viewer import live_layout_attachment
+from spatial_replay.logs.sink import Attachment
 from spatial_replay.logs.source import MemorySource, Source
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
 from spatial_replay.monitor.stream import Stretch
@@ -217,8 +220,27 @@ class Tuned:
             ]
         )
 
+    @cached_property
+    def curves(self) -> bytes:
+        """The message of /spatial/curves."""
+        results = [
+            CurvedResult(tree, stretch, float(stream.robustness[0]), *stream.final[0].tolist())
+            for tree, stream, stretch in zip(
+                self.evaluation.trees, self.evaluation.streams, self.stretches, strict=True
+            )
+        ]
+        return encode_curves(self.tuning.inside.times_ns, results, self.tuning.first_ns)
+
+    @cached_property
+    def layout(self) -> Attachment:
+        """How to open a server of this log in a viewer."""
+        annotator = self.annotator()
+        annotator.messages(*self.part(0, 1))
+        annotator.pass_over(*self.part(1, len(self.tuning.inside)))
+        return live_layout_attachment(annotator.contents({each.topic for each in self.tuning.own.channels}))
+
     def annotator(self, scene: SceneState | None = None) -> Annotator:
-        """Who writes the messages of these samples, from the first on ; see `AnnotatedEvaluation`."""
+        """Who writes the messages of these samples, from the first on; see `AnnotatedEvaluation`."""
         return self.evaluation.annotator(scene)
 
     def part(self, begin: int, end: int) -> tuple[Trace, list[Stretch]]:
@@ -235,6 +257,14 @@ def constant_text(constant: Constant) -> str:
     if constant.duration_ns is not None:
         return format_duration(constant.duration_ns)
     return repr(constant.value).removesuffix(".0")
+
+
+def values_of(constants: Mapping[str, Constant]) -> dict[str, float | str]:
+    """Constants as `Tuning.evaluate` takes them."""
+    return {
+        name: each.value if each.duration_ns is None else constant_text(each)
+        for name, each in constants.items()
+    }
 
 
 def _places(files: Sequence[Specification]) -> dict[str, tuple[int, str]]:

@@ -1,0 +1,88 @@
+"""`spatial-replay serve`: look at a replay in a viewer, and change the specification's constants there."""
+
+from __future__ import annotations
+
+import ipaddress
+from typing import TYPE_CHECKING
+
+import click
+
+from spatial_replay.cli.evaluating import Request, evaluation_options, prepared, report_reading
+from spatial_replay.cli.failures import say
+from spatial_replay.cli.progress import progress
+from spatial_replay.cli.verdicts import print_verdicts
+
+if TYPE_CHECKING:
+    from spatial_replay.replay.tuning import Tuning
+
+
+@click.command()
+@evaluation_options
+@click.option(
+    "--port",
+    metavar="P",
+    type=click.IntRange(0, 65535),
+    default=8765,
+    show_default=True,
+    help="Where to listen; 0 for any that is free.",
+)
+@click.option(
+    "--host",
+    metavar="ADDRESS",
+    default="127.0.0.1",
+    show_default=True,
+    help="The address to listen at; anyone who reaches it can read the log.",
+)
+@click.option(
+    "--play", is_flag=True, help="Play at once, rather than wait at the start for a viewer to do so."
+)
+@click.option("--layout", is_flag=True, help="Print the layout to import in the viewer, and serve nothing.")
+def serve(request: Request, port: int, host: str, play: bool, layout: bool) -> None:
+    """Replay a log to Foxglove or Lichtblick, over WebSocket.
+
+    In the viewer, open a connection to the address that is printed. There, play, pause, seek and change the
+    speed; every constant of the specifications is a parameter: change one, and the curves, colours, events
+    and the verdict of the whole log follow.
+
+    T is 12.5s or 1500ms after the first sample, integer nanoseconds, or 2026-01-31T12:00:00Z. Ctrl-C ends it,
+    with code 130.
+
+    \b
+    Examples:
+      spatial-replay serve run.mcap --spec blocks.spatial
+      spatial-replay serve run.mcap --spec blocks.spatial --layout > live.json
+    """
+    # the numerical libraries load when there is work for them
+    from spatial_replay.runs.live.serving import serving
+
+    tuning = _tuning(request)
+    tuned = tuning.evaluate()
+    if layout:
+        click.echo(tuned.layout.data)
+        return
+    report_reading(tuned.replayed)
+    with serving(tuning, host=host, port=port, play=play) as server:
+        print_verdicts(tuned.replayed, None)
+        if not _is_loopback(host):
+            say("warning", f"anyone who reaches {server.address} can read this log", colour="yellow")
+        click.echo(f"serving at {server.address}; Ctrl-C ends it")
+        click.echo(f"  in Foxglove or Lichtblick: Open connection, Foxglove WebSocket, {server.address}")
+        click.echo("  its layout: the same command with --layout > live.json, to import there")
+        server.wait()
+
+
+def _tuning(request: Request) -> Tuning:
+    from spatial_replay.replay.annotated import check_parameters
+    from spatial_replay.replay.tuning import Tuning
+
+    task = prepared(request)
+    check_parameters(task.files, task.each)
+    with progress("samples") as advance:
+        return Tuning(task.source, task.files, window=task.window, each=task.each, advance=advance)
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -1,0 +1,67 @@
+"""A live server from its start to its end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from spatial_replay.errors import UsageError
+from spatial_replay.replay.tuning import Tuning
+from spatial_replay.runs.live.session import Session
+
+LOOPBACK = "127.0.0.1"
+PORT = 8765
+"""Where viewers look for a server unless told otherwise."""
+
+
+@dataclass(frozen=True)
+class Serving:
+    """A server at work.
+
+    Attributes:
+        address: what viewers connect to: ws://127.0.0.1:8765.
+    """
+
+    address: str
+    session: Session
+    _loop: Future[None]
+
+    def wait(self) -> None:
+        """Wait until it ends, which it does only when something fails, and raise that."""
+        self._loop.result()
+
+
+@contextmanager
+def serving(
+    tuning: Tuning, *, host: str = LOOPBACK, port: int = PORT, play: bool = False
+) -> Iterator[Serving]:
+    """Let viewers look at a log, and change the constants of its specifications, for a while.
+
+    Args:
+        host: the address to listen at; anyone who reaches it can read the log.
+        port: 0 for any that is free.
+        play: play from the start, rather than wait there for a viewer to do so.
+
+    Raises:
+        UsageError: nothing can listen there, or the library for it is not installed.
+        LogError: the log cannot be read.
+    """
+    try:
+        from spatial_replay.runs.live.server import LiveServer
+    except ImportError:
+        raise UsageError(
+            "serving takes foxglove-sdk, which is not installed: pip install 'spatial-replay[live]'"
+        ) from None
+    session = Session(tuning)
+    server = LiveServer(session, host, port)
+    with ThreadPoolExecutor(1, "live") as thread:
+        loop = thread.submit(session.run, server)
+        try:
+            if play:
+                session.control(is_playing=True, speed=1.0)
+            yield Serving(server.address, session, loop)
+        finally:
+            session.stop()
+            server.stop()

@@ -1,0 +1,54 @@
+"""What viewers want of a session, until its thread gets to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import Any
+
+from spatial_replay.replay.tuning import Tuned
+
+Values = dict[str, float | str]
+"""Numbers and, as texts, durations, by the names of constants."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """Something to be worked out from the present evaluation, and where the answer goes."""
+
+    work: Callable[[Tuned], Any]
+    answer: Future[Any] = field(default_factory=Future)
+
+    def settle(self, tuned: Tuned) -> None:
+        """Work it out, unless whoever asked is gone."""
+        if not self.answer.set_running_or_notify_cancel():
+            return
+        try:
+            self.answer.set_result(self.work(tuned))
+        except Exception as error:
+            self.answer.set_exception(error)
+
+
+@dataclass
+class Wishes:
+    """What has been asked for and is not done yet; of several of a kind the last one counts.
+
+    Attributes:
+        values: those of the constants that differ from what is written, if they are to change.
+        is_steered: whether to play, pause or change the speed.
+        is_moved: whether to go to another time.
+        topics: which topics somebody has subscribed to.
+        questions: all of them are answered, in order.
+        stop: whether the session is to end.
+    """
+
+    values: Values | None = None
+    is_steered: bool = False
+    is_moved: bool = False
+    topics: set[str] = field(default_factory=set)
+    questions: list[Question] = field(default_factory=list)
+    stop: bool = False
+
+    def __bool__(self) -> bool:
+        return self != Wishes()
