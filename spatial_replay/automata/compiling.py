@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from types import MappingProxyType
 from typing import Literal, TypeAlias, get_args
 
 from spatial_replay.automata.automaton import MAX_PROPOSITIONS, MAX_ROWS, Automaton, automaton_of
-from spatial_replay.automata.machine import Machine, least
+from spatial_replay.automata.machine import least
 from spatial_replay.automata.mona import compiled_by_mona
-from spatial_replay.automata.obstacles import too_large
+from spatial_replay.automata.obstacles import no_automaton
 from spatial_replay.automata.progression import progressed
 from spatial_replay.automata.propositions import Propositions
 from spatial_replay.automata.skeleton import Skeleton
@@ -53,50 +53,64 @@ def automaton(
     source = Source.of(specification.source, specification.filename) if specification.source else None
     propositions = Propositions(spec.formula)
     skeleton = Skeleton(spec.formula, propositions, source)
-    count = len(propositions.all)
-    if count > MAX_PROPOSITIONS:
-        reason = f"it has {count} propositions, an automaton at most {MAX_PROPOSITIONS}"
-        raise too_large(spec, source, [reason])
-    reasons = []
-    for each in get_args(Compiler) if compiler is None else (compiler,):
-        if each == "mona" and (before := _stored(stored, specification, spec)) is not None:
-            return before
-        try:
-            machine = (
-                progressed(skeleton, count) if each == "own" else compiled_by_mona(spec.formula, propositions)
-            )
-        except NoAutomatonError as error:
-            reasons.append(f"{_NAMES[each]}: {error}")
-            continue
-        return _value(machine, spec, propositions, source)
-    raise too_large(spec, source, reasons)
+    compilers = get_args(Compiler) if compiler is None else (compiler,)
+    try:
+        return _compiled(spec, skeleton, propositions, compilers, _read(stored, specification, spec))
+    except NoAutomatonError as error:
+        raise no_automaton(spec, source, str(error)) from error
 
 
-def _stored(stored: Iterable[bytes], specification: Specification, spec: NamedSpec) -> Automaton | None:
-    read = (automaton_from(data, specification, spec) for data in stored)
-    return next((each for each in read if each is not None), None)
-
-
-def _value(machine: Machine, spec: NamedSpec, propositions: Propositions, source: Source | None) -> Automaton:
-    """The automaton that is kept of what a compiler gave.
+def _compiled(
+    spec: NamedSpec,
+    skeleton: Skeleton,
+    propositions: Propositions,
+    compilers: Sequence[Compiler],
+    stored: Iterator[Automaton],
+) -> Automaton:
+    """The automaton of the first compiler that gives one; the first that is stored, rather than ask MONA.
 
     Raises:
-        NoAutomatonError: it is too large to be kept.
+        NoAutomatonError: why none does.
     """
-    try:
-        result = automaton_of(least(machine), spec.name, propositions.all)
-        rows = max(len(result.entries), len(result.decisions))
-        if rows > MAX_ROWS:
-            raise too_large(
-                spec, source, [f"it takes {rows} states or decisions, at most {MAX_ROWS} are kept"]
-            )
-        # once here, so that what is handed out has guards
-        result.transitions  # noqa: B018
-    except RecursionError:
-        raise too_large(spec, source, ["its decisions are nested too deeply"]) from None
-    except NoAutomatonError as error:
-        raise too_large(spec, source, [str(error)]) from error
-    return result
+    count = len(propositions.all)
+    if count > MAX_PROPOSITIONS:
+        raise NoAutomatonError(f"it has {count} propositions, an automaton at most {MAX_PROPOSITIONS}")
+    reasons = []
+    for each in compilers:
+        if each == "mona" and (before := next(stored, None)) is not None:
+            return before
+        try:
+            if each == "own":
+                machine = progressed(skeleton, count)
+            else:
+                machine = compiled_by_mona(spec.formula, propositions)
+        except NoAutomatonError as error:
+            reasons.append(f"{_NAMES[each]}: {error}")
+        else:
+            return _kept(automaton_of(least(machine), spec.name, propositions.all))
+    raise NoAutomatonError("; ".join(reasons))
+
+
+def _read(stored: Iterable[bytes], specification: Specification, spec: NamedSpec) -> Iterator[Automaton]:
+    """Those of files that are of a spec, read when they are asked for."""
+    for data in stored:
+        found = automaton_from(data, specification, spec)
+        if found is not None:
+            yield found
+
+
+def _kept(automaton: Automaton) -> Automaton:
+    """An automaton that is small enough, and knows its guards.
+
+    Raises:
+        NoAutomatonError: it is too large.
+    """
+    rows = max(len(automaton.entries), len(automaton.decisions))
+    if rows > MAX_ROWS:
+        raise NoAutomatonError(f"it takes {rows} states or decisions, at most {MAX_ROWS} are kept")
+    # once here, so that what is handed out has guards
+    automaton.transitions  # noqa: B018
+    return automaton
 
 
 def chosen_spec(specification: Specification, name: str | None) -> NamedSpec:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from spatial_replay.errors import NoAutomatonError
 from spatial_replay.spec.faults import Source
@@ -37,12 +37,12 @@ def refuse_operators(formula: Formula, source: Source | None) -> None:
         raise NoAutomatonError("\n".join(dict.fromkeys(map(str, faults))))
 
 
-def too_large(spec: NamedSpec, source: Source | None, reasons: Iterable[str]) -> NoAutomatonError:
-    """The error for a spec whose automaton is too large; its widest window is blamed, or else all of it."""
+def no_automaton(spec: NamedSpec, source: Source | None, reason: str) -> NoAutomatonError:
+    """The error for a spec that no compiler is up to; its widest window is blamed, or else all of it."""
     place = max(_temporal(spec.formula), key=_width, default=spec.formula)
     if not _width(place):
         place = _unnamed(spec.formula)
-    message = f"`{written(place)}` makes the automaton of {spec.name} too large: {'; '.join(reasons)}"
+    message = f"`{written(place)}` leaves {spec.name} without an automaton: {reason}"
     hint = "for an automaton, write smaller bounds, or split it into several specs"
     return obstacle(source, place, message, hint)
 

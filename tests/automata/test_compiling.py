@@ -137,7 +137,7 @@ def test_what_is_too_large_is_told_with_its_widest_window_and_every_reason() -> 
     with pytest.raises(NoAutomatonError) as raised:
         automaton(parse_specification(text, filename="task.spatial"), "slow", compiler="own")
     assert str(raised.value).splitlines() == [
-        "task.spatial:2:28: error: `F[20, 20]` makes the automaton of slow too large: this package: the "
+        "task.spatial:2:28: error: `F[20, 20]` leaves slow without an automaton: this package: the "
         "automaton takes more than 5000 states",
         "  spec slow = G (a ovlp b -> F[20, 20] c ovlp d)",
         "                             ^^^^^^^^^^^^^^^^^^",
@@ -156,7 +156,7 @@ def test_what_is_no_specification_is_told(value: object) -> None:
 
 def test_too_many_propositions_are_told() -> None:
     text = " and ".join(f"(F p{number} >= 0)" for number in range(65))
-    with pytest.raises(NoAutomatonError, match=r"`and` makes .* 65 propositions, an automaton at most 64"):
+    with pytest.raises(NoAutomatonError, match=r"`and` leaves .* 65 propositions, an automaton at most 64"):
         machine_of(text)
 
 
