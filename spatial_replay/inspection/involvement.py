@@ -2,7 +2,8 @@
 
 A formula without temporal operators inside speaks of its objects in the present sample. The largest such
 subformulas of a specification are its *concerns*; each counts with the sign in which the specification
-needs it: under a negation, or left of an implication, low robustness is what is wanted.
+needs it: under a negation, or left of an implication, low robustness is what is wanted. A concern counts
+until the largest temporal subformula that it is in, its *duty*, is done: no later sample can undo it.
 """
 
 from __future__ import annotations
@@ -44,21 +45,51 @@ class OpenGroup(NamedTuple):
     excluded: frozenset[str]
 
 
+class Duty(NamedTuple):
+    """A largest temporal subformula.
+
+    Attributes:
+        node: its id in the formula's tree.
+        sign: 1 where the formula needs it to hold, -1 where it needs it not to.
+    """
+
+    node: int
+    sign: float
+
+    def is_done(self, series: Floats, at: Integers) -> NDArray[np.bool_]:
+        """(S,) whether it holds, or does not where it must not, whatever comes; see `Evaluated`."""
+        if self.sign > 0.0:
+            return np.asarray(series[self.node, 2, at] >= 0.0)
+        return np.asarray(series[self.node, 3, at] < 0.0)
+
+
 class Concern(NamedTuple):
     """One largest subformula without temporal operators.
 
     Attributes:
         node: its id in the formula's tree.
         sign: 1 where the formula needs it to hold, -1 where it needs it not to.
+        duty: what it is asked for; None where nothing temporal is about it.
         objects, regions: names.
         groups: open groups, whose members are objects too.
     """
 
     node: int
     sign: float
+    duty: Duty | None
     objects: frozenset[str]
     regions: frozenset[str]
     groups: frozenset[OpenGroup]
+
+    def robustness(self, series: Floats, at: Integers) -> Floats:
+        """(S,) how well it holds now, in the sign that counts; NaN once its duty is done.
+
+        Args:
+            series: (N, 4, T), see `Evaluated`.
+            at: (S,) indices of samples.
+        """
+        now: Floats = self.sign * series[self.node, 1, at]
+        return now if self.duty is None else np.where(self.duty.is_done(series, at), np.nan, now)
 
 
 class Evaluated(NamedTuple):
@@ -106,6 +137,7 @@ def concerns_of(formula: Formula, object: str | None = None) -> tuple[Concern, .
         if parent is not None:
             temporal[parent] |= temporal[identifier]
     signs: list[float] = []
+    duties: list[Duty | None] = []
     operands_passed = [0] * len(nodes)
     found = []
     for identifier, parent, node in nodes:
@@ -114,8 +146,11 @@ def concerns_of(formula: Formula, object: str | None = None) -> tuple[Concern, .
         else:
             signs.append(signs[parent] * _sign(nodes[parent][2], operands_passed[parent]))
             operands_passed[parent] += 1
+        above = None if parent is None else duties[parent]
+        starts = above is None and isinstance(node, Temporal)
+        duties.append(Duty(identifier, signs[identifier]) if starts else above)
         if signs[identifier] and not temporal[identifier] and (parent is None or temporal[parent]):
-            found.append(_concern(identifier, signs[identifier], node, object))
+            found.append(_concern(identifier, signs[identifier], duties[identifier], node, object))
     return tuple(found)
 
 
@@ -128,7 +163,7 @@ def iter_subformulas(formula: Formula) -> Iterator[Formula]:
 def worst_robustness(
     evaluated: Sequence[Evaluated], seen: Seen, regions: Sequence[str]
 ) -> tuple[Floats, Floats]:
-    """The least robustness now, in the sign that counts, that each object and region takes part in.
+    """The least robustness now, in the sign that counts, that each object and region still takes part in.
 
     Returns:
         (S, objects) and (S, regions); NaN for what takes part in nothing that is known.
@@ -141,7 +176,7 @@ def worst_robustness(
         at = np.minimum(np.searchsorted(times_ns, seen.times_ns), len(times_ns) - 1)
         is_evaluated = times_ns[at] == seen.times_ns
         for concern in concerns:
-            now = np.where(is_evaluated, concern.sign * series[concern.node, 1, at], np.nan)
+            now = np.where(is_evaluated, concern.robustness(series, at), np.nan)
             for column in _columns(concern.objects, seen.names):
                 objects[:, column] = np.fmin(objects[:, column], now)
             for column in _columns(concern.regions, regions):
@@ -164,7 +199,9 @@ def _sign(parent: Formula, operand: int) -> float:
             return 1.0
 
 
-def _concern(identifier: int, sign: float, formula: Formula, object: str | None) -> Concern:
+def _concern(
+    identifier: int, sign: float, duty: Duty | None, formula: Formula, object: str | None
+) -> Concern:
     objects: set[str] = set()
     regions: set[str] = set()
     groups: set[OpenGroup] = set()
@@ -188,7 +225,7 @@ def _concern(identifier: int, sign: float, formula: Formula, object: str | None)
                         objects.update(set(group.members) - excluded)
                 case _:
                     pass
-    return Concern(identifier, sign, frozenset(objects), frozenset(regions), frozenset(groups))
+    return Concern(identifier, sign, duty, frozenset(objects), frozenset(regions), frozenset(groups))
 
 
 def _with_bindings(formula: Formula) -> Iterator[tuple[Formula, _Bindings]]:

@@ -133,7 +133,7 @@ def _worst(evaluated: Sequence[Evaluated], times_ns: Integers) -> tuple[Integers
         at = np.minimum(np.searchsorted(own.times_ns, times_ns), len(own.times_ns) - 1)
         is_evaluated = own.times_ns[at] == times_ns
         for number, one in enumerate(own.concerns):
-            now = one.sign * own.series[one.node, 1, at]
+            now = one.robustness(own.series, at)
             is_worse = is_evaluated & (now < worst) & (now > -np.inf)
             result[is_worse], concern[is_worse], worst[is_worse] = index, number, now[is_worse]
     return result, concern, worst

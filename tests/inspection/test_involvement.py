@@ -42,7 +42,7 @@ def signs(formula) -> list[tuple[int, float]]:
 
 def test_a_formula_without_temporal_operators_is_one_concern():
     formula = Boolean("not", (Boolean("->", (atom(A, B), atom(A, GOAL))),))
-    assert concerns_of(formula) == (Concern(0, 1.0, frozenset("ab"), frozenset({"goal"}), frozenset()),)
+    assert concerns_of(formula) == (Concern(0, 1.0, None, frozenset("ab"), frozenset({"goal"}), frozenset()),)
 
 
 def test_concerns_are_the_largest_subformulas_below_temporal_operators():

@@ -439,6 +439,15 @@ def test_an_open_quantifier_and_a_look_back_have_no_arrow():
         assert "witness" not in {each.id for each in message.entities}
 
 
+@pytest.mark.parametrize(
+    "text", ["F a closeto[1] b", "not (G a farfrom[1] b)", "(not a farfrom[9] b) U (a closeto[1] b)"]
+)
+def test_what_is_done_for_good_is_asked_no_more(text):
+    shown = pointed(f"spec s = {text}", *[{"a": box_at(0.0), "b": box_at(x)} for x in (4.0, 1.5, 12.0)])
+    assert [tint(message, "object/a") for message in shown[1:]] == ["grey", "grey"]
+    assert not any(each.id == "witness" for message in shown[1:] for each in message.entities)
+
+
 def test_a_group_with_nobody_in_it_hides_no_arrow():
     drink = 'group drinks = class "drink"\nspec s = F (exists o in drinks: o closeto[1] a)\n'
     [message] = pointed(drink + "spec t = G a closeto[1] b", {"a": box_at(0.0), "b": box_at(3.0)})
