@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 _LONGEST_LABEL: Final = 12
 """Characters of a proposition that stands on an arrow as it is."""
 _MOST_STATES: Final = 40
-"""States of an automaton that is drawn without being asked for."""
+_MOST_CUBES: Final = 400
+"""States, and cubes on arrows, of an automaton that is drawn without being asked for."""
 _MOST_LINES: Final = 200
 """Lines in words."""
 _ARROW: Final = hexadecimal(NEUTRAL)
@@ -31,7 +32,7 @@ _INCH: Final = 72.0
 def automaton_html(automaton: Automaton) -> Html:
     """Its size; if it is small, also a drawing, if Graphviz is there, and its states and moves in words."""
     title = element("div", element("b", automaton.name), quiet(f" {size_words(automaton)}"))
-    if len(automaton.states) > _MOST_STATES:
+    if _is_large(automaton):
         return element("div", title, quiet("too large to be drawn here; plot() draws it, to_dot() writes it"))
     drawing = automaton_svg(automaton)
     shown = quiet("drawing it takes Graphviz") if drawing is None else Html(drawing)
@@ -45,7 +46,7 @@ def automaton_html(automaton: Automaton) -> Html:
 
 def automaton_svg(automaton: Automaton) -> str | None:
     """The automaton drawn by Graphviz; None if it is large or cannot be drawn here."""
-    if len(automaton.states) > _MOST_STATES:
+    if _is_large(automaton):
         return None
     try:
         drawing = graphviz_text(_abbreviated(automaton), "svg")
@@ -53,6 +54,12 @@ def automaton_svg(automaton: Automaton) -> str | None:
         return None
     # what comes before is for files, not for pages
     return drawing[drawing.index("<svg") :]
+
+
+def _is_large(automaton: Automaton) -> bool:
+    if len(automaton.states) > _MOST_STATES:
+        return True
+    return sum(len(each.guard) for each in automaton.transitions) > _MOST_CUBES
 
 
 def draw_automaton(automaton: Automaton, ax: Axes | None = None) -> Axes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -27,6 +27,8 @@ _MOST_CURVES: Final = 6
 _WIDTH, _HEIGHT = 8.0, 2.4
 """Of a panel, in inches."""
 _LONGEST_NAME: Final = 24
+_SHADE: Final = 0.15
+"""How strong the colour of the band is."""
 _GAP: Final = 0.11
 """Between two labels, as a share of a panel's height."""
 
@@ -39,7 +41,7 @@ class Curve(NamedTuple):
     colour: str
 
 
-def draw_evaluation(evaluation: Evaluation, ax: Axes | Sequence[Axes] | None = None) -> tuple[Axes, ...]:
+def draw_evaluation(evaluation: Evaluation, ax: Axes | Iterable[Axes] | None = None) -> tuple[Axes, ...]:
     """Draw each result in axes of its own, below each other; of many, the worst ones.
 
     Args:
@@ -48,23 +50,31 @@ def draw_evaluation(evaluation: Evaluation, ax: Axes | Sequence[Axes] | None = N
     Raises:
         UsageError: more or fewer axes than results, or matplotlib is not installed.
     """
-    if ax is None:
-        shown = worst_of(evaluation.results, _MOST_PANELS)
-        size = (_WIDTH, 0.4 + _HEIGHT * len(shown))
-        panels = new_panels(len(shown), 1, size, same_x=True) if shown else ()
-    else:
-        shown, panels = evaluation.results, tuple(ax) if isinstance(ax, Sequence) else (ax,)
-    if len(shown) != len(panels):
-        results = counted(len(shown), "result")
-        raise UsageError(f"ax has {len(panels)} axes for {results}; give one for each, or draw one result")
-    for result, panel in zip(shown, panels, strict=True):
-        draw_result(result, panel)
+    if ax is not None:
+        given = np.array(list(ax) if isinstance(ax, Iterable) else [ax], object)
+        return _drawn(evaluation.results, tuple(given.flat))
+    shown = worst_of(evaluation.results, _MOST_PANELS)
+    if not shown:
+        return ()
+    size = (_WIDTH, 0.4 + _HEIGHT * len(shown))
+    panels = _drawn(shown, new_panels(len(shown), 1, size, same_x=True))
+    for panel in panels:
         panel.label_outer()
     if len(shown) < len(evaluation.results):
         left_out = len(evaluation.results) - len(shown)
         panels[-1].set_xlabel(
             f"{panels[-1].get_xlabel()}\nand {counted(left_out, 'result')} more, none worse"
         )
+    return panels
+
+
+def _drawn(results: Sequence[SpecResult], panels: tuple[Axes, ...]) -> tuple[Axes, ...]:
+    """Each result in its axes."""
+    if len(results) != len(panels):
+        count = counted(len(results), "result")
+        raise UsageError(f"ax has {len(panels)} axes for {count}; give one for each, or draw one result")
+    for result, panel in zip(results, panels, strict=True):
+        draw_result(result, panel)
     return panels
 
 
@@ -82,16 +92,17 @@ def draw_result(result: SpecResult, ax: Axes | None = None) -> Axes:
     ax.set_xlim(seconds[0], seconds[-1] if len(seconds) > 1 else 1.0)
     ax.set_ylim(low, high)
     ax.axhline(0.0, color=NEUTRAL, linewidth=0.8, zorder=1)
+    has_band = not np.isnan(lower).all()
     ax.fill_between(
         seconds, np.clip(lower, low, high), np.clip(upper, low, high),
-        color=curves[0].colour, alpha=0.15, linewidth=0,
+        color=curves[0].colour, alpha=_SHADE, linewidth=0,
     )  # fmt: skip
     for number, curve in enumerate(curves):
         # the result's own shows below a part's where both are the same
         ax.plot(seconds, curve.values, color=curve.colour, linewidth=1.2 if number else 3.0)
-    _name_curves(ax, curves)
+    _name_curves(ax, curves, has_band)
     ax.set_title(_title(result), loc="left", fontsize=10)
-    ax.set_xlabel("time from the first sample in s; shaded: what the robustness can still become")
+    ax.set_xlabel("time from the first sample in s")
     ax.set_ylabel("robustness")
     ax.spines[["top", "right"]].set_visible(False)
     return ax
@@ -100,14 +111,21 @@ def draw_result(result: SpecResult, ax: Axes | None = None) -> Axes:
 def _curves(result: SpecResult) -> list[Curve]:
     """The result's own curve, and those of the first specs that it is made of."""
     colours = {Verdict.SATISFIED: POSITIVE, Verdict.VIOLATED: NEGATIVE}
-    values = np.where(np.isfinite(result.series[:, 0]), result.series[:, 0], np.nan)
-    curves = [Curve(title_of(result), values[0], hexadecimal(colours.get(result.verdict, NEUTRAL)))]
+    own = hexadecimal(colours.get(result.verdict, NEUTRAL))
     named = {node.name: number for number, _, node in reversed(list(iter_nodes(result.formula))) if node.name}
     parts = sorted((number, name) for name, number in named.items() if number)
     # blue and vermillion say how the result is
-    for (number, name), colour in zip(parts, CURVES[2 : _MOST_CURVES + 1], strict=False):
-        curves.append(Curve(name, values[number], colour))
-    return curves
+    others = zip(parts, CURVES[2 : _MOST_CURVES + 1], strict=False)
+    return [
+        Curve(title_of(result), _finite(result, 0), own),
+        *(Curve(name, _finite(result, number), colour) for (number, name), colour in others),
+    ]
+
+
+def _finite(result: SpecResult, node: int) -> Floats:
+    """A node's value, where it is a number."""
+    values = result.series[node, 0]
+    return np.where(np.isfinite(values), values, np.nan)
 
 
 def _limits(curves: Sequence[Floats]) -> tuple[float, float]:
@@ -118,16 +136,28 @@ def _limits(curves: Sequence[Floats]) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def _name_curves(ax: Axes, curves: Sequence[Curve]) -> None:
-    """Write each curve's name to the right of where it ends, none over another."""
+def _name_curves(ax: Axes, curves: Sequence[Curve], has_band: bool) -> None:
+    """Write to the right what each curve is, and below what the band is; no name over another."""
     low, high = ax.get_ylim()
-    ends = [_last(curve.values) for curve in curves]
-    places = _apart([(end - low) / (high - low) for end in ends])
+    ends = [(_last(curve.values) - low) / (high - low) for curve in curves]
+    *places, bottom = _apart([*ends, 0.0])
     for place, curve in zip(places, curves, strict=True):
-        ax.plot(1.02, place, "s", color=curve.colour, transform=ax.transAxes, clip_on=False)
-        weight = "bold" if curve is curves[0] else "normal"
-        name = plain(curve.name, _LONGEST_NAME)
-        ax.text(1.035, place, name, transform=ax.transAxes, va="center", fontsize=9, fontweight=weight)
+        _draw_key(ax, place, curve.name, curve.colour, is_bold=curve is curves[0])
+    if has_band:
+        _draw_key(ax, bottom, "still possible", curves[0].colour, alpha=2 * _SHADE)
+
+
+def _draw_key(
+    ax: Axes, place: float, name: str, colour: str, *, alpha: float = 1.0, is_bold: bool = False
+) -> None:
+    """A square of a colour to the right of the axes, and what it stands for."""
+    weight = "bold" if is_bold else "normal"
+    mark, word = {"color": colour, "alpha": alpha}, {"fontweight": weight}
+    for text, points, style in (("■", 5, mark), (plain(name, _LONGEST_NAME), 17, word)):
+        ax.annotate(
+            text, (1.0, place), (points, 0), xycoords="axes fraction", textcoords="offset points",
+            va="center", fontsize=9, **style,
+        )  # fmt: skip
 
 
 def _last(values: Floats) -> float:
@@ -139,11 +169,14 @@ def _last(values: Floats) -> float:
 def _apart(places: Sequence[float]) -> list[float]:
     """Places moved, in their order, so that none is nearer than the gap to another and none above 1."""
     apart = list(places)
+    order = sorted(range(len(places)), key=places.__getitem__)
     below = -np.inf
-    for number in sorted(range(len(places)), key=places.__getitem__):
-        below = apart[number] = max(places[number], below + _GAP)
-    excess = max(below - 1.0, 0.0)
-    return [place - excess for place in apart]
+    for number in order:
+        below = apart[number] = max(apart[number], below + _GAP)
+    above = 1.0 + _GAP
+    for number in reversed(order):
+        above = apart[number] = min(apart[number], above - _GAP)
+    return apart
 
 
 def _title(result: SpecResult) -> str:

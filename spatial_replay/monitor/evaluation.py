@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from reprlib import repr as shortened
@@ -266,7 +266,7 @@ class Evaluation:
         worst = worst_verdict(result.verdict for result in results)
         return next(result for result in results if result.verdict is worst).witness(node)
 
-    def plot(self, ax: Axes | Sequence[Axes] | None = None) -> tuple[Axes, ...]:
+    def plot(self, ax: Axes | Iterable[Axes] | None = None) -> tuple[Axes, ...]:
         """Draw each result as curves over time; see `draw_evaluation`."""
         from spatial_replay.monitor.curves import draw_evaluation
 
