@@ -92,7 +92,7 @@ def draw_result(result: SpecResult, ax: Axes | None = None) -> Axes:
     ax.set_xlim(seconds[0], seconds[-1] if len(seconds) > 1 else 1.0)
     ax.set_ylim(low, high)
     ax.axhline(0.0, color=NEUTRAL, linewidth=0.8, zorder=1)
-    has_band = not np.isnan(lower).all()
+    has_band = bool((lower < upper).any())
     ax.fill_between(
         seconds, np.clip(lower, low, high), np.clip(upper, low, high),
         color=curves[0].colour, alpha=_SHADE, linewidth=0,
