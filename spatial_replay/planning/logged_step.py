@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,10 +37,10 @@ class LoggedStep:
     """
 
     step: Step
-    sample: Sample
+    sample: Sample = field(repr=False)
     outcome: Outcome | None
     end_ns: int | None
-    travelled: tuple[tuple[float, float], ...]
+    travelled: tuple[tuple[float, float], ...] = field(repr=False)
 
     def plot(self) -> tuple[Axes, ...]:
         """Draw the maps with the objects as they were; see `draw_step`."""

@@ -76,6 +76,10 @@ class GradientMap:
 
         return draw_map(self, ax, turn=turn, sample=sample, target=target)
 
+    def __repr__(self) -> str:
+        cells = f"{self.grid.columns} x {self.grid.rows}"
+        return f"<GradientMap of {self.name}: {cells} cells, {self.best():.4g} at best>"
+
     def _repr_html_(self) -> str:
         from spatial_replay.planning.map_picture import map_html
 
