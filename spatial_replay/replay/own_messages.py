@@ -7,16 +7,19 @@ from typing import Final
 
 import numpy as np
 
+from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.block import Block, Channel, Messages
 from spatial_replay.logs.merging import merge, select
 from spatial_replay.logs.reading import read_blocks
-from spatial_replay.logs.source import MemorySource
 from spatial_replay.replay.selection import Selection
 from spatial_replay.trace.trace import Trace, window_of
 
 _FEW: Final = 2_000
 _FEW_BYTES: Final = 1 << 26
 """Messages of one topic, and bytes of all such topics, that are held in memory."""
+
+_PIECE: Final = 256
+"""Samples that are made messages of at once."""
 
 
 class OwnMessages:
@@ -27,7 +30,7 @@ class OwnMessages:
 
     Attributes:
         channels: in the order in which they were met.
-        start_ns, end_ns: times of the first and the last message; 0 and -1 if there are none.
+        start_ns, end_ns: times of the first and the last message or sample; 0 and -1 if there are none.
     """
 
     def __init__(self, selection: Selection) -> None:
@@ -46,11 +49,10 @@ class OwnMessages:
         """Take in the next block of the log."""
         window = self._selection.window
         begin, end = window_of(block.messages.log_time_ns, window.start_ns, window.end_ns)
-        if end > begin:
-            times_ns = block.messages.log_time_ns[begin:end]
-            self.start_ns = int(times_ns[0]) if not self._counts else min(self.start_ns, int(times_ns[0]))
-            self.end_ns = max(self.end_ns, int(times_ns[-1]))
-            self._count(select(block.messages, np.arange(begin, end)))
+        messages = select(block.messages, np.arange(begin, end))
+        self._span(messages.log_time_ns)
+        self._span(self._selection.inside(block.trace).times_ns)
+        self._count(messages)
         if self._counts:
             self._samples = []
         else:
@@ -64,36 +66,47 @@ class OwnMessages:
         """
         selection = self._selection
         first = 0
-        source = selection.source if self._counts else MemorySource(self._trace(), selection.source.name)
-        for block in read_blocks(source, max(start_ns, selection.window.start_ns), selection.window.end_ns):
+        for block in self._iter_blocks(max(start_ns, selection.window.start_ns)):
             yield selection.own_messages(block, first)
             first += len(selection.inside(block.trace))
 
-    def newest_before(self, time_ns: int) -> Messages:
+    def few_before(self, time_ns: int) -> Messages:
         """Of each topic with few messages the last one before a time."""
-        return newest(
-            merge(
-                [
-                    select(messages, np.arange(np.searchsorted(messages.log_time_ns, time_ns)))
-                    for pieces in self._few.values()
-                    for messages in pieces
-                ]
-            )
-        )
+        before = [
+            select(messages, np.arange(np.searchsorted(messages.log_time_ns, time_ns)))
+            for pieces in self._few.values()
+            for messages in pieces
+        ]
+        return standing(merge(before), time_ns)
 
-    def _trace(self) -> Trace:
+    def _iter_blocks(self, start_ns: int) -> Iterator[Block]:
+        """The log from a time on; from memory, in small pieces, where its samples are all that it has."""
+        if self._counts:
+            yield from read_blocks(self._selection.source, start_ns, self._selection.window.end_ns)
+            return
         if len(self._samples) > 1:
             self._samples = [Trace.concatenate(self._samples)]
-        return self._samples[0]
+        for trace in self._samples:
+            begin = int(np.searchsorted(trace.times_ns, start_ns))
+            for at in range(begin, len(trace), _PIECE):
+                yield Block(trace.slice(at, at + _PIECE))
+
+    def _span(self, times_ns: Integers) -> None:
+        if len(times_ns):
+            first_ns, last_ns = times_ns[[0, -1]].tolist()
+            self.start_ns = first_ns if self.end_ns < 0 else min(self.start_ns, first_ns)
+            self.end_ns = max(self.end_ns, last_ns)
 
     def _count(self, messages: Messages) -> None:
         """Take in messages in the window; topics that have many are held no longer."""
         for number, channel in messages.channels.items():
             chosen = np.flatnonzero(messages.channel == number)
+            if not len(chosen):
+                continue
             if channel not in self._counts:
                 self._few[channel] = []
             self._counts[channel] = self._counts.get(channel, 0) + len(chosen)
-            if channel in self._few and len(chosen):
+            if channel in self._few:
                 own = select(messages, chosen)
                 self._few[channel].append(own)
                 self._bytes += _size(own)
@@ -107,6 +120,7 @@ class Reading:
     def __init__(self, own: OwnMessages, start_ns: int) -> None:
         self._pieces = own.iter_from(start_ns)
         self._waiting = Messages()
+        self._taken = 0
         self._is_over = False
 
     def take_before(self, end_ns: int) -> Messages:
@@ -120,17 +134,19 @@ class Reading:
             if piece is None:
                 self._is_over = True
             else:
-                self._waiting = merge([self._waiting, piece])
-        count = int(np.searchsorted(self._waiting.log_time_ns, end_ns))
-        taken = select(self._waiting, np.arange(count))
-        self._waiting = select(self._waiting, np.arange(count, len(self._waiting)))
-        return taken
+                rest = select(self._waiting, np.arange(self._taken, len(self._waiting)))
+                self._waiting, self._taken = merge([rest, piece]), 0
+        begin = self._taken
+        self._taken = max(begin, int(np.searchsorted(self._waiting.log_time_ns, end_ns)))
+        return select(self._waiting, np.arange(begin, self._taken))
 
 
-def newest(messages: Messages) -> Messages:
-    """Of each channel the last message."""
+def standing(messages: Messages, time_ns: int) -> Messages:
+    """Of each channel the messages from a time on or, where there are none, the last one before."""
     _, last = np.unique(messages.channel[::-1], return_index=True)
-    return select(messages, np.sort(len(messages) - 1 - last))
+    chosen = messages.log_time_ns >= time_ns
+    chosen[len(messages) - 1 - last] = True
+    return select(messages, np.flatnonzero(chosen))
 
 
 def _reaches(messages: Messages, end_ns: int) -> bool:

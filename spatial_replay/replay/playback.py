@@ -7,9 +7,10 @@ from typing import Final
 
 import numpy as np
 
+from spatial_replay.inspection.scene import SceneState
 from spatial_replay.logs.block import Channel, Messages
 from spatial_replay.logs.merging import merge, select
-from spatial_replay.replay.own_messages import Reading, newest
+from spatial_replay.replay.own_messages import Reading, standing
 from spatial_replay.replay.tuning import Tuned
 
 _STANDS_NS: Final = 2_000_000_000
@@ -17,6 +18,9 @@ _STANDS_NS: Final = 2_000_000_000
 
 _MOST_EVENTS: Final = 500
 """How many messages are sent at once of what was told before."""
+
+_PIECE: Final = 64
+"""Samples in which objects are looked for at once."""
 
 
 class Playback:
@@ -33,14 +37,12 @@ class Playback:
 
     def __init__(self, tuned: Tuned) -> None:
         """Begin before the first message; `seek` first."""
-        times_ns, own = tuned.tuning.inside.times_ns, tuned.tuning.own
-        has_own = own.end_ns >= own.start_ns
-        self.start_ns = min(int(times_ns[0]), own.start_ns) if has_own else int(times_ns[0])
-        self.end_ns = max(int(times_ns[-1]), own.end_ns)
+        own = tuned.tuning.own
+        self.start_ns, self.end_ns = own.start_ns, own.end_ns
         self.time_ns = self.start_ns
         self.tuned = tuned
-        self._times_ns = times_ns
-        self._annotator = tuned.annotator()
+        self._times_ns = tuned.tuning.inside.times_ns
+        self._annotator = tuned.annotator(SceneState(scale=_scale(tuned)))
         self._reading = Reading(own, self.start_ns)
         self._next = 0
 
@@ -65,7 +67,7 @@ class Playback:
         told = merge(self._annotator.pass_over(*self.tuned.part(0, shown)))
         last = select(told, np.arange(max(0, len(told) - _MOST_EVENTS), len(told)))
         derived = self._annotator.messages(*self.tuned.part(shown, self._next))
-        return merge([last, *derived, *self._seek_own(int(self._times_ns[shown]))])
+        return merge([last, *derived, self._seek_own(int(self._times_ns[shown]))])
 
     def advance_to(self, time_ns: int) -> Messages:
         """What comes after the messages taken so far, up to a time, that included.
@@ -84,10 +86,20 @@ class Playback:
         index = self._next + samples - 1
         return int(self._times_ns[index]) if index < len(self._times_ns) else self.end_ns
 
-    def _seek_own(self, sample_ns: int) -> list[Messages]:
+    def _seek_own(self, sample_ns: int) -> Messages:
         """The log's own messages that stand at the present time, and those at that time."""
         own = self.tuned.tuning.own
         since_ns = max(min(self.time_ns - _STANDS_NS, sample_ns), self.start_ns)
         self._reading = Reading(own, since_ns)
-        before = [own.newest_before(since_ns), self._reading.take_before(self.time_ns)]
-        return [newest(merge(before)), self._reading.take_before(self.time_ns + 1)]
+        found = merge([own.few_before(since_ns), self._reading.take_before(self.time_ns + 1)])
+        return standing(found, self.time_ns)
+
+
+def _scale(tuned: Tuned) -> float | None:
+    """The scale of the annotated log's scene, which the first objects in it set."""
+    annotator = tuned.annotator()
+    for begin in range(0, len(tuned.tuning.inside), _PIECE):
+        annotator.messages(*tuned.part(begin, begin + _PIECE))
+        if annotator.scene.scale is not None:
+            break
+    return annotator.scene.scale

@@ -1,0 +1,163 @@
+"""A log played from any time on is the annotated log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import spatial_replay as sr
+from replay.runs import STEP_NS, PiecewiseSource, content_of, record, run, sample
+from spatial_replay.logs.block import Messages
+from spatial_replay.logs.source import Source, open_source
+from spatial_replay.logs.topics import OBJECTS, ROBUSTNESS, SCENE, SPECIFICATION
+from spatial_replay.replay import Window, run_replay
+from spatial_replay.replay.playback import Playback
+from spatial_replay.replay.tuning import Tuning
+
+ROOT = Path(__file__).parents[2]
+TEXT = """\
+const far = 0.5
+region goal = box(4, -1, 9, 2)
+spec reach = F (cube enclosedin goal)
+spec apart = G (cube dist "cup 物" >= far)
+"""
+COUNT = 24
+Sent = tuple[str, int, bytes]
+
+
+def specification() -> sr.Specification:
+    return sr.parse_specification(TEXT, filename="blocks.spatial")
+
+
+def playback(source: Source | None = None, window: Window | None = None) -> Playback:
+    source = source or PiecewiseSource(run(COUNT), 7)
+    return Playback(Tuning(source, [specification()], window=window).evaluate())
+
+
+def sent(messages: Messages) -> list[Sent]:
+    topics = [messages.channels[number].topic for number in messages.channel.tolist()]
+    return list(zip(topics, messages.log_time_ns.tolist(), messages.payloads, strict=True))
+
+
+def annotated(source: Source, output: Path, window: Window | None = None) -> list[Sent]:
+    """What a replay writes."""
+    run_replay(source, [specification()], output=output, window=window)
+    return [(topic, time_ns, data) for topic, time_ns, _, _, data in content_of(output).messages]
+
+
+def played(of: Playback, from_ns: int, until: Sequence[int] = ()) -> list[Sent]:
+    """All that is sent from a time on, in stretches up to some times and then to the end."""
+    found = sent(of.seek(from_ns))
+    for time_ns in (*sorted(until), of.end_ns):
+        found += sent(of.advance_to(time_ns))
+    return found
+
+
+@cache
+def whole() -> list[Sent]:
+    with TemporaryDirectory() as folder:
+        return annotated(PiecewiseSource(run(COUNT), 5), Path(folder) / "a.mcap")
+
+
+TIMES = st.lists(st.integers(0, COUNT * STEP_NS), max_size=6)
+
+
+@settings(max_examples=25)
+@given(TIMES)
+def test_from_the_start_it_is_the_annotated_log_however_it_is_cut(until: list[int]) -> None:
+    assert played(playback(), 0, until) == whole()
+
+
+@settings(max_examples=25)
+@given(st.lists(st.integers(0, COUNT * STEP_NS), min_size=1, max_size=3), TIMES)
+def test_after_seeks_it_is_the_annotated_log_from_there_on(sought: list[int], until: list[int]) -> None:
+    player = playback()
+    for time_ns in sought:
+        player.seek(time_ns)
+    from_ns = sought[-1]
+    found = [each for each in played(player, from_ns, until) if each[1] > from_ns]
+    expected = [each for each in whole() if each[1] > from_ns]
+    # samples are so far apart that each is drawn
+    assert found == expected
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 2 * COUNT * STEP_NS))
+def test_a_seek_sends_what_stands_there(time_ns: int) -> None:
+    found = sent(playback().seek(time_ns))
+    for topic in (OBJECTS, ROBUSTNESS):
+        last_ns = max(each[1] for each in whole() if each[0] == topic and each[1] <= time_ns)
+        newest = [each for each in whole() if each[0] == topic and each[1] == last_ns]
+        assert [each for each in found if each[0] == topic] == newest
+    [specified] = [data for topic, _, data in found if topic == SPECIFICATION]
+    assert specified == next(data for topic, _, data in whole() if topic == SPECIFICATION)
+    told = [each for each in whole() if each[0] == "/spatial/log" and each[1] <= time_ns]
+    assert [each for each in found if each[0] == "/spatial/log"] == told
+
+
+def test_a_seek_deletes_what_is_shown_and_gone() -> None:
+    player = playback()
+    player.seek(2 * STEP_NS)
+    [drawn] = [data for topic, _, data in sent(player.seek(3 * STEP_NS)) if topic == SCENE]
+    update = SceneUpdate.FromString(drawn)
+    assert "cup 物" not in sample(3).objects
+    assert [each.id for each in update.deletions] == ["object/cup 物"]
+
+
+@pytest.mark.parametrize("window", [Window(), Window(3 * STEP_NS, 17 * STEP_NS), Window(every=3)])
+@pytest.mark.parametrize("is_recorded", [False, True])
+def test_a_window_is_played_as_a_replay_writes_it(window: Window, is_recorded: bool, tmp_path: Path) -> None:
+    source: Source = PiecewiseSource(run(COUNT), 7)
+    if is_recorded:
+        source = open_source(record(run(COUNT), tmp_path / "run.mcap"))
+    expected = annotated(source, tmp_path / "annotated.mcap", window)
+    player = playback(source, window)
+    times_ns = np.arange(player.start_ns, player.end_ns, STEP_NS // 2).tolist()
+    assert played(player, 0, times_ns) == expected
+
+
+def test_messages_of_others_are_played_and_stand_after_a_seek(tmp_path: Path) -> None:
+    source = open_source(ROOT / "recordings/push.mcap")
+    file = sr.load_specification(ROOT / "recordings/push.spatial")
+    run_replay(source, [file], output=tmp_path / "annotated.mcap")
+    content = content_of(tmp_path / "annotated.mcap")
+    whole = [(topic, time_ns, data) for topic, time_ns, _, _, data in content.messages]
+    player = Playback(Tuning(source, [file]).evaluate())
+    middle_ns = (player.start_ns + player.end_ns) // 2
+    steps = range(player.start_ns, player.end_ns, 333_333_333)
+    assert played(player, 0, steps) == whole
+    found = sent(player.seek(middle_ns))
+    others = {topic for topic in content.topics() if topic.startswith("/plan/")}
+    assert others
+    for topic in others:
+        before = [each for each in whole if each[0] == topic and each[1] <= middle_ns]
+        assert [each for each in found if each[0] == topic] == before[-1:]
+
+
+def test_other_numbers_are_shown_where_it_is() -> None:
+    player = playback()
+    player.seek(5 * STEP_NS)
+    player.tuned = player.tuned.tuning.evaluate({"far": 2.0})
+    fresh = Playback(player.tuned)
+    assert sent(player.seek(player.time_ns)) == sent(fresh.seek(5 * STEP_NS))
+
+
+@settings(max_examples=25)
+@given(st.lists(st.integers(-STEP_NS, 2 * COUNT * STEP_NS), min_size=2, max_size=6))
+def test_it_stays_within_the_log_and_goes_forwards(times_ns: list[int]) -> None:
+    player = playback()
+    places = []
+    for time_ns in times_ns:
+        player.advance_to(time_ns)
+        places.append(player.time_ns)
+    assert all(first <= second for first, second in pairwise(places))
+    assert places[-1] <= player.end_ns == (COUNT - 1) * STEP_NS

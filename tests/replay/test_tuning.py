@@ -1,0 +1,146 @@
+"""A log in memory, evaluated again with other values for the constants of its specifications."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import spatial_replay as sr
+from replay.runs import PAST, STEP_NS, PiecewiseSource, run
+from spatial_replay.errors import LogError, SpecificationError, UsageError
+from spatial_replay.replay import Window
+from spatial_replay.replay.tuning import Tuned, Tuning, constant_text, values_of
+
+TEXT = """\
+const far = {far}
+const soon = {soon}
+region goal = box(4, -1, 9, 2)
+spec reach = F[0s, soon] (cube enclosedin goal)
+spec apart = G (cube dist "cup 物" >= far)
+spec both = reach and apart
+"""
+WRITTEN = TEXT.format(far="0.5", soon="2s")
+
+
+def specification(text: str = WRITTEN, name: str = "blocks.spatial") -> sr.Specification:
+    return sr.parse_specification(text, filename=name)
+
+
+def tuning(*files: sr.Specification, size: int = 5, window: Window | None = None) -> Tuning:
+    return Tuning(PiecewiseSource(run(40), size), files or [specification()], window=window)
+
+
+def numbers(tuned: Tuned) -> list[np.ndarray]:
+    return [stretch.series for stretch in tuned.stretches]
+
+
+def assert_equal(tuned: Tuned, evaluation: sr.Evaluation) -> None:
+    expected = [result.series for result in evaluation.results]
+    for own, other in zip(numbers(tuned), expected, strict=True):
+        np.testing.assert_array_equal(own, other)
+
+
+DISTANCES = st.floats(-3.0, 3.0).map(lambda number: round(number, 3))
+SECONDS = st.integers(1, 40).map(lambda number: f"{number / 4}s")
+
+
+@settings(max_examples=25)
+@given(DISTANCES, SECONDS, st.integers(1, 41))
+def test_other_values_give_what_the_edited_text_gives(far: float, soon: str, size: int) -> None:
+    tuned = tuning(size=size).evaluate({"far": far, "soon": soon})
+    edited = specification(TEXT.format(far=far, soon=soon))
+    assert_equal(tuned, sr.evaluate(edited, run(40)))
+
+
+@settings(max_examples=25)
+@given(st.lists(st.tuples(DISTANCES, SECONDS), min_size=1, max_size=4))
+def test_what_was_tried_before_changes_no_number(tried: list[tuple[float, str]]) -> None:
+    held = tuning()
+    for far, soon in tried:
+        held.evaluate({"far": far, "soon": soon})
+    assert_equal(held.evaluate(), sr.evaluate(specification(), run(40)))
+
+
+def test_constants_are_told_as_they_are_written_and_as_they_are() -> None:
+    held = tuning()
+    assert {name: constant_text(each) for name, each in held.constants.items()} == {
+        "far": "0.5",
+        "soon": "2s",
+    }
+    tuned = held.evaluate({"far": 1})
+    assert values_of(tuned.constants) == {"far": 1.0, "soon": "2s"}
+    assert values_of(held.constants) == {"far": 0.5, "soon": "2s"}
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"fat": 1.0}, "did you mean 'far'"),
+        ({"far": "1"}, "far cannot be '1': it is a number"),
+        ({"soon": 2.0}, "a duration, given as a text such as '2s'"),
+        ({"soon": "two"}, "soon"),
+        ({"far": float("nan")}, "finite number"),
+        ({"far": float("inf")}, "finite number"),
+    ],
+)
+def test_values_that_cannot_be_are_refused(values: dict[str, float | str], said: str) -> None:
+    held = tuning()
+    with pytest.raises(UsageError, match=said):
+        held.evaluate(values)
+    assert_equal(held.evaluate(), sr.evaluate(specification(), run(40)))
+
+
+def test_a_specification_that_means_nothing_with_a_value_is_refused() -> None:
+    text = 'const wide = 0.5\nspec near = G (cube dist enlarge("cup 物", wide) >= 0)\n'
+    held = tuning(specification(text))
+    with pytest.raises(SpecificationError):
+        held.evaluate({"wide": -1.0})
+
+
+def test_a_name_that_two_files_share_is_called_after_the_file() -> None:
+    other = 'const far = 0.25\nconst own = 0.1\nspec wide = G (cube dist enlarge("cup 物", own) >= far)\n'
+    held = tuning(specification(), specification(other, "wide.spatial"))
+    assert list(held.constants) == ["blocks.far", "soon", "wide.far", "own"]
+    tuned = held.evaluate({"wide.far": 0.75})
+    assert values_of(tuned.constants)["blocks.far"] == 0.5
+    assert values_of(tuned.constants)["wide.far"] == 0.75
+    with pytest.raises(UsageError, match=r"blocks\.far"):
+        held.evaluate({"far": 1.0})
+
+
+@pytest.mark.parametrize("window", [Window(2 * STEP_NS), Window(0, 20 * STEP_NS), Window(STEP_NS, every=3)])
+def test_a_window_is_evaluated_as_a_replay_evaluates_it(window: Window) -> None:
+    held = Tuning(PiecewiseSource(run(40), 7), [specification(WRITTEN + PAST)], window=window)
+    replayed = sr.replay.Replay(
+        PiecewiseSource(run(40), 4), [specification(WRITTEN + PAST)], window=window, keep_series=True
+    )
+    for _ in replayed.iter_messages():
+        pass
+    expected = [result.series for result in replayed.result().results]
+    for own, other in zip(numbers(held.evaluate()), expected, strict=True):
+        assert other is not None
+        np.testing.assert_array_equal(own, other)
+
+
+def test_a_template_is_evaluated_for_its_objects() -> None:
+    text = "const far = 0.5\nspec calm(ego) = G (ego dist cube >= far)\n"
+    source = PiecewiseSource(run(12), 5)
+    held = Tuning(source, [specification(text)], each={"ego": "class:dish"})
+    assert [tree.object for tree in held.evaluate({"far": 0.0}).evaluation.trees] == ["cup 物"]
+
+
+def test_what_holds_no_sample_cannot_be_tuned() -> None:
+    with pytest.raises(LogError):
+        Tuning(PiecewiseSource(run(0), 5), [specification()])
+    with pytest.raises(UsageError, match="window"):
+        tuning(window=Window(10**15))
+
+
+def test_results_can_be_inquired_into() -> None:
+    tuned = tuning().evaluate({"far": 4.0})
+    assert tuned.verdict == "violated"
+    [both] = tuned.replayed.results
+    assert both.inquiry is not None
+    assert both.inquiry.witness().verdict == "violated"
