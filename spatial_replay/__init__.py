@@ -5,8 +5,7 @@ Names are loaded when they are first used, so that importing the package loads n
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from spatial_replay.errors import (
     GeometryError,
@@ -19,6 +18,7 @@ from spatial_replay.errors import (
     TraceError,
     UsageError,
 )
+from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
     from spatial_replay.automata.automaton import Automaton
@@ -87,15 +87,4 @@ _HOMES = {
     "read_trace": "spatial_replay.logs.source",
 }
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(_HOMES[name]), name)
-    # kept, so that the next use does not come here
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = loaded_when_used(globals(), _HOMES)
