@@ -20,13 +20,15 @@ if TYPE_CHECKING:
 _LONGEST_LABEL: Final = 12
 """Characters of a proposition that stands on an arrow as it is."""
 _MOST_STATES: Final = 40
-_MOST_CUBES: Final = 400
+_MOST_CUBES: Final = 100
 """States, and cubes on arrows, of an automaton that is drawn without being asked for."""
 _MOST_LINES: Final = 200
 """Lines in words."""
 _ARROW: Final = hexadecimal(NEUTRAL)
 _INCH: Final = 72.0
 """Graphviz counts in points."""
+_LONGEST_SIDE: Final = 40.0
+"""Of a figure, in inches."""
 
 
 def automaton_html(automaton: Automaton) -> Html:
@@ -74,7 +76,8 @@ def draw_automaton(automaton: Automaton, ax: Axes | None = None) -> Axes:
     width, height = _point(layout["bb"].removeprefix("0,0,"))
     meanings = _meanings(short)
     if ax is None:
-        ax = new_panel((max(width / _INCH, 5.0), 0.5 + height / _INCH + 0.2 * len(meanings)))
+        inches = max(width / _INCH, 5.0), 0.5 + height / _INCH + 0.2 * len(meanings)
+        ax = new_panel((min(inches[0], _LONGEST_SIDE), min(inches[1], _LONGEST_SIDE)))
     ax.set_axis_off()
     ax.set_aspect("equal")
     ax.set_xlim(-2.0, width + 2.0)
