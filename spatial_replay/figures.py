@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from spatial_replay.errors import UsageError
-from spatial_replay.markup import printable
 from spatial_replay.palette import NEGATIVE, POSITIVE
+from spatial_replay.wording import printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,9 +8,8 @@ from types import MappingProxyType
 from typing import Final
 
 from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
+from spatial_replay.wording import printable
 
-_LONGEST: Final = 300
-"""Characters after which a text is cut."""
 _VERDICT_COLOURS: Final[Mapping[str, tuple[float, float, float]]] = MappingProxyType(
     {"satisfied": POSITIVE, "violated": NEGATIVE}
 )
@@ -28,12 +27,6 @@ def element(tag: str, *content: str, **attributes: str) -> Html:
     written = "".join(f' {name}="{escape(value)}"' for name, value in attributes.items())
     inner = "".join(each if isinstance(each, Html) else escape(printable(each)) for each in content)
     return Html(f"<{tag}{written}>{inner}</{tag}>")
-
-
-def printable(text: str, longest: int = _LONGEST) -> str:
-    """A text without what a page or a figure would not show as it stands, cut after so many characters."""
-    shown = "".join(character if character.isprintable() else " " for character in text)
-    return shown if len(shown) <= longest else shown[: longest - 1] + "…"
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Html:
@@ -63,8 +56,3 @@ def verdict_mark(verdict: str) -> Html:
     colour = hexadecimal(_VERDICT_COLOURS.get(verdict, NEUTRAL))
     mark = element("span", "■", style=f"color:{colour}")
     return element("span", mark, " ", verdict, style="white-space:nowrap")
-
-
-def counted(count: int, noun: str) -> str:
-    """A number and its noun: "1 state", "2 states"."""
-    return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"

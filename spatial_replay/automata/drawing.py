@@ -9,6 +9,7 @@ from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.moves import Transition
 from spatial_replay.errors import OutputError, UsageError
 from spatial_replay.palette import NEGATIVE, POSITIVE, hexadecimal, light
+from spatial_replay.wording import counted
 
 _DRAWING_S = 120.0
 """How long Graphviz may take."""
@@ -30,7 +31,7 @@ def words_text(automaton: Automaton) -> str:
 
 def size_words(automaton: Automaton) -> str:
     """How large it is: "33 states, 6 propositions"."""
-    return f"{_count(len(automaton.states), 'state')}, {_count(len(automaton.propositions), 'proposition')}"
+    return f"{counted(len(automaton.states), 'state')}, {counted(len(automaton.propositions), 'proposition')}"
 
 
 def state_words(automaton: Automaton, state: int) -> str:
@@ -178,7 +179,3 @@ def _escaped(text: str) -> str:
 
 def _quoted(text: str) -> str:
     return f'"{_escaped(text)}"'
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

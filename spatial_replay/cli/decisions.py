@@ -8,7 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from spatial_replay.cli.verdicts import counted
+from spatial_replay.wording import counted
 
 if TYPE_CHECKING:
     from spatial_replay.logs.messages.PlanDecision_pb2 import (

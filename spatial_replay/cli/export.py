@@ -11,7 +11,7 @@ from spatial_replay.cli.exit_codes import ExitCode
 from spatial_replay.cli.failures import say
 from spatial_replay.cli.options import output_option
 from spatial_replay.cli.progress import progress
-from spatial_replay.cli.verdicts import counted
+from spatial_replay.wording import counted
 
 if TYPE_CHECKING:
     from spatial_replay.replay.table import Quantity

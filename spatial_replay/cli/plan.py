@@ -10,7 +10,7 @@ from spatial_replay.cli.exit_codes import exit_code_from_verdicts
 from spatial_replay.cli.options import output_option, profile_option, refuse_several
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.simulated import SCENARIOS, Simulating, injections_from, simulation_options
-from spatial_replay.cli.verdicts import counted
+from spatial_replay.wording import counted
 
 
 @click.group()

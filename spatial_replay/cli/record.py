@@ -12,7 +12,7 @@ from spatial_replay.cli.exit_codes import ExitCode
 from spatial_replay.cli.options import Reading, output_option, profile_option, reading_options
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.simulated import SCENARIOS, recording_command
-from spatial_replay.cli.verdicts import counted
+from spatial_replay.wording import counted
 
 
 @click.group()

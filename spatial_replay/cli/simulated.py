@@ -14,7 +14,7 @@ from spatial_replay.cli.exit_codes import ExitCode
 from spatial_replay.cli.options import output_option, profile_option
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.times import duration_ns_from_text
-from spatial_replay.cli.verdicts import counted
+from spatial_replay.wording import counted
 
 if TYPE_CHECKING:
     from spatial_replay.simulation.injection import Injection

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from spatial_replay.cli.times import text_from_duration_ns
+from spatial_replay.wording import counted
 
 if TYPE_CHECKING:
     from spatial_replay.replay import Replayed, ReplayedSpec
@@ -98,8 +99,3 @@ def _over_window(result: ReplayedSpec, first_ns: int, window_ns: int) -> str:
 
 def _shown(number: float) -> str:
     return "not determined" if math.isnan(number) else f"{number:.6g}"
-
-
-def counted(count: int, noun: str) -> str:
-    """A number of things: "1 sample", "1,579 samples"."""
-    return f"{count:,} {noun}{'' if count == 1 else 's'}"

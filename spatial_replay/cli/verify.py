@@ -10,8 +10,8 @@ from spatial_replay.cli.exit_codes import ExitCode
 from spatial_replay.cli.failures import say
 from spatial_replay.cli.options import Reading, reading_options
 from spatial_replay.cli.progress import progress
-from spatial_replay.cli.verdicts import counted
 from spatial_replay.errors import UsageError
+from spatial_replay.wording import counted
 
 
 @click.command()

@@ -10,11 +10,11 @@ import numpy as np
 from spatial_replay.errors import UsageError
 from spatial_replay.figures import new_panel, new_panels, plain
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.markup import counted
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.monitor.verdict_table import robustness_text, title_of, worst_of
 from spatial_replay.palette import CURVES, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
 from spatial_replay.spec.formula import iter_nodes
+from spatial_replay.wording import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,10 +6,11 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import TYPE_CHECKING, Final
 
-from spatial_replay.markup import Html, counted, element, folded, quiet, table, verdict_mark
+from spatial_replay.markup import Html, element, folded, quiet, table, verdict_mark
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.picture import tree_cell
 from spatial_replay.spec.tree import iter_branches
+from spatial_replay.wording import counted
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.evaluation import Evaluation, SpecResult

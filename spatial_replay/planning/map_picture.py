@@ -11,10 +11,11 @@ import numpy as np
 from spatial_replay.figures import INK, new_panel, plain, signed_colours
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.inspection.rings import outlines_of
-from spatial_replay.markup import Html, counted, element, quiet, table
+from spatial_replay.markup import Html, element, quiet, table
 from spatial_replay.planning.maps import FREE, REASONS, GradientMap
 from spatial_replay.planning.poses import moved_object
 from spatial_replay.trace.sample import Sample
+from spatial_replay.wording import counted
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -7,10 +7,11 @@ from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from spatial_replay.figures import INK, new_panel, plain
-from spatial_replay.markup import Html, code, counted, element, quiet, table
+from spatial_replay.markup import Html, code, element, quiet, table
 from spatial_replay.palette import NEUTRAL
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operands_of
 from spatial_replay.spec.tree import iter_branches, label_of, title_of
+from spatial_replay.wording import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

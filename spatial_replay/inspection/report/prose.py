@@ -9,7 +9,8 @@ from typing import Final
 from spatial_replay import __version__
 from spatial_replay.inspection.report.contents import Report, ReportedResult
 from spatial_replay.inspection.words import time_text
-from spatial_replay.markup import Html, counted, element
+from spatial_replay.markup import Html, element
+from spatial_replay.wording import counted
 
 _UNFOLDED: Final = 6
 """How many explanations are unfolded: the first ones."""
