@@ -213,7 +213,7 @@ def _omissions(report: Report, samples: int, kept: int, maps: int) -> Sequence[s
         said.append(f"The scene has every {_ordinal(report.film.stride)} message of /spatial/scene.")
     if len(report.results) > MOST_DRAWN:
         said.append(
-            f"Explanations, trees and curves are of the worst {MOST_DRAWN} of {len(report.results):,} results."
+            f"Explanations, trees, curves are of the worst {MOST_DRAWN} of {len(report.results):,} results."
         )
     if any(len(result.robustness) > MOST_NODES for result in report.drawn):
         said.append(f"Of trees with more than {MOST_NODES} nodes the uppermost {MOST_NODES} are shown.")

@@ -45,7 +45,7 @@ def page(report: Report) -> bytes:
         f"<script>{library}</script>",
         f"<script>{script}</script></body></html>\n",
     ]
-    # half of a pair of surrogates, as in names of broken logs, has no bytes of its own
+    # the name of a file need not be a text
     return "".join(parts).encode("utf-8", "replace")
 
 

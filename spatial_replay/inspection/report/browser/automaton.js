@@ -22,7 +22,7 @@ function makeAutomaton(clock) {
     const result = clock.run.results[clock.result];
     if (!drawn) return;
     const sample = placeIn(result, clock.sample);
-    const set = sample === null ? -1 : result.automaton.path[sample];
+    const set = sample === null ? -1 : result.automaton.path[Math.min(sample, result.samples - 1)];
     if (set === drawn.set) return;
     drawn.set = set;
     const states = set < 0 ? [] : result.automaton.sets[set];

@@ -1,0 +1,355 @@
+"""The report's page in a real browser: the run can be looked at, by mouse and by keys, on any screen."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, ConsoleMessage, Error, Locator, Page, expect
+
+import spatial_replay as sr
+from inspection.report_pages import RECORDINGS, report_of_recording, report_of_samples
+from spatial_replay.logs.source import open_source
+from spatial_replay.replay import load_files
+from spatial_replay.replay.report import write_report
+
+Open = Callable[..., Page]
+MINUS = "\N{MINUS SIGN}"
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
+    """The pages of some runs, by what is special about them."""
+    folder = tmp_path_factory.mktemp("pages")
+    report_of_recording(folder / "violated.html", "table.jsonl", "table_edited.spatial")
+    report_of_recording(folder / "satisfied.html", "table.jsonl", "table.spatial")
+    report_of_recording(folder / "planned.html", "push.mcap")
+    broken = folder / "broken.mcap"
+    broken.write_bytes((RECORDINGS / "push.mcap").read_bytes()[:300_000])
+    source = open_source(broken)
+    files = load_files([RECORDINGS / "push.spatial"], source)
+    write_report(source, files, folder / "damaged.html")
+    crowd = [
+        sr.Sample(
+            t * 10**8, {f"p{k}": sr.Footprint.disc(3 * k + t * (k % 2), k, 1) for k in range(t // 4, 6)}
+        )
+        for t in range(20)
+    ]
+    report_of_samples(
+        folder / "template.html",
+        crowd,
+        "spec calm(ego) = G (ego dist (all except ego) >= 1)",
+        each={"ego": "all"},
+    )
+    samples = [
+        sr.Sample(t * 10**7, {"a": sr.Footprint.disc(np.sin(t / 500), 0, 1), "b": sr.Footprint.disc(3, 0, 1)})
+        for t in range(100_000)
+    ]
+    report_of_samples(folder / "long.html", samples, "spec apart = G (a dist b >= 0.1)\nspec s = apart")
+    return {page.stem: page for page in folder.glob("*.html")}
+
+
+@pytest.fixture
+def open_page(browser: Browser, pages: Mapping[str, Path]) -> Iterator[Open]:
+    """Opens a page and waits until it is there; any complaint or request of it fails the test in the end."""
+    complaints: list[str] = []
+
+    def heard(message: ConsoleMessage) -> None:
+        if message.type in ("error", "warning"):
+            complaints.append(message.text)
+
+    def failed(error: Error) -> None:
+        complaints.append(str(error))
+
+    def opened(
+        name: str, *, width: int = 1280, height: int = 900, scheme: str = "light", at: str = ""
+    ) -> Page:
+        page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=scheme)
+        page.set_default_timeout(10_000)
+        page.on("console", heard)
+        page.on("pageerror", failed)
+        page.on("request", lambda request: complaints.append(request.url) if request.url != url else None)
+        url = pages[name].as_uri()
+        page.goto(url + at)
+        page.wait_for_selector("html[data-ready]")
+        return page
+
+    yield opened
+    for context in browser.contexts:
+        context.close()
+    assert complaints == []
+
+
+def row(page: Page, name: str) -> Locator:
+    """The row of a named node in the tree."""
+    return page.locator(".tree .row", has=page.locator("b", has_text=re.compile(f"^{name}$")))
+
+
+def readout(page: Page) -> Locator:
+    return page.locator(".transport output")
+
+
+def colour_of(page: Page, locator: Locator) -> str:
+    return str(locator.evaluate("each => getComputedStyle(each).color"))
+
+
+def test_the_run_is_first_shown_as_it_ended(open_page: Open) -> None:
+    page = open_page("violated")
+    expect(readout(page)).to_have_text("9.967 s / 9.967 s")
+    expect(row(page, "laid").locator(".mark")).to_have_class("mark is-violated")
+    expect(row(page, "served").locator(".mark")).to_have_class("mark is-satisfied")
+    expect(row(page, "table_set").locator(".number").first).to_have_text(f"{MINUS}0.1552")
+
+
+def test_the_tree_shows_how_things_stand_at_the_cursor(open_page: Open) -> None:
+    page = open_page("violated")
+    mark = row(page, "plate_first").locator(".mark")
+    satisfied = colour_of(page, mark)
+    page.keyboard.press("Home")
+    expect(readout(page)).to_have_text("0.000 s / 9.967 s")
+    expect(mark).to_have_class("mark is-failing")
+    assert colour_of(page, mark) != satisfied
+    expect(row(page, "plate_first").locator(".number").first).to_have_text(f"{MINUS}0.2802")
+    expect(row(page, "plate_first").locator(".what")).to_contain_text("fails so far")
+
+
+def test_choosing_an_event_goes_there(open_page: Open) -> None:
+    page = open_page("violated")
+    event = page.locator(".event", has_text="parallel").first
+    event.click()
+    expect(readout(page)).to_have_text("4.667 s / 9.967 s")
+    expect(event).to_have_attribute("aria-current", "true")
+    expect(page.locator("#tree .which")).to_contain_text("parallel at 4.667 s")
+    page.locator(".event", has_text="is violated").first.focus()
+    page.keyboard.press("Enter")
+    expect(readout(page)).to_have_text("4.000 s / 9.967 s")
+
+
+def test_a_time_in_an_explanation_leads_there(open_page: Open) -> None:
+    page = open_page("violated")
+    page.locator(".verdict").first.get_by_role("button", name="4.000 s").click()
+    expect(readout(page)).to_have_text("4.000 s / 9.967 s")
+    expect(page.locator("#tree .which")).to_contain_text("table_set at 4.000 s")
+
+
+def test_keys_move_the_cursor(open_page: Open) -> None:
+    page = open_page("violated")
+    for key, time in (
+        ("Home", "0.000"), ("ArrowRight", "0.033"), ("ArrowRight", "0.067"), ("ArrowLeft", "0.033"),
+        ("Shift+ArrowRight", "1.033"), ("n", "2.133"), ("n", "4.000"), ("p", "2.133"), ("End", "9.967"),
+    ):  # fmt: skip
+        page.keyboard.press(key)
+        expect(readout(page)).to_have_text(f"{time} s / 9.967 s")
+
+
+def test_everything_can_be_reached_by_the_tab_key(open_page: Open) -> None:
+    page = open_page("satisfied")
+    reached = set()
+    for _ in range(120):
+        page.keyboard.press("Tab")
+        reached.add(page.evaluate("document.activeElement.className || document.activeElement.tagName"))
+        if "button help" in reached:
+            break
+    assert {
+        "skip",
+        "summary",
+        "row",
+        "lane-name ",
+        "event",
+        "slider",
+        "button play",
+        "button help",
+    } <= reached
+    assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
+
+
+def test_it_plays_and_pauses(open_page: Open) -> None:
+    page = open_page("violated")
+    page.get_by_label("Speed").select_option("10")
+    page.locator("body").click(position={"x": 2, "y": 2})
+    page.keyboard.press("Space")
+    expect(page.get_by_role("button", name="Pause")).to_be_visible()
+    expect(readout(page)).not_to_have_text("9.967 s / 9.967 s")
+    page.keyboard.press("Space")
+    expect(page.get_by_role("button", name="Play")).to_be_visible()
+    page.keyboard.press("Space")
+    # it stops by itself where the run ends
+    expect(readout(page)).to_have_text("9.967 s / 9.967 s")
+    expect(page.get_by_role("button", name="Play")).to_be_visible()
+
+
+def test_the_address_keeps_the_time(open_page: Open) -> None:
+    page = open_page("violated", at="#t=5&r=2")
+    expect(readout(page)).to_have_text("5.000 s / 9.967 s")
+    expect(page.locator("#tree .which")).to_contain_text("poured at 5.000 s")
+    page.keyboard.press("Home")
+    page.wait_for_url("**#t=0&r=2")
+
+
+def test_pressing_on_a_lane_or_the_curves_moves_the_cursor(open_page: Open) -> None:
+    page = open_page("violated")
+    for place in (page.locator(".strip").first, page.locator(".u-over")):
+        box = place.bounding_box()
+        assert box is not None
+        place.click(position={"x": box["width"] / 2, "y": box["height"] / 2})
+        assert abs(page.evaluate("Number(document.querySelector('.slider').value)") - 500) < 5
+        page.keyboard.press("End")
+
+
+def test_lanes_and_curves_stand_one_below_the_other(open_page: Open) -> None:
+    for width in (1280, 360):
+        page = open_page("violated", width=width)
+        edges = [
+            page.locator(place).first.evaluate(
+                "each => [each.getBoundingClientRect().left, each.clientWidth]"
+            )
+            for place in (".strip", ".u-over")
+        ]
+        assert np.allclose(*edges, atol=1.5)
+
+
+def test_looking_closer_keeps_the_cursor_in_sight(open_page: Open) -> None:
+    page = open_page("violated", at="#t=4")
+    for _ in range(3):
+        page.keyboard.press("+")
+    labels = page.evaluate("document.querySelector('.lanes .cursor').style.left")
+    assert 0 <= float(labels.removesuffix("%")) <= 100
+    page.keyboard.press("End")
+    assert page.locator(".lanes .cursor").is_visible()
+    page.keyboard.press("0")
+    assert page.evaluate("document.querySelector('.lanes .cursor').style.left") == "100%"
+
+
+def test_the_scene_changes_with_the_cursor(open_page: Open) -> None:
+    page = open_page("violated")
+    picture = "document.querySelector('.stage').toDataURL()"
+    last = page.evaluate(picture)
+    expect(page.locator(".caption")).to_have_text("nothing is violated now")
+    page.keyboard.press("Home")
+    expect(page.locator(".caption")).to_contain_text("what is violated most now, by 0.")
+    first = page.evaluate(picture)
+    assert first != last
+    page.get_by_label("names").uncheck()
+    assert page.evaluate(picture) != first
+
+
+def test_the_automaton_shows_where_the_run_is(open_page: Open) -> None:
+    page = open_page("planned")
+    here = page.locator(".state.here text")
+    expect(page.locator(".moves")).to_contain_text("accepting")
+    last = here.text_content()
+    page.keyboard.press("Home")
+    expect(here).to_have_count(1)
+    assert here.text_content() != last
+    expect(page.locator(".move.ahead").first).to_be_attached()
+
+
+def test_decisions_show_what_was_tried_and_lead_to_their_time(open_page: Open) -> None:
+    page = open_page("planned")
+    card = page.locator(".card").nth(0)
+    card.get_by_role("button").click()
+    expect(readout(page)).to_have_text("0.033 s / 17.967 s")
+    expect(card).to_have_attribute("aria-current", "true")
+    card.locator("summary").click()
+    expect(card).to_contain_text("Given up: no object can do it.")
+    expect(card.locator("figcaption", has_text="red, chosen").last).to_be_visible()
+    assert card.locator("canvas").first.evaluate(
+        "each => each.getContext('2d').getImageData(0, 0, each.width, each.height).data.some(Boolean)"
+    )
+    with_map = page.evaluate("document.querySelector('.stage').toDataURL()")
+    page.get_by_label("map", exact=True).uncheck()
+    assert page.evaluate("document.querySelector('.stage').toDataURL()") != with_map
+
+
+def test_each_object_of_a_template_can_be_looked_into(open_page: Open) -> None:
+    page = open_page("template")
+    expect(page.locator(".lane-name")).to_have_count(6)
+    page.locator(".lane-name", has_text="calm(p0)").click()
+    # it left long before the run ended, and stands as it did then
+    expect(page.locator("#tree .which")).to_contain_text("calm(p0)")
+    expect(page.locator(".tree .row .number").nth(1)).to_have_text("")
+    page.keyboard.press("Home")
+    expect(page.locator(".tree .row .number").nth(1)).not_to_have_text("")
+
+
+def test_a_damaged_log_is_announced(open_page: Open) -> None:
+    page = open_page("damaged")
+    expect(page.get_by_role("alert")).to_contain_text("The log is damaged")
+
+
+@pytest.mark.parametrize("name", ["violated", "satisfied", "planned", "damaged", "template", "long"])
+@pytest.mark.parametrize("width", [360, 1280])
+def test_nothing_is_wider_than_the_screen(open_page: Open, name: str, width: int) -> None:
+    page = open_page(name, width=width, height=760)
+    page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
+    assert page.evaluate("document.documentElement.scrollWidth") == width
+    assert page.locator(".transport").evaluate("each => each.getBoundingClientRect().bottom") <= 760
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_texts_stand_out_from_their_ground(open_page: Open, scheme: str) -> None:
+    page = open_page("violated", scheme=scheme, at="#t=3")
+    assert page.evaluate(CONTRASTS) == []
+
+
+def test_light_and_dark_can_be_chosen(open_page: Open) -> None:
+    page = open_page("satisfied", scheme="dark")
+    ground = "getComputedStyle(document.body).backgroundColor"
+    dark = page.evaluate(ground)
+    page.get_by_role("button", name="Light").click()
+    assert page.evaluate(ground) != dark
+    page.get_by_role("button", name="Dark").click()
+    assert page.evaluate(ground) == dark
+
+
+def test_without_scripts_verdicts_can_be_read(browser: Browser, pages: Mapping[str, Path]) -> None:
+    context = browser.new_context(java_script_enabled=False)
+    page = context.new_page()
+    page.goto(pages["violated"].as_uri())
+    expect(page.locator("#verdicts")).to_contain_text("which fails by 0.155214 at 4.000 s")
+    assert page.locator("noscript").bounding_box() is not None
+    context.close()
+
+
+def test_a_hundred_thousand_samples_can_be_gone_through(open_page: Open) -> None:
+    page = open_page("long")
+    page.keyboard.press("Home")
+    for key in ("n", "+", "+", "ArrowRight", "0", "End", "Home"):
+        page.keyboard.press(key)
+    expect(readout(page)).to_have_text("0.000 s / 999.990 s")
+    page.keyboard.press("ArrowRight")
+    expect(readout(page)).to_have_text("0.010 s / 999.990 s")
+
+
+CONTRASTS = """() => {
+  const canvas = document.createElement("canvas").getContext("2d", {willReadFrequently: true});
+  const parts = (colour) => {
+    canvas.clearRect(0, 0, 1, 1);
+    canvas.fillStyle = colour;
+    canvas.fillRect(0, 0, 1, 1);
+    return [...canvas.getImageData(0, 0, 1, 1).data];
+  };
+  const luminance = ([r, g, b]) => [r, g, b].map((part) => part / 255)
+    .map((part) => part <= 0.04045 ? part / 12.92 : ((part + 0.055) / 1.055) ** 2.4)
+    .reduce((sum, part, index) => sum + part * [0.2126, 0.7152, 0.0722][index], 0);
+  const ground = (each) => {
+    for (; each; each = each.parentElement) {
+      const found = parts(getComputedStyle(each).backgroundColor);
+      if (found[3] === 255) return found;
+    }
+    return [255, 255, 255, 255];
+  };
+  const faint = [];
+  for (const each of document.querySelectorAll("body *:not(script):not(style)")) {
+    const hasText = [...each.childNodes].some((node) => node.nodeType === 3 && node.data.trim());
+    if (!hasText || !each.checkVisibility() || each.closest("svg, .u-wrap")) continue;
+    const [light, dark] = [luminance(parts(getComputedStyle(each).color)), luminance(ground(each))]
+      .sort((one, other) => other - one);
+    const contrast = (light + 0.05) / (dark + 0.05);
+    if (contrast < 4.5) faint.push(`${each.className}: ${contrast.toFixed(2)}`);
+  }
+  return faint;
+}"""

@@ -1,0 +1,85 @@
+"""Reads a report's page as a program would: its elements, its facts, its numbers."""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import spatial_replay as sr
+from spatial_replay.logs.source import MemorySource, open_source
+from spatial_replay.replay import load_files
+from spatial_replay.replay.report import write_report
+
+RECORDINGS = Path(__file__).parent.parent.parent / "recordings"
+TYPES = {"f8": "<f8", "f4": "<f4", "i4": "<i4", "u2": "<u2", "u1": "u1"}
+
+
+class Page(HTMLParser):
+    """A page's elements in their order, and the text in each kind of them."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.text = text
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self._open: list[str] = []
+        self._texts: list[tuple[tuple[str, ...], str]] = []
+        self.feed(text)
+        self.close()
+        self.facts = json.loads(self.script("facts"))
+        self._numbers = zlib.decompress(base64.b64decode(self.script("numbers")))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+        if tag != "meta":
+            self._open.append(f"{tag}#{dict(attrs).get('id', '')}")
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop().startswith(f"{tag}#")
+
+    def handle_data(self, data: str) -> None:
+        self._texts.append((tuple(self._open), data))
+
+    def tags(self, tag: str) -> list[dict[str, str | None]]:
+        """The attributes of every element of a kind."""
+        return [attributes for each, attributes in self.elements if each == tag]
+
+    def script(self, identifier: str) -> str:
+        return self.within(f"script#{identifier}")
+
+    def within(self, element: str) -> str:
+        """All text within elements of a kind and an id: "section#verdicts"."""
+        return "".join(text for inside, text in self._texts if element in inside)
+
+    def scripts(self) -> list[str]:
+        """The scripts that a browser runs."""
+        return [text for inside, text in self._texts if inside and inside[-1] == "script#"]
+
+    def numbers(self, reference: dict[str, Any]) -> np.ndarray:
+        return np.frombuffer(
+            self._numbers, TYPES[reference["kind"]], reference["length"], reference["offset"]
+        )
+
+
+def page_of(output: Path) -> Page:
+    return Page(output.read_bytes().decode("utf-8"))
+
+
+def report_of_samples(output: Path, samples: list[sr.Sample], *texts: str, **options: Any) -> Page:
+    """The page of some samples and specifications."""
+    files = [sr.parse_specification(text) for text in texts]
+    write_report(MemorySource.from_samples(samples), files, output, **options)
+    return page_of(output)
+
+
+def report_of_recording(output: Path, log: str, *specs: str, **options: Any) -> Page:
+    """The page of a recording."""
+    source = open_source(RECORDINGS / log)
+    files = load_files([RECORDINGS / spec for spec in specs], source)
+    write_report(source, files, output, **options)
+    return page_of(output)

@@ -1,0 +1,273 @@
+"""The report's page says what was found, holds what it needs, and lets nothing of the log run."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.Grid_pb2 import Grid
+
+import spatial_replay as sr
+from inspection.report_pages import RECORDINGS, Page, page_of, report_of_recording, report_of_samples
+from spatial_replay.errors import UsageError
+from spatial_replay.logs.source import open_source
+from spatial_replay.replay import load_files
+from spatial_replay.replay.report import write_report
+
+HOSTILE = (
+    "</script><img src=x onerror=alert(1)>",
+    "<!--<script>",
+    "]]>&amp;\"'`${alert(1)}",
+    "line\u2028and\u2029paragraph",
+)
+
+
+def moving(count: int, name: str = "a") -> list[sr.Sample]:
+    """A box that moves towards a disc, and away again."""
+    return [
+        sr.Sample(
+            t * 10**8,
+            {
+                name: sr.Footprint.box(abs(t - count // 2), 0, abs(t - count // 2) + 1, 1),
+                "b": sr.Footprint.disc(0, 2, 1),
+            },
+        )
+        for t in range(count)
+    ]
+
+
+@pytest.fixture(scope="module")
+def violated(tmp_path_factory: pytest.TempPathFactory) -> Page:
+    output = tmp_path_factory.mktemp("pages") / "violated.html"
+    return report_of_recording(output, "table.jsonl", "table_edited.spatial")
+
+
+@pytest.fixture(scope="module")
+def planned(tmp_path_factory: pytest.TempPathFactory) -> Page:
+    return report_of_recording(tmp_path_factory.mktemp("pages") / "planned.html", "push.mcap")
+
+
+# ---------------------------------------------------------------------------------- what the page says
+
+
+def test_verdicts_and_explanations_can_be_read_without_scripts(violated: Page) -> None:
+    said = violated.within("section#verdicts")
+    assert "violatedtable_setrobustness -0.155214" in said
+    assert "which fails by 0.155214 at 4.000 s" in said
+    assert "It would be satisfied with 0.235215 or more in place of 0.08" in said
+
+
+def test_the_page_says_which_run_it_is_of(violated: Page) -> None:
+    header = violated.within("header#")
+    assert "table.jsonl" in header
+    assert "table_edited.spatial · 9.967 s · 300 samples · semantics ltlf · spatial-replay" in header
+    assert "const deadline = 4s" in violated.within("footer#")
+    assert "results_sha256" in violated.within("footer#")
+
+
+def test_numbers_are_those_of_the_evaluation(violated: Page) -> None:
+    trace = sr.read_trace(RECORDINGS / "table.jsonl")
+    evaluation = sr.evaluate(sr.load_specification(RECORDINGS / "table_edited.spatial"), trace)
+    assert np.array_equal(violated.numbers(violated.facts["times"]), trace.times_ns / 1e9)
+    for result, found in zip(violated.facts["results"], evaluation, strict=True):
+        assert (result["name"], result["verdict"]) == (found.name, found.verdict)
+        series = violated.numbers(result["series"]).reshape(found.series.shape)
+        assert np.array_equal(series, found.series.astype(np.float32), equal_nan=True)
+
+
+def test_nodes_show_their_own_part_of_the_formula(violated: Page) -> None:
+    nodes = {node["name"]: node for node in violated.facts["results"][0]["nodes"] if node["name"]}
+    assert nodes["laid"]["head"] == "F[0s, 4s] …"
+    assert nodes["plate_first"]["head"] == "… U …"
+    assert nodes["table_set"]["head"] == "and"
+    assert nodes["table_set"]["asked"]
+
+
+def test_below_a_temporal_operator_a_node_is_asked_at_every_sample(tmp_path: Path) -> None:
+    text = "spec s = (a leftof b) and G (not (a ovlp b))"
+    nodes = report_of_samples(tmp_path / "run.html", moving(5), text).facts["results"][0]["nodes"]
+    assert [(node["head"], node["asked"]) for node in nodes] == [
+        ("and", True), ("a leftof b", True), ("G …", True), ("not", False), ("a ovlp b", False),
+    ]  # fmt: skip
+
+
+def test_events_are_those_of_an_annotated_log(violated: Page) -> None:
+    events = violated.facts["events"]
+    assert [event["time"] for event in events] == sorted(event["time"] for event in events)
+    found = next(event for event in events if event["text"].startswith("`table_set` is violated"))
+    assert (found["time"], found["standing"], found["specification"]) == (4.0, "violated", "table_set")
+
+
+def test_the_scene_is_that_of_the_messages(tmp_path: Path) -> None:
+    text = "region here = box(-1, -1, 3, 3)\nspec s = G (a enclosedin here)"
+    page = report_of_samples(tmp_path / "run.html", moving(9), text)
+    film = page.facts["film"]
+    assert [(each["kind"], each["name"]) for each in film["entities"]] == [
+        ("region", "here"), ("object", "a"), ("object", "b"),
+    ]  # fmt: skip
+    low, size = np.array(film["low"]), np.array(film["high"]) - film["low"]
+    assert low.tolist() == [-1.0, -1.0]
+    box = film["entities"][1]
+    corners = low + page.numbers(box["points"]).reshape(9, 4, 2) / 65535 * size
+    assert np.allclose(corners[0].min(axis=0), [4, 0], atol=1e-3)
+    assert np.allclose(corners[4].min(axis=0), [0, 0], atol=1e-3)
+    # the first and the last two samples violate it, and are pointed at
+    assert page.numbers(film["witness"]["frames"]).tolist() == [0, 1, 7, 8]
+    assert film["witness"]["labels"][0] == "-2"
+
+
+def test_an_object_out_of_sight_is_not_drawn(tmp_path: Path) -> None:
+    samples = [
+        each if t != 2 else sr.Sample(each.time_ns, {"a": each.objects["a"]})
+        for t, each in enumerate(moving(5))
+    ]
+    page = report_of_samples(tmp_path / "run.html", samples, "spec s = F (a ovlp b)")
+    entity = next(each for each in page.facts["film"]["entities"] if each["name"] == "b")
+    assert page.numbers(entity["form"]).tolist() == [0, 0, 65535, 0, 0]
+
+
+def test_the_automaton_is_drawn_as_it_leads_on(planned: Page) -> None:
+    automaton = planned.facts["results"][0]["automaton"]
+    columns = {state["number"]: state["at"][0] for state in automaton["states"]}
+    assert columns[0] == 0
+    assert all(
+        columns[move["source"]] < columns[move["target"]]
+        for move in automaton["moves"]
+        if move["source"] != move["target"]
+    )
+    path = [automaton["sets"][code] for code in planned.numbers(automaton["path"])]
+    assert path[0] != path[-1]
+    assert path[-1][0] in {state["number"] for state in automaton["states"] if state["accepting"]}
+
+
+def test_a_result_without_automaton_says_why(violated: Page) -> None:
+    result = violated.facts["results"][0]
+    assert result["automaton"] is None
+    assert "an automaton counts samples" in result["no_automaton"]
+
+
+def test_decisions_come_with_their_maps(planned: Page) -> None:
+    decisions = planned.facts["decisions"]
+    first = decisions[0]
+    assert first["reason"].startswith("push red")
+    assert first["outcome"]["succeeded"]
+    chosen = first["maps"][-1]
+    assert (chosen["title"], chosen["chosen"], chosen["edge"]) == ("red", True, 1)
+    assert [each["title"] for each in first["maps"] if each["edge"] == 0] == ["green", "red", "blue"]
+    logged = [
+        Grid.FromString(payload)
+        for payloads, _ in open_source(RECORDINGS / "push.mcap").iter_payloads("/plan/gradient_map")
+        for payload in payloads
+    ]
+    drawn = [each for decision in decisions for each in decision["maps"]]
+    assert len(drawn) == len(logged)
+    for grid, each in zip(logged, drawn, strict=True):
+        cells = np.frombuffer(grid.data, np.uint8).reshape(-1, grid.cell_stride)[:, :4]
+        assert each["columns"] == grid.column_count
+        assert np.array_equal(planned.numbers(each["values"]), cells.copy().view("<f4")[:, 0], equal_nan=True)
+
+
+def test_instances_of_a_template_have_their_own_results(tmp_path: Path) -> None:
+    page = report_of_samples(
+        tmp_path / "run.html", moving(6), "spec calm(ego) = G (ego dist b >= 0)", each={"ego": "all"}
+    )
+    assert [result["title"] for result in page.facts["results"]] == ["calm(a)", "calm(b)"]
+    assert "calm(a)" in page.within("section#verdicts")
+
+
+def test_a_damaged_log_is_said_to_be_so_first(tmp_path: Path) -> None:
+    log = tmp_path / "broken.mcap"
+    log.write_bytes((RECORDINGS / "push.mcap").read_bytes()[:200_000])
+    source = open_source(log)
+    write_report(source, load_files([RECORDINGS / "push.spatial"], source), tmp_path / "run.html")
+    page = page_of(tmp_path / "run.html")
+    assert "The log is damaged: verdicts are over what could be read." in page.within("header#")
+    assert any(each.get("role") == "alert" for each in page.tags("div"))
+
+
+def test_under_the_papers_semantics_nothing_is_explained(tmp_path: Path) -> None:
+    page = report_of_samples(tmp_path / "run.html", moving(6), "F (a ovlp b)", semantics="paper")
+    assert not page.facts["settles"]
+    assert "What decides" not in page.within("section#verdicts")
+    assert "semantics paper" in page.within("header#")
+
+
+# ------------------------------------------------------------------------------- what the page is made of
+
+
+def test_texts_of_logs_and_specifications_stay_texts(tmp_path: Path) -> None:
+    for number, name in enumerate(HOSTILE):
+        quoted = '"' + name.replace("\\", "\\\\").replace('"', '\\"') + '"'
+        text = f"# {name.splitlines()[0]} </pre><script>alert(1)</script>\nspec s = F ({quoted} ovlp b)\n"
+        page = report_of_samples(tmp_path / f"{number}.html", moving(6, name), text)
+        assert {
+            tag for tag, _ in page.elements if tag in ("img", "iframe", "object", "embed", "link")
+        } == set()
+        assert len(page.tags("script")) == 4
+        assert not any(key.startswith("on") for _, attributes in page.elements for key in attributes)
+        assert name in {entity["name"] for entity in page.facts["film"]["entities"]}
+        assert "<!--" not in page.text
+        assert "\u2028" not in page.script("facts")
+
+
+def test_a_file_name_that_is_no_text_is_shown_as_far_as_it_is_one(tmp_path: Path) -> None:
+    log = tmp_path / os.fsdecode(b"run\xff.jsonl")
+    log.write_bytes((RECORDINGS / "table.jsonl").read_bytes())
+    source = open_source(log)
+    write_report(source, load_files([RECORDINGS / "table.spatial"], source), tmp_path / "run.html")
+    assert "run?.jsonl" in page_of(tmp_path / "run.html").within("header#")
+
+
+def test_nothing_is_loaded_and_nothing_else_may_run(violated: Page) -> None:
+    policy = next(each["content"] for each in violated.tags("meta") if "http-equiv" in each) or ""
+    assert policy.startswith("default-src 'none'")
+    assert "unsafe" not in policy
+    for code in [*violated.scripts(), violated.within("style#")]:
+        digest = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
+        assert f"'sha256-{digest}'" in policy
+    assert len(violated.scripts()) == 2
+    assert not any("src" in attributes for _, attributes in violated.elements)
+    assert [each["href"] for each in violated.tags("a")] == ["#main"]
+
+
+def test_scripts_never_take_texts_for_html(violated: Page) -> None:
+    for code in violated.scripts():
+        assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(", code)
+
+
+def test_equal_runs_give_equal_pages(tmp_path: Path, violated: Page) -> None:
+    again = report_of_recording(tmp_path / "elsewhere.html", "table.jsonl", "table_edited.spatial")
+    assert again.text == violated.text
+    assert str(tmp_path) not in again.text
+    assert str(RECORDINGS) not in again.text
+
+
+def test_a_large_run_keeps_less_and_says_so(tmp_path: Path) -> None:
+    samples = [
+        sr.Sample(t * 10**7, {"a": sr.Footprint.disc(np.sin(t / 50), 0, 1), "b": sr.Footprint.disc(3, 0, 1)})
+        for t in range(12_000)
+    ]
+    specs = "\n".join(f"spec s{k} = G (a dist b >= {k / 100})" for k in range(60))
+    page = report_of_samples(tmp_path / "run.html", samples, specs)
+    kept = page.numbers(page.facts["times"])
+    assert len(page.facts["results"]) == 24
+    assert len(kept) * 24 * 2 * 4 <= 4_000_000
+    assert (kept[0], kept[-1]) == (0.0, 119.99)
+    assert page.facts["film"]["times"]["length"] <= 3_000
+    header = page.within("header#")
+    assert "of the worst 24 of 60 results" in header
+    assert "message of /spatial/scene" in header
+    assert page.within("section#verdicts").count("robustness") >= 60
+
+
+def test_the_page_never_takes_the_place_of_an_input(tmp_path: Path) -> None:
+    output = tmp_path / "run.html"
+    output.write_text("mine")
+    with pytest.raises(UsageError, match="is an input too"):
+        report_of_samples(output, moving(3), "F (a ovlp b)", inputs=[output])
+    assert output.read_text() == "mine"

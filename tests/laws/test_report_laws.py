@@ -1,0 +1,89 @@
+"""What a report's page keeps of a run, and how it writes that down."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from spatial_replay.inspection.report.packing import json_text, singles
+from spatial_replay.inspection.report.thinning import Curves, kept_samples
+
+NUMBERS = st.one_of(
+    st.floats(-10, 10), st.sampled_from([np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-300, -1e-300])
+)
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+)
+
+
+@st.composite
+def runs(draw: st.DrawFn) -> tuple[np.ndarray, list[Curves]]:
+    """Times of samples, and curves over stretches of them."""
+    count = draw(st.integers(1, 300))
+    times_ns = np.cumsum(draw(arrays.arrays(np.int64, count, elements=st.integers(1, 10**9))))
+    curves = []
+    for _ in range(draw(st.integers(0, 3))):
+        begin = draw(st.integers(0, count - 1))
+        end = draw(st.integers(begin, count))
+        shape = (draw(st.integers(1, 3)), 4, end - begin)
+        curves.append(Curves(times_ns[begin:end], draw(arrays.arrays(np.float64, shape, elements=NUMBERS))))
+    return times_ns, curves
+
+
+@given(runs(), st.integers(8, 400))
+def test_no_more_samples_are_kept_than_there_is_room_for(
+    run: tuple[np.ndarray, list[Curves]], most: int
+) -> None:
+    times_ns, curves = run
+    kept = kept_samples(times_ns, curves, most)
+    assert len(kept) <= most
+    assert (np.diff(kept) > 0).all()
+    assert (kept[0], kept[-1]) == (0, len(times_ns) - 1)
+    if len(times_ns) <= most:
+        assert len(kept) == len(times_ns)
+
+
+@given(arrays.arrays(np.float64, 2_000, elements=st.floats(0.5, 2)), st.integers(0, 1_999), st.floats(3, 9))
+def test_a_peak_of_one_sample_is_kept(numbers: np.ndarray, at: int, peak: float) -> None:
+    numbers[at] = peak
+    series = np.stack([numbers, numbers, numbers, numbers])[None]
+    times_ns = np.arange(2_000)
+    kept = kept_samples(times_ns, [Curves(times_ns, series)], 400)
+    assert at in kept
+    assert numbers[kept].min() == numbers.min()
+
+
+@given(arrays.arrays(np.bool_, 1_500))
+def test_of_few_changes_of_sign_both_sides_are_kept(changes: np.ndarray) -> None:
+    turns = np.flatnonzero(changes)[:60]
+    sign = np.ones(1_500)
+    for turn in turns:
+        sign[turn:] *= -1.0
+    series = np.stack([sign, sign, sign, sign])[None]
+    times_ns = np.arange(1_500)
+    kept = set(kept_samples(times_ns, [Curves(times_ns, series)], 800).tolist())
+    after = np.flatnonzero(np.diff(sign)) + 1
+    assert set(after.tolist()) <= kept
+    assert {turn - 1 for turn in after.tolist()} <= kept
+
+
+@given(arrays.arrays(np.float64, st.integers(0, 50), elements=st.floats(width=64)))
+def test_half_the_room_keeps_every_sign(numbers: np.ndarray) -> None:
+    half = singles(numbers)
+    assert np.array_equal(half >= 0.0, numbers >= 0.0)
+    assert np.array_equal(half < 0.0, numbers < 0.0)
+    assert np.array_equal(np.isnan(half), np.isnan(numbers))
+
+
+@given(VALUES)
+def test_json_in_a_page_reads_back_and_has_no_sign_of_html(value: Any) -> None:
+    text = json_text(value)
+    assert json.loads(text) == value
+    assert text.isascii()
+    assert not set("<>&") & set(text)
