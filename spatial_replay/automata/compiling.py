@@ -80,10 +80,8 @@ def _compiled(
         if each == "mona" and (before := next(stored, None)) is not None:
             return before
         try:
-            if each == "own":
-                machine = progressed(skeleton, count)
-            else:
-                machine = compiled_by_mona(spec.formula, propositions)
+            compiled = progressed if each == "own" else compiled_by_mona
+            machine = compiled(skeleton, count)
         except NoAutomatonError as error:
             reasons.append(f"{_NAMES[each]}: {error}")
         else:

@@ -12,10 +12,9 @@ from typing import NamedTuple
 
 from spatial_replay.automata.diagrams import Diagrams
 from spatial_replay.automata.machine import Machine
-from spatial_replay.automata.mona_program import mona_program
-from spatial_replay.automata.propositions import Propositions
+from spatial_replay.automata.mona_program import mona_program, require_translatable
+from spatial_replay.automata.skeleton import Skeleton
 from spatial_replay.errors import NoAutomatonError
-from spatial_replay.spec.formula import Formula
 
 _TIMEOUT_S = 10.0
 _MAX_MEMORY = 4 * 2**30
@@ -33,36 +32,35 @@ _COUNT = re.compile(r"Automaton has (\d+) states?")
 _MOVE = re.compile(r"State (\d+): ([01X]*) -> state (\d+)")
 
 
-def compiled_by_mona(formula: Formula, propositions: Propositions) -> Machine:
-    """The automaton of a formula without past operators.
+def compiled_by_mona(skeleton: Skeleton, propositions: int) -> Machine:
+    """The automaton of a skeleton over so many propositions.
 
     Raises:
         NoAutomatonError: MONA is not installed, fails or takes too long; a formula too large for it.
     """
-    return machine_of(mona_program(formula, propositions), len(propositions.all))
-
-
-def machine_of(program: str, propositions: int) -> Machine:
-    """The automaton of a program about the sets `P0`, `P1` and so on, one for each proposition.
-
-    Raises:
-        NoAutomatonError: as `compiled_by_mona`.
-    """
+    require_translatable(skeleton)
+    executable = _executable()
+    program = mona_program(skeleton)
     if len(program) > _MAX_PROGRAM:
         raise NoAutomatonError(
             f"its program has {len(program)} characters, at most {_MAX_PROGRAM} are given to it"
         )
-    return _machine(_output(program), propositions)
+    return _machine(_output(executable, program), propositions)
 
 
-def _output(program: str) -> str:
+def _executable() -> str:
+    """Where MONA is, looked for before anything is loaded to write a program for it."""
+    executable = shutil.which("mona")
+    if executable is None:
+        raise NoAutomatonError("it is not installed, and may still compile it: apt-get install mona")
+    return executable
+
+
+def _output(executable: str, program: str) -> str:
     """What MONA prints of a program.
 
     The program goes through a pipe and nothing through a shell or a file, so any number may run at once.
     """
-    executable = shutil.which("mona")
-    if executable is None:
-        raise NoAutomatonError("it is not installed, and may still compile it: apt-get install mona")
     command = [executable, "-q", "-u", "-w", "/dev/stdin"]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT

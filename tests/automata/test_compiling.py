@@ -146,6 +146,24 @@ def test_what_is_too_large_is_told_with_its_widest_window_and_every_reason() -> 
     ]
 
 
+@pytest.mark.parametrize(
+    ("text", "operator", "reason"),
+    [
+        ("F[0, 111] a ovlp b", "F[0, 111]", "the formula nests 222 deep, at most 220 can be translated"),
+        ("F[221, 221] a ovlp b", "F[221, 221]", "the formula nests 221 deep, at most 220 can be translated"),
+        # each stands twice in what encloses it
+        ("G " * 16 + "a ovlp b", "G", "the formula has more than 20000 subformulas to translate"),
+    ],
+)
+def test_what_is_too_large_to_translate_for_mona_is_told(text: str, operator: str, reason: str) -> None:
+    with pytest.raises(NoAutomatonError) as raised:
+        automaton(parse_specification(text, filename="task.spatial"), compiler="mona")
+    told = str(raised.value)
+    assert f"task.spatial:1:1: error: `{operator}` leaves " in told
+    assert f"MONA: with its bounds unrolled {reason}" in told
+    assert "for an automaton, write smaller bounds" in told
+
+
 @pytest.mark.parametrize("value", ["F a ovlp b", None, b"F a ovlp b"])
 def test_what_is_no_specification_is_told(value: object) -> None:
     with pytest.raises(

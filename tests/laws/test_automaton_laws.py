@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 from itertools import product
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -19,13 +21,15 @@ from spatial_replay.spec.formula import NamedSpec, Specification
 
 known = st.booleans()
 perhaps_unknown = st.sampled_from([False, True, None])
+compilers = ["own", "mona"] if shutil.which("mona") else ["own"]
 
 
+@pytest.mark.parametrize("compiler", compilers)
 @given(formulas_with_automata, leaf_runs(max_size=8))
-def test_the_sign_of_robustness_and_acceptance_agree(formula, run):
+def test_the_sign_of_robustness_and_acceptance_agree(compiler, formula, run):
     # only the first of its channels is looked at: everything is known
     run = type(run)(run.times_ns, {name: _known(cells) for name, cells in run.nominal.items()}, run.wide, 1)
-    machine = compiled(formula)
+    machine = compiled(formula, compiler)
     samples = Prefix(run.times_ns, run.nominal_leaf, goes_on=False)
     rho = samples.rho(formula, 0).low
     symbols = [
