@@ -6,6 +6,7 @@ import ipaddress
 import json
 from functools import partial
 from reprlib import repr as shortened
+from threading import Thread
 from types import MappingProxyType
 from typing import Final
 
@@ -24,6 +25,9 @@ from spatial_replay.runs.live.words import CONSTANTS
 
 _LONGEST_TEXT: Final = 64
 """Characters of a duration."""
+
+_FAREWELL_S: Final = 1.0
+"""How long the library, which waits for every viewer, may take to stop."""
 
 _STATUS: Final = MappingProxyType(
     {
@@ -90,8 +94,10 @@ class LiveServer:
         return f"ws://{self._host}:{self._server.port}"
 
     def stop(self) -> None:
-        """Let all viewers go."""
-        self._server.stop()
+        """Let all viewers go; one that takes nothing is not waited for longer than a moment."""
+        stopping = Thread(target=self._server.stop, daemon=True)
+        stopping.start()
+        stopping.join(_FAREWELL_S)
         for channel in self._channels.values():
             channel.close()
 

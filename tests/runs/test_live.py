@@ -1,0 +1,394 @@
+"""A log live in viewers, over real connections."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import struct
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from websockets.asyncio.client import connect
+from websockets.exceptions import WebSocketException
+
+import spatial_replay as sr
+from replay.runs import STEP_NS, PiecewiseSource, content_of, run
+from runs.viewer import ENDED, PATIENCE_S, PAUSED, PLAYING, PROTOCOL, Message, State, Viewer, viewer
+from spatial_replay.errors import UsageError
+from spatial_replay.inspection.curves import MOST_POINTS
+from spatial_replay.logs.messages.Curves_pb2 import Curves
+from spatial_replay.logs.messages.Robustness_pb2 import Robustness
+from spatial_replay.logs.messages.Specification_pb2 import Specification
+from spatial_replay.logs.topics import CURVES_TOPIC, OBJECTS, ROBUSTNESS, SCENE, SPECIFICATION
+from spatial_replay.replay import run_replay
+from spatial_replay.replay.tuning import Tuning
+from spatial_replay.runs.live.serving import Serving, serving
+
+TEXT = """\
+const far = 0.5
+const soon = 10s
+region goal = box(4, -1, 9, 2)
+spec reach = F[0s, soon] (cube enclosedin goal)
+spec apart = G (cube dist "cup 物" >= far)
+"""
+COUNT = 24
+END_NS = (COUNT - 1) * STEP_NS
+FAST = 50.0
+
+
+def specification() -> sr.Specification:
+    return sr.parse_specification(TEXT, filename="blocks.spatial")
+
+
+@contextmanager
+def served(count: int = COUNT) -> Iterator[Serving]:
+    tuning = Tuning(PiecewiseSource(run(count), 7), [specification()])
+    with serving(tuning, port=0) as server:
+        yield server
+
+
+@pytest.fixture
+def server() -> Iterator[Serving]:
+    with served() as running:
+        yield running
+
+
+def watch(server: Serving, looking: Callable[[Viewer], Awaitable[None]]) -> None:
+    """Look at a server through one viewer."""
+
+    async def session() -> None:
+        async with viewer(server.address) as own:
+            await looking(own)
+
+    asyncio.run(session())
+
+
+def value(message: Message) -> tuple[str, float]:
+    """The specification that a message on robustness is about, and the number of its root."""
+    robustness = Robustness.FromString(message.data)
+    return robustness.specification, robustness.nodes[0].value
+
+
+def test_it_says_what_it_has(server: Serving) -> None:
+    async def looking(own: Viewer) -> None:
+        assert own.info["name"] == "spatial-replay: run"
+        assert {"parameters", "playbackControl", "services", "time", "assets"} <= {*own.info["capabilities"]}
+        assert own.info["dataEndTime"] == {"sec": 5, "nsec": 750_000_000}
+        assert {OBJECTS, SCENE, ROBUSTNESS, SPECIFICATION, CURVES_TOPIC} <= {*own.channels}
+
+    watch(server, looking)
+
+
+def test_whoever_subscribes_sees_the_first_sample_and_the_curves_of_all(server: Serving) -> None:
+    async def looking(own: Viewer) -> None:
+        await own.subscribe()
+        found = await own.until(lambda each: isinstance(each, Message) and each.topic == SCENE)
+        messages = [each for each in found if isinstance(each, Message)]
+        assert {each.time_ns for each in messages} == {0}
+        [drawn] = [each for each in messages if each.topic == SCENE]
+        ids = {entity.id for entity in SceneUpdate.FromString(drawn.data).entities}
+        assert {"object/cube", "object/cup 物", "region/goal"} <= ids
+
+    watch(server, looking)
+
+    async def counting(own: Viewer) -> None:
+        await own.subscribe([CURVES_TOPIC])
+        curves = Curves.FromString((await own.message(CURVES_TOPIC)).data)
+        assert list(curves.time) == [index * STEP_NS / 1e9 for index in range(COUNT)]
+        assert [(each.name, each.verdict) for each in curves.specifications] == [
+            ("reach", "satisfied"),
+            ("apart", "unknown"),
+        ]
+        evaluated = sr.evaluate(specification(), run(COUNT))
+        for each in curves.specifications:
+            assert list(each.nodes[0].value) == pytest.approx(evaluated.node(each.name).value, nan_ok=True)
+
+    watch(server, counting)
+
+
+def test_played_from_the_start_it_is_the_annotated_log(server: Serving, tmp_path: Path) -> None:
+    output = tmp_path / "annotated.mcap"
+    run_replay(PiecewiseSource(run(COUNT), 7), [specification()], output=output)
+    expected = [(topic, time_ns, data) for topic, time_ns, _, _, data in content_of(output).messages]
+    last = expected[-1]
+
+    async def looking(own: Viewer) -> None:
+        await own.subscribe(topic for topic in own.channels if topic != CURVES_TOPIC)
+        await own.message(SCENE)
+        assert (await own.control(play=True, speed=10.0, seek_ns=0, request="play")).status == PLAYING
+        found = await own.until(lambda each: isinstance(each, Message) and each[:2] == last[:2])
+        # whoever has just subscribed may be sent the first sample twice
+        assert {tuple(each) for each in found if isinstance(each, Message)} == set(expected)
+
+    watch(server, looking)
+
+
+def test_play_pause_seek_and_speed_are_answered(server: Serving) -> None:
+    async def looking(own: Viewer) -> None:
+        await own.subscribe([ROBUSTNESS])
+        sought = await own.control(seek_ns=3 * STEP_NS + 1, request="seek")
+        assert sought == State(PAUSED, 3 * STEP_NS + 1, 1.0, True, "seek")
+        assert (await own.message(ROBUSTNESS, lambda each: each.time_ns > 0)).time_ns == 3 * STEP_NS
+        playing = await own.control(play=True, speed=FAST, request="play")
+        assert (playing.status, playing.speed, playing.did_seek) == (PLAYING, FAST, False)
+        ended = await own.next_of(State, lambda each: each.status == ENDED)
+        assert (ended.time_ns, ended.request) == (END_NS, "")
+        again = await own.control(play=True, speed=1.0, request="again")
+        assert again == State(PLAYING, 0, 1.0, True, "again")
+        paused = await own.control(speed=1.0, request="pause")
+        assert (paused.status, paused.did_seek) == (PAUSED, False)
+
+    watch(server, looking)
+
+
+@pytest.mark.parametrize(
+    ("speed", "becomes"), [(float("nan"), 1.0), (0.0, 1.0), (-2.0, 1.0), (float("inf"), 1.0), (1e9, 100.0)]
+)
+def test_speeds_that_cannot_be_are_bounded(server: Serving, speed: float, becomes: float) -> None:
+    async def looking(own: Viewer) -> None:
+        assert (await own.control(speed=speed)).speed == becomes
+        assert (await own.control(speed=1.0, seek_ns=2**63, request="far")).time_ns == END_NS
+
+    watch(server, looking)
+
+
+def test_the_time_is_told_while_it_plays(server: Serving) -> None:
+    async def looking(own: Viewer) -> None:
+        await own.control(play=True, speed=FAST)
+        times = [await own.next_of(int) for _ in range(2)]
+        assert 0 <= times[0] < times[1] <= END_NS
+
+    watch(server, looking)
+
+
+def test_a_constant_changes_verdict_curves_and_all_that_is_shown(server: Serving) -> None:
+    async def looking(own: Viewer) -> None:
+        assert await own.constants() == {"far": 0.5, "soon": "10s"}
+        await own.subscribe([CURVES_TOPIC, ROBUSTNESS, SPECIFICATION])
+        before = Curves.FromString((await own.message(CURVES_TOPIC)).data)
+        await own.control(seek_ns=2 * STEP_NS)
+        assert await own.set(far=3.0) == {"far": 3.0, "soon": "10s"}
+        assert "`apart` is violated" in await own.note("verdict", "(far = 3)")
+        changed = await own.message(CURVES_TOPIC, lambda each: Curves.FromString(each.data) != before)
+        curves = Curves.FromString(changed.data)
+        assert [each.verdict for each in before.specifications] == ["satisfied", "unknown"]
+        assert [each.verdict for each in curves.specifications] == ["satisfied", "violated"]
+        edited = sr.parse_specification(TEXT.replace("far = 0.5", "far = 3.0"))
+        expected = ("apart", sr.evaluate(edited, run(COUNT)).node("apart").value[2])
+        shown = await own.message(ROBUSTNESS, lambda each: value(each) == expected)
+        assert shown.time_ns == 2 * STEP_NS
+        await own.message(
+            SPECIFICATION, lambda each: ">= 3" in Specification.FromString(each.data).files[0].source
+        )
+
+    watch(server, looking)
+
+
+def test_after_a_change_viewers_are_told_that_what_they_show_is_out_of_date(server: Serving) -> None:
+    async def looking(own: Viewer) -> None:
+        await own.control(seek_ns=STEP_NS)
+        await own.set(soon="1s")
+        state = await own.next_of(State, lambda each: each.did_seek)
+        assert (state.time_ns, state.request) == (STEP_NS, "")
+        assert "`reach` is violated" in await own.note("verdict", "(soon = 1s)")
+
+    watch(server, looking)
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ({"fat": 1.0}, "did you mean 'far'"),
+        ({"far": "near"}, "it is a number"),
+        ({"soon": 3}, "a duration"),
+        ({"soon": "later"}, "soon"),
+        ({"soon": "9" * 5000}, "soon"),
+        ({"far": True}, "far"),
+        ({"far": {"a": [1]}}, "far"),
+        ({"far": [1.0]}, "far"),
+        ({"far": 1.0, "soon": "x"}, "soon"),
+    ],
+)
+def test_values_that_make_no_sense_change_nothing(
+    server: Serving, values: dict[str, object], reason: str
+) -> None:
+    async def looking(own: Viewer) -> None:
+        await own.send(
+            op="setParameters",
+            parameters=[{"name": name, "value": given} for name, given in values.items()],
+            id="set",
+        )
+        assert reason in await own.note("constants")
+        assert await own.constants() == {"far": 0.5, "soon": "10s"}
+
+    watch(server, looking)
+
+
+def test_of_many_changes_the_last_one_counts(server: Serving) -> None:
+    async def looking(own: Viewer) -> None:
+        for number in range(50):
+            await own.send(op="setParameters", parameters=[{"name": "far", "value": number / 10}])
+        await own.note("verdict", "(far = 4.9)")
+        assert (await own.constants())["far"] == 4.9
+
+    watch(server, looking)
+
+
+def test_viewers_share_one_place_and_one_set_of_constants(server: Serving) -> None:
+    async def session() -> None:
+        async with viewer(server.address) as first, viewer(server.address) as second:
+            await second.send(op="subscribeParameterUpdates", parameterNames=["far"])
+            await second.subscribe([CURVES_TOPIC])
+            await second.message(CURVES_TOPIC)
+            await first.control(seek_ns=STEP_NS, request="mine")
+            assert (await second.next_of(State, lambda each: each.did_seek)).time_ns == STEP_NS
+            await first.set(far=3.0)
+            told = await second.next_of(dict, lambda each: each["op"] == "parameterValues")
+            assert told["parameters"] == [{"name": "far", "type": "float64", "value": 3.0}]
+            await second.note("verdict", "(far = 3)")
+            await second.message(CURVES_TOPIC)
+
+    asyncio.run(session())
+
+
+NONSENSE = [
+    "{{{",
+    '{"op": "no such thing"}',
+    '{"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 99999}]}',
+    '{"op": "subscribe"}',
+    "[" * 10_000,
+    b"",
+    b"\x09garbage",
+    b"\x03\x00",
+    struct.pack("<BBfBQI", 3, 9, 1.0, 0, 0, 0),
+    struct.pack("<BBfBQI", 3, 0, 1.0, 0, 0, 2**31),
+    struct.pack("<BIII", 2, 77, 1, 4) + b"json{}",
+    b"\x01" + bytes(4) + b"data",
+    bytes(1 << 22),
+]
+
+
+def test_nonsense_and_sudden_ends_disturb_nobody(server: Serving) -> None:
+    async def session() -> None:
+        async with viewer(server.address) as sane:
+            await sane.subscribe([ROBUSTNESS])
+            await sane.message(ROBUSTNESS)
+            for raw in NONSENSE:
+                async with viewer(server.address) as insane:
+                    await insane.connection.send(raw)
+                    insane.connection.transport.abort()
+            with pytest.raises((WebSocketException, OSError)):
+                async with connect(server.address):
+                    pass
+            raw_socket = socket.create_connection(("127.0.0.1", int(server.address.rpartition(":")[2])))
+            raw_socket.sendall(b"GET / HTTP/1.1\r\n\r\n\x00\xff")
+            raw_socket.close()
+            await sane.control(play=True, speed=FAST)
+            await sane.next_of(State, lambda each: each.status == ENDED)
+
+    asyncio.run(session())
+
+
+def test_a_viewer_that_takes_nothing_holds_nobody_up_nor_the_end() -> None:
+    async def session() -> None:
+        with served(600) as server:
+            async with viewer(server.address) as sane:
+                stuck = await connect(server.address, subprotocols=[PROTOCOL])
+                every = [{"id": number, "channelId": number} for number in sane.channels.values()]
+                await stuck.send(json.dumps({"op": "subscribe", "subscriptions": every}))
+                stuck.transport.pause_reading()
+                await sane.subscribe([ROBUSTNESS])
+                await sane.control(play=True, speed=100.0)
+                await sane.next_of(State, lambda each: each.status == ENDED)
+        stuck.transport.abort()
+
+    asyncio.run(session())
+
+
+def test_services_answer_in_json(server: Serving) -> None:
+    async def looking(own: Viewer) -> None:
+        shown = await own.call("evaluate", {})
+        assert [each["verdict"] for each in shown["specifications"]] == ["satisfied", "unknown"]
+        assert "series" not in shown["specifications"][0]
+        other = await own.call("evaluate", {"constants": {"far": 3.0, "soon": "1s"}})
+        assert [each["verdict"] for each in other["specifications"]] == ["violated", "violated"]
+        assert await own.constants() == {"far": 0.5, "soon": "10s"}
+        [why] = (await own.call("explain", {"node": "apart"}))["explanations"]
+        assert why["explanation"][0].startswith("`apart` is unknown")
+        assert len((await own.call("explain", None, raw=b""))["explanations"]) == 2
+
+    watch(server, looking)
+
+
+@pytest.mark.parametrize(
+    ("service", "raw", "said"),
+    [
+        ("evaluate", b"{", "no JSON"),
+        ("evaluate", b"[" * 60_000, "no JSON"),
+        ("evaluate", b"[]", "not of type 'object'"),
+        ("evaluate", b'{"constant": {}}', "'constant' was unexpected"),
+        ("evaluate", b'{"constants": {"fat": 1}}', "did you mean 'far'"),
+        ("evaluate", b'{"constants": {"far": NaN}}', "finite"),
+        ("evaluate", b" " * 100_000, "bytes"),
+        ("explain", b'{"node": "apat"}', "apart"),
+        ("explain", b'{"object": "nobody"}', "nobody"),
+    ],
+)
+def test_services_say_what_is_wrong_with_a_request(
+    server: Serving, service: str, raw: bytes, said: str
+) -> None:
+    async def looking(own: Viewer) -> None:
+        with pytest.raises(ValueError, match=said):
+            await own.call(service, None, raw=raw)
+
+    watch(server, looking)
+
+
+def test_files_can_be_fetched_by_known_names_only(server: Serving) -> None:
+    async def looking(own: Viewer) -> None:
+        layout = json.loads((await own.fetch("spatial-replay://layout.json")).data)
+        assert "Parameters!constants" in layout["configById"]
+        text = (await own.fetch("spatial-replay://specification/blocks.spatial")).data.decode()
+        assert sr.parse_specification(text) == specification()
+        assert (await own.fetch("spatial-replay://automaton/apart.dot")).data.startswith(b"digraph")
+        for uri in ("", "../pyproject.toml", "specification/../blocks.spatial", "automaton//etc/passwd"):
+            assert (await own.fetch(f"spatial-replay://{uri}")).error
+        assert (await own.fetch("file:///etc/passwd")).error
+
+    watch(server, looking)
+
+
+def test_a_port_that_is_taken_is_told(server: Serving) -> None:
+    port = int(server.address.rpartition(":")[2])
+    tuning = Tuning(PiecewiseSource(run(3), 7), [specification()])
+    with pytest.raises(UsageError, match=f"port {port}: .*; choose another"), serving(tuning, port=port):
+        pass
+
+
+def test_long_logs_have_thinned_curves() -> None:
+    with served(3 * MOST_POINTS) as server:
+
+        async def looking(own: Viewer) -> None:
+            await own.subscribe([CURVES_TOPIC])
+            curves = Curves.FromString((await own.message(CURVES_TOPIC)).data)
+            assert len(curves.time) == MOST_POINTS
+            assert list(curves.time) == sorted(curves.time)
+            for each in curves.specifications:
+                for node in each.nodes:
+                    assert len(node.value) == MOST_POINTS
+                    assert len(node.now) in (0, MOST_POINTS)
+
+        watch(server, looking)
+
+
+def test_viewers_are_let_go_when_it_ends() -> None:
+    async def session() -> None:
+        with served() as server:
+            connection = await connect(server.address, subprotocols=[PROTOCOL])
+        await asyncio.wait_for(connection.wait_closed(), PATIENCE_S)
+
+    asyncio.run(session())
