@@ -255,7 +255,7 @@ def test_decisions_show_what_was_tried_and_lead_to_their_time(open_page: Open) -
     expect(card).to_have_attribute("aria-current", "true")
     card.locator("summary").click()
     expect(card).to_contain_text("Given up: no object can do it.")
-    expect(card.locator("figcaption", has_text="red, chosen").last).to_be_visible()
+    expect(card.locator(".candidate", has_text="red chosen").locator("canvas")).to_be_visible()
     assert card.locator("canvas").first.evaluate(
         "each => each.getContext('2d').getImageData(0, 0, each.width, each.height).data.some(Boolean)"
     )

@@ -69,9 +69,15 @@ class PlanMaker:
 
 
 class _Owner(NamedTuple):
-    """Whose map one is: the edge by its place among those considered, and how far the object is turned."""
+    """Whose map one is.
+
+    Attributes:
+        edge, place: of the edge among those considered, and of the candidate among the edge's.
+        turn: how far the object is turned, in radians.
+    """
 
     edge: int
+    place: int
     candidate: PlanCandidate
     turn: float
 
@@ -106,9 +112,9 @@ def plan_value(plan: Plan, first_ns: int, packing: Packing) -> Mapping[str, Any]
 def _maps_of(plan: Plan, decision: PlanDecision) -> Iterator[tuple[_Owner | None, Grid]]:
     """The maps that a decision rests on; of a log that does not say whose they are, those of its time."""
     owners = {
-        named.number: _Owner(edge, candidate, named.turn)
+        named.number: _Owner(edge, place, candidate, named.turn)
         for edge, considered in enumerate(decision.considered)
-        for candidate in considered.candidates
+        for place, candidate in enumerate(considered.candidates)
         for named in candidate.maps
     }
     if owners:
@@ -141,8 +147,8 @@ def _map_value(drawn: _Drawn, owner: _Owner | None, packing: Packing) -> Mapping
         "scale": float(np.abs(known).max(initial=0.0)),
         "values": packing.add(singles(drawn.values), "f4"),
         "edge": None,
+        "candidate": None,
         "title": "",
-        "chosen": False,
         "target": None,
     }
     if owner is None:
@@ -152,8 +158,8 @@ def _map_value(drawn: _Drawn, owner: _Owner | None, packing: Packing) -> Mapping
     turned = f", turned by {math.degrees(owner.turn):.3g}°" if len(candidate.maps) > 1 else ""
     return value | {
         "edge": owner.edge,
+        "candidate": owner.place,
         "title": f"{candidate.object}{turned}",
-        "chosen": candidate.chosen and has_target,
         "target": _target_value(candidate.target) if has_target else None,
     }
 

@@ -27,9 +27,9 @@ function makeDecision(clock, decision) {
   const said = element("div", {}, title, element("p", {}, sentence(decision.reason)),
     decision.outcome ? element("p", {}, outcomeWords(decision.outcome)) : null);
   return element("li", {class: "card"},
-    element("div", {class: "said"}, said, meant ? makeMap(clock, meant) : null),
+    element("div", {class: "said"}, said, meant ? makeMap(clock, meant, false) : null),
     tried.length ? element("details", {}, element("summary", {}, lookedInto(decision)), ...tried,
-      unnamed.length ? maps(clock, unnamed) : null) : null);
+      element("div", {class: "candidates"}, ...unnamed.map((map) => makeMap(clock, map, false)))) : null);
 }
 
 function lookedInto({edges, maps: drawn}) {
@@ -53,35 +53,29 @@ function sentence(text) {
 }
 
 function makeEdge(clock, decision, edge, number) {
-  const guards = (texts) => texts.map((text) => element("li", {}, element("code", {}, text)));
-  const mine = decision.maps.filter((map) => map.edge === number);
+  const guards = (texts) => element("ul", {}, ...texts.map((text) => element("li", {}, element("code", {}, text))));
+  const mapsOf = (place) => decision.maps.filter((map) => map.edge === number && map.candidate === place);
   return element("section", {class: "edge"},
     element("h3", {}, `${edge.aim ? "Aimed at" : "Looked into"} ${edge.path.slice(0, 2).join(" → ")}`,
       element("span", {class: "quiet"}, ` on the path ${edge.path.join(" → ")}`)),
     element("p", {class: "quiet"}, edge.progress.length > 1 ? "To reach one of" : "To reach"),
-    element("ul", {}, ...guards(edge.progress)),
+    guards(edge.progress),
     edge.constraints.length ? element("p", {class: "quiet"}, "Never on the way") : null,
-    edge.constraints.length ? element("ul", {}, ...guards(edge.constraints)) : null,
-    element("table", {}, element("tbody", {}, ...edge.candidates.map(candidateRow))),
-    mine.length ? maps(clock, mine) : null,
+    edge.constraints.length ? guards(edge.constraints) : null,
+    element("div", {class: "candidates"},
+      ...edge.candidates.map((candidate, place) => makeCandidate(clock, candidate, mapsOf(place)))),
     edge.pruned ? element("p", {class: "pruned"}, `Given up: ${sentence(edge.pruned)}`) : null);
 }
 
-function candidateRow(candidate) {
-  const {target} = candidate;
-  const way = target ? `to ${target.words}, robustness ${target.robustness}, ` : "";
-  const why = candidate.rejected || `${way}at best ${candidate.best}`;
+function makeCandidate(clock, candidate, own) {
+  const {object, target, rejected, best} = candidate;
   const standing = {chosen: "satisfied", possible: "holding", rejected: "violated"}[candidate.standing];
-  return element("tr", {}, element("td", {}, mark(standing), candidate.standing),
-    element("th", {scope: "row"}, candidate.object),
-    element("td", {}, why));
+  const why = rejected || `to ${target.words}, robustness ${target.robustness}; at best ${best}`;
+  return element("div", {class: "candidate"}, ...own.map((map) => makeMap(clock, map, own.length > 1)),
+    element("p", {}, mark(standing), element("b", {}, object), ` ${candidate.standing}: ${sentence(why)}`));
 }
 
-function maps(clock, list) {
-  return element("div", {class: "maps"}, ...list.map((map) => makeMap(clock, map)));
-}
-
-function makeMap(clock, map) {
+function makeMap(clock, map, isTitled) {
   const {made, redraw} = canvas(`Gradient map of ${map.title || "a candidate"}`, (context, width, height) => {
     const at = projection(map.low, map.high, width, height, 1);
     drawMap(context, clock.run, map, at);
@@ -91,7 +85,5 @@ function makeMap(clock, map) {
   });
   made.style.aspectRatio = String((map.high[0] - map.low[0]) / (map.high[1] - map.low[1]));
   window.addEventListener("themechange", redraw);
-  return element("figure", {}, made,
-    element("figcaption", {}, map.title || "a candidate", map.chosen ? ", chosen" : "",
-      `: up to ±${numberText(map.scale)}`));
+  return element("figure", {}, made, isTitled ? element("figcaption", {}, map.title || "a candidate") : null);
 }

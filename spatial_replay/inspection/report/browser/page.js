@@ -1,6 +1,7 @@
 // Puts the page together once the run is read.
 
 function makePage(run) {
+  document.documentElement.dataset.read = "true";
   const clock = new Clock(run);
   makeTransport(clock, run.events);
   linkVerdicts(clock);

@@ -28,12 +28,24 @@ function makeScene(clock) {
     if (before && before[0] === frame && before[1] === decision) return;
     before = [frame, decision];
     redraw();
-    const pointed = film.witness.get(frame);
-    caption.textContent = pointed
-      ? `the arrow: what is violated most now, by ${pointed.label.replace("-", "")}` : "nothing is violated now";
+    caption.textContent = worstWords(film, frame);
   };
   clock.on("time", show);
   window.addEventListener("themechange", redraw);
+}
+
+function worstWords(film, frame) {
+  const pointed = film.witness.get(frame);
+  if (pointed) return `the arrow: what is violated most now, by ${pointed.label.replace("-", "")}`;
+  return film.entities.some((entity) => isViolated(entity, frame))
+    ? "something is violated now, at which no arrow can point" : "nothing is violated now";
+}
+
+// Whether an entity has a colour between grey and vermillion.
+function isViolated(entity, frame) {
+  if (entity.form[frame] === ABSENT) return false;
+  const place = 3 * entity.shown[frame];
+  return entity.colours[place] > entity.colours[place + 2];
 }
 
 // What the colours mean.
