@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from functools import cache
 from itertools import pairwise
@@ -15,10 +16,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import spatial_replay as sr
+from inspection.layouts import panels, paths_of
+from inspection.message_paths import values
 from replay.runs import STEP_NS, PiecewiseSource, content_of, record, run, sample
+from spatial_replay.inspection.annotator import messages_of
+from spatial_replay.inspection.curves import CURVES_CHANNEL
 from spatial_replay.logs.block import Messages
+from spatial_replay.logs.mcap_writer import LogWriter
+from spatial_replay.logs.output import open_output
 from spatial_replay.logs.source import Source, open_source
-from spatial_replay.logs.topics import OBJECTS, ROBUSTNESS, SCENE, SPECIFICATION
+from spatial_replay.logs.topics import CURVES_TOPIC, OBJECTS, ROBUSTNESS, SCENE, SPECIFICATION
 from spatial_replay.replay import Window, run_replay
 from spatial_replay.replay.playback import Playback
 from spatial_replay.replay.tuning import Tuning
@@ -161,3 +168,25 @@ def test_it_stays_within_the_log_and_goes_forwards(times_ns: list[int]) -> None:
         places.append(player.time_ns)
     assert all(first <= second for first, second in pairwise(places))
     assert places[-1] <= player.end_ns == (COUNT - 1) * STEP_NS
+
+
+@pytest.mark.parametrize("name", ["table.jsonl", "push.mcap"])
+def test_the_layout_finds_all_it_shows_in_what_is_sent(name: str, tmp_path: Path) -> None:
+    log = ROOT / "recordings" / name
+    file = sr.load_specification(log.with_suffix(".spatial"))
+    tuned = Tuning(open_source(log), [file]).evaluate()
+    player = Playback(tuned)
+    output = tmp_path / "sent.mcap"
+    with open_output(output) as stream:
+        writer = LogWriter(stream)
+        writer.write_messages(messages_of(CURVES_CHANNEL, np.array([player.start_ns]), [tuned.curves], 0))
+        writer.write_messages(player.seek(player.start_ns))
+        writer.write_messages(player.advance_to(player.end_ns))
+        writer.close()
+    layout = json.loads(tuned.layout.data)
+    assert panels(layout["layout"]) == set(layout["configById"])
+    assert {"Plot!whole", "Parameters!constants"} <= set(layout["configById"])
+    paths = paths_of(layout["configById"])
+    assert any(path.startswith(CURVES_TOPIC) for path in paths)
+    for path in paths:
+        assert values(output, path), path

@@ -1,0 +1,93 @@
+"""`spatial-replay serve`, as it is run in a terminal or by a program."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import signal
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from cli.program import PROGRAM, environment, run_program
+from runs.viewer import State, viewer
+
+RECORDINGS = Path(__file__).parents[2] / "recordings"
+TABLE = ("serve", str(RECORDINGS / "table.jsonl"), "--spec", str(RECORDINGS / "table.spatial"))
+
+
+@contextmanager
+def running(*options: str) -> Iterator[tuple[subprocess.Popen[str], str, str]]:
+    """The program at work, its address, and what it said until then."""
+    with subprocess.Popen(
+        [*PROGRAM, *TABLE, *options],
+        env=environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        said = ""
+        while line := process.stdout.readline():
+            said += line
+            if found := re.search(r"serving at (ws://\S+);", line):
+                yield process, found[1], said
+                return
+        pytest.fail(f"it ended: {process.communicate()[1]}")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_says_its_verdict_and_its_address_and_ends_when_it_is_told_to(number: signal.Signals) -> None:
+    with running("--port", "0") as (process, address, said):
+        assert "table_set  satisfied" in said
+
+        async def looking() -> None:
+            async with viewer(address) as own:
+                assert await own.constants() == {"deadline": "8s", "near": 0.08}
+
+        asyncio.run(looking())
+        process.send_signal(number)
+        assert process.wait(60) == 130
+
+
+def test_it_plays_at_once_if_asked_to() -> None:
+    with running("--port", "0", "--play", "--to", "5s") as (process, address, _):
+
+        async def looking() -> None:
+            async with viewer(address) as own:
+                await own.subscribe()
+                await own.next_of(State, lambda each: each.time_ns > 0)
+
+        asyncio.run(looking())
+        process.send_signal(signal.SIGINT)
+
+
+def test_it_warns_when_others_can_connect() -> None:
+    with running("--port", "0", "--host", "0.0.0.0") as (process, _, _):
+        process.send_signal(signal.SIGINT)
+        _, warned = process.communicate(timeout=60)
+    assert "anyone who reaches ws://0.0.0.0" in warned
+
+
+def test_it_prints_its_layout(tmp_path: Path) -> None:
+    done = run_program(*TABLE, "--layout", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "Parameters!constants" in json.loads(done.stdout)["configById"]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--host", "no.such.host.invalid"), "cannot listen at no.such.host.invalid"),
+        (("--port", "70000"), "70000"),
+        (("--from", "99s"), "no sample in the window"),
+    ],
+)
+def test_what_cannot_work_is_refused(options: tuple[str, ...], said: str, tmp_path: Path) -> None:
+    done = run_program(*TABLE, *options, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr

@@ -1,0 +1,55 @@
+"""How much of a fast playback viewers are sent."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from spatial_replay.logs.block import Channel, Messages
+from spatial_replay.logs.topics import EVENTS, ROBUSTNESS, SCENE
+from spatial_replay.runs.live.thinning import thinned
+
+CHANNELS = {
+    number: Channel(topic, "protobuf", None) for number, topic in enumerate((EVENTS, ROBUSTNESS, SCENE))
+}
+
+
+def messages(times: list[tuple[int, int]]) -> Messages:
+    times_ns = np.array([time_ns for time_ns, _ in times], np.int64)
+    return Messages(
+        channels=CHANNELS,
+        channel=np.array([number for _, number in times], np.int64),
+        sequence=np.arange(len(times)),
+        log_time_ns=times_ns,
+        publish_time_ns=times_ns,
+        payloads=[bytes([index % 256]) for index in range(len(times))],
+    )
+
+
+def kept(of: Messages) -> list[tuple[int, int, bytes]]:
+    return list(zip(of.log_time_ns.tolist(), of.channel.tolist(), of.payloads, strict=True))
+
+
+TIMES = st.lists(st.tuples(st.integers(0, 60), st.sampled_from([0, 1, 1, 2]))).map(sorted)
+
+
+@given(TIMES, st.integers(1, 20))
+def test_each_topic_has_so_many_times_and_its_last_one(times: list[tuple[int, int]], most: int) -> None:
+    whole = messages(times)
+    sent = kept(thinned(whole, most))
+    assert [each for each in kept(whole) if each in sent] == sent
+    for number, channel in CHANNELS.items():
+        before = [time_ns for time_ns, own in times if own == number]
+        after = [time_ns for time_ns, own, _ in sent if own == number]
+        expected = len(set(before)) if channel.topic == EVENTS else min(most, len(set(before)))
+        assert len(set(after)) == expected
+        assert before[-1:] == after[-1:]
+        assert all(Counter(after)[time_ns] == Counter(before)[time_ns] for time_ns in after)
+
+
+def test_times_are_spread_evenly() -> None:
+    sent = thinned(messages([(time_ns, 1) for time_ns in range(100)]), 5)
+    assert set(np.diff(sent.log_time_ns).tolist()) <= {19, 20}

@@ -1,0 +1,73 @@
+"""Where a playback is, by the clock."""
+
+from __future__ import annotations
+
+from itertools import accumulate
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from spatial_replay.runs.live.transport import FASTEST, SLOWEST, Status, Transport
+
+START_NS, END_NS = 5_000_000_000, 65_000_000_000
+SECOND_NS = 1_000_000_000
+
+
+def test_it_begins_paused_at_the_start() -> None:
+    transport = Transport(START_NS, END_NS)
+    assert transport.state(100.0) == (Status.PAUSED, START_NS, 1.0, False)
+    assert transport.time_ns(200.0) == START_NS
+
+
+@given(st.lists(st.tuples(st.floats(0.0, 2.0), st.sampled_from([0.5, 1.0, 3.0])), max_size=8))
+def test_it_plays_what_has_passed_at_each_speed(parts: list[tuple[float, float]]) -> None:
+    transport = Transport(START_NS, END_NS)
+    now = 100.0
+    transport.play(now)
+    for seconds, speed in parts:
+        transport.set_speed(speed, now)
+        now += seconds
+    played_s = sum(seconds * speed for seconds, speed in parts)
+    assert transport.time_ns(now) == pytest.approx(START_NS + played_s * 1e9, abs=100)
+
+
+@given(st.lists(st.floats(0.0, 30.0), min_size=1, max_size=8))
+def test_it_never_goes_back_nor_beyond_the_end(waits: list[float]) -> None:
+    transport = Transport(START_NS, END_NS)
+    transport.play(0.0)
+    places = [transport.time_ns(now) for now in accumulate(waits)]
+    assert places == sorted(places)
+    assert places[-1] <= END_NS
+
+
+def test_a_pause_is_no_time() -> None:
+    transport = Transport(START_NS, END_NS)
+    transport.play(0.0)
+    transport.pause(2.0)
+    transport.play(50.0)
+    assert transport.time_ns(51.0) == START_NS + 3 * SECOND_NS
+
+
+def test_it_has_ended_when_it_is_paused_at_the_end() -> None:
+    transport = Transport(START_NS, END_NS)
+    transport.play(0.0)
+    assert transport.state(1000.0).status is Status.PLAYING
+    transport.pause(1000.0)
+    assert transport.state(2000.0) == (Status.ENDED, END_NS, 1.0, False)
+
+
+@given(st.integers(-(2**63), 2**64), st.booleans())
+def test_a_seek_stays_within_the_log(time_ns: int, is_playing: bool) -> None:
+    transport = Transport(START_NS, END_NS)
+    if is_playing:
+        transport.play(0.0)
+    transport.move_to(time_ns, 7.0)
+    assert transport.time_ns(7.0) == min(max(time_ns, START_NS), END_NS)
+
+
+@given(st.floats())
+def test_the_speed_stays_within_limits(speed: float) -> None:
+    transport = Transport(START_NS, END_NS)
+    transport.set_speed(speed, 0.0)
+    assert SLOWEST <= transport.state(0.0).speed <= FASTEST
