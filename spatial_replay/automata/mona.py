@@ -141,4 +141,7 @@ def _node(diagrams: Diagrams, cubes: list[_Cube], variable: int) -> int:
     low, high = ([cube for cube in cubes if cube.symbol[variable] != other] for other in ("1", "0"))
     if not low or not high:
         raise NoAutomatonError(f"it printed moves that leave {symbol!r} open")
-    return diagrams.decide(variable, _node(diagrams, low, variable + 1), _node(diagrams, high, variable + 1))
+    when_false = _node(diagrams, low, variable + 1)
+    # a variable that is free in every cube is not to double the work
+    when_true = when_false if low == high else _node(diagrams, high, variable + 1)
+    return diagrams.decide(variable, when_false, when_true)

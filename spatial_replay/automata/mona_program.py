@@ -1,4 +1,4 @@
-"""Formulas in the language of MONA: written as LTLf, which ltlf2dfa alone translates; its only importer."""
+"""Formulas in the language of MONA, into which ltlf2dfa translates LTLf; the only importer of ltlf2dfa."""
 
 from __future__ import annotations
 

@@ -47,6 +47,15 @@ def test_mona_compiles_what_nests_220_deep_however_deep_its_caller_is(text: str)
     assert result == automaton(specification, compiler="own")
 
 
+@needs_mona
+def test_of_many_propositions_a_state_may_look_at_any_one() -> None:
+    text = "p39 >= 0"
+    for number in reversed(range(39)):
+        text = f"(p{number} >= 0) and X ({text})"
+    specification = parse_specification(text)
+    assert automaton(specification, compiler="mona") == automaton(specification, compiler="own")
+
+
 def _through_mona(text: str) -> Automaton:
     return automaton(parse_specification(text), compiler="mona")
 
