@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 
 from spatial_replay.errors import LogError
 from spatial_replay.logs.block import Block
@@ -37,8 +38,10 @@ def read_ahead(blocks: Generator[Block, None, None]) -> Iterator[Block]:
                 waiting = thread.submit(next, blocks, None)
                 yield block
         finally:
-            # where it was read: a database is closed by the thread that opened it
-            thread.submit(blocks.close).result()
+            # by the thread that read them, which alone may close a database; after an interruption while that
+            # began, and when the interpreter ends, by whoever drops them last
+            with suppress(ValueError, RuntimeError):
+                thread.submit(blocks.close).result()
 
 
 def reading_options(source: Source) -> dict[str, object]:
