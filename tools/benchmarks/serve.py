@@ -1,0 +1,102 @@
+"""A log served live, as a viewer on the same machine waits for it."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import struct
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Subprotocol
+
+import spatial_replay as sr
+from spatial_replay.logs.source import MemorySource
+from spatial_replay.logs.topics import CURVES_TOPIC, SCENE
+from spatial_replay.replay.tuning import Tuning
+from spatial_replay.runs.live.serving import serving
+from spatial_replay.trace.trace import Trace
+
+SAMPLES = 100_000
+PATIENCE_S = 60.0
+
+
+class Viewer:
+    """A viewer that waits for messages of one topic at a time."""
+
+    def __init__(self, connection: ClientConnection) -> None:
+        self._connection = connection
+        self._channels: dict[str, int] = {}
+        while not self._channels:
+            match json.loads(connection.recv(PATIENCE_S)):
+                case {"op": "advertise", "channels": channels}:
+                    self._channels = {each["topic"]: each["id"] for each in channels}
+
+    def subscribe(self, topic: str) -> None:
+        number = self._channels[topic]
+        self._send(op="subscribe", subscriptions=[{"id": number, "channelId": number}])
+
+    def unsubscribe(self, topic: str) -> None:
+        self._send(op="unsubscribe", subscriptionIds=[self._channels[topic]])
+
+    def set(self, name: str, value: float) -> None:
+        self._send(op="setParameters", parameters=[{"name": name, "value": value, "type": "float64"}])
+
+    def wait_for(self, topic: str) -> None:
+        head = struct.pack("<BI", 1, self._channels[topic])
+        while True:
+            received = self._connection.recv(PATIENCE_S)
+            if isinstance(received, bytes) and received.startswith(head):
+                return
+
+    def _send(self, **request: Any) -> None:
+        self._connection.send(json.dumps(request))
+
+
+def bench_serve(measure: Any) -> None:
+    """The block-pushing specification over its camera recording, again and again to 100,000 samples."""
+    data = Path(os.environ.get("SPATIAL_REPLAY_DATA", "")) / "paper"
+    if not data.is_dir():
+        return
+    text = json.loads((data / "expected.json").read_text())["blocks_moving_passage"]["spec"]
+    specification = sr.parse_specification("const near = 70\n" + text.replace("closeto ", "closeto[near] "))
+    trace = _long(sr.read_trace(data / "blocks_moving_passage.jsonl.gz"))
+    tuning = Tuning(MemorySource(trace), [specification])
+    values = itertools.count(20)
+    with (
+        serving(tuning, port=0) as server,
+        connect(server.address, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None) as connection,
+    ):
+        viewer = Viewer(connection)
+
+        def change(topic: str) -> None:
+            viewer.set("near", float(next(values)))
+            viewer.wait_for(topic)
+
+        def look() -> None:
+            viewer.subscribe(SCENE)
+            viewer.wait_for(SCENE)
+            viewer.unsubscribe(SCENE)
+
+        measure("subscribe to first scene", lambda _: look(), unit="viewer", limit_s=0.1)
+        viewer.subscribe(CURVES_TOPIC)
+        viewer.wait_for(CURVES_TOPIC)
+        measure("change to curves of all", lambda _: change(CURVES_TOPIC), unit="change", limit_s=0.1)
+        viewer.subscribe(SCENE)
+        viewer.wait_for(SCENE)
+        measure("change to scene", lambda _: change(SCENE), unit="change")
+
+
+def _long(trace: Trace) -> Trace:
+    """The trace, again and again."""
+    step_ns = int(np.median(np.diff(trace.times_ns)))
+    length_ns = int(trace.times_ns[-1] - trace.times_ns[0]) + step_ns
+    repeated = [
+        replace(trace, times_ns=trace.times_ns + index * length_ns)
+        for index in range(SAMPLES // len(trace) + 1)
+    ]
+    return Trace.concatenate(repeated).slice(0, SAMPLES)
