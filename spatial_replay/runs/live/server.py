@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import json
+import logging
 from functools import partial
 from reprlib import repr as shortened
 from threading import Thread
@@ -23,8 +24,12 @@ from spatial_replay.runs.live.session import Session
 from spatial_replay.runs.live.transport import State, Status
 from spatial_replay.runs.live.words import CONSTANTS
 
+# what viewers send wrongly is told to them; nobody else has to read it
+logging.getLogger("foxglove").addHandler(logging.NullHandler())
+
 _LONGEST_TEXT: Final = 64
-"""Characters of a duration."""
+_LONGEST_NOTE: Final = 2_000
+"""Characters of a duration, and of a note."""
 
 _FAREWELL_S: Final = 1.0
 """How long the library, which waits for every viewer, may take to stop."""
@@ -131,7 +136,7 @@ class LiveServer:
 
     def tell(self, note: Note) -> None:
         """See `Outlet.tell`."""
-        self._server.publish_status(note.text, _LEVELS[note.level], note.about)
+        self._server.publish_status(note.text[:_LONGEST_NOTE], _LEVELS[note.level], note.about)
 
     def withdraw(self, about: str) -> None:
         """See `Outlet.withdraw`."""

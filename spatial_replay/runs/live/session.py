@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from threading import Condition
 from typing import Final, TypeVar
@@ -31,6 +32,8 @@ MOST_TIMES: Final = 20
 
 _MOST_SAMPLES: Final = 4_096
 """Samples that are worked on at once: what is slower than it should be still answers."""
+
+_OVER: Final = "the server is stopping"
 
 _Answer = TypeVar("_Answer")
 
@@ -62,6 +65,7 @@ class Session:
         self._transport = Transport(self.start_ns, self.end_ns)
         self._values = self._shown = values_of(tuning.constants)
         self._wishes = Wishes()
+        self._questions: deque[Question] = deque()
         self._wished = Condition()
         self._is_over = False
 
@@ -128,8 +132,8 @@ class Session:
         question = Question(work)
         with self._wished:
             if self._is_over:
-                raise UsageError("the server is stopping")
-            self._wishes.questions.append(question)
+                raise UsageError(_OVER)
+            self._questions.append(question)
             self._wished.notify()
         answer: _Answer = question.answer.result()
         return answer
@@ -151,18 +155,18 @@ class Session:
                     self._play_on(outlet)
                 except LogError as error:
                     outlet.tell(Note(LOG, Level.ERROR, str(error)))
-                    outlet.tell_state(self.control(is_playing=False, speed=1.0))
+                    self._pause(outlet)
         finally:
             with self._wished:
                 self._is_over = True
-                for question in self._wishes.questions:
-                    question.answer.set_exception(UsageError("the server is stopping"))
+            for question in self._questions:
+                question.answer.set_exception(UsageError(_OVER))
 
     def _next_wishes(self) -> Wishes:
         """What is wanted by now or, while nothing plays, once something is."""
         with self._wished:
             is_playing = self._transport.state(self._clock()).status is Status.PLAYING
-            self._wished.wait_for(lambda: self._wishes, PERIOD_S if is_playing else None)
+            self._wished.wait_for(lambda: self._wishes or self._questions, PERIOD_S if is_playing else None)
             wishes, self._wishes = self._wishes, Wishes()
             return wishes
 
@@ -172,8 +176,8 @@ class Session:
             self._seek(outlet)
         if wishes.topics:
             self._show(wishes.topics, outlet)
-        for question in wishes.questions:
-            question.settle(self.tuned)
+        while self._questions:
+            self._questions.popleft().settle(self.tuned)
 
     def _evaluate(self, values: Values, outlet: Outlet) -> bool:
         """Evaluate the whole log with other constants; False, and the old ones stay, if that cannot be."""
@@ -222,10 +226,13 @@ class Session:
         outlet.tell_time(time_ns)
         if time_ns < self.end_ns:
             return
+        self._pause(outlet)
+
+    def _pause(self, outlet: Outlet) -> None:
+        """Stay here, unless somebody wants to be elsewhere."""
         with self._wished:
-            if self._wishes.is_moved:
-                return
-            self._transport.pause(self._clock())
+            if not self._wishes.is_moved:
+                self._transport.pause(self._clock())
         outlet.tell_state(self._state())
 
     def _next_time_ns(self) -> int | None:

@@ -39,7 +39,6 @@ class Wishes:
         is_steered: whether to play, pause or change the speed.
         is_moved: whether to go to another time.
         topics: which topics somebody has subscribed to.
-        questions: all of them are answered, in order.
         stop: whether the session is to end.
     """
 
@@ -47,7 +46,6 @@ class Wishes:
     is_steered: bool = False
     is_moved: bool = False
     topics: set[str] = field(default_factory=set)
-    questions: list[Question] = field(default_factory=list)
     stop: bool = False
 
     def __bool__(self) -> bool:
