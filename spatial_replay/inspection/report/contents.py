@@ -118,10 +118,14 @@ class Report:
 
 
 def worst_results(verdicts: Sequence[Verdict]) -> list[int]:
-    """Which results are looked into, in order: `MOST_DRAWN` of them at most, violated before unknown ones."""
+    """Which results are looked into, in order: `MOST_DRAWN` of them at most."""
+    return sorted(worst_first(verdicts)[:MOST_DRAWN])
+
+
+def worst_first(verdicts: Sequence[Verdict]) -> list[int]:
+    """The places of results: those violated, those unknown, the others, each kind in order."""
     severity = {Verdict.VIOLATED: 0, Verdict.UNKNOWN: 1}
-    ordered = sorted(range(len(verdicts)), key=lambda number: severity.get(verdicts[number], 2))
-    return sorted(ordered[:MOST_DRAWN])
+    return sorted(range(len(verdicts)), key=lambda number: severity.get(verdicts[number], 2))
 
 
 @dataclass(frozen=True)
@@ -213,7 +217,8 @@ def _omissions(report: Report, samples: int, kept: int, maps: int) -> Sequence[s
         said.append(f"The scene has every {_ordinal(report.film.stride)} message of /spatial/scene.")
     if len(report.results) > MOST_DRAWN:
         said.append(
-            f"Explanations, trees, curves are of the worst {MOST_DRAWN} of {len(report.results):,} results."
+            f"Explanations, trees and curves are of {MOST_DRAWN} of {len(report.results):,} results, "
+            "the worst."
         )
     if any(len(result.robustness) > MOST_NODES for result in report.drawn):
         said.append(f"Of trees with more than {MOST_NODES} nodes the uppermost {MOST_NODES} are shown.")

@@ -7,13 +7,13 @@ from html import escape
 from typing import Final
 
 from spatial_replay import __version__
-from spatial_replay.inspection.report.contents import Report, ReportedResult
+from spatial_replay.inspection.report.contents import Report, ReportedResult, worst_first
 from spatial_replay.inspection.words import time_text
 from spatial_replay.markup import Html, element
 from spatial_replay.wording import counted
 
-_UNFOLDED: Final = 6
-"""How many explanations are unfolded: the first ones."""
+_MANY: Final = 6
+"""Of more results than these only the first explanation is unfolded."""
 _WITHOUT_SCRIPTS: Final = "Without scripts this page shows verdicts and explanations alone."
 
 
@@ -110,10 +110,12 @@ def _verdicts(report: Report) -> Iterator[Html]:
     if not report.results:
         yield element("p", "No object was there for a template to stand for.")
     places = {id(result): place for place, result in enumerate(report.drawn)}
-    for number, result in enumerate(report.results):
+    are_many = len(report.results) > _MANY
+    worst = worst_first([result.verdict for result in report.results])
+    for number, result in enumerate(report.results[place] for place in worst):
         # which result the page shows when something in the verdict is chosen
         drawn = {"data-result": str(places[id(result)])} if id(result) in places else {}
-        unfolded = {"open": ""} if result.sentences and number < _UNFOLDED else {}
+        unfolded = {"open": ""} if result.sentences and not (are_many and number) else {}
         attributes = {"class": "verdict", **drawn, **unfolded}
         sentences = [element("p", *_with_code(sentence)) for sentence in result.sentences]
         yield element(

@@ -48,12 +48,14 @@ function drawAutomaton(automaton) {
     made: svg("path", {class: "move", d: curve(places.get(move.source), places.get(move.target)),
       "marker-end": "url(#tip)"}, svg("title", {}, move.guard)),
   }));
-  const states = new Map(automaton.states.map((state) => [state.number, drawState(state, places.get(state.number))]));
+  const states = new Map(automaton.states.map(
+    (state) => [state.number, drawState(state, places.get(state.number))]));
   const [x, y] = places.get(automaton.states[0].number);
   const made = svg("svg", {
     viewBox: `-52 ${low} ${wide + 94} ${high - low}`, width: wide + 94, height: high - low, role: "img",
     "aria-label": `Automaton with ${automaton.summary}`,
-  }, svg("defs", {}, tip("tip"), tip("tip-ahead")), svg("path", {class: "move", d: `M${x - 46} ${y} H${x - RADIUS - 5}`, "marker-end": "url(#tip)"}),
+  }, svg("defs", {}, tip("tip"), tip("tip-ahead")),
+  svg("path", {class: "move", d: `M${x - 46} ${y} H${x - RADIUS - 5}`, "marker-end": "url(#tip)"}),
   ...moves.map((move) => move.made), ...states.values());
   return {made, moves, states, set: null};
 }

@@ -56,7 +56,8 @@ function quantityChooser(choose) {
 
 // What is drawn: the root, and the parts that have a name (so far: those that are asked once).
 function curvesOf(run, result, quantity) {
-  const named = result.nodes.filter((node) => node.parent === null || (node.name && (quantity === NOW || node.asked)));
+  const named = result.nodes.filter(
+    (node) => node.parent === null || (node.name && (quantity === NOW || node.asked)));
   const {curves: colours} = run.palette;
   return named.slice(0, colours.length + 1).map((node, index) => ({
     node,
@@ -87,8 +88,8 @@ function columns(result, curves) {
 
 function options(clock, result, curves, shown, width) {
   const ink = colour("quiet"), grid = colour("grid");
-  const axis = {stroke: ink, grid: {stroke: grid, width: 1}, ticks: {stroke: grid, width: 1, size: 4},
-    font: "12px system-ui, sans-serif"};
+  const axis = {stroke: ink, grid: {stroke: grid, width: 1}, ticks: {stroke: grid, width: 1, size: 4}, font: FONT,
+    labelFont: FONT};
   const root = result.nodes[0];
   const visible = curves.filter((curve) => !shown.hidden.has(curve.node.id));
   return {
@@ -100,11 +101,11 @@ function options(clock, result, curves, shown, width) {
     },
     axes: [
       {...axis, size: 30, values: (_, ticks) => ticks.map((tick) => `${Number(tick.toFixed(6))} s`)},
-      {...axis, size: gutter() - AXIS_LABEL, label: unitText(root.unit), labelSize: AXIS_LABEL, labelFont: "12px system-ui, sans-serif",
+      {...axis, size: gutter() - AXIS_LABEL, label: unitText(root.unit), labelSize: AXIS_LABEL,
         values: (_, ticks) => ticks.map(numberText)},
     ],
     series: [{}, ...curves.map((curve) => ({
-      label: curve.name, show: !shown.hidden.has(curve.node.id), points: {show: false},
+      label: curve.name, show: !shown.hidden.has(curve.node.id), points: {show: result.samples === 1, size: 8},
       width: curve.colour ? 1.5 : 2.5, stroke: curve.colour ?? ((chart) => signGradient(chart)),
     }))],
     hooks: {

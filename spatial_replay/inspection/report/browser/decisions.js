@@ -4,6 +4,11 @@ function makeDecisions(clock) {
   const place = body("decisions");
   if (!place) return;
   const cards = clock.run.decisions.map((decision) => makeDecision(clock, decision));
+  const hasMaps = clock.run.decisions.some((decision) => decision.maps.length);
+  if (hasMaps) {
+    place.append(key([{ground: "positive", words: "there it would hold"},
+      {ground: "negative", words: "there it would not"}, {ground: "hatched", words: "blocked"}]));
+  }
   place.append(element("ol", {class: "cards"}, ...cards));
   let here = null;
   clock.on("time", () => {
@@ -35,7 +40,8 @@ function makeDecision(clock, decision) {
 function lookedInto({edges, maps: drawn}) {
   const count = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
   const candidates = edges.reduce((sum, edge) => sum + edge.candidates.length, 0);
-  return `Looked into ${count(edges.length, "edge")}, ${count(candidates, "candidate")}, ${count(drawn.length, "map")}`;
+  const parts = [count(edges.length, "edge"), count(candidates, "candidate"), count(drawn.length, "map")];
+  return `Looked into ${parts.join(", ")}`;
 }
 
 function inShort({kind, target}) {

@@ -1,6 +1,7 @@
 // Elements of the page. All text goes in as text, never as HTML.
 
 const SVG = "http://www.w3.org/2000/svg";
+const FONT = "12px system-ui, sans-serif";
 
 function element(tag, attributes = {}, ...content) {
   return filled(document.createElement(tag), attributes, content);
@@ -40,6 +41,16 @@ function numberText(number) {
   const size = Math.abs(number);
   const text = size >= 1e5 || size < 1e-4 ? size.toExponential(2) : String(Number(size.toPrecision(4)));
   return `${number < 0 ? "−" : ""}${text.replace("-", "−")}`;
+}
+
+// What grounds mean, each with its words, and how high and how strong it is.
+function key(entries) {
+  return element("p", {class: "key"}, ...entries.map(({ground, words, height = 0.8, opacity = 1}) => {
+    const block = element("i", {class: `block ${ground}`});
+    block.style.height = `${height * 0.75}rem`;
+    block.style.opacity = opacity;
+    return element("span", {}, block, words);
+  }));
 }
 
 function colour(name) {

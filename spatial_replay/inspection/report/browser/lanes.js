@@ -29,17 +29,12 @@ function makeLanes(clock) {
   window.addEventListener("themechange", () => lanes.forEach((lane) => lane.redraw()));
 }
 
-// What the heights and shades of lanes mean.
 function laneKey() {
-  const shown = ["violated", "failing", "holding", "satisfied", "unknown"];
-  return element("p", {class: "key"}, ...shown.map((standing) => {
-    const block = element("i", {class: "block"});
-    block.style.height = `${HEIGHTS[standing] * 0.75}rem`;
-    block.style.opacity = OPACITIES[standing];
-    block.style.background = `var(--${STANDINGS[standing].colour})`;
-    const {words} = STANDINGS[standing];
+  return key(Object.keys(HEIGHTS).map((standing) => {
+    const {colour: ground, words} = STANDINGS[standing];
     const isFinal = standing === "violated" || standing === "satisfied";
-    return element("span", {}, block, isFinal ? `${words}, whatever comes` : words);
+    const [height, opacity] = [HEIGHTS[standing], OPACITIES[standing]];
+    return {ground, words: isFinal ? `${words}, whatever comes` : words, height, opacity};
   }));
 }
 
@@ -79,8 +74,8 @@ function makeLane(clock, result, node, number) {
 }
 
 // What fails is drawn higher than what holds, and that higher than what is unknown; what is final is full.
-const HEIGHTS = {violated: 1, failing: 1, satisfied: 0.6, holding: 0.6, unknown: 0.3, absent: 0.1};
-const OPACITIES = {violated: 1, satisfied: 1, failing: 0.5, holding: 0.4, unknown: 0.6, absent: 0.4};
+const HEIGHTS = {violated: 1, failing: 1, holding: 0.6, satisfied: 0.6, unknown: 0.3};
+const OPACITIES = {violated: 1, failing: 0.5, holding: 0.4, satisfied: 1, unknown: 0.6};
 
 function drawStretch(context, clock, [from, to, standing], fills, width, height) {
   const left = shareOf(clock, from) * width, right = shareOf(clock, to) * width;

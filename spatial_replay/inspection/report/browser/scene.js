@@ -20,7 +20,8 @@ function makeScene(clock) {
   const hasMaps = clock.run.decisions.some((decision) => decision.maps.length);
   place.append(made, element("div", {class: "scene-foot"}, caption, element("span", {class: "choice"},
     layerBox("names", "labels", layers, redraw), hasMaps ? layerBox("map", "map", layers, redraw) : null)),
-  sceneKey());
+  key([{ground: "positive", words: "all that is asked of it holds now"},
+    {ground: "negative", words: "something does not"}, {ground: "neutral", words: "nothing is asked, or unknown"}]));
   let before = null;
   const show = () => {
     const frame = indexAt(film.times, clock.time);
@@ -46,18 +47,6 @@ function isViolated(entity, frame) {
   if (entity.form[frame] === ABSENT) return false;
   const place = 3 * entity.shown[frame];
   return entity.colours[place] > entity.colours[place + 2];
-}
-
-// What the colours mean.
-function sceneKey() {
-  const entry = (name, words) => {
-    const block = element("i", {class: "block"});
-    block.style.height = "0.625rem";
-    block.style.background = `var(--${name})`;
-    return element("span", {}, block, words);
-  };
-  return element("p", {class: "key"}, entry("positive", "all that is asked of it holds now"),
-    entry("negative", "something does not"), entry("neutral", "nothing is asked, or unknown"));
 }
 
 function layerBox(label, name, layers, redraw) {
@@ -122,7 +111,7 @@ function drawScene(context, clock, film, layers, width, height) {
   const labels = [];
   for (const entity of film.entities) drawEntity(context, entity, frame, at, labels);
   if (decision) drawPlan(context, clock.run, decision, at);
-  if (layers.labels) for (const label of labels) drawLabel(context, label);
+  if (layers.labels) drawLabels(context, labels, width);
   const pointed = film.witness.get(frame);
   if (pointed) drawWitness(context, pointed, at, width);
 }
@@ -156,22 +145,32 @@ function drawEntity(context, entity, frame, at, labels) {
   labels.push({text: entity.name, box, isRegion});
 }
 
-// A name stands within what is large enough for it, else above; a region's in its lower left corner.
-function drawLabel(context, {text, box, isRegion}) {
-  context.font = `${isRegion ? "italic " : ""}12px system-ui, sans-serif`;
-  const name = text.length > 32 ? `${text.slice(0, 31)}…` : text;
-  const fits = context.measureText(name).width < box[2] - box[0] - 6 && box[3] - box[1] > 16;
-  let x = (box[0] + box[2]) / 2, y = fits ? (box[1] + box[3]) / 2 : box[1] - 8;
-  context.textAlign = "center";
-  context.textBaseline = "middle";
-  if (isRegion) {
-    context.textAlign = "left";
-    [x, y] = [box[0] + 5, box[3] - 9];
+// Names of objects, then those of regions; one that would cover another is left out.
+function drawLabels(context, labels, width) {
+  const taken = [];
+  for (const label of labels.toSorted((one, other) => one.isRegion - other.isRegion)) {
+    context.font = `${label.isRegion ? "italic " : ""}${FONT}`;
+    const name = label.text.length > 32 ? `${label.text.slice(0, 31)}…` : label.text;
+    const half = context.measureText(name).width / 2;
+    const [x, y] = placeOfLabel(label, half, width);
+    const covers = ([left, right, row]) => x - half < right && x + half > left && Math.abs(y - row) < 13;
+    if (taken.some(covers)) continue;
+    taken.push([x - half, x + half, y]);
+    outlined(context, name, x, y, colour(label.isRegion ? "quiet" : "ink"));
   }
-  outlined(context, name, x, y, colour(isRegion ? "quiet" : "ink"));
+}
+
+// The middle of a name: within what is large enough for it, else above; a region's in its lower left corner.
+function placeOfLabel({box: [left, top, right, bottom], isRegion}, half, width) {
+  if (isRegion) return [left + 5 + half, bottom - 9];
+  const fits = 2 * half < right - left - 6 && bottom - top > 16;
+  const x = Math.min(Math.max((left + right) / 2, half + 2), Math.max(width - half - 2, half + 2));
+  return [x, fits ? (top + bottom) / 2 : top - 8];
 }
 
 function outlined(context, text, x, y, fill) {
+  context.textAlign = "center";
+  context.textBaseline = "middle";
   context.lineWidth = 3;
   context.lineJoin = "round";
   context.strokeStyle = colour("panel");
@@ -197,9 +196,7 @@ function drawWitness(context, {ends, label}, at, width) {
   }
   context.closePath();
   context.fill();
-  context.font = "600 12px system-ui, sans-serif";
-  context.textAlign = "center";
-  context.textBaseline = "middle";
+  context.font = `600 ${FONT}`;
   const text = label.replace("-", "−"), half = context.measureText(text).width / 2 + 4;
   const x = Math.min(Math.max((x0 + x1) / 2, half), width - half);
   outlined(context, text, x, Math.max((y0 + y1) / 2 - 12, 10), colour("negative-text"));

@@ -1,0 +1,97 @@
+"""`report`: the page is there, and the exit code says what is on it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+import spatial_replay as sr
+from inspection.report_pages import RECORDINGS, page_of
+from spatial_replay.cli.application import application
+from spatial_replay.errors import SpecificationError, UsageError
+
+
+def call(*arguments: object) -> tuple[int, str]:
+    result = CliRunner().invoke(application, [str(each) for each in arguments], standalone_mode=False)
+    if result.exception is not None:
+        raise result.exception
+    return int(result.return_value), result.output
+
+
+@pytest.mark.parametrize(("spec", "code"), [("table.spatial", 0), ("table_edited.spatial", 1)])
+def test_the_code_is_the_verdict(tmp_path: Path, spec: str, code: int) -> None:
+    output = tmp_path / "run.html"
+    ended, said = call("report", RECORDINGS / "table.jsonl", "--spec", RECORDINGS / spec, "-o", output)
+    assert ended == code
+    assert f"wrote {output}" in said
+    assert ("violated" if code else "satisfied") in page_of(output).within("header#")
+
+
+def test_a_log_is_reported_on_with_its_own_specification(tmp_path: Path) -> None:
+    code, _ = call("report", RECORDINGS / "push.mcap", "-o", tmp_path / "run.html")
+    assert code == 0
+    assert "push.spatial" in page_of(tmp_path / "run.html").within("header#")
+
+
+def test_what_is_left_of_a_damaged_log_is_reported_on(tmp_path: Path) -> None:
+    log = tmp_path / "broken.mcap"
+    log.write_bytes((RECORDINGS / "push.mcap").read_bytes()[:200_000])
+    code, said = call("report", log, "--spec", RECORDINGS / "push.spatial", "-o", tmp_path / "run.html")
+    assert code == 3
+    assert "damaged" in said
+    assert "The log is damaged" in page_of(tmp_path / "run.html").within("header#")
+
+
+def test_what_is_unknown_is_said_to_be(tmp_path: Path) -> None:
+    spec = tmp_path / "s.spatial"
+    spec.write_text("spec s = a ovlp b\n")
+    with sr.Recorder(tmp_path / "run.mcap", specifications=[sr.load_specification(spec)]) as recorder:
+        for t in range(3):
+            objects = {"a": sr.Footprint.box(0, 0, 1, 1)} | ({"b": sr.Footprint.disc(0, 0, 1)} if t else {})
+            recorder.write(sr.Sample(t * 10**8, objects))
+    code, _ = call("report", tmp_path / "run.mcap", "-o", tmp_path / "run.html")
+    assert code == 4
+    page = page_of(tmp_path / "run.html")
+    assert "b is not in the sample" in page.within("section#verdicts")
+    assert page.facts["results"][0]["nodes"][0]["value"] == "-inf … inf"
+
+
+def test_part_of_a_log_and_another_meaning(tmp_path: Path) -> None:
+    spec = tmp_path / "s.spatial"
+    spec.write_text("spec s = F (cup ovlp plate)\n")
+    arguments = (
+        "--spec",
+        spec,
+        "--from",
+        "2s",
+        "--to",
+        "4s",
+        "--semantics",
+        "paper",
+        "-o",
+        tmp_path / "run.html",
+    )
+    code, _ = call("report", RECORDINGS / "table.jsonl", *arguments)
+    assert code == 1
+    page = page_of(tmp_path / "run.html")
+    assert "2.000 s to 3.967 s · 60 samples · semantics paper" in page.within("header#")
+    times = page.numbers(page.facts["times"])
+    assert (times[0], round(times[-1], 3), len(times)) == (2.0, 3.967, 60)
+
+
+def test_what_cannot_work_leaves_no_page(tmp_path: Path) -> None:
+    output, log = tmp_path / "run.html", RECORDINGS / "table.jsonl"
+    with pytest.raises(click.MissingParameter):
+        call("report", log)
+    with pytest.raises(UsageError, match="holds no specification of its own"):
+        call("report", log, "-o", output)
+    spec = tmp_path / "s.spatial"
+    spec.write_text("spec s = F (nobody ovlp plate)\n")
+    with pytest.raises(SpecificationError):
+        call("report", log, "--spec", spec, "-o", output)
+    with pytest.raises(UsageError, match="is an input"):
+        call("report", log, "--spec", spec, "-o", spec)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["s.spatial"]
