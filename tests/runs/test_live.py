@@ -20,10 +20,23 @@ from replay.runs import STEP_NS, PiecewiseSource, content_of, run
 from runs.viewer import ENDED, PATIENCE_S, PAUSED, PLAYING, PROTOCOL, Message, State, Viewer, viewer
 from spatial_replay.errors import UsageError
 from spatial_replay.inspection.curves import MOST_POINTS
+from spatial_replay.logs.block import Channel, Schema
+from spatial_replay.logs.mcap_writer import LogWriter
 from spatial_replay.logs.messages.Curves_pb2 import Curves
+from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.messages.Robustness_pb2 import Robustness
 from spatial_replay.logs.messages.Specification_pb2 import Specification
-from spatial_replay.logs.topics import CURVES_TOPIC, OBJECTS, ROBUSTNESS, SCENE, SPECIFICATION
+from spatial_replay.logs.objects import encode_objects
+from spatial_replay.logs.output import open_output
+from spatial_replay.logs.source import open_source
+from spatial_replay.logs.topics import (
+    CURVES_TOPIC,
+    OBJECTS,
+    ROBUSTNESS,
+    SCENE,
+    SPECIFICATION,
+    protobuf_channel,
+)
 from spatial_replay.replay import run_replay
 from spatial_replay.replay.tuning import Tuning
 from spatial_replay.runs.live.serving import Serving, serving
@@ -360,6 +373,34 @@ def test_files_can_be_fetched_by_known_names_only(server: Serving) -> None:
         assert (await own.fetch("file:///etc/passwd")).error
 
     watch(server, looking)
+
+
+def test_what_others_wrote_is_played_if_viewers_can_read_it(tmp_path: Path) -> None:
+    schema = Schema("any.Thing", "ros1msg", b"int32 number")
+    first, second = (Channel("/tf", "ros1", schema, {"by": name}) for name in ("arm", "base"))
+    notes, secret = Channel("/notes", "json", None), Channel("/secret", "ros1", None)
+    objects = protobuf_channel(OBJECTS, ObjectStates)
+    log = tmp_path / "run.mcap"
+    with open_output(log) as stream, LogWriter(stream) as writer:
+        for index, payload in enumerate(encode_objects(run(COUNT))):
+            writer.write(objects, index * STEP_NS, payload)
+            for channel in (first, second, notes, secret):
+                writer.write(channel, index * STEP_NS, b"12")
+    tuning = Tuning(open_source(log), [specification()])
+    with serving(tuning, port=0) as server:
+
+        async def looking(own: Viewer) -> None:
+            assert {"/tf", "/notes"} <= {*own.channels}
+            assert "/secret" not in own.channels
+            await own.subscribe(["/tf", "/notes"])
+            await own.control(play=True, speed=FAST, seek_ns=10 * STEP_NS)
+            after = [index * STEP_NS for index in range(11, COUNT)]
+            for topic, publishers in (("/tf", 2), ("/notes", 1)):
+                expected = sorted(after * publishers)
+                found = [await own.message(topic, lambda each: each.time_ns > 10 * STEP_NS) for _ in expected]
+                assert [each.time_ns for each in found] == expected
+
+        watch(server, looking)
 
 
 def test_a_port_that_is_taken_is_told(server: Serving) -> None:

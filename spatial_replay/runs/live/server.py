@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 import json
 import logging
+from collections.abc import Sequence
 from functools import partial
 from reprlib import repr as shortened
 from threading import Thread
@@ -16,7 +17,7 @@ from foxglove import Parameter, Service, ServiceRequest
 from foxglove import websocket as protocol
 
 from spatial_replay.errors import SpatialReplayError, UsageError
-from spatial_replay.logs.block import Channel, Messages
+from spatial_replay.logs.block import Channel, Messages, Schema
 from spatial_replay.runs.live.answers import SERVICES, answer
 from spatial_replay.runs.live.assets import asset
 from spatial_replay.runs.live.outlet import Level, Note
@@ -73,7 +74,7 @@ class LiveServer:
         """
         self._session = session
         self._context = foxglove.Context()
-        self._channels = {channel: self._channel(channel) for channel in session.channels}
+        self._channels = self._sent(session.channels)
         self._host = f"[{host}]" if _is_v6(host) else host
         try:
             self._server = foxglove.start_server(
@@ -115,7 +116,7 @@ class LiveServer:
         wanted = {
             number: sent
             for number, channel in messages.channels.items()
-            if (sent := self._channels[channel]).has_sinks()
+            if (sent := self._channels.get(channel)) is not None and sent.has_sinks()
         }
         numbers, times_ns = messages.channel.tolist(), messages.log_time_ns.tolist()
         for number, time_ns, payload in zip(numbers, times_ns, messages.payloads, strict=True):
@@ -142,17 +143,26 @@ class LiveServer:
         """See `Outlet.withdraw`."""
         self._server.remove_status([about])
 
+    def _sent(self, channels: Sequence[Channel]) -> dict[Channel, foxglove.Channel]:
+        """What is offered to viewers: what can be read without a schema of its own, or has one."""
+        sent: dict[tuple[str, str, Schema | None], foxglove.Channel] = {}
+        found: dict[Channel, foxglove.Channel] = {}
+        for channel in channels:
+            if channel.schema is not None or channel.encoding == "json":
+                # channels that only differ in who publishes on them are one to a viewer
+                alike = channel.topic, channel.encoding, channel.schema
+                if alike not in sent:
+                    sent[alike] = self._channel(channel)
+                found[channel] = sent[alike]
+        return found
+
     def _channel(self, channel: Channel) -> foxglove.Channel:
         schema = channel.schema
         described = None
         if schema is not None:
             described = foxglove.Schema(name=schema.name, encoding=schema.encoding, data=schema.data)
         return foxglove.Channel(
-            channel.topic,
-            schema=described,
-            message_encoding=channel.encoding,
-            context=self._context,
-            metadata=dict(channel.metadata),
+            channel.topic, schema=described, message_encoding=channel.encoding, context=self._context
         )
 
     def _service(self, name: str) -> Service:
