@@ -34,6 +34,14 @@ def output_option(text: str, *, required: bool = False) -> Callable[[_Command], 
     return click.option("-o", "--output", type=_OutputFile(path_type=Path), required=required, help=text)
 
 
+semantics_option = click.option(
+    "--semantics",
+    type=click.Choice(["ltlf", "paper"]),
+    default="ltlf",
+    show_default=True,
+    help="What a formula means: robustness over finite traces, or the paper's Def. 16 to the letter.",
+)
+
 profile_option = click.option(
     "--profile",
     type=click.Choice(["paper", "spatial_spec"]),

@@ -9,7 +9,7 @@ import click
 
 from spatial_replay.cli.evaluating import Request, evaluation_options, prepared, report_reading
 from spatial_replay.cli.exit_codes import exit_code_from_verdicts
-from spatial_replay.cli.options import output_option
+from spatial_replay.cli.options import output_option, semantics_option
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.times import duration_ns_from_text, read_for
 from spatial_replay.cli.verdicts import print_verdicts, write_document
@@ -36,13 +36,7 @@ if TYPE_CHECKING:
     metavar="DURATION",
     help="Also evaluate the samples of the last so many seconds, at every sample: 10s.",
 )
-@click.option(
-    "--semantics",
-    type=click.Choice(["ltlf", "paper"]),
-    default="ltlf",
-    show_default=True,
-    help="What a formula means: robustness over finite traces, or the paper's Def. 16 to the letter.",
-)
+@semantics_option
 def replay(
     request: Request,
     output: Path | None,

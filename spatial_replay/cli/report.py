@@ -9,7 +9,7 @@ import click
 
 from spatial_replay.cli.evaluating import Request, evaluation_options, prepared, report_reading
 from spatial_replay.cli.exit_codes import exit_code_from_verdicts
-from spatial_replay.cli.options import output_option
+from spatial_replay.cli.options import output_option, semantics_option
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.verdicts import print_verdicts
 
@@ -20,13 +20,7 @@ if TYPE_CHECKING:
 @click.command()
 @evaluation_options
 @output_option("Write the page (HTML) here.", required=True)
-@click.option(
-    "--semantics",
-    type=click.Choice(["ltlf", "paper"]),
-    default="ltlf",
-    show_default=True,
-    help="What a formula means: robustness over finite traces, or the paper's Def. 16 to the letter.",
-)
+@semantics_option
 def report(request: Request, output: Path, semantics: Semantics) -> int:
     """Write what a recorded run did as one page that any browser opens.
 

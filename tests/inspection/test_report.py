@@ -70,6 +70,14 @@ def test_the_page_says_which_run_it_is_of(violated: Page) -> None:
     assert "results_sha256" in violated.within("footer#")
 
 
+def test_a_run_on_the_calendar_says_when_it_was(tmp_path: Path, violated: Page) -> None:
+    noon_ns = 1_769_860_800 * 10**9
+    samples = [sr.Sample(noon_ns + each.time_ns, each.objects) for each in moving(3)]
+    header = report_of_samples(tmp_path / "run.html", samples, "F (a ovlp b)").within("header#")
+    assert "2026-01-31 12:00:00 UTC · 0.200 s · 3 samples" in header
+    assert "UTC" not in violated.within("header#")
+
+
 def test_numbers_are_those_of_the_evaluation(violated: Page) -> None:
     trace = sr.read_trace(RECORDINGS / "table.jsonl")
     evaluation = sr.evaluate(sr.load_specification(RECORDINGS / "table_edited.spatial"), trace)

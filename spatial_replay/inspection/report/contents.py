@@ -149,7 +149,8 @@ def page_data(report: Report) -> PageData:
     times_ns = np.unique(
         np.concatenate([report.film.times_ns, *(result.times_ns for result in drawn)]).astype(np.int64)
     )
-    kept = times_ns[kept_samples(times_ns, [_curves(each) for each in drawn], _room(drawn, len(times_ns)))]
+    curves = [_curves(each) for each in drawn if len(each.times_ns)]
+    kept = times_ns[kept_samples(times_ns, curves, _room(drawn, len(times_ns)))]
     plan = plan_value(report.plan, report.first_ns, packing)
     facts = {
         "settles": report.semantics == "ltlf",

@@ -12,8 +12,8 @@ from typing import Final
 from spatial_replay.inspection.report.contents import Report, page_data
 from spatial_replay.inspection.report.packing import json_text
 from spatial_replay.inspection.report.prose import footer, header, panels, text
+from spatial_replay.inspection.report.theme import theme
 from spatial_replay.markup import element
-from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
 
 _STYLES: Final = ("uplot/uPlot.min.css", "browser/page.css", "browser/panels.css")
 _LIBRARY: Final = "uplot/uPlot.iife.min.js"
@@ -27,7 +27,7 @@ _SCRIPTS: Final = (
 def page(report: Report) -> bytes:
     """The page, in UTF-8; equal reports give equal bytes."""
     data = page_data(report)
-    style = "\n".join([_colours(), *map(_asset, _STYLES)])
+    style = "\n".join([theme(), *map(_asset, _STYLES)])
     library, script = _asset(_LIBRARY), _script()
     parts = [
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">',
@@ -71,8 +71,3 @@ def _policy(scripts: Sequence[str], style: str) -> str:
 
 def _digest(content: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()}'"
-
-
-def _colours() -> str:
-    named = {"positive": POSITIVE, "negative": NEGATIVE, "neutral": NEUTRAL}
-    return f":root{{{''.join(f'--{name}:{hexadecimal(colour)};' for name, colour in named.items())}}}"

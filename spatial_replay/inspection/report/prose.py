@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
 from html import escape
 from typing import Final
 
@@ -12,6 +13,8 @@ from spatial_replay.inspection.words import time_text
 from spatial_replay.markup import Html, element
 from spatial_replay.wording import counted
 
+_CALENDAR_NS: Final = 500_000_000 * 10**9
+"""Times of logs from here on count from 1970; other clocks began when something was switched on."""
 _MANY: Final = 6
 """Of more results than these only the first explanation is unfolded."""
 _WITHOUT_SCRIPTS: Final = "Without scripts this page shows verdicts and explanations alone."
@@ -72,6 +75,8 @@ def text(words: str) -> Html:
 
 def _about(report: Report) -> Iterator[str]:
     yield ", ".join(file.filename for file in report.files)
+    if report.first_ns >= _CALENDAR_NS:
+        yield f"{datetime.fromtimestamp(report.first_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
     start, end = (time_text(time_ns, report.first_ns) for time_ns in (report.start_ns, report.end_ns))
     yield f"{start} to {end}" if report.start_ns != report.first_ns else end
     yield counted(report.samples, "sample")

@@ -26,25 +26,27 @@ class Curves(NamedTuple):
 def kept_samples(times_ns: Integers, curves: Sequence[Curves], most: int) -> Integers:
     """Indices of the samples to keep, in order: all of them, or at most `most`.
 
-    Of a run that is too long those are the first and the last, others at equal distances, those before and
-    after changes of sign, and those in which a curve has its least and its greatest number within a stretch:
-    in this order as long as there is room, and spread over the run where there is not.
+    Of a run that is too long those are the first and the last of all and of each curve, others at equal
+    distances, those before and after changes of sign, and those in which a curve has its least and its
+    greatest number within a stretch: in this order as long as there is room, and spread over the run where
+    there is not.
 
     Args:
         times_ns: (T,) int64, of all samples.
-        most: at least 8.
+        most: at least 8, and 4 for each of the curves.
     """
     count = len(times_ns)
     if count <= most:
         return np.arange(count)
+    starts = [int(np.searchsorted(times_ns, each.times_ns[0])) for each in curves]
     chosen = np.zeros(count, np.bool_)
     chosen[np.linspace(0, count - 1, most // 4).astype(np.int64)] = True
+    for start, each in zip(starts, curves, strict=True):
+        chosen[[start, start + len(each.times_ns) - 1]] = True
     stretches = max(1, most // 16)
     for limit, found_in in ((most * 5 // 8, _turns), (most, lambda series: _extremes(series, stretches))):
-        for each in curves:
-            if len(each.times_ns):
-                first = int(np.searchsorted(times_ns, each.times_ns[0]))
-                _choose(chosen, first + found_in(each.series), limit)
+        for start, each in zip(starts, curves, strict=True):
+            _choose(chosen, start + found_in(each.series), limit)
     return np.flatnonzero(chosen)
 
 

@@ -123,10 +123,13 @@ function themeButton() {
     window.dispatchEvent(new Event("themechange"));
   }});
   const show = () => { made.textContent = isDark() ? "Light" : "Dark"; };
-  dark.addEventListener("change", () => {
-    show();
-    window.dispatchEvent(new Event("themechange"));
-  });
+  // what is drawn for paper has other colours, too
+  for (const query of [dark, window.matchMedia("print")]) {
+    query.addEventListener("change", () => {
+      show();
+      window.dispatchEvent(new Event("themechange"));
+    });
+  }
   show();
   return made;
 }
