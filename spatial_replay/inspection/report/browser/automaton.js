@@ -53,7 +53,7 @@ function drawAutomaton(automaton) {
   const [x, y] = places.get(automaton.states[0].number);
   const made = svg("svg", {
     viewBox: `-52 ${low} ${wide + 94} ${high - low}`, width: wide + 94, height: high - low, role: "img",
-    "aria-label": `Automaton with ${automaton.summary}`,
+    "aria-label": `Automaton with ${automaton.summary}`, class: wide < 6 * COLUMN ? "small" : null,
   }, svg("defs", {}, tip("tip"), tip("tip-ahead")),
   svg("path", {class: "move", d: `M${x - 46} ${y} H${x - RADIUS - 5}`, "marker-end": "url(#tip)"}),
   ...moves.map((move) => move.made), ...states.values());

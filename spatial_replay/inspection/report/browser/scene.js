@@ -110,7 +110,7 @@ function drawScene(context, clock, film, layers, width, height) {
   if (layers.map && map) drawMap(context, clock.run, map, at);
   const labels = [];
   for (const entity of film.entities) drawEntity(context, entity, frame, at, labels);
-  if (decision) drawPlan(context, clock.run, decision, at);
+  if (decision) drawPlan(context, clock, decision, at);
   if (layers.labels) drawLabels(context, labels, width);
   const pointed = film.witness.get(frame);
   if (pointed) drawWitness(context, pointed, at, width);
@@ -202,12 +202,16 @@ function drawWitness(context, {ends, label}, at, width) {
   outlined(context, text, x, Math.max((y0 + y1) / 2 - 12, 10), colour("negative-text"));
 }
 
-function drawPlan(context, run, decision, at) {
-  const {target, outcome} = decision;
+function drawPlan(context, clock, {target, outcome, time}, at) {
   if (!target) return;
   drawWay(context, target.way, at, {colour: colour("ink"), width: 1.5, dash: [3, 4]});
   drawTarget(context, target.at, at);
-  if (outcome) drawWay(context, run.numbers(outcome.travelled), at, {colour: colour("quiet"), width: 2});
+  if (!outcome) return;
+  // a point for each sample, of which those up to now are shown
+  const points = clock.run.numbers(outcome.travelled);
+  const share = outcome.time > time ? Math.min((clock.time - time) / (outcome.time - time), 1) : 1;
+  const travelled = points.subarray(0, 2 * Math.ceil(share * points.length / 2));
+  drawWay(context, travelled, at, {colour: colour("quiet"), width: 2});
 }
 
 // The last decision that is not later than a time.
