@@ -11,7 +11,13 @@ import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Error, Locator, Page, expect
 
 import spatial_replay as sr
-from inspection.report_pages import RECORDINGS, report_of_recording, report_of_samples
+from inspection.report_pages import (
+    RECORDINGS,
+    report_of_recording,
+    report_of_samples,
+    report_of_trace,
+    two_discs,
+)
 from spatial_replay.logs.source import open_source
 from spatial_replay.replay import load_files
 from spatial_replay.replay.report import write_report
@@ -44,11 +50,8 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
         "spec calm(ego) = G (ego dist (all except ego) >= 1)",
         each={"ego": "all"},
     )
-    samples = [
-        sr.Sample(t * 10**7, {"a": sr.Footprint.disc(np.sin(t / 500), 0, 1), "b": sr.Footprint.disc(3, 0, 1)})
-        for t in range(100_000)
-    ]
-    report_of_samples(folder / "long.html", samples, "spec apart = G (a dist b >= 0.1)\nspec s = apart")
+    text = "spec apart = G (a dist b >= 0.1)\nspec meet = F (a dist b <= 0.01)\nspec s = apart and meet"
+    report_of_trace(folder / "long.html", two_discs(100_000), text)
     return {page.stem: page for page in folder.glob("*.html")}
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import zlib
+from collections.abc import Iterable
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,11 @@ from typing import Any
 import numpy as np
 
 import spatial_replay as sr
+from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.logs.source import MemorySource, open_source
 from spatial_replay.replay import load_files
 from spatial_replay.replay.report import write_report
+from spatial_replay.trace.trace import Trace
 
 RECORDINGS = Path(__file__).parent.parent.parent / "recordings"
 TYPES = {"f8": "<f8", "f4": "<f4", "i4": "<i4", "u2": "<u2", "u1": "u1"}
@@ -70,11 +73,42 @@ def page_of(output: Path) -> Page:
     return Page(output.read_bytes().decode("utf-8"))
 
 
-def report_of_samples(output: Path, samples: list[sr.Sample], *texts: str, **options: Any) -> Page:
+def report_of_samples(output: Path, samples: Iterable[sr.Sample], *texts: str, **options: Any) -> Page:
     """The page of some samples and specifications."""
+    return report_of_trace(output, Trace.from_samples(samples), *texts, **options)
+
+
+def report_of_trace(output: Path, trace: Trace, *texts: str, **options: Any) -> Page:
+    """The page of a trace and specifications."""
     files = [sr.parse_specification(text) for text in texts]
-    write_report(MemorySource.from_samples(samples), files, output, **options)
+    write_report(MemorySource(trace), files, output, **options)
     return page_of(output)
+
+
+def two_discs(count: int) -> Trace:
+    """A long run, at 100 Hz: disc a swings beside disc b, which rests."""
+    times = np.arange(count)
+    centres = np.stack([np.sin(times / 50), np.zeros(count), np.full(count, 3.0), np.zeros(count)], axis=1)
+    observations = np.arange(2 * count)
+    unknown = np.full(2 * count, np.nan)
+    discs = FootprintBatch(
+        part_start=np.arange(2 * count + 1),
+        vertex_start=np.arange(2 * count + 1),
+        vertices=centres.reshape(-1, 2),
+        radius=np.ones(2 * count),
+        bottom=unknown,
+        top=unknown,
+    )
+    return Trace(
+        times_ns=times * 10**7,
+        names=("a", "b"),
+        rows=observations.reshape(-1, 2),
+        footprints=discs,
+        yaw=unknown,
+        uncertainty=np.zeros(2 * count),
+        class_code=np.zeros(2 * count, np.int64),
+        classes=(None,),
+    )
 
 
 def report_of_recording(output: Path, log: str, *specs: str, **options: Any) -> Page:

@@ -13,10 +13,18 @@ import pytest
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
 
 import spatial_replay as sr
-from inspection.report_pages import RECORDINGS, Page, page_of, report_of_recording, report_of_samples
+from inspection.report_pages import (
+    RECORDINGS,
+    Page,
+    page_of,
+    report_of_recording,
+    report_of_samples,
+    report_of_trace,
+    two_discs,
+)
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.source import open_source
-from spatial_replay.replay import load_files
+from spatial_replay.replay import load_files, run_replay
 from spatial_replay.replay.report import write_report
 
 HOSTILE = (
@@ -256,17 +264,22 @@ def test_equal_runs_give_equal_pages(tmp_path: Path, violated: Page) -> None:
     assert str(RECORDINGS) not in again.text
 
 
+def test_an_annotated_log_gives_the_page_of_its_source(tmp_path: Path, planned: Page) -> None:
+    annotated = tmp_path / "push.mcap"
+    source = open_source(RECORDINGS / "push.mcap")
+    run_replay(source, load_files([], source), output=annotated)
+    source = open_source(annotated)
+    write_report(source, load_files([], source), tmp_path / "run.html")
+    assert page_of(tmp_path / "run.html").text == planned.text
+
+
 def test_a_large_run_keeps_less_and_says_so(tmp_path: Path) -> None:
-    samples = [
-        sr.Sample(t * 10**7, {"a": sr.Footprint.disc(np.sin(t / 50), 0, 1), "b": sr.Footprint.disc(3, 0, 1)})
-        for t in range(12_000)
-    ]
     large = "spec large = G (" + " and ".join(f"a dist b >= {k / 100}" for k in range(100)) + ")"
     specs = "\n".join([large, *(f"spec s{k} = G (a dist b >= {k / 100})" for k in range(59))])
-    page = report_of_samples(tmp_path / "run.html", samples, specs)
+    page = report_of_trace(tmp_path / "run.html", two_discs(12_000), specs)
     kept = page.numbers(page.facts["times"])
     assert len(page.facts["results"]) == 24
-    assert len(kept) < len(samples)
+    assert len(kept) < 12_000
     assert sum(result["series"]["length"] for result in page.facts["results"]) <= 4_000_000
     assert (kept[0], kept[-1]) == (0.0, 119.99)
     assert page.facts["film"]["times"]["length"] <= 3_000
