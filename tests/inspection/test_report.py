@@ -24,7 +24,7 @@ from inspection.report_pages import (
 )
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.source import open_source
-from spatial_replay.replay import load_files, run_replay
+from spatial_replay.replay import Window, load_files, run_replay
 from spatial_replay.replay.report import write_report
 
 HOSTILE = (
@@ -288,6 +288,50 @@ def test_a_large_run_keeps_less_and_says_so(tmp_path: Path) -> None:
     assert "24 of 60 results, the worst" in header
     assert "message of /spatial/scene" in header
     assert page.within("section#verdicts").count("robustness") >= 60
+
+
+def test_of_a_large_tree_the_uppermost_nodes_are_shown(tmp_path: Path) -> None:
+    deep = " and ".join(f"(F (a dist b >= {k}) or G (a dist b <= {k}))" for k in range(150))
+    page = report_of_samples(tmp_path / "run.html", moving(3), f"spec s = {deep}")
+    nodes = page.facts["results"][0]["nodes"]
+    assert len(nodes) == 400
+    assert sum(node["head"] in ("F …", "G …") for node in nodes) > 150
+    assert all(node["parent"] is None or node["parent"] < place for place, node in enumerate(nodes))
+    assert "the uppermost 400 are shown" in page.within("header#")
+
+
+def test_what_a_log_says_of_its_samples_is_told(tmp_path: Path) -> None:
+    log = tmp_path / "run.jsonl"
+    square = '{"name": "%s", "polygon": [[0, 0], [1, 0], [%s, 1]]}'
+    rows = [
+        f'{{"time_ns": {t}, "objects": [{square % ("a", 1)}, {square % ("b", "null" if t == 3 else 2)}]}}'
+        for t in range(5)
+    ]
+    log.write_text("\n".join(rows))
+    write_report(open_source(log), [sr.parse_specification("G (a ovlp b)")], tmp_path / "run.html")
+    assert "1 observation holds no finite number: unknown there." in page_of(tmp_path / "run.html").within(
+        "header#"
+    )
+
+
+def test_a_template_that_stands_for_nobody_says_so(tmp_path: Path) -> None:
+    car = sr.TrackedObject(sr.Footprint.disc(0, 0, 1), class_name="car")
+    samples = [sr.Sample(t, {} if t else {"a": car}) for t in range(4)]
+    page = report_of_samples(
+        tmp_path / "run.html",
+        samples,
+        "spec calm(ego) = G (ego dist ego >= 0)",
+        each={"ego": "class:car"},
+        window=Window(start_ns=1),
+    )
+    assert page.facts["results"] == []
+    assert "No object was there for a template to stand for." in page.within("section#verdicts")
+
+
+def test_objects_far_away_are_drawn(tmp_path: Path) -> None:
+    samples = [sr.Sample(t, {"a": sr.Footprint.disc((-1) ** t * 1e99, 0, 1)}) for t in range(4)]
+    film = report_of_samples(tmp_path / "run.html", samples, "G (a ovlp a)").facts["film"]
+    assert np.isfinite(film["low"] + film["high"]).all()
 
 
 def test_the_page_never_takes_the_place_of_an_input(tmp_path: Path) -> None:

@@ -126,7 +126,7 @@ def _maps_of(plan: Plan, decision: PlanDecision) -> Iterator[tuple[_Owner | None
 
 
 def _drawn(grid: Grid) -> _Drawn | None:
-    """A map's robustness; None of a message whose sizes do not fit together."""
+    """A map's robustness; None of a message whose sizes do not fit together, or make no rectangle."""
     columns, cell, row = grid.column_count, grid.cell_stride, grid.row_stride
     rows = len(grid.data) // row if row else 0
     offset = next((field.offset for field in grid.fields if field.name.startswith("robustness")), cell)
@@ -135,6 +135,8 @@ def _drawn(grid: Grid) -> _Drawn | None:
     numbers = np.ndarray((rows, columns), "<f4", grid.data, offset, (row, cell))
     x, y = grid.pose.position.x, grid.pose.position.y
     high = x + columns * grid.cell_size.x, y + rows * grid.cell_size.y
+    if not np.isfinite([x, y, *high]).all() or high[0] <= x or high[1] <= y:
+        return None
     return _Drawn(numbers.astype(np.float64), (x, y), high)
 
 
@@ -221,11 +223,14 @@ def _candidate_value(candidate: PlanCandidate) -> Mapping[str, Any]:
 
 
 def _target_value(target: PlanTarget) -> Mapping[str, Any]:
+    """A target in words, and as points to be drawn: none of them if one is not finite."""
+    points = [target.x, target.y, *target.waypoints]
+    is_drawn = bool(np.isfinite(points).all())
     turned = f", turned by {math.degrees(target.turn):.3g}°" if target.turn else ""
     return {
         "object": target.object,
-        "at": [target.x, target.y],
+        "at": points[:2] if is_drawn else None,
         "words": f"({target.x:.4g}, {target.y:.4g}){turned}",
         "robustness": number_text(target.robustness),
-        "way": list(target.waypoints),
+        "way": points[2:] if is_drawn else [],
     }

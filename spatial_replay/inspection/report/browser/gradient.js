@@ -93,7 +93,9 @@ function drawWay(context, points, at, style) {
   context.restore();
 }
 
-function drawTarget(context, [x, y], at) {
+function drawTarget(context, target, at) {
+  if (!target) return;
+  const [x, y] = target;
   context.save();
   context.strokeStyle = colour("ink");
   context.lineWidth = 2;

@@ -1,0 +1,105 @@
+"""Decisions on a report's page, whatever a log tells of them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from foxglove_schemas_protobuf.Grid_pb2 import Grid
+
+from spatial_replay.inspection.report.decisions import MOST_CELLS, PlanMaker, plan_value
+from spatial_replay.inspection.report.packing import Packing, json_text
+from spatial_replay.logs.messages.PlanDecision_pb2 import (
+    PlanCandidate,
+    PlanDecision,
+    PlanEdge,
+    PlanMap,
+    PlanTarget,
+)
+
+
+def grid(time_ns: int = 0, *, rows: int = 2, columns: int = 3, value: float = 1.0) -> Grid:
+    message = Grid(column_count=columns, row_stride=4 * columns, cell_stride=4)
+    message.timestamp.FromNanoseconds(time_ns)
+    message.cell_size.x = message.cell_size.y = 0.5
+    message.fields.add(name="robustness", offset=0)
+    message.data = np.full((rows, columns), value, "<f4").tobytes()
+    return message
+
+
+def decision(time_ns: int, *maps: PlanMap, target: PlanTarget | None = None) -> PlanDecision:
+    candidate = PlanCandidate(object="cup", best=-math.inf, rejected="no way", maps=maps, target=target)
+    return PlanDecision(
+        time_ns=time_ns,
+        number=0,
+        kind=PlanDecision.KIND_NO_PATH,
+        considered=[
+            PlanEdge(path=[0, 1], candidates=[candidate], pruned="no object can do it (cup: no way)")
+        ],
+        target=target,
+    )
+
+
+def value_of(told: PlanDecision, *grids: Grid) -> dict:
+    maker = PlanMaker()
+    maker.add_decision(told.SerializeToString())
+    for number, each in enumerate(grids):
+        maker.add_map(number, each.SerializeToString())
+    value = plan_value(maker.plan(), 0, Packing())
+    assert json_text(value)
+    return dict(value)
+
+
+def test_what_was_tried_in_vain_is_told() -> None:
+    (told,) = value_of(decision(10**9, PlanMap(number=0)), grid(10**9))["decisions"]
+    assert (told["time"], told["kind"], told["target"]) == (1.0, "no path", None)
+    (edge,) = told["edges"]
+    assert (edge["path"], edge["aim"], edge["pruned"]) == ([0, 1], False, "no object can do it")
+    assert edge["candidates"][0]["best"] == "nowhere free"
+    assert [(each["title"], each["edge"], each["candidate"]) for each in told["maps"]] == [("cup", 0, 0)]
+
+
+def test_maps_of_several_orientations_say_which() -> None:
+    maps = [PlanMap(number=0, turn=0.0), PlanMap(number=1, turn=math.pi / 2)]
+    (told,) = value_of(decision(0, *maps), grid(), grid())["decisions"]
+    assert [each["title"] for each in told["maps"]] == ["cup, turned by 0°", "cup, turned by 90°"]
+
+
+def test_maps_that_nobody_names_are_those_of_the_decisions_time() -> None:
+    (told,) = value_of(decision(5), grid(4), grid(5))["decisions"]
+    assert [(each["title"], each["edge"]) for each in told["maps"]] == [("", None)]
+
+
+def test_what_cannot_be_read_tells_nothing() -> None:
+    maker = PlanMaker()
+    maker.add_decision(b"\xff\xff")
+    maker.add_map(0, b"\xff\xff")
+    assert plan_value(maker.plan(), 0, Packing()) == {"decisions": [], "maps_left_out": 0}
+
+
+def test_a_map_whose_sizes_do_not_fit_is_not_drawn() -> None:
+    crooked = [grid() for _ in range(5)]
+    crooked[0].row_stride = 5
+    crooked[1].cell_stride = 0
+    crooked[2].fields[0].name = "height"
+    crooked[3].cell_size.x = math.nan
+    crooked[4].column_count = 0
+    named = [PlanMap(number=number) for number in range(5)]
+    value = value_of(decision(0, *named), *crooked)
+    assert value["decisions"][0]["maps"] == []
+    assert value["maps_left_out"] == 0
+
+
+def test_a_target_that_is_nowhere_is_told_and_not_drawn() -> None:
+    target = PlanTarget(object="cup", x=math.nan, y=0.0, turn=0.0, waypoints=[math.inf, 0.0], robustness=1.0)
+    (told,) = value_of(decision(0, target=target))["decisions"]
+    assert told["target"]["words"] == "(nan, 0)"
+    assert (told["target"]["at"], told["target"]["way"]) == (None, [])
+
+
+def test_no_more_cells_are_kept_than_there_is_room_for() -> None:
+    side = math.isqrt(MOST_CELLS // 2)
+    grids = [grid(rows=side, columns=side) for _ in range(3)]
+    value = value_of(decision(0, *(PlanMap(number=number) for number in range(3))), *grids)
+    assert len(value["decisions"][0]["maps"]) == 2
+    assert value["maps_left_out"] == 1
