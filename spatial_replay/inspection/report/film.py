@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -13,7 +13,7 @@ from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.inspection.layout import WITNESS
+from spatial_replay.inspection.layout import REGION, WITNESS
 from spatial_replay.inspection.report.packing import Packing
 
 MOST_FRAMES: Final = 3_000
@@ -71,41 +71,50 @@ class _Outlined(NamedTuple):
     colour: tuple[int, int, int]
 
 
+class _Pointed(NamedTuple):
+    """The arrow at the worst violation of one frame: from where to where it leads, (2, 2), and its number."""
+
+    frame: int
+    ends: Floats
+    label: str
+
+
+class _Box(NamedTuple):
+    """The part of the plane that everything lies in: its lower left corner, and its size, above 0."""
+
+    low: Floats
+    size: Floats
+
+    def steps(self, points: Floats) -> Floats:
+        """Points (n, 2) as the page has them: in steps of the box."""
+        return np.asarray(np.round((points - self.low) / self.size * _STEPS))
+
+
 def film_value(film: Film, first_ns: int, packing: Packing) -> Mapping[str, Any]:
-    """The film as the page reads it.
-
-    Coordinates are in steps of the bounding box of all frames, from its lower left corner.
-    """
+    """The film as the page reads it; coordinates are in steps of the box that everything lies in."""
     entities = _entities(film.frames)
-    pointed = [_pointed(frame) for frame in film.frames]
-    low, high = _bounds(entities, pointed)
-    size = np.where(high > low, high - low, 1.0)
-
-    def steps(points: Floats) -> Floats:
-        return np.asarray(np.round((points - low) / size * _STEPS))
-
+    pointed = list(_iter_pointed(film.frames))
+    box = _box(entities, pointed)
     return {
         "times": packing.add((film.times_ns - first_ns) / 1e9, "f8"),
         "stride": film.stride,
-        "low": low.tolist(),
-        "high": (low + size).tolist(),
+        "low": box.low.tolist(),
+        "high": (box.low + box.size).tolist(),
         "entities": [
-            _entity_value(identifier, shown, len(film.frames), steps, packing)
+            _entity_value(identifier, shown, len(film.frames), box, packing)
             for identifier, shown in sorted(entities.items(), key=_drawing_order)
         ],
         "witness": {
-            "frames": packing.add(np.flatnonzero([each is not None for each in pointed]), "i4"),
-            "points": packing.add(
-                steps(np.array([each[0] for each in pointed if each is not None]).reshape(-1, 2)), "u2"
-            ),
-            "labels": [each[1] for each in pointed if each is not None],
+            "frames": packing.add(np.array([each.frame for each in pointed]), "i4"),
+            "points": packing.add(box.steps(_joined([each.ends for each in pointed])), "u2"),
+            "labels": [each.label for each in pointed],
         },
     }
 
 
 def _drawing_order(item: tuple[str, Any]) -> tuple[bool, str]:
     """Regions lie below objects."""
-    return not item[0].startswith("region/"), item[0]
+    return not item[0].startswith(REGION), item[0]
 
 
 def _entities(frames: Sequence[SceneUpdate]) -> Mapping[str, dict[int, _Outlined]]:
@@ -125,38 +134,39 @@ def _outlined(entity: SceneEntity) -> _Outlined:
 
 
 def _byte(share: float) -> int:
-    return min(255, max(0, round(255.0 * share)))
+    return round(255.0 * share)
 
 
-def _pointed(frame: SceneUpdate) -> tuple[list[tuple[float, float]], str] | None:
-    """From where to where the arrow at the worst violation leads, and its number."""
-    for entity in frame.entities:
-        if entity.id == WITNESS and entity.arrows:
-            return list(_ends(entity.arrows[0])), entity.texts[0].text.strip()
-    return None
+def _iter_pointed(frames: Sequence[SceneUpdate]) -> Iterator[_Pointed]:
+    for number, frame in enumerate(frames):
+        for entity in frame.entities:
+            if entity.id == WITNESS and entity.arrows:
+                yield _Pointed(number, _ends(entity.arrows[0]), entity.texts[0].text.strip())
 
 
-def _ends(arrow: ArrowPrimitive) -> Iterator[tuple[float, float]]:
+def _ends(arrow: ArrowPrimitive) -> Floats:
     x, y = arrow.pose.position.x, arrow.pose.position.y
     angle = 2.0 * math.atan2(arrow.pose.orientation.z, arrow.pose.orientation.w)
     length = arrow.shaft_length + arrow.head_length
-    yield x, y
-    yield x + length * math.cos(angle), y + length * math.sin(angle)
+    return np.array([(x, y), (x + length * math.cos(angle), y + length * math.sin(angle))])
 
 
-def _bounds(entities: Mapping[str, Mapping[int, _Outlined]], pointed: Iterable[Any]) -> tuple[Floats, Floats]:
-    """The lower left and the upper right corner of everything."""
-    points = [ring for shown in entities.values() for each in shown.values() for ring in each.rings]
-    points += [np.array(each[0]) for each in pointed if each is not None]
-    everything = np.concatenate([*points, np.empty((0, 2))])
-    everything = everything[np.isfinite(everything).all(axis=1)]
+def _box(entities: Mapping[str, Mapping[int, _Outlined]], pointed: Sequence[_Pointed]) -> _Box:
+    rings = [ring for shown in entities.values() for each in shown.values() for ring in each.rings]
+    everything = _joined([*rings, *(each.ends for each in pointed)])
     if not len(everything):
-        return np.zeros(2), np.ones(2)
-    return np.asarray(everything.min(axis=0)), np.asarray(everything.max(axis=0))
+        return _Box(np.zeros(2), np.ones(2))
+    low, size = everything.min(axis=0), np.ptp(everything, axis=0)
+    return _Box(low, np.where(size > 0.0, size, 1.0))
+
+
+def _joined(points: Sequence[Floats]) -> Floats:
+    """All points, (n, 2)."""
+    return np.concatenate([np.empty((0, 2)), *points])
 
 
 def _entity_value(
-    identifier: str, shown: Mapping[int, _Outlined], frames: int, steps: Any, packing: Packing
+    identifier: str, shown: Mapping[int, _Outlined], frames: int, box: _Box, packing: Packing
 ) -> Mapping[str, Any]:
     """One entity: in which form it is shown in each frame, and the points and colours of those frames."""
     forms: dict[tuple[int, ...], int] = {}
@@ -165,13 +175,12 @@ def _entity_value(
         form = tuple(len(ring) for ring in each.rings)
         of_frame[number] = forms.setdefault(form, len(forms))
     kind, _, name = identifier.partition("/")
+    rings = [ring for each in shown.values() for ring in each.rings]
     return {
         "kind": kind,
         "name": name,
         "forms": list(forms),
         "form": packing.add(of_frame, "u2"),
-        "points": packing.add(
-            steps(np.concatenate([ring for each in shown.values() for ring in each.rings])), "u2"
-        ),
+        "points": packing.add(box.steps(_joined(rings)), "u2"),
         "colours": packing.add(np.array([each.colour for each in shown.values()]), "u1"),
     }

@@ -51,7 +51,7 @@ def panels(report: Report) -> Html:
     sections.append(_panel("events", "Events"))
     if report.plan.decisions:
         sections.append(_panel("decisions", "Decisions"))
-    return element("main", *sections, id="main")
+    return element("main", *sections, id="main", tabindex="-1")
 
 
 def footer(report: Report) -> Html:

@@ -81,11 +81,15 @@ class Clock {
     if (this.isAtEnd) this.seek(this.start);
     this.isPlaying = true;
     this.tell("play");
+    // for those who want little motion, a few pictures a second
+    const least = window.matchMedia("(prefers-reduced-motion: reduce)").matches ? 300 : 0;
     let before = performance.now();
     const tick = (now) => {
       if (!this.isPlaying) return;
-      this.seek(this.time + this.speed * (now - before) / 1000);
-      before = now;
+      if (now - before >= least) {
+        this.seek(this.time + this.speed * (now - before) / 1000);
+        before = now;
+      }
       if (this.isAtEnd) this.pause();
       else requestAnimationFrame(tick);
     };
