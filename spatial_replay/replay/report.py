@@ -78,7 +78,7 @@ def _report(replay: Replay, replayed: Replayed, collector: Collector) -> Report:
         files=tuple(replay.files),
         results=tuple(_results(replay, replayed, collector)),
         film=collector.film,
-        happenings=collector.happenings,
+        events=collector.events,
         plan=collector.plan,
     )
 

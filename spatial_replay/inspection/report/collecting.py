@@ -7,8 +7,8 @@ from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from spatial_replay.inspection.report.decisions import Plan, PlanMaker
+from spatial_replay.inspection.report.events import ReportedEvent, event_of
 from spatial_replay.inspection.report.film import Film, FilmMaker
-from spatial_replay.inspection.report.happenings import Happening, happening_of
 from spatial_replay.inspection.report.states import StatePath, StatePathMaker
 from spatial_replay.logs.block import Messages
 from spatial_replay.logs.messages.AutomatonState_pb2 import AutomatonState
@@ -28,7 +28,7 @@ class Collector:
     def __init__(self) -> None:
         self._film = FilmMaker()
         self._plan = PlanMaker()
-        self._happenings: list[Happening] = []
+        self._events: list[ReportedEvent] = []
         self._paths: dict[tuple[str, str], StatePathMaker] = {}
 
     def add(self, messages: Messages) -> None:
@@ -49,8 +49,8 @@ class Collector:
         return self._plan.plan()
 
     @property
-    def happenings(self) -> tuple[Happening, ...]:
-        return tuple(self._happenings)
+    def events(self) -> tuple[ReportedEvent, ...]:
+        return tuple(self._events)
 
     def path(self, name: str, object: str | None) -> StatePath:
         """Where the automaton of a result was; nowhere if it has none."""
@@ -60,7 +60,7 @@ class Collector:
         self._film.add(taken.time_ns, payload)
 
     def _take_event(self, _: Taken, payload: bytes) -> None:
-        self._happenings.append(happening_of(payload))
+        self._events.append(event_of(payload))
 
     def _take_state(self, _: Taken, payload: bytes) -> None:
         message = AutomatonState.FromString(payload)

@@ -9,8 +9,9 @@ from functools import cache
 from importlib.resources import files
 from typing import Final
 
-from spatial_replay.inspection.report.contents import Report, page_data
+from spatial_replay.inspection.report.contents import Report
 from spatial_replay.inspection.report.packing import json_text
+from spatial_replay.inspection.report.page_data import page_data
 from spatial_replay.inspection.report.prose import footer, header, panels, text
 from spatial_replay.inspection.report.theme import theme
 from spatial_replay.markup import element

@@ -11,7 +11,7 @@ MOST_EVENTS: Final = 2_000
 """How many events a page lists at most: the first ones."""
 
 
-class Happening(NamedTuple):
+class ReportedEvent(NamedTuple):
     """One change.
 
     Attributes:
@@ -23,16 +23,16 @@ class Happening(NamedTuple):
     facts: Mapping[str, str]
 
 
-def happening_of(payload: bytes) -> Happening:
+def event_of(payload: bytes) -> ReportedEvent:
     """A message of /spatial/events."""
     event = Event.FromString(payload)
     facts = {each.key: each.value for each in event.metadata}
-    return Happening(event.start_time.ToNanoseconds(), facts)
+    return ReportedEvent(event.start_time.ToNanoseconds(), facts)
 
 
-def happening_values(happenings: Sequence[Happening], first_ns: int) -> list[Mapping[str, Any]]:
+def event_values(events: Sequence[ReportedEvent], first_ns: int) -> list[Mapping[str, Any]]:
     """The list as the page reads it, in the order in which things began."""
-    ordered = sorted(happenings, key=lambda each: each.start_ns)
+    ordered = sorted(events, key=lambda each: each.start_ns)
     return [
         {
             "time": (each.start_ns - first_ns) / 1e9,
