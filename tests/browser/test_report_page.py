@@ -226,6 +226,13 @@ def test_looking_closer_keeps_the_cursor_in_sight(open_page: Open) -> None:
     assert page.evaluate("document.querySelector('.lanes .cursor').style.left") == "100%"
 
 
+def test_states_and_decisions_have_lanes_of_their_own(open_page: Open) -> None:
+    lanes = open_page("planned").locator(".lane-name")
+    expect(lanes).to_have_text(["✓push", "✓beside", "✓order", "✓gaps", "state", "decision"])
+    # a result without an automaton has no states
+    expect(open_page("violated").locator("span.lane-name")).to_have_count(0)
+
+
 def test_the_scene_changes_with_the_cursor(open_page: Open) -> None:
     page = open_page("violated")
     picture = "document.querySelector('.stage').toDataURL()"
@@ -269,7 +276,7 @@ def test_decisions_show_what_was_tried_and_lead_to_their_time(open_page: Open) -
 
 def test_each_object_of_a_template_can_be_looked_into(open_page: Open) -> None:
     page = open_page("template")
-    expect(page.locator(".lane-name")).to_have_count(6)
+    expect(page.locator("button.lane-name")).to_have_count(6)
     page.locator(".lane-name", has_text="calm(p0)").click()
     # it left long before the run ended, and stands as it did then
     expect(page.locator("#tree .which")).to_contain_text("calm(p0)")

@@ -1,4 +1,5 @@
-// A lane for each result, and for the named parts of the chosen one: how it stands over time.
+// A lane for each result, and for the named parts of the chosen one: how it stands over time; and below them
+// what the automaton and a planner do.
 
 // How much room names and the scale of curves take at the left, so that all times stand below each other.
 function gutter() {
@@ -13,6 +14,9 @@ function makeLanes(clock) {
   let lanes = [];
   clock.on("result", () => {
     lanes = clock.run.results.flatMap((result, number) => lanesOf(clock, result, number));
+    const chosen = clock.run.results[clock.result];
+    if (chosen?.automaton) lanes.push(stateLane(clock, chosen));
+    if (clock.run.decisions.length) lanes.push(decisionLane(clock));
     place.replaceChildren(...lanes.map((lane) => lane.made), over);
     for (const lane of lanes) lane.redraw();
   });
