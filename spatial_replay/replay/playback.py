@@ -48,8 +48,11 @@ class Playback:
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """Those of the log's own messages."""
-        return self.tuned.tuning.own.channels
+        """All that there can be messages of."""
+        own = self.tuned.tuning.own
+        first = Reading(own, self.start_ns).take_before(self.start_ns + 1)
+        opening = merge([*self.tuned.annotator().messages(*self.tuned.part(0, 1)), first])
+        return tuple(dict.fromkeys((*opening.channels.values(), *own.channels)))
 
     def seek(self, time_ns: int) -> Messages:
         """Go to a time: what stands there, and what is at that time.

@@ -16,7 +16,7 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import WebSocketException
 
 import spatial_replay as sr
-from replay.runs import STEP_NS, PiecewiseSource, content_of, run
+from replay.runs import STEP_NS, PiecewiseSource, content_of, record, run
 from runs.viewer import ENDED, PATIENCE_S, PAUSED, PLAYING, PROTOCOL, Message, State, Viewer, viewer
 from spatial_replay.errors import UsageError
 from spatial_replay.inspection.curves import MOST_POINTS
@@ -399,6 +399,20 @@ def test_what_others_wrote_is_played_if_viewers_can_read_it(tmp_path: Path) -> N
                 expected = sorted(after * publishers)
                 found = [await own.message(topic, lambda each: each.time_ns > 10 * STEP_NS) for _ in expected]
                 assert [each.time_ns for each in found] == expected
+
+        watch(server, looking)
+
+
+def test_a_log_that_cannot_be_read_any_more_is_told(tmp_path: Path) -> None:
+    log = record(run(COUNT), tmp_path / "run.mcap")
+    with serving(Tuning(open_source(log), [specification()]), port=0) as server:
+        log.unlink()
+
+        async def looking(own: Viewer) -> None:
+            await own.control(play=True, seek_ns=10 * STEP_NS)
+            assert "could not be read" in await own.note("log")
+            assert (await own.next_of(State, lambda each: each.request == "")).status == PAUSED
+            assert await own.constants() == {"far": 0.5, "soon": "10s"}
 
         watch(server, looking)
 

@@ -40,9 +40,6 @@ class Outlet(Protocol):
     def tell_time(self, time_ns: int) -> None:
         """Say at which time of the log the playback is."""
 
-    def tell_constants(self) -> None:
-        """Say what the constants are, where that is not the answer to a viewer."""
-
     def tell(self, note: Note) -> None:
         """Show a note."""
 

@@ -63,10 +63,11 @@ class LiveServer:
     A viewer that does not take what it is sent loses the oldest of it, and is let go when it takes nothing.
     """
 
-    def __init__(self, session: Session, host: str, port: int) -> None:
+    def __init__(self, session: Session, channels: Sequence[Channel], host: str, port: int) -> None:
         """Listen.
 
         Args:
+            channels: all that there can be messages of.
             port: 0 for any that is free.
 
         Raises:
@@ -74,7 +75,7 @@ class LiveServer:
         """
         self._session = session
         self._context = foxglove.Context()
-        self._channels = self._sent(session.channels)
+        self._channels = self._sent(channels)
         self._host = f"[{host}]" if _is_v6(host) else host
         try:
             self._server = foxglove.start_server(
@@ -86,7 +87,7 @@ class LiveServer:
                 services=[self._service(name) for name in SERVICES],
                 asset_handler=lambda uri: session.ask(partial(asset, uri=uri)),
                 context=self._context,
-                playback_time_range=(session.start_ns, session.end_ns),
+                playback_time_range=session.span_ns,
             )
         except RuntimeError as error:
             reason = str(error).rpartition("bind port: ")[2].partition(" (os error")[0]
@@ -130,10 +131,6 @@ class LiveServer:
     def tell_time(self, time_ns: int) -> None:
         """See `Outlet.tell_time`."""
         self._server.broadcast_time(time_ns)
-
-    def tell_constants(self) -> None:
-        """See `Outlet.tell_constants`."""
-        self._server.publish_parameter_values(_parameters(self._session))
 
     def tell(self, note: Note) -> None:
         """See `Outlet.tell`."""

@@ -8,7 +8,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from spatial_replay.errors import UsageError
+from spatial_replay.inspection.curves import CURVES_CHANNEL
+from spatial_replay.replay.playback import Playback
 from spatial_replay.replay.tuning import Tuning
+from spatial_replay.runs.live.player import Player
 from spatial_replay.runs.live.session import Session
 
 LOOPBACK = "127.0.0.1"
@@ -25,7 +28,6 @@ class Serving:
     """
 
     address: str
-    session: Session
     _loop: Future[None]
 
     def wait(self) -> None:
@@ -54,14 +56,16 @@ def serving(
         raise UsageError(
             "serving takes foxglove-sdk, which is not installed: pip install 'spatial-replay[live]'"
         ) from None
-    session = Session(tuning)
-    server = LiveServer(session, host, port)
-    with ThreadPoolExecutor(1, "live") as thread:
-        loop = thread.submit(session.run, server)
+    playback = Playback(tuning.evaluate())
+    playback.seek(playback.start_ns)
+    session = Session(tuning, playback.start_ns, playback.end_ns)
+    server = LiveServer(session, (*playback.channels, CURVES_CHANNEL), host, port)
+    with ThreadPoolExecutor(1, "player") as thread:
+        loop = thread.submit(Player(playback, session, server).run)
         try:
             if play:
                 session.control(is_playing=True, speed=1.0)
-            yield Serving(server.address, session, loop)
+            yield Serving(server.address, loop)
         finally:
             session.stop()
             server.stop()

@@ -37,14 +37,14 @@ class Wishes:
     Attributes:
         values: those of the constants that differ from what is written, if they are to change.
         is_steered: whether to play, pause or change the speed.
-        is_moved: whether to go to another time.
+        sought_ns: another time to go to.
         topics: which topics somebody has subscribed to.
         stop: whether the session is to end.
     """
 
     values: Values | None = None
     is_steered: bool = False
-    is_moved: bool = False
+    sought_ns: int | None = None
     topics: set[str] = field(default_factory=set)
     stop: bool = False
 

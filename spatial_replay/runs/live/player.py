@@ -1,0 +1,105 @@
+"""Does what viewers want: plays, seeks, evaluates again, and sends what comes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Final
+
+import numpy as np
+
+from spatial_replay.errors import LogError
+from spatial_replay.inspection.annotator import messages_of
+from spatial_replay.inspection.curves import CURVES_CHANNEL
+from spatial_replay.logs.block import Messages
+from spatial_replay.logs.merging import select
+from spatial_replay.logs.topics import CURVES_TOPIC
+from spatial_replay.replay.playback import Playback
+from spatial_replay.runs.live.outlet import Level, Note, Outlet
+from spatial_replay.runs.live.session import Session
+from spatial_replay.runs.live.thinning import thinned
+from spatial_replay.runs.live.wishes import Values, Wishes
+from spatial_replay.runs.live.words import LOG, verdict_note
+
+PERIOD_S: Final = 1 / 30
+"""From one stretch that is sent to the next."""
+
+MOST_TIMES: Final = 20
+"""Samples of a stretch that are sent, so that a fast playback is no more than viewers take."""
+
+_MOST_SAMPLES: Final = 4_096
+"""Samples that are worked on at once: what is slower than it should be still answers."""
+
+
+class Player:
+    """All the work of a session; on one thread, so that nothing has to wait for anything else."""
+
+    def __init__(self, playback: Playback, session: Session, outlet: Outlet) -> None:
+        self._playback = playback
+        self._session = session
+        self._outlet = outlet
+
+    def run(self) -> None:
+        """Do what viewers want until the session is stopped."""
+        try:
+            while not (wishes := self._session.next_wishes(PERIOD_S)).stop:
+                try:
+                    self._fulfil(wishes)
+                    self._play_on()
+                except LogError as error:
+                    self._outlet.tell(Note(LOG, Level.ERROR, str(error)))
+                    self._outlet.tell_state(self._session.pause())
+        finally:
+            self._session.end()
+
+    def _fulfil(self, wishes: Wishes) -> None:
+        time_ns = self._playback.time_ns if wishes.sought_ns is None else wishes.sought_ns
+        if wishes.values is not None:
+            self._evaluate(wishes.values, time_ns)
+        if wishes.values is not None or wishes.sought_ns is not None:
+            self._seek(time_ns)
+        if wishes.topics:
+            self._show(wishes.topics)
+        self._session.answer(self._playback.tuned)
+
+    def _evaluate(self, values: Values, time_ns: int) -> None:
+        """Evaluate the whole log with other constants; what was shown before is out of date."""
+        self._playback.tuned = self._playback.tuned.tuning.evaluate(values)
+        self._outlet.tell_state(self._session.state._replace(time_ns=time_ns, did_seek=True))
+
+    def _seek(self, time_ns: int) -> None:
+        """Show what stands at a time, and go on from there."""
+        self._show_whole(time_ns)
+        self._outlet.publish(self._playback.seek(time_ns))
+        self._outlet.tell_time(time_ns)
+        self._session.go_on_from(time_ns)
+
+    def _show(self, topics: Collection[str]) -> None:
+        """Send again what stands on some topics."""
+        time_ns = self._playback.time_ns
+        if CURVES_TOPIC in topics:
+            self._show_whole(time_ns)
+        self._outlet.publish(_on_topics(self._playback.seek(time_ns), topics))
+        self._outlet.tell_state(self._session.state)
+        self._outlet.tell_time(time_ns)
+
+    def _show_whole(self, time_ns: int) -> None:
+        """Show what is known of the whole log: curves and verdict."""
+        tuned = self._playback.tuned
+        if self._outlet.wants(CURVES_TOPIC):
+            self._outlet.publish(messages_of(CURVES_CHANNEL, np.array([time_ns]), [tuned.curves], 0))
+        self._outlet.tell(verdict_note(tuned))
+
+    def _play_on(self) -> None:
+        """Send what has come since the last stretch, if it plays."""
+        time_ns = self._session.play_up_to(self._playback.reach_ns(_MOST_SAMPLES))
+        if time_ns is None:
+            return
+        self._outlet.publish(thinned(self._playback.advance_to(time_ns), MOST_TIMES))
+        self._outlet.tell_time(time_ns)
+        if time_ns == self._playback.end_ns:
+            self._outlet.tell_state(self._session.pause())
+
+
+def _on_topics(messages: Messages, topics: Collection[str]) -> Messages:
+    numbers = [number for number, channel in messages.channels.items() if channel.topic in topics]
+    return select(messages, np.flatnonzero(np.isin(messages.channel, numbers)))
