@@ -7,6 +7,7 @@ import json
 import re
 import signal
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -91,3 +92,18 @@ def test_what_cannot_work_is_refused(options: tuple[str, ...], said: str, tmp_pa
     done = run_program(*TABLE, *options, cwd=tmp_path)
     assert done.returncode == 2
     assert said in done.stderr
+
+
+def test_without_its_library_it_says_what_to_install(tmp_path: Path) -> None:
+    program = "import sys; sys.modules['foxglove'] = None; from spatial_replay.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", program, *TABLE, "--port", "0"],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.returncode == 2
+    assert "pip install 'spatial-replay[live]'" in done.stderr
