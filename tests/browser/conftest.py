@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Iterator
 
 import pytest
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Browser, expect, sync_playwright
 
 CHROMIUM = shutil.which("chromium")
 
@@ -22,6 +22,10 @@ QUIET = (
     "--disable-sync",
     "--no-first-run",
 )
+
+
+# a machine may be busy with other tests
+expect.set_options(timeout=20_000)
 
 
 @pytest.fixture(scope="module")

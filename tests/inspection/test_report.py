@@ -340,3 +340,15 @@ def test_the_page_never_takes_the_place_of_an_input(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="is an input too"):
         report_of_samples(output, moving(3), "F (a ovlp b)", inputs=[output])
     assert output.read_text() == "mine"
+
+
+def test_of_a_large_automaton_the_states_of_the_run_are_drawn(tmp_path: Path) -> None:
+    page = report_of_samples(tmp_path / "run.html", moving(20), "spec s = F[90, 100] (a ovlp b)")
+    automaton = page.facts["results"][0]["automaton"]
+    shown = [state["number"] for state in automaton["states"]]
+    assert len(shown) == 60
+    assert automaton["left_out"] > 0
+    path = {state for code in page.numbers(automaton["path"]) for state in automaton["sets"][code]}
+    assert path <= set(shown)
+    assert {move["source"] for move in automaton["moves"]} >= path
+    assert len({tuple(state["at"]) for state in automaton["states"]}) == 60

@@ -15,8 +15,8 @@ from spatial_replay.logs.messages.AutomatonState_pb2 import AutomatonState
 
 MOST_STATES: Final = 60
 """How many states a page draws at most: those that the run is in, and then those nearest to the start."""
-_MOST_MOVES: Final = 600
-_LONGEST_GUARD: Final = 400
+_MOST_MOVES: Final = 300
+_LONGEST_GUARD: Final = 300
 _SWEEPS: Final = 4
 
 
@@ -58,11 +58,12 @@ def automaton_value(automaton: Automaton, path: StatePath) -> Mapping[str, Any]:
     """An automaton as the page draws it: its states with their places, its moves with their guards."""
     shown = _shown_states(automaton, path)
     places = _places(automaton, shown)
+    visited = _visited(path)
     moves = [move for move in automaton.transitions if move.source in places and move.target in places]
+    moves.sort(key=lambda move: move.source not in visited)
     return {
         "summary": size_words(automaton),
         "left_out": len(automaton.states) - len(shown),
-        "propositions": [each.label for each in automaton.propositions],
         "states": [
             {
                 "number": state,
@@ -81,10 +82,14 @@ def automaton_value(automaton: Automaton, path: StatePath) -> Mapping[str, Any]:
     }
 
 
+def _visited(path: StatePath) -> set[int]:
+    return {state for states in path.sets for state in states}
+
+
 def _shown_states(automaton: Automaton, path: StatePath) -> list[int]:
-    visited = sorted({state for states in path.sets for state in states} | {automaton.initial})
-    others = [state for state in automaton.states if state not in set(visited)]
-    return sorted([*visited, *others][:MOST_STATES])
+    visited = _visited(path) | {automaton.initial}
+    others = [state for state in automaton.states if state not in visited]
+    return sorted([*sorted(visited), *others][:MOST_STATES])
 
 
 def _places(automaton: Automaton, shown: Sequence[int]) -> Mapping[int, tuple[int, float]]:
