@@ -23,6 +23,13 @@ from spatial_replay.replay import load_files
 from spatial_replay.replay.report import write_report
 
 Open = Callable[..., Page]
+HOSTILE = (
+    "</script><img src=x onerror=alert(1)>",
+    "<svg onload=alert(1)>",
+    "`${alert(1)}`",
+    "javascript:alert(1)//\"'",
+    "no end " * 30,
+)
 MINUS = "\N{MINUS SIGN}"
 
 
@@ -52,7 +59,17 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     )
     text = "spec apart = G (a dist b >= 0.1)\nspec meet = F (a dist b <= 0.01)\nspec s = apart and meet"
     report_of_trace(folder / "long.html", two_discs(100_000), text)
+    hostile = [
+        sr.Sample(t * 10**8, {name: sr.Footprint.disc(3 * k, t, 1) for k, name in enumerate(HOSTILE)})
+        for t in range(9)
+    ]
+    ovlp = " or ".join(f"({quoted(name)} ovlp {quoted(HOSTILE[0])})" for name in HOSTILE[1:])
+    report_of_samples(folder / "hostile.html", hostile, f"spec {'s' * 200} = F ({ovlp})")
     return {page.stem: page for page in folder.glob("*.html")}
+
+
+def quoted(name: str) -> str:
+    return '"' + name.replace('"', '\\"') + '"'
 
 
 @pytest.fixture
@@ -73,6 +90,7 @@ def open_page(browser: Browser, pages: Mapping[str, Path]) -> Iterator[Open]:
         page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=scheme)
         page.on("console", heard)
         page.on("pageerror", failed)
+        page.on("dialog", lambda dialog: complaints.append(dialog.message))
         page.on("request", lambda request: complaints.append(request.url) if request.url != url else None)
         url = pages[name].as_uri()
         page.goto(url + at)
@@ -288,7 +306,9 @@ def test_a_damaged_log_is_announced(open_page: Open) -> None:
     expect(page.get_by_role("alert")).to_contain_text("The log is damaged")
 
 
-@pytest.mark.parametrize("name", ["violated", "satisfied", "planned", "damaged", "template", "long"])
+@pytest.mark.parametrize(
+    "name", ["violated", "satisfied", "planned", "damaged", "template", "long", "hostile"]
+)
 @pytest.mark.parametrize("width", [360, 1280])
 def test_nothing_is_wider_than_the_screen(open_page: Open, name: str, width: int) -> None:
     page = open_page(name, width=width, height=760)
@@ -320,6 +340,15 @@ def test_without_scripts_verdicts_can_be_read(browser: Browser, pages: Mapping[s
     expect(page.locator("#verdicts")).to_contain_text("which fails by 0.155214 at 4.000 s")
     assert page.locator("noscript").bounding_box() is not None
     context.close()
+
+
+def test_names_are_shown_as_they_are(open_page: Open) -> None:
+    page = open_page("hostile")
+    for key in ("Home", "n", "End"):
+        page.keyboard.press(key)
+    for name in HOSTILE:
+        expect(page.locator("#tree")).to_contain_text(quoted(name))
+    assert page.locator("img, svg svg, [onload], [onerror]").count() == 0
 
 
 def test_a_hundred_thousand_samples_can_be_gone_through(open_page: Open) -> None:
