@@ -15,6 +15,7 @@ import pytest
 import spatial_replay as sr
 from replay.runs import STEP_NS, PiecewiseSource, run
 from spatial_replay.errors import UsageError
+from spatial_replay.inspection.curves import CURVES_CHANNEL
 from spatial_replay.logs.block import Messages
 from spatial_replay.logs.topics import ROBUSTNESS
 from spatial_replay.replay.playback import Playback
@@ -48,9 +49,6 @@ class Kept:
 
     def tell(self, note: Note) -> None:
         self.told.put(note)
-
-    def withdraw(self, about: str) -> None:
-        raise AssertionError(f"nobody showed a note about {about}")
 
     def until(self, is_wanted: Callable[[object], bool]) -> list[object]:
         """All that is told up to the first that is wanted."""
@@ -126,6 +124,15 @@ def test_a_clock_that_runs_away_is_followed_in_pieces() -> None:
         times = [each for each in told if isinstance(each, int)]
         assert times == sorted(times)
         assert times[-1] == 5_999 * STEP_NS
+
+
+def test_curves_are_sent_again_while_it_plays() -> None:
+    with playing(40, Clock()) as (session, outlet):
+        session.control(is_playing=True, speed=1.0)
+        told = outlet.until(
+            lambda told: isinstance(told, Messages) and CURVES_CHANNEL in told.channels.values()
+        )
+        assert not any(isinstance(each, State) for each in told)
 
 
 def test_nobody_is_answered_after_the_end() -> None:

@@ -42,6 +42,3 @@ class Outlet(Protocol):
 
     def tell(self, note: Note) -> None:
         """Show a note."""
-
-    def withdraw(self, about: str) -> None:
-        """Show the note about something no longer."""

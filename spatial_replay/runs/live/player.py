@@ -26,6 +26,9 @@ PERIOD_S: Final = 1 / 30
 MOST_TIMES: Final = 20
 """Samples of a stretch that are sent, so that a fast playback is no more than viewers take."""
 
+_CURVES_EVERY: Final = 60
+"""Stretches after which the curves are sent again: some viewers forget them while they open their panels."""
+
 _MOST_SAMPLES: Final = 4_096
 """Samples that are worked on at once: what is slower than it should be still answers."""
 
@@ -37,6 +40,7 @@ class Player:
         self._playback = playback
         self._session = session
         self._outlet = outlet
+        self._stretches = 0
 
     def run(self) -> None:
         """Do what viewers want until the session is stopped."""
@@ -65,10 +69,11 @@ class Player:
         """Evaluate the whole log with other constants; what was shown before is out of date."""
         self._playback.tuned = self._playback.tuned.tuning.evaluate(values)
         self._outlet.tell_state(self._session.state._replace(time_ns=time_ns, did_seek=True))
+        self._outlet.tell(verdict_note(self._playback.tuned))
 
     def _seek(self, time_ns: int) -> None:
         """Show what stands at a time, and go on from there."""
-        self._show_whole(time_ns)
+        self._show_curves(time_ns)
         self._outlet.publish(self._playback.seek(time_ns))
         self._outlet.tell_time(time_ns)
         self._session.go_on_from(time_ns)
@@ -77,17 +82,17 @@ class Player:
         """Send again what stands on some topics."""
         time_ns = self._playback.time_ns
         if CURVES_TOPIC in topics:
-            self._show_whole(time_ns)
+            self._show_curves(time_ns)
+            self._outlet.tell(verdict_note(self._playback.tuned))
         self._outlet.publish(_on_topics(self._playback.seek(time_ns), topics))
         self._outlet.tell_state(self._session.state)
         self._outlet.tell_time(time_ns)
 
-    def _show_whole(self, time_ns: int) -> None:
-        """Show what is known of the whole log: curves and verdict."""
-        tuned = self._playback.tuned
+    def _show_curves(self, time_ns: int) -> None:
+        """Show what is known of the whole log; viewers forget it whenever they go to another time."""
         if self._outlet.wants(CURVES_TOPIC):
-            self._outlet.publish(messages_of(CURVES_CHANNEL, np.array([time_ns]), [tuned.curves], 0))
-        self._outlet.tell(verdict_note(tuned))
+            curves = [self._playback.tuned.curves]
+            self._outlet.publish(messages_of(CURVES_CHANNEL, np.array([time_ns]), curves, 0))
 
     def _play_on(self) -> None:
         """Send what has come since the last stretch, if it plays."""
@@ -96,6 +101,9 @@ class Player:
             return
         self._outlet.publish(thinned(self._playback.advance_to(time_ns), MOST_TIMES))
         self._outlet.tell_time(time_ns)
+        self._stretches += 1
+        if self._stretches % _CURVES_EVERY == 0:
+            self._show_curves(time_ns)
         if time_ns == self._playback.end_ns:
             self._outlet.tell_state(self._session.pause())
 

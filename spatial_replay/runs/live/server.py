@@ -137,7 +137,7 @@ class LiveServer:
         self._server.publish_status(note.text[:_LONGEST_NOTE], _LEVELS[note.level], note.about)
 
     def withdraw(self, about: str) -> None:
-        """See `Outlet.withdraw`."""
+        """Show the note about something no longer."""
         self._server.remove_status([about])
 
     def _sent(self, channels: Sequence[Channel]) -> dict[Channel, foxglove.Channel]:
