@@ -8,7 +8,8 @@ class Clock {
     this.end = run.times.length ? run.times[run.times.length - 1] : 0;
     this.time = this.end;
     this.view = [this.start, this.end];
-    this.result = 0;
+    this.worst = worstOf(run.results);
+    this.result = this.worst;
     this.speed = 1;
     this.isPlaying = false;
     this.watchers = {time: [], view: [], result: [], play: []};
@@ -108,6 +109,12 @@ class Clock {
   }
 }
 
+// The first result of those that are violated or, without any, unknown.
+function worstOf(results) {
+  const found = ["violated", "unknown"].map((verdict) => results.findIndex((each) => each.verdict === verdict));
+  return found.find((place) => place >= 0) ?? 0;
+}
+
 // Keeps time and result in the address, so that a link leads to them: #t=4.2&r=1.
 function keepInAddress(clock) {
   const given = new URLSearchParams(location.hash.slice(1));
@@ -116,7 +123,7 @@ function keepInAddress(clock) {
   let waiting = null, before = [clock.time, clock.result];
   const write = () => {
     waiting = null;
-    const result = clock.result ? `&r=${clock.result}` : "";
+    const result = clock.result === clock.worst ? "" : `&r=${clock.result}`;
     history.replaceState(null, "", `#t=${Number(clock.time.toFixed(6))}${result}`);
   };
   const later = () => {
