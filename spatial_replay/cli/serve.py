@@ -55,13 +55,12 @@ def serve(request: Request, port: int, host: str, play: bool, layout: bool) -> N
     # the numerical libraries load when there is work for them
     from spatial_replay.runs.live.serving import serving
 
-    tuning = _tuning(request)
-    tuned = tuning.evaluate()
+    tuned = _tuning(request).evaluate()
     if layout:
         click.echo(tuned.layout.data)
         return
     report_reading(tuned.replayed)
-    with serving(tuning, host=host, port=port, play=play) as server:
+    with serving(tuned, host=host, port=port, play=play) as server:
         print_verdicts(tuned.replayed, None)
         if not _is_loopback(host):
             say("warning", f"anyone who reaches {server.address} can read this log", colour="yellow")

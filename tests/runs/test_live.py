@@ -60,7 +60,7 @@ def specification() -> sr.Specification:
 @contextmanager
 def served(count: int = COUNT) -> Iterator[Serving]:
     tuning = Tuning(PiecewiseSource(run(count), 7), [specification()])
-    with serving(tuning, port=0) as server:
+    with serving(tuning.evaluate(), port=0) as server:
         yield server
 
 
@@ -387,7 +387,7 @@ def test_what_others_wrote_is_played_if_viewers_can_read_it(tmp_path: Path) -> N
             for channel in (first, second, notes, secret):
                 writer.write(channel, index * STEP_NS, b"12")
     tuning = Tuning(open_source(log), [specification()])
-    with serving(tuning, port=0) as server:
+    with serving(tuning.evaluate(), port=0) as server:
 
         async def looking(own: Viewer) -> None:
             assert {"/tf", "/notes"} <= {*own.channels}
@@ -405,7 +405,7 @@ def test_what_others_wrote_is_played_if_viewers_can_read_it(tmp_path: Path) -> N
 
 def test_a_log_that_cannot_be_read_any_more_is_told(tmp_path: Path) -> None:
     log = record(run(COUNT), tmp_path / "run.mcap")
-    with serving(Tuning(open_source(log), [specification()]), port=0) as server:
+    with serving(Tuning(open_source(log), [specification()]).evaluate(), port=0) as server:
         log.unlink()
 
         async def looking(own: Viewer) -> None:
@@ -420,7 +420,10 @@ def test_a_log_that_cannot_be_read_any_more_is_told(tmp_path: Path) -> None:
 def test_a_port_that_is_taken_is_told(server: Serving) -> None:
     port = int(server.address.rpartition(":")[2])
     tuning = Tuning(PiecewiseSource(run(3), 7), [specification()])
-    with pytest.raises(UsageError, match=f"port {port}: .*; choose another"), serving(tuning, port=port):
+    with (
+        pytest.raises(UsageError, match=f"port {port}: .*; choose another"),
+        serving(tuning.evaluate(), port=port),
+    ):
         pass
 
 

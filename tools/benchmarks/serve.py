@@ -68,7 +68,7 @@ def bench_serve(measure: Any) -> None:
     tuning = Tuning(MemorySource(trace), [specification])
     values = itertools.count(20)
     with (
-        serving(tuning, port=0) as server,
+        serving(tuning.evaluate(), port=0) as server,
         connect(server.address, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None) as connection,
     ):
         viewer = Viewer(connection)

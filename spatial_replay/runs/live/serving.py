@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from spatial_replay.errors import UsageError
 from spatial_replay.inspection.curves import CURVES_CHANNEL
 from spatial_replay.replay.playback import Playback
-from spatial_replay.replay.tuning import Tuning
+from spatial_replay.replay.tuning import Tuned
 from spatial_replay.runs.live.player import Player
 from spatial_replay.runs.live.session import Session
 
@@ -36,12 +36,11 @@ class Serving:
 
 
 @contextmanager
-def serving(
-    tuning: Tuning, *, host: str = LOOPBACK, port: int = PORT, play: bool = False
-) -> Iterator[Serving]:
+def serving(tuned: Tuned, *, host: str = LOOPBACK, port: int = PORT, play: bool = False) -> Iterator[Serving]:
     """Let viewers look at a log, and change the constants of its specifications, for a while.
 
     Args:
+        tuned: what is shown at first, with the constants as they are written.
         host: the address to listen at; anyone who reaches it can read the log.
         port: 0 for any that is free.
         play: play from the start, rather than wait there for a viewer to do so.
@@ -56,9 +55,9 @@ def serving(
         raise UsageError(
             "serving takes foxglove-sdk, which is not installed: pip install 'spatial-replay[live]'"
         ) from None
-    playback = Playback(tuning.evaluate())
+    playback = Playback(tuned)
     playback.seek(playback.start_ns)
-    session = Session(tuning, playback.start_ns, playback.end_ns)
+    session = Session(tuned.tuning, playback.start_ns, playback.end_ns)
     server = LiveServer(session, (*playback.channels, CURVES_CHANNEL), host, port)
     with ThreadPoolExecutor(1, "player") as thread:
         loop = thread.submit(Player(playback, session, server).run)
