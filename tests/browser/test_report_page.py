@@ -148,6 +148,14 @@ def test_choosing_an_event_goes_there(open_page: Open) -> None:
     expect(readout(page)).to_have_text("4.000 s / 9.967 s")
 
 
+def test_what_is_violated_is_explained_at_once(open_page: Open) -> None:
+    page = open_page("violated")
+    expect(page.locator(".verdict[open]")).to_have_count(1)
+    page.locator(".verdict", has_text="poured").locator("summary").click()
+    expect(page.get_by_text("milk and cup are 0.113693 apart")).to_be_visible()
+    expect(open_page("satisfied").locator(".verdict[open]")).to_have_count(3)
+
+
 def test_a_time_in_an_explanation_leads_there(open_page: Open) -> None:
     page = open_page("violated")
     page.locator(".verdict").first.get_by_role("button", name="4.000 s").click()
@@ -258,8 +266,11 @@ def test_the_scene_changes_with_the_cursor(open_page: Open) -> None:
     expect(page.locator(".caption")).to_contain_text("what is violated most now, by 0.")
     first = page.evaluate(picture)
     assert first != last
-    page.get_by_label("names").uncheck()
-    assert page.evaluate(picture) != first
+    page.keyboard.press("n")
+    for layer in ("names", "trails"):
+        before = page.evaluate(picture)
+        page.get_by_label(layer).uncheck()
+        assert page.evaluate(picture) != before
 
 
 def test_the_automaton_shows_where_the_run_is(open_page: Open) -> None:

@@ -16,7 +16,7 @@ from spatial_replay.wording import counted
 _CALENDAR_NS: Final = 500_000_000 * 10**9
 """Times of logs from here on count from 1970; other clocks began when something was switched on."""
 _MANY: Final = 6
-"""Of more results than these only the first explanation is unfolded."""
+"""Of more results than these only the first explanation is unfolded, else those of the gravest verdict."""
 _WITHOUT_SCRIPTS: Final = "Without scripts this page shows verdicts and explanations alone."
 
 
@@ -120,7 +120,8 @@ def _verdicts(report: Report) -> Iterator[Html]:
     for number, result in enumerate(report.results[place] for place in worst):
         # which result the page shows when something in the verdict is chosen
         drawn = {"data-result": str(places[id(result)])} if id(result) in places else {}
-        unfolded = {"open": ""} if result.sentences and not (are_many and number) else {}
+        is_unfolded = result.verdict == report.verdict and not (are_many and number)
+        unfolded = {"open": ""} if result.sentences and is_unfolded else {}
         attributes = {"class": "verdict", **drawn, **unfolded}
         sentences = [element("p", *_with_code(sentence)) for sentence in result.sentences]
         yield element(

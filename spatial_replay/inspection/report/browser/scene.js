@@ -10,7 +10,7 @@ function makeScene(clock) {
     place.append(element("p", {}, "The log has no scene."));
     return;
   }
-  const layers = {map: true, labels: true};
+  const layers = {labels: true, trails: true, map: true};
   const {made, redraw} = canvas("The scene from above", (context, width, height) => {
     drawScene(context, clock, film, layers, width, height);
   });
@@ -19,7 +19,8 @@ function makeScene(clock) {
   const caption = element("p", {class: "caption"});
   const hasMaps = clock.run.decisions.some((decision) => decision.maps.length);
   place.append(made, element("div", {class: "scene-foot"}, caption, element("span", {class: "choice"},
-    layerBox("names", "labels", layers, redraw), hasMaps ? layerBox("map", "map", layers, redraw) : null)),
+    layerBox("names", "labels", layers, redraw), layerBox("trails", "trails", layers, redraw),
+    hasMaps ? layerBox("map", "map", layers, redraw) : null)),
   key([{ground: "positive", words: "all that is asked of it holds now"},
     {ground: "negative", words: "something does not"}, {ground: "neutral", words: "nothing is asked, or unknown"}]));
   let before = null;
@@ -108,6 +109,7 @@ function drawScene(context, clock, film, layers, width, height) {
   const decision = decisionAt(clock.run, clock.time);
   const map = decision?.maps.at(-1);
   if (layers.map && map) drawMap(context, clock.run, map, at);
+  if (layers.trails) drawTrails(context, film, frame, at);
   const labels = [];
   for (const entity of film.entities) drawEntity(context, entity, frame, at, labels);
   if (decision) drawPlan(context, clock, decision, at);
