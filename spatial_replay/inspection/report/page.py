@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections.abc import Sequence
-from functools import cache
 from importlib.resources import files
 from typing import Final
 
@@ -50,7 +49,6 @@ def page(report: Report) -> bytes:
     return "".join(parts).encode("utf-8", "replace")
 
 
-@cache
 def _asset(name: str) -> str:
     return files(__package__).joinpath(name).read_text("utf-8")
 
