@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from spatial_replay.automata.diagrams import LEAF
 from spatial_replay.automata.guards import guard_words
@@ -62,6 +62,16 @@ class Automaton:
                 of what `automaton` gives.
         """
         return transitions_of(self._moves, self.successors)
+
+    def with_transitions(self) -> Self:
+        """This automaton, with transitions that are found.
+
+        Raises:
+            NoAutomatonError: as `transitions`.
+        """
+        # what finds them keeps them
+        _ = self.transitions
+        return self
 
     @cached_property
     def successors(self) -> tuple[tuple[int, ...], ...]:

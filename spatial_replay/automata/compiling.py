@@ -106,9 +106,7 @@ def _kept(automaton: Automaton) -> Automaton:
     rows = max(len(automaton.entries), len(automaton.decisions))
     if rows > MAX_ROWS:
         raise NoAutomatonError(f"it takes {rows} states or decisions, at most {MAX_ROWS} are kept")
-    # once here, so that what is handed out has guards
-    automaton.transitions  # noqa: B018
-    return automaton
+    return automaton.with_transitions()
 
 
 def chosen_spec(specification: Specification, name: str | None) -> NamedSpec:

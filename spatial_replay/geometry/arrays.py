@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 Floats: TypeAlias = NDArray[np.float64]
 Integers: TypeAlias = NDArray[np.int64]
 Flags: TypeAlias = NDArray[np.int8]
+Booleans: TypeAlias = NDArray[np.bool_]
 
 
 def read_only_floats(values: ArrayLike) -> Floats:

@@ -8,9 +8,8 @@ from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from spatial_replay.geometry.arrays import Flags, Floats, Integers
+from spatial_replay.geometry.arrays import Booleans, Flags, Floats, Integers
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.geometry.measure import Operand
@@ -26,8 +25,6 @@ from spatial_replay.spec.formula import (
     Variable,
 )
 from spatial_replay.trace.trace import ABSENT, Trace
-
-Booleans = NDArray[np.bool_]
 
 Bindings = Mapping[str, str]
 """Names of the objects that variables stand for."""

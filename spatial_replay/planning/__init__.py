@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from spatial_replay.planning.logged_step import LoggedStep, read_steps
     from spatial_replay.planning.maps import GradientMap, gradient_map
     from spatial_replay.planning.planner import Planner
+    from spatial_replay.planning.poses import moved_object
     from spatial_replay.planning.settings import Settings
     from spatial_replay.planning.step import Candidate, Executor, Outcome, Step, Target
     from spatial_replay.planning.workspace import Grid, Workspace
@@ -34,6 +35,7 @@ __all__ = [
     "Target",
     "Workspace",
     "gradient_map",
+    "moved_object",
     "proposition_maps",
     "read_steps",
 ]
@@ -52,6 +54,7 @@ _HOMES: Mapping[str, str] = MappingProxyType(
         "Target": "spatial_replay.planning.step",
         "Workspace": "spatial_replay.planning.workspace",
         "gradient_map": "spatial_replay.planning.maps",
+        "moved_object": "spatial_replay.planning.poses",
         "proposition_maps": "spatial_replay.planning.displacement",
         "read_steps": "spatial_replay.planning.logged_step",
     }

@@ -9,10 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Integers, read_only_integers
+from spatial_replay.geometry.arrays import Booleans, Integers, read_only_integers
 from spatial_replay.planning.path_kernel import search
-
-Booleans = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

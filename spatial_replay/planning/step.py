@@ -94,7 +94,7 @@ class Consideration:
         edge: from which state to which.
         progress: what is to hold for the edge to be taken.
         constraints: what must not hold on the way, for it leads elsewhere.
-        candidates: the objects looked at, in the order of the specification.
+        candidates: the objects looked at, in the order of the settings' `movable`; without it, by name.
         pruned: why the edge was given up, or "".
     """
 

@@ -7,10 +7,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Floats
+from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.planning.checks import (
     count_faults,
@@ -21,8 +20,6 @@ from spatial_replay.planning.checks import (
     refuse_faults,
 )
 from spatial_replay.trace.sample import Sample
-
-Booleans = NDArray[np.bool_]
 
 MOST_CELLS = 4_000_000
 """Cells of a grid, over all angles; beyond it a cell size was mistyped."""
