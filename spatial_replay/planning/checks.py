@@ -35,6 +35,13 @@ def number_faults(values: Mapping[str, Any], least: float = -math.inf) -> list[s
     ]
 
 
+def point_faults(name: str, value: Any) -> list[str]:
+    """A value to be a point (x, y) of finite numbers."""
+    if not isinstance(value, tuple) or len(value) != 2:
+        return [f"{name} is {value!r}; give (x, y)"]
+    return number_faults({f"{name}[{place}]": number for place, number in enumerate(value)})
+
+
 def count_faults(values: Mapping[str, Any]) -> list[str]:
     """Values by name, to be whole numbers of at least 1."""
     return [

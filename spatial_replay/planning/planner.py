@@ -10,6 +10,7 @@ from spatial_replay.automata.compiling import automaton as automaton_of
 from spatial_replay.automata.moves import Transition
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.planning.candidates import Movables, with_choice
+from spatial_replay.planning.checks import kind_faults, refuse_faults
 from spatial_replay.planning.edges import consideration_of, why_no_path, worst_state
 from spatial_replay.planning.observing import Observer, Symbol, refuse_template
 from spatial_replay.planning.settings import Settings
@@ -52,9 +53,11 @@ class Planner:
 
         Raises:
             NoAutomatonError: past operators, bounds in seconds, or too large a formula.
-            UsageError: no such spec, several to choose from, a template, or propositions about earlier
-                samples.
+            UsageError: no such spec, several to choose from, a template, propositions about earlier samples,
+                or settings that are none.
         """
+        if settings is not None:
+            refuse_faults(kind_faults("settings", settings, Settings, "Settings(workspace), or None"))
         self.automaton: Automaton = automaton_of(specification, name)
         refuse_template(specification, self.automaton.name)
         self._settings = settings
@@ -108,9 +111,11 @@ class Planner:
 
         Raises:
             TraceError: a time that does not come after the last one's.
-            UsageError: at the first sample: the settings name objects to be moved that nobody knows, or there
-                are no settings and no objects.
+            UsageError: what is no sample; at the first one: the settings name objects to be moved that nobody
+                knows, or there are no settings and no objects.
         """
+        if not isinstance(sample, Sample):
+            raise UsageError(f"{sample!r} is no sample; give a Sample(time_ns, objects)")
         if self._sample is not None and sample.time_ns <= self._sample.time_ns:
             raise TraceError(
                 f"a sample at {sample.time_ns} ns follows one at {self._sample.time_ns} ns; give times that "
@@ -164,8 +169,10 @@ class Planner:
         A place where an object could not be brought is avoided when the same edge is tried again.
 
         Raises:
-            UsageError: no step is being executed.
+            UsageError: what is no outcome, or no step is being executed.
         """
+        if not isinstance(outcome, Outcome):
+            raise UsageError(f"{outcome!r} is no outcome; give an Outcome(succeeded, reason)")
         step = self._running
         if step is None or step.target is None or step.aim is None:
             raise UsageError("no step is being executed; call next_step() first")

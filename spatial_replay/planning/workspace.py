@@ -17,6 +17,7 @@ from spatial_replay.planning.checks import (
     kind_faults,
     member_faults,
     number_faults,
+    point_faults,
     refuse_faults,
 )
 from spatial_replay.trace.sample import Sample
@@ -156,9 +157,7 @@ class Workspace:
         yield from kind_faults("yaws", self.yaws, tuple, "a tuple of angles in radians") or number_faults(
             {f"yaws[{place}]": yaw for place, yaw in enumerate(self.yaws)}
         )
-        yield from kind_faults("base", self.base, tuple, "(x, y)") or number_faults(
-            dict(zip(("base[0]", "base[1]"), self.base, strict=True))
-        )
+        yield from point_faults("base", self.base)
         faults = number_faults({"nearest": self.nearest}, 0)
         yield from faults
         if not is_number(self.farthest):

@@ -151,6 +151,8 @@ def test_a_grid_has_whole_numbers_of_cells():
         ({"nearest": -1.0, "clearance": "1"}, r"nearest is -1.0(.|\n)*clearance is '1'"),
         ({"farthest": math.nan}, "farthest is nan"),
         ({"base": 3.0}, "base is 3.0"),
+        ({"base": (1.0, 2.0, 3.0)}, r"base is \(1.0, 2.0, 3.0\); give \(x, y\)"),
+        ({"base": ("a", 2.0)}, r"base\[0\] is 'a'"),
         ({"yaws": 0.5}, "yaws is 0.5"),
         ({"supports": "plate"}, "supports is 'plate'"),
         ({"obstacles": (1,)}, "obstacles has 1"),

@@ -220,6 +220,19 @@ def test_steps_come_in_their_order():
         one.next_step()
 
 
+def test_what_is_no_sample_or_outcome_changes_nothing():
+    with pytest.raises(UsageError, match="settings is 'x'; give Settings"):
+        planner("F (cup enclosedin plate)", "x")
+    one = planner("F (cup enclosedin plate)")
+    with pytest.raises(UsageError, match="None is no sample; give a Sample"):
+        one.observe(None)
+    one.observe(sr.Sample(0, THINGS))
+    one.next_step()
+    with pytest.raises(UsageError, match="True is no outcome; give an Outcome"):
+        one.conclude(True)
+    one.conclude(Outcome(True))
+
+
 def test_formulas_that_cannot_be_planned_are_refused():
     with pytest.raises(UsageError, match="looks at earlier samples"):
         planner("F (cup moved[1] cup[-3])")
