@@ -8,23 +8,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.errors import SpecificationError, UsageError
+from spatial_replay.errors import UsageError
 from spatial_replay.inspection.annotation import kept_files
 from spatial_replay.inspection.automata import KeptAutomaton
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.planning.black_box import PLAN_METADATA, BlackBox
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings_text import text_from_settings
-from spatial_replay.planning.step import Kind
+from spatial_replay.planning.step import Kind, Step
 from spatial_replay.planning.warm_up import warm_up
 from spatial_replay.runs.care import settings_for
 from spatial_replay.runs.executor import WorldExecutor
+from spatial_replay.runs.names import refuse_unknown_names
 from spatial_replay.runs.plan_loop import PlanLoop
-from spatial_replay.runs.run_log import run_log
-from spatial_replay.runs.scripted import run_options
+from spatial_replay.runs.run_log import RunLog, run_log
+from spatial_replay.runs.scripted import about_run
 from spatial_replay.simulation.injection import Injection
+from spatial_replay.simulation.world import World
 from spatial_replay.simulation.worlds import default_specification, make_world
-from spatial_replay.spec import check_names
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
 
@@ -92,39 +93,53 @@ def record_plan(
     """
     (kept,) = kept_files([default_specification(scenario) if file is None else file])
     _refuse_missing(kept, name)
-    options = run_options(seed=seed, noise_m=noise_m, injections=injections)
-    about = {"source": scenario, "seed": str(seed), "options": options, "planned": "true"}
-    warm_up()
+    made = about_run(scenario, seed=seed, noise_m=noise_m, injections=injections)
+    about = {**made, "planned": "true"}
     # a world or a planner that cannot be made leaves the output alone
     with closing(make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, gui=gui)) as world:
-        _check_names(kept, world.sample())
+        refuse_unknown_names([kept], world.sample())
         planner = Planner(kept, settings_for(world), name=name)
+        warm_up()
         with run_log(output, [kept], about, inputs, _known(kept, planner.automaton)) as log:
-            plan = {
-                "settings": text_from_settings(planner.settings),
-                "file": kept.filename,
-                "specification": planner.automaton.name,
-            }
-            log.add_metadata(PLAN_METADATA, plan)
+            log.add_metadata(PLAN_METADATA, _plan(planner, kept))
             loop = PlanLoop(BlackBox(planner), log, WorldExecutor(world, world.skill), world.step)
+            last = _satisfied(world, loop, advance)
+        return _told(log, loop, planner.automaton.name, last)
 
-            def hear(sample: Sample) -> None:
-                loop.observe(sample)
-                advance(1)
 
-            world.attach(hear)
-            last = loop.run()
-        return PlannedRun(
-            samples=log.samples,
-            seconds=log.seconds,
-            ended=last.kind,
-            name=planner.automaton.name,
-            verdict=log.verdicts[planner.automaton.name],
-            reason=last.reason,
-            steps=loop.executed,
-            pruned=len(last.pruned),
-            planning_s=loop.planning_s,
-        )
+def _satisfied(world: World, loop: PlanLoop, advance: Callable[[int], None]) -> Step:
+    """The last decision of a loop that hears every sample of a world."""
+
+    def hear(sample: Sample) -> None:
+        loop.observe(sample)
+        advance(1)
+
+    world.attach(hear)
+    return loop.run()
+
+
+def _told(log: RunLog, loop: PlanLoop, name: str, last: Step) -> PlannedRun:
+    """What came of a run that has ended."""
+    return PlannedRun(
+        samples=log.samples,
+        seconds=log.seconds,
+        ended=last.kind,
+        name=name,
+        verdict=log.verdicts[name],
+        reason=last.reason,
+        steps=loop.executed,
+        pruned=len(last.pruned),
+        planning_s=loop.planning_s,
+    )
+
+
+def _plan(planner: Planner, file: Specification) -> dict[str, str]:
+    """What a log's metadata keeps to make the decisions again."""
+    return {
+        "settings": text_from_settings(planner.settings),
+        "file": file.filename,
+        "specification": planner.automaton.name,
+    }
 
 
 def _refuse_missing(file: Specification, name: str | None) -> None:
@@ -145,15 +160,3 @@ def _known(file: Specification, automaton: Automaton) -> list[KeptAutomaton]:
         for spec in file.results
         if spec.name == automaton.name
     ]
-
-
-def _check_names(file: Specification, sample: Sample) -> None:
-    """That a world has what a specification names.
-
-    Raises:
-        SpecificationError: with every name that it does not have.
-    """
-    remarks = check_names(file, sorted(sample.objects), sorted(sample.signals))
-    missing = [remark for remark in remarks if remark.severity == "error"]
-    if missing:
-        raise SpecificationError(missing)

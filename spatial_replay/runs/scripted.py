@@ -9,8 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from spatial_replay.errors import UsageError
-from spatial_replay.runs.run_log import run_log
+from spatial_replay.runs.names import refuse_unknown_names
+from spatial_replay.runs.run_log import RunLog, run_log
 from spatial_replay.simulation.injection import Injection
+from spatial_replay.simulation.tabletop import Tabletop
+from spatial_replay.simulation.world import Execution
 from spatial_replay.simulation.worlds import default_specification, make_world
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
@@ -55,31 +58,41 @@ def record_script(
         advance: told how many more samples are done.
 
     Raises:
+        SpecificationError: names that the world does not have.
         UsageError: no such scenario, no simulator, a duration of 0, a specification that cannot be recorded.
         OutputError: the output cannot be written.
     """
     if duration_ns is not None and duration_ns <= 0:
         raise UsageError("a run of 0 s has no sample; give a longer duration")
     files = [default_specification(scenario)] if files is None else list(files)
-    options = run_options(seed=seed, noise_m=noise_m, injections=injections)
-    about = {"source": scenario, "seed": str(seed), "options": options}
-    # a world that cannot be made leaves the output alone
+    about = about_run(scenario, seed=seed, noise_m=noise_m, injections=injections)
+    # a world that cannot be made, or has not what is named, leaves the output alone
     with closing(make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, gui=gui)) as world:
+        refuse_unknown_names(files, world.sample())
         with run_log(output, files, about, inputs) as log:
-
-            def hear(sample: Sample) -> None:
-                log.write(sample)
-                advance(1)
-
-            world.attach(hear)
-            result = world.follow(world.script(), duration_ns)
-            if not log.samples:
-                # the robot had nothing to do, or could do nothing
-                world.step()
+            result = _followed(world, log, duration_ns, advance)
         outcome = "stopped in the middle of its motion" if result is None else result.reason
         return SimulatedRun(log.samples, log.seconds, tuple(world.scene.bodies), outcome)
 
 
-def run_options(*, seed: int, noise_m: float, injections: Sequence[Injection]) -> str:
+def about_run(scenario: str, *, seed: int, noise_m: float, injections: Sequence[Injection]) -> dict[str, str]:
     """What a log's metadata keeps of how a run was made."""
-    return json.dumps({"seed": seed, "noise_m": noise_m, "inject": [str(each) for each in injections]})
+    options = {"seed": seed, "noise_m": noise_m, "inject": [str(each) for each in injections]}
+    return {"source": scenario, "seed": str(seed), "options": json.dumps(options)}
+
+
+def _followed(
+    world: Tabletop, log: RunLog, duration_ns: int | None, advance: Callable[[int], None]
+) -> Execution | None:
+    """How the script went, every sample of it in the log; None if it was not done within the duration."""
+
+    def hear(sample: Sample) -> None:
+        log.write(sample)
+        advance(1)
+
+    world.attach(hear)
+    result = world.follow(world.script(), duration_ns)
+    if not log.samples:
+        # the robot had nothing to do, or could do nothing
+        world.step()
+    return result

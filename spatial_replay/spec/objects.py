@@ -57,13 +57,14 @@ def _atoms(specification: Specification) -> Iterable[Atom]:
 
 
 def check_names(
-    specification: Specification, known: Iterable[str], signals: Iterable[str]
+    specification: Specification, known: Iterable[str], signals: Iterable[str], *, where: str = "log"
 ) -> tuple[Diagnostic, ...]:
     """Compare the names of a specification with those of a log.
 
     Args:
         known: names of the log's objects.
         signals: names of its numeric signals.
+        where: what has them, if it is no log.
 
     Returns:
         An error for each object and signal that the log never has, with the nearest that it has; a
@@ -78,14 +79,14 @@ def check_names(
         source.diagnostic(
             "error",
             places.get(name, Span(0, 0)),
-            f"the log never has the {kind} {name!r}",
+            f"the {where} never has the {kind} {name!r}",
             " ".join(filter(None, (nearest_hint(name, candidates), _listing(kind, candidates)))),
         )
         for kind, name, candidates in missing
     ]
     for name, span in defined.items():
         if name in objects:
-            message = f"the log has an object {name!r}, which this definition hides"
+            message = f"the {where} has an object {name!r}, which this definition hides"
             found.append(source.diagnostic("warning", span, message, "give the definition another name"))
     return tuple(sorted(found, key=lambda each: (each.line, each.column)))
 

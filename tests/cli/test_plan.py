@@ -60,7 +60,7 @@ def test_of_several_results_one_is_chosen(tmp_path: Path, capsys: pytest.Capture
     [
         (SATISFIED, ["--of", "clam"], "task.spatial has no result 'clam'; its results are: calm"),
         ("spec calm = G O (green leftof red)\n", [], "past operators"),
-        ("spec calm = F (pink leftof red)\n", [], "never has the object 'pink'"),
+        ("spec calm = F (pink leftof red)\n", [], "the world never has the object 'pink'"),
         ("spec calm = F (\n", [], "task.spatial:1"),
         (SATISFIED, ["--inject", "drop@1s"], "drop"),
     ],

@@ -47,6 +47,20 @@ def test_a_specification_takes_the_place_of_the_scenarios(tmp_path: Path) -> Non
     assert "recorded/push.spatial" not in kept
 
 
+def test_names_that_the_world_does_not_have_leave_the_output_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, specification = tmp_path / "run.mcap", tmp_path / "a.spatial"
+    path.write_text("kept")
+    specification.write_text("spec left = F (gren leftof blue and speed >= 1)\n")
+    assert run(["record", "push", "-o", str(path), "--spec", str(specification)]) == 2
+    said = capsys.readouterr().err
+    assert "a.spatial:1:16: error: the world never has the object 'gren'" in said
+    assert "did you mean 'green'?" in said
+    assert "the world never has the signal 'speed'" in said
+    assert path.read_text() == "kept"
+
+
 @pytest.mark.parametrize(
     "wrong", [["--inject", "drop@1s"], ["--duration", "0s"], ["--inject", "quake"], ["--noise", "inf"]]
 )

@@ -60,12 +60,12 @@ def test_what_cannot_be_done_ends_and_says_why(tmp_path: Path) -> None:
 
 def test_names_that_the_world_does_not_have_are_refused(tmp_path: Path) -> None:
     pytest.importorskip("pybullet", reason="PyBullet is not installed; it has wheels for Python 3.11")
-    with pytest.raises(sr.SpecificationError, match="never has the object 'pink'"):
+    with pytest.raises(sr.SpecificationError, match="the world never has the object 'pink'"):
         record_plan("push", tmp_path / "run.mcap", sr.parse_specification("F (pink leftof red)"))
     assert not (tmp_path / "run.mcap").exists()
     # before anything else about the specification, such as how long its automaton takes
     too_large = sr.parse_specification("G (pink leftof red -> F[30, 30] (red leftof blue))")
-    with pytest.raises(sr.SpecificationError, match="never has the object 'pink'"):
+    with pytest.raises(sr.SpecificationError, match="the world never has the object 'pink'"):
         record_plan("push", tmp_path / "run.mcap", too_large)
 
 
