@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import click
@@ -79,6 +80,9 @@ def planning_command(scenario: str) -> click.Command:
             f"{counted(planned.steps, 'motion')}, {counted(planned.pruned, 'edge')} given up"
         )
         click.echo(f"the planner: {planned.reason}")
+        if planned.ended == "no path":
+            told = shlex.join(["spatial-replay", "info", str(output), "--decisions"])
+            click.echo(f"  {told} tells what was tried, and why it was given up")
         click.echo(f"the log: {planned.name} is {planned.verdict}")
         # a run that waited in vain was cut short: that its goal was not reached is no violation
         return exit_code_from_verdicts(["unknown" if planned.ended == "wait" else planned.verdict])

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Final
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.moves import Transition
 from spatial_replay.planning.step import Consideration, Edge, Guards
+
+_LISTED: Final = 4
+"""Edges that are named for a reason; others are counted."""
 
 
 def consideration_of(
@@ -47,15 +51,21 @@ def worst_state(automaton: Automaton, states: Iterable[int]) -> int | None:
 
 
 def why_no_path(automaton: Automaton, state: int, pruned: Mapping[Edge, str]) -> str:
-    """That every way from a state to acceptance was given up, with the edges on these ways."""
+    """That every way from a state to acceptance was given up, with edges on these ways for each reason."""
     ahead, found = [state], {state}
     while ahead:
         after = set(automaton.successors[ahead.pop()]) - found
         found |= after
         ahead += after
-    edges = "; ".join(
-        f"{source} -> {target}: {reason}"
-        for (source, target), reason in sorted(pruned.items())
-        if source in found
-    )
-    return f"no path left: every way from state {state} was given up ({edges})"
+    edges: dict[str, list[str]] = {}
+    for (source, target), reason in sorted(pruned.items()):
+        if source in found:
+            # what is in brackets differs from edge to edge
+            edges.setdefault(reason.split(" (", 1)[0], []).append(f"{source} -> {target}")
+    reasons = "; ".join(f"{_listed(each)}: {reason}" for reason, each in edges.items())
+    return f"no path left: every way from state {state} was given up ({reasons})"
+
+
+def _listed(edges: Sequence[str]) -> str:
+    more = f" and {len(edges) - _LISTED} more" if len(edges) > _LISTED else ""
+    return ", ".join(edges[:_LISTED]) + more

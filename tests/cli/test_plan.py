@@ -35,7 +35,9 @@ def test_what_is_satisfied_exits_with_0(tmp_path: Path, capsys: pytest.CaptureFi
 def test_where_no_path_is_left_it_exits_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert plan(tmp_path, IMPOSSIBLE) == 1
     said = capsys.readouterr().out
-    assert "the planner: no path left: every way from state 0 was given up (0 -> 1: no object can" in said
+    reason = "no path left: every way from state 0 was given up (0 -> 1: no object can do it)"
+    assert f"the planner: {reason}\n" in said
+    assert f"spatial-replay info {tmp_path / 'run.mcap'} --decisions tells" in said
     assert said.endswith("the log: torn is violated\n")
 
 

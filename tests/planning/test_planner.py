@@ -233,6 +233,18 @@ def test_what_is_no_sample_or_outcome_changes_nothing():
     one.conclude(Outcome(True))
 
 
+def test_a_reason_names_a_few_edges_of_many():
+    never = " and ".join(f"(F (cup leftof {one} and cup rightof {one}))" for one in ("fork", "plate", "cup"))
+    steps, _ = run(planner(never), THINGS)
+    assert steps[-1].kind == "no path"
+    assert len(steps[-1].pruned) == 7
+    assert steps[-1].reason == (
+        "no path left: every way from state 0 was given up "
+        "(0 -> 1, 0 -> 2, 0 -> 3, 0 -> 4 and 3 more: no object can do it)"
+    )
+    assert all("cup: " in reason for _, reason in steps[-1].pruned)
+
+
 def test_formulas_that_cannot_be_planned_are_refused():
     with pytest.raises(UsageError, match="looks at earlier samples"):
         planner("F (cup moved[1] cup[-3])")
