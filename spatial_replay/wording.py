@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 _LONGEST: Final = 300
@@ -11,6 +12,15 @@ _LONGEST: Final = 300
 def counted(count: int, noun: str) -> str:
     """A number of things: "1 sample", "1,579 samples"."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
+def json_number(number: float) -> float | str | None:
+    """A number as JSON can hold it: infinite ones are the strings "inf" and "-inf", NaN is null."""
+    if math.isnan(number):
+        return None
+    if math.isinf(number):
+        return "inf" if number > 0 else "-inf"
+    return number
 
 
 def printable(text: str, longest: int = _LONGEST) -> str:

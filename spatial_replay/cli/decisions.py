@@ -8,9 +8,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from spatial_replay.wording import counted
+from spatial_replay.wording import counted, json_number
 
 if TYPE_CHECKING:
+    from google.protobuf.message import Message
+
     from spatial_replay.logs.messages.PlanDecision_pb2 import (
         PlanCandidate,
         PlanDecision,
@@ -35,19 +37,26 @@ def decision_rows(decisions: Sequence[PlanDecision]) -> list[dict[str, Any]]:
     """The same as values for JSON."""
     from google.protobuf.json_format import MessageToDict
 
-    return [
-        _with_plain_times(MessageToDict(decision, preserving_proto_field_name=True), decision)
-        for decision in decisions
-    ]
+    rows = [MessageToDict(decision, preserving_proto_field_name=True) for decision in decisions]
+    for row, decision in zip(rows, decisions, strict=True):
+        _write_numbers(row, decision)
+        row["kind"] = decision.Kind.Name(decision.kind).removeprefix("KIND_").lower().replace("_", " ")
+    return rows
 
 
-def _with_plain_times(row: dict[str, Any], decision: PlanDecision) -> dict[str, Any]:
-    """The library writes 64-bit integers as texts; here they are numbers, as elsewhere."""
-    row["time_ns"] = decision.time_ns
-    row["kind"] = decision.Kind.Name(decision.kind).removeprefix("KIND_").lower().replace("_", " ")
-    if decision.HasField("outcome"):
-        row["outcome"]["end_ns"] = decision.outcome.end_ns
-    return row
+def _write_numbers(row: dict[str, Any], message: Message) -> None:
+    """Write the numbers of a message as elsewhere; the library has its own texts for some."""
+    for field, value in message.ListFields():
+        written = row[field.name]
+        if field.type == field.TYPE_FIXED64:
+            row[field.name] = value
+        elif field.type == field.TYPE_DOUBLE:
+            many = isinstance(written, list)
+            row[field.name] = [json_number(each) for each in value] if many else json_number(value)
+        elif field.type == field.TYPE_MESSAGE:
+            parts = zip(written, value, strict=True) if isinstance(written, list) else [(written, value)]
+            for part, of_part in parts:
+                _write_numbers(part, of_part)
 
 
 def _lines(decision: PlanDecision) -> Iterator[str]:
@@ -78,12 +87,11 @@ def _edge_lines(edge: PlanEdge, *, is_aim: bool) -> Iterator[str]:
 
 
 def _candidate(candidate: PlanCandidate) -> str:
-    best = "-inf" if math.isinf(candidate.best) else f"{candidate.best:.4g}"
     name = f"{candidate.object}{_maps(candidate)}"
     if candidate.rejected:
         return f"{name}: rejected, {candidate.rejected}"
     mark = "chosen" if candidate.chosen else "possible"
-    return f"{name}: {mark}, {best} at best; {_way(candidate.target)}"
+    return f"{name}: {mark}, {candidate.best:.4g} at best; {_way(candidate.target)}"
 
 
 def _maps(candidate: PlanCandidate) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,6 +13,7 @@ from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.replay.found import Replayed, ReplayedSpec
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import iter_nodes, operator_of
+from spatial_replay.wording import json_number
 
 
 def document(replayed: Replayed, *, signal: bool = False, window_ns: int | None = None) -> Mapping[str, Any]:
@@ -51,9 +51,9 @@ def _result(result: ReplayedSpec, first_ns: int, signal: bool, window_ns: int | 
         "name": result.name,
         "object": result.object,
         "verdict": str(result.verdict),
-        "robustness": _number(float(result.robustness[0])),
-        "lower": _number(lower),
-        "upper": _number(upper),
+        "robustness": json_number(float(result.robustness[0])),
+        "lower": json_number(lower),
+        "upper": json_number(upper),
         "first_satisfied_ns": result.first_satisfied_ns,
         "worst": None,
         "nodes": [
@@ -64,9 +64,9 @@ def _result(result: ReplayedSpec, first_ns: int, signal: bool, window_ns: int | 
                 "name": node.name,
                 "text": format_formula(node),
                 "verdict": str(final_verdict(*result.final[identifier].tolist())),
-                "robustness": _number(float(result.robustness[identifier])),
-                "lower": _number(float(result.final[identifier, 0])),
-                "upper": _number(float(result.final[identifier, 1])),
+                "robustness": json_number(float(result.robustness[identifier])),
+                "lower": json_number(float(result.final[identifier, 0])),
+                "upper": json_number(float(result.final[identifier, 1])),
             }
             for identifier, parent, node in iter_nodes(result.formula)
         ],
@@ -94,8 +94,8 @@ def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
         "node": witness.node,
         "name": witness.path[0].name,
         "verdict": str(witness.verdict),
-        "lower": _number(witness.lower),
-        "upper": _number(witness.upper),
+        "lower": json_number(witness.lower),
+        "upper": json_number(witness.upper),
         "time_ns": witness.time_ns,
         "path": [{"node": step.node, "time_ns": step.time_ns} for step in witness.path],
         "atom": None,
@@ -108,9 +108,9 @@ def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
             "text": deciding.text,
             "relation": deciding.atom.relation,
             "objects": list(deciding.objects),
-            "value": _number(deciding.value),
-            "lower": _number(deciding.lower),
-            "upper": _number(deciding.upper),
+            "value": json_number(deciding.value),
+            "lower": json_number(deciding.lower),
+            "upper": json_number(deciding.upper),
             "measured": [_measured(each) for each in deciding.measured],
             "unknown": list(deciding.unknown),
         }
@@ -130,20 +130,12 @@ def _measured(measured: Measured) -> dict[str, Any]:
     return {
         "quantity": measured.quantity,
         "names": list(measured.names),
-        "value": _number(measured.value),
+        "value": json_number(measured.value),
         "spread": measured.spread,
         "points": None if contact is None else [list(contact.first), list(contact.second)],
     }
 
 
-def _number(number: float) -> float | str | None:
-    if math.isnan(number):
-        return None
-    if math.isinf(number):
-        return "inf" if number > 0 else "-inf"
-    return number
-
-
 def _numbers(rows: Floats) -> list[list[float | str | None]]:
     """One list for each node."""
-    return [[_number(number) for number in row] for row in rows.tolist()]
+    return [[json_number(number) for number in row] for row in rows.tolist()]

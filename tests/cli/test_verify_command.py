@@ -118,6 +118,15 @@ def test_machines_get_decisions_in_json(tmp_path: Path) -> None:
     assert decisions[0]["target"]["object"] in {"red", "blue"}
 
 
+def test_infinite_numbers_are_written_as_everywhere(tmp_path: Path) -> None:
+    everywhere = sr.Footprint.box(-1, -1, 2, 2)
+    walled = replace(PUSH, workspace=replace(PUSH.workspace, obstacles=(everywhere,)))
+    record_plan_of(tmp_path / "run.mcap", settings=walled)
+    _, said = call("info", tmp_path / "run.mcap", "--decisions", "--json")
+    candidates = json.loads(said)["decisions"][0]["considered"][0]["candidates"]
+    assert [each["best"] for each in candidates] == ["-inf", "-inf", "-inf"]
+
+
 def test_a_log_without_decisions_says_so(recorded: Path) -> None:
     with pytest.raises(sr.UsageError, match="holds no decisions"):
         call("info", recorded, "--decisions")
