@@ -42,7 +42,9 @@ def message_of(error: BaseException) -> str:
     """What an error says to the one who ran the command."""
     match error:
         case click.Abort() | KeyboardInterrupt():
-            return "interrupted"
+            # the command line's library puts an error of its own in the place of the interruption
+            notes = getattr(error.__cause__ or error, "__notes__", ())
+            return "\n  ".join(["interrupted", *notes])
         case click.UsageError(ctx=click.Context() as context):
             return f"{error.format_message()}\n  '{context.command_path} --help' shows what it takes"
         case click.ClickException():

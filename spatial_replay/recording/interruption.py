@@ -6,6 +6,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 
 TERMINATED = 128 + signal.SIGTERM
@@ -35,6 +36,18 @@ def uninterrupted() -> Iterator[None]:
                 signal.signal(number, handler)
     if came:
         signal.raise_signal(came[0])
+
+
+@contextmanager
+def leaving(output: Path) -> Iterator[None]:
+    """Note on an interruption that ends the block where the shorter log is."""
+    try:
+        yield
+    except KeyboardInterrupt as interruption:
+        interruption.add_note(
+            f"{output} holds what was recorded until then, and says that it was interrupted"
+        )
+        raise
 
 
 @contextmanager

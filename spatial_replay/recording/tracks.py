@@ -14,7 +14,7 @@ from spatial_replay.logs.mcap_writer import LogWriter
 from spatial_replay.logs.output import open_output, refuse_inputs
 from spatial_replay.logs.reading import read_blocks, reading_options
 from spatial_replay.logs.source import Source
-from spatial_replay.recording.interruption import uninterrupted
+from spatial_replay.recording.interruption import leaving, uninterrupted
 from spatial_replay.recording.recording import Recording, refuse_templates
 from spatial_replay.spec import check_names
 from spatial_replay.spec.formula import Diagnostic, Specification
@@ -73,7 +73,7 @@ def record_source(
     traces = _traces(source, tally)
     # a source that holds nothing raises here, before the output is touched
     first = next(traces)
-    with open_output(output) as stream:
+    with leaving(output), open_output(output) as stream:
         about = {"source": source.name, "options": json.dumps(reading_options(source))}
         _record(LogWriter(stream), about, files, chain([first], traces), advance)
     return tally.recorded(files)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from spatial_replay.inspection.automata import KeptAutomaton
@@ -13,7 +13,7 @@ from spatial_replay.logs.merging import merge
 from spatial_replay.logs.output import open_output, refuse_inputs
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.recording import Recording
-from spatial_replay.recording.interruption import terminable, uninterrupted
+from spatial_replay.recording.interruption import leaving, terminable, uninterrupted
 from spatial_replay.recording.recording import refuse_templates
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
@@ -136,14 +136,17 @@ def run_log(
     """
     refuse_inputs(output, inputs)
     refuse_templates(files)
-    with terminable(), open_output(output) as stream:
+    interrupted = True
+    with leaving(output), terminable(), open_output(output) as stream, ExitStack() as ending:
+        # an interruption meanwhile leaves a log that is ended all the same
         with uninterrupted():
             writer = LogWriter(stream)
             log = RunLog(writer, Recording(writer, files, about, known))
-        interrupted = True
-        try:
-            yield log
-            interrupted = False
-        finally:
-            with uninterrupted():
-                log.end(interrupted=interrupted)
+            ending.callback(lambda: _end(log, interrupted=interrupted))
+        yield log
+        interrupted = False
+
+
+def _end(log: RunLog, *, interrupted: bool) -> None:
+    with uninterrupted():
+        log.end(interrupted=interrupted)

@@ -59,7 +59,13 @@ def test_an_interrupted_recording_is_a_proper_shorter_log(tmp_path: Path, number
     (tmp_path / "a.spatial").write_text("spec s = F cube ovlp cube\nspec t = G cube ovlp cube\n")
     command = [*PROGRAM, "record", "tracks", "run.jsonl", "--spec", "a.spatial", "-o", "run.mcap"]
     code, said = interrupted(command, number, tmp_path, lambda: _size(tmp_path / "run.mcap") > 10**4)
-    assert (code, said) == (130, "spatial-replay: error: interrupted")
+    assert (code, said.splitlines()) == (
+        130,
+        [
+            "spatial-replay: error: interrupted",
+            "  run.mcap holds what was recorded until then, and says that it was interrupted",
+        ],
+    )
     count = len(read_trace(tmp_path / "run.mcap"))
     assert 0 < count < MANY
     content = content_of(tmp_path / "run.mcap")

@@ -101,7 +101,13 @@ def test_without_the_extra_it_says_what_to_install(
 def test_an_interrupted_simulation_is_a_proper_shorter_log(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     code, said = interrupted([*PROGRAM, *LONG], signal.SIGINT, tmp_path, lambda: _size(path) > 10**5)
-    assert (code, said) == (130, "spatial-replay: error: interrupted")
+    assert (code, said.splitlines()) == (
+        130,
+        [
+            "spatial-replay: error: interrupted",
+            "  run.mcap holds what was recorded until then, and says that it was interrupted",
+        ],
+    )
     count = len(read_trace(path))
     assert count > 30
     ending = {"samples": str(count), "dropped": "0", "interrupted": "true"}
