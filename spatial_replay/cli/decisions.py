@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from textwrap import wrap
+from typing import TYPE_CHECKING, Any, Final
 
 from spatial_replay.wording import counted, json_number
 
@@ -20,17 +21,27 @@ if TYPE_CHECKING:
         PlanTarget,
     )
 
+_LEAST_WIDTH: Final = 60
+"""Of lines, however narrow a terminal is."""
+_LONGEST: Final = 400
+"""Characters of alternatives; JSON has all."""
 
-def decision_lines(log: Path, decisions: Sequence[PlanDecision]) -> Iterator[str]:
-    """Step by step: what was aimed at, tried, rejected and chosen, and how it went."""
-    motions = sum(decision.HasField("target") for decision in decisions)
-    given_up = len(decisions[-1].pruned)
-    yield (
-        f"{log.name}: {counted(len(decisions), 'decision')} for {decisions[-1].specification!r}, "
-        f"{counted(motions, 'motion')}, {counted(given_up, 'edge')} given up"
-    )
-    for decision in decisions:
-        yield from _lines(decision)
+
+def decision_lines(log: Path, decisions: Sequence[PlanDecision], width: int) -> Iterator[str]:
+    """Step by step: what was aimed at, tried, rejected and chosen, and how it went.
+
+    Args:
+        width: characters after which lines are broken.
+    """
+    for line in _whole_lines(log, decisions):
+        indent = " " * (len(line) - len(line.lstrip(" ")) + 4)
+        yield from wrap(
+            line,
+            max(width, _LEAST_WIDTH),
+            subsequent_indent=indent,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
 
 
 def decision_rows(decisions: Sequence[PlanDecision]) -> list[dict[str, Any]]:
@@ -59,13 +70,33 @@ def _write_numbers(row: dict[str, Any], message: Message) -> None:
                 _write_numbers(part, of_part)
 
 
+def _whole_lines(log: Path, decisions: Sequence[PlanDecision]) -> Iterator[str]:
+    *before, last = decisions
+    motions = sum(decision.HasField("target") and decision.HasField("outcome") for decision in decisions)
+    is_cut = last.HasField("target") and not last.HasField("outcome")
+    yield (
+        f"{log.name}: {counted(len(decisions), 'decision')} for {last.specification!r}, "
+        f"{counted(motions, 'motion')}{' and one cut short' if is_cut else ''}, "
+        f"{counted(len(last.pruned), 'edge')} given up"
+    )
+    for decision in before:
+        yield from _lines(decision)
+    yield from _lines(last)
+    if is_cut:
+        yield "  the log ends during this motion"
+
+
 def _lines(decision: PlanDecision) -> Iterator[str]:
     states = ", ".join(map(str, decision.states))
     yield f"step {decision.number} at {_seconds(decision.time_ns)}, state {states}"
     for edge in decision.considered:
-        yield from _edge_lines(edge, is_aim=decision.HasField("target") and edge is decision.considered[-1])
-    yield f"  {decision.reason}"
-    if decision.HasField("target"):
+        yield from _edge_lines(edge, is_aim=edge is decision.considered[-1] and not edge.pruned)
+    if not decision.HasField("target"):
+        yield f"  {decision.reason}"
+    else:
+        # what it is for is told by the edge that is aimed at
+        aim = _either([guard.text for edge in decision.considered[-1:] for guard in edge.progress])
+        yield f"  {decision.reason.removesuffix(f': {aim}')}"
         yield f"  {_way(decision.target)}"
     if decision.HasField("outcome"):
         outcome = decision.outcome
@@ -77,9 +108,9 @@ def _lines(decision: PlanDecision) -> Iterator[str]:
 def _edge_lines(edge: PlanEdge, *, is_aim: bool) -> Iterator[str]:
     path = " -> ".join(map(str, edge.path))
     yield f"  {'aimed at' if is_aim else 'looked into'} {edge.source} -> {edge.target} on the path {path}"
-    yield f"    to reach  {_either([guard.text for guard in edge.progress])}"
+    yield f"    to reach  {_some([guard.text for guard in edge.progress])}"
     if edge.constraints:
-        yield f"    never     {_either([guard.text for guard in edge.constraints])}"
+        yield f"    never     {_some([guard.text for guard in edge.constraints])}"
     for candidate in edge.candidates:
         yield f"    {_candidate(candidate)}"
     if edge.pruned:
@@ -113,9 +144,15 @@ def _way(target: PlanTarget) -> str:
 
 
 def _either(texts: Sequence[str]) -> str:
-    shown = [f"({text})" if len(texts) > 1 else text for text in texts[:4]]
-    more = f" or {len(texts) - 4} more" if len(texts) > 4 else ""
-    return " or ".join(shown) + more
+    return " or ".join(f"({text})" for text in texts) if len(texts) > 1 else "".join(texts)
+
+
+def _some(texts: Sequence[str]) -> str:
+    """Alternatives, or the first of them and how many more there are."""
+    ends = list(accumulate(map(len, texts)))
+    count = max(1, sum(end <= _LONGEST for end in ends))
+    more = f" or {len(texts) - count} more" if count < len(texts) else ""
+    return (f"({texts[0]})" if more and count == 1 else _either(texts[:count])) + more
 
 
 def _seconds(time_ns: int) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -100,7 +101,7 @@ def _decisions(log: Path, as_json: bool) -> int:
         document = {"name": log.name, "damaged": bool(told.faults), "decisions": rows}
         click.echo(json.dumps(document, indent=2, ensure_ascii=False))
     else:
-        for line in decision_lines(log, told.decisions):
+        for line in decision_lines(log, told.decisions, shutil.get_terminal_size((100, 24)).columns):
             click.echo(line)
     return ExitCode.DAMAGED if told.faults else ExitCode.SATISFIED
 

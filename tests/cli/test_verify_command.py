@@ -94,6 +94,31 @@ def test_decisions_are_told_step_by_step(tmp_path: Path) -> None:
     assert lines[-1] == "  the specification is satisfied: hold"
 
 
+def test_decisions_fit_the_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "70")
+    record_plan_of(tmp_path / "run.mcap")
+    _, said = call("info", tmp_path / "run.mcap", "--decisions")
+    assert max(map(len, said.splitlines())) <= 70
+    _, whole = call("info", tmp_path / "run.mcap", "--decisions", "--json")
+    told = " ".join(said.split())
+    for edge in json.loads(whole)["decisions"][0]["considered"]:
+        assert f"to reach {edge['progress'][0]['text']}" in told
+
+
+def test_a_motion_that_the_log_ends_in_is_not_done(tmp_path: Path) -> None:
+    def seen(sample: sr.Sample) -> sr.Sample:
+        if sample.time_ns > 2 * 10**8:
+            raise KeyboardInterrupt
+        return sample
+
+    with pytest.raises(KeyboardInterrupt):
+        record_plan_of(tmp_path / "run.mcap", seen_as=seen)
+    _, said = call("info", tmp_path / "run.mcap", "--decisions")
+    lines = said.splitlines()
+    assert lines[0] == "run.mcap: 2 decisions for 'push', 1 motion and one cut short, 1 edge given up"
+    assert lines[-1] == "  the log ends during this motion"
+
+
 def test_decisions_of_a_log_that_was_cut_short_are_told(tmp_path: Path) -> None:
     record_plan_of(tmp_path / "run.mcap", slips=1)
     whole = (tmp_path / "run.mcap").read_bytes()
