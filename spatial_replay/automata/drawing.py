@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+from collections.abc import Sequence
+from dataclasses import replace
+from textwrap import wrap
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.moves import Transition
@@ -13,8 +16,12 @@ from spatial_replay.wording import counted
 
 _DRAWING_S = 120.0
 """How long Graphviz may take."""
-_WIDTH = 60
-"""Characters after which a label of a drawing goes on in a new line."""
+_LONGEST_LABEL = 12
+"""Characters of a proposition that stands on an arrow as it is."""
+_WIDTH = 20
+"""Characters after which a label of an arrow goes on in a new line."""
+_LEGEND_WIDTH = 100
+"""Characters of a line below a drawing."""
 
 
 def words_text(automaton: Automaton) -> str:
@@ -54,11 +61,34 @@ def state_colour(automaton: Automaton, state: int) -> str:
     return "#ffffff" if state in automaton.can_accept else hexadecimal(light(NEGATIVE))
 
 
+def abbreviated(automaton: Automaton) -> Automaton:
+    """The automaton with short names for long propositions, as fit on arrows."""
+    taken = {each.label for each in automaton.propositions}
+    names = (name for number in range(2 * len(taken) + 1) if (name := f"p{number}") not in taken)
+    return replace(
+        automaton,
+        propositions=tuple(
+            each if len(each.label) <= _LONGEST_LABEL else replace(each, name=next(names))
+            for each in automaton.propositions
+        ),
+    )
+
+
+def meanings(automaton: Automaton) -> list[str]:
+    """What the names of propositions stand for: "p0: cup leftof plate"."""
+    return [f"{each.name}: {each.text}" for each in automaton.propositions if each.name is not None]
+
+
 def dot_text(automaton: Automaton) -> str:
-    """The automaton in the language of Graphviz, with guards in words.
+    """The automaton in the language of Graphviz, with guards in words and long propositions told below.
 
     Accepting states have a double outline; those that accept for good are blue, traps are vermillion.
     """
+    short = abbreviated(automaton)
+    return _digraph(short, meanings(short))
+
+
+def _digraph(automaton: Automaton, legend: Sequence[str] = ()) -> str:
     lines = [
         f"digraph {_quoted(automaton.name)} {{",
         "  rankdir=LR;",
@@ -67,6 +97,9 @@ def dot_text(automaton: Automaton) -> str:
         "  start [shape=point];",
         f"  start -> {automaton.initial};",
     ]
+    if legend:
+        told = "".join(f"{_escaped(line)}\\l" for each in legend for line in _legend_lines(each))
+        lines.append(f'  graph [fontname="Helvetica", fontsize=11, labelloc=b, labeljust=l, label="{told}"];')
     for state in automaton.states:
         shape = "doublecircle" if state in automaton.accepting else "circle"
         colour = state_colour(automaton, state)
@@ -109,18 +142,22 @@ def svg_text(automaton: Automaton) -> str:
     """The automaton drawn by Graphviz.
 
     Raises:
-        UsageError, OutputError: as `graphviz_text`.
-    """
-    return graphviz_text(automaton, "svg")
-
-
-def graphviz_text(automaton: Automaton, form: str) -> str:
-    """What Graphviz makes of the automaton, in one of its formats: "svg", "json0".
-
-    Raises:
         UsageError: Graphviz is not installed.
         OutputError: Graphviz fails, or takes too long.
     """
+    return _graphviz(automaton, dot_text(automaton), "svg")
+
+
+def layout_text(automaton: Automaton) -> str:
+    """Where Graphviz puts states and arrows, without what is told below, as JSON.
+
+    Raises:
+        UsageError, OutputError: as `svg_text`.
+    """
+    return _graphviz(automaton, _digraph(automaton), "json0")
+
+
+def _graphviz(automaton: Automaton, text: str, form: str) -> str:
     executable = shutil.which("dot")
     if executable is None:
         raise UsageError(
@@ -130,7 +167,7 @@ def graphviz_text(automaton: Automaton, form: str) -> str:
     try:
         done = subprocess.run(
             [executable, f"-T{form}"],
-            input=dot_text(automaton).encode(),
+            input=text.encode(),
             capture_output=True,
             check=False,
             timeout=_DRAWING_S,
@@ -170,6 +207,10 @@ def _broken(text: str) -> list[str]:
             lines.append("")
         lines[-1] += f" {word}" if lines[-1] else word
     return lines
+
+
+def _legend_lines(text: str) -> list[str]:
+    return wrap(text, _LEGEND_WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
 
 
 def _escaped(text: str) -> str:

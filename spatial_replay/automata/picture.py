@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.drawing import graphviz_text, size_words, state_colour, words_text
+from spatial_replay.automata.drawing import (
+    abbreviated,
+    layout_text,
+    meanings,
+    size_words,
+    state_colour,
+    svg_text,
+    words_text,
+)
 from spatial_replay.errors import OutputError, UsageError
 from spatial_replay.figures import INK, draw_curve, draw_disc, new_panel, plain
 from spatial_replay.markup import Html, code, element, folded, quiet
@@ -17,8 +24,6 @@ from spatial_replay.palette import NEUTRAL, hexadecimal
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_LONGEST_LABEL: Final = 12
-"""Characters of a proposition that stands on an arrow as it is."""
 _MOST_STATES: Final = 40
 _MOST_CUBES: Final = 100
 """States, and cubes on arrows, of an automaton that is drawn without being asked for."""
@@ -38,12 +43,11 @@ def automaton_html(automaton: Automaton) -> Html:
         return element("div", title, quiet("too large to be drawn here; plot() draws it, to_dot() writes it"))
     drawing = automaton_svg(automaton)
     shown = quiet("drawing it takes Graphviz") if drawing is None else Html(drawing)
-    meanings = [element("div", code(line)) for line in _meanings(_abbreviated(automaton))]
     words = words_text(automaton).split("\n")
     lines = [element("div", code(line)) for line in words[:_MOST_LINES]]
     more = [quiet(f"… and {len(words) - _MOST_LINES:,} lines more")] if len(words) > _MOST_LINES else []
     drawn = element("div", shown, style="overflow-x:auto")
-    return element("div", title, drawn, *meanings, folded("in words", *lines, *more))
+    return element("div", title, drawn, folded("in words", *lines, *more))
 
 
 def automaton_svg(automaton: Automaton) -> str | None:
@@ -51,7 +55,7 @@ def automaton_svg(automaton: Automaton) -> str | None:
     if _is_large(automaton):
         return None
     try:
-        drawing = graphviz_text(_abbreviated(automaton), "svg")
+        drawing = svg_text(automaton)
     except (UsageError, OutputError):
         return None
     # what comes before is for files, not for pages
@@ -71,12 +75,12 @@ def draw_automaton(automaton: Automaton, ax: Axes | None = None) -> Axes:
         UsageError: Graphviz or matplotlib is not installed.
         OutputError: Graphviz fails, or takes too long.
     """
-    short = _abbreviated(automaton)
-    layout = json.loads(graphviz_text(short, "json0"))
+    short = abbreviated(automaton)
+    layout = json.loads(layout_text(short))
     width, height = _point(layout["bb"].removeprefix("0,0,"))
-    meanings = _meanings(short)
+    legend = meanings(short)
     if ax is None:
-        inches = max(width / _INCH, 5.0), 0.5 + height / _INCH + 0.2 * len(meanings)
+        inches = max(width / _INCH, 5.0), 0.5 + height / _INCH + 0.2 * len(legend)
         ax = new_panel((min(inches[0], _LONGEST_SIDE), min(inches[1], _LONGEST_SIDE)))
     ax.set_axis_off()
     ax.set_aspect("equal")
@@ -87,28 +91,11 @@ def draw_automaton(automaton: Automaton, ax: Axes | None = None) -> Axes:
     for node in layout["objects"]:
         _draw_state(ax, automaton, node)
     ax.set_title(plain(f"{automaton.name}: {size_words(automaton)}"), loc="left", fontsize=10)
-    text = "\n".join(plain(line, 100) for line in meanings)
+    text = "\n".join(plain(line, 100) for line in legend)
     ax.annotate(
         text, (0, 0), (0, -6), xycoords="axes fraction", textcoords="offset points", va="top", fontsize=8.5
     )
     return ax
-
-
-def _abbreviated(automaton: Automaton) -> Automaton:
-    """The automaton with short names for propositions that have none and are long."""
-    taken = {each.label for each in automaton.propositions}
-    names = (name for number in range(2 * len(taken) + 1) if (name := f"p{number}") not in taken)
-    return replace(
-        automaton,
-        propositions=tuple(
-            each if len(each.label) <= _LONGEST_LABEL else replace(each, name=next(names))
-            for each in automaton.propositions
-        ),
-    )
-
-
-def _meanings(automaton: Automaton) -> list[str]:
-    return [f"{each.name}: {each.text}" for each in automaton.propositions if each.name is not None]
 
 
 def _draw_state(ax: Axes, automaton: Automaton, node: Mapping[str, Any]) -> None:

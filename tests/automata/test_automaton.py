@@ -118,6 +118,16 @@ def test_for_graphviz() -> None:
     assert '  0 -> 1 [label="p >= 0"];' in text
 
 
+def test_for_graphviz_long_propositions_are_told_below() -> None:
+    near = "(cup dist plate <= 0.25) and (cup dist fork <= 0.25) and (fork dist plate <= 0.25)"
+    text = dot_text(automaton(parse_specification(f"spec p0 = q >= 0\nspec t = (F ({near})) and G p0")))
+    assert '[label="p1 and p0"]' in text
+    below = next(line for line in text.splitlines() if "label=" in line and "p1: " in line)
+    assert "p0: q >= 0\\l" in below
+    assert "(cup dist plate <= 0.25)" in below
+    assert "(cup dist plate" not in text.replace(below, "")
+
+
 def test_in_the_hanoi_format(done: Automaton) -> None:
     lines = hoa_text(automaton(parse_specification("G ((p >= 0) -> F q >= 0)"))).splitlines()
     assert lines == [
