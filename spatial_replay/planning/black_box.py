@@ -21,7 +21,7 @@ from spatial_replay.planning.map_message import map_message, maps_of
 from spatial_replay.planning.path_message import path_message
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.poses import centre_of
-from spatial_replay.planning.step import Outcome, Step
+from spatial_replay.planning.step import Outcome, Step, wait_outcome
 from spatial_replay.trace.sample import Sample
 
 PLAN_METADATA: Final = "spatial_replay_plan"
@@ -63,18 +63,24 @@ class BlackBox:
             self._travelled.append(centre_of(tracked.footprint))
 
     def decide(self) -> tuple[Step, Messages]:
-        """The planner's next step, and the messages that tell of it.
+        """The planner's next step, and the messages that tell of it; none while the same wait goes on.
+
+        What became of a wait is told when something else is decided.
 
         Raises:
             UsageError: nothing was observed yet, or the last step was not concluded.
         """
-        self._step = step = self.planner.next_step()
+        step = self.planner.next_step()
+        if step is self._step:
+            return step, self._messages(step.time_ns, [], [], [])
+        waited = self._waited(step.time_ns)
+        self._step = step
         self._tracked = self._object_moved()
         self._travelled = [] if self._tracked is None else [centre_of(self._tracked.footprint)]
         self._decision = decision_message(step, self.planner.automaton.name, self._written[_MAPS])
         maps = [map_message(turned, step.time_ns) for turned in maps_of(step)]
         path = path_message(step.target, self._tracked, step.time_ns)
-        return step, self._messages(step.time_ns, [self._decision], maps, [path])
+        return step, self._messages(step.time_ns, [*waited, self._decision], maps, [path])
 
     def conclude(self, outcome: Outcome) -> Messages:
         """Say how the last step went; the messages that tell of it.
@@ -86,11 +92,22 @@ class BlackBox:
         if self._step is None or self._sample is None:
             raise UsageError("no step is being executed; decide on one first")
         step, end_ns = self._step, self._sample.time_ns
-        told = outcome_message(outcome, end_ns, self.planner.states, self._travelled)
-        self._decision.outcome.CopyFrom(told)
+        told = self._concluded(outcome, end_ns)
         path = path_message(step.target, self._tracked, end_ns, self._travelled)
         self._step = None
-        return self._messages(end_ns, [self._decision], [], [path])
+        return self._messages(end_ns, [told], [], [path])
+
+    def _waited(self, end_ns: int) -> list[PlanDecision]:
+        """The last decision with its outcome, if it was to wait."""
+        if self._step is None or self._step.kind != "wait":
+            return []
+        return [self._concluded(wait_outcome(self._step, self.planner.states), end_ns)]
+
+    def _concluded(self, outcome: Outcome, end_ns: int) -> PlanDecision:
+        """The last decision with its outcome."""
+        told = outcome_message(outcome, end_ns, self.planner.states, self._travelled)
+        self._decision.outcome.CopyFrom(told)
+        return self._decision
 
     def _object_moved(self) -> TrackedObject | None:
         """The object that the last step moves, as it is now."""

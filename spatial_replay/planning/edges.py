@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.moves import Transition
+from spatial_replay.planning.drift import Drift
+from spatial_replay.planning.observing import Symbol
 from spatial_replay.planning.step import Consideration, Edge, Guards
 
 _LISTED: Final = 4
@@ -14,24 +16,54 @@ _LISTED: Final = 4
 
 
 def consideration_of(
-    automaton: Automaton, way: tuple[Transition, ...], pruned: Collection[Edge]
+    automaton: Automaton, way: tuple[Transition, ...], given_up: Collection[Edge], symbol: Symbol
 ) -> Consideration:
     """The first edge of a path with its progress and constraint sets.
 
     Args:
-        pruned: edges that were given up: taking one of these is no harm.
+        given_up: taking one of these edges is no harm.
+        symbol: what the newest sample says. What the automaton does if the next one says the same is no harm
+            either, unless acceptance is lost by it.
     """
     first = way[0]
     edge = (first.source, first.target)
-    elsewhere = (
-        each
-        for each in automaton.transitions
-        if each.source == first.source
-        and each.target not in edge
-        and (each.source, each.target) not in pruned
-    )
+    elsewhere = _elsewhere(automaton, edge, given_up, symbol)
     path = (first.source, *(each.target for each in way))
     return Consideration(path, edge, _guards(automaton, [first]), _guards(automaton, elsewhere), ())
+
+
+def twins_of(
+    automaton: Automaton,
+    consideration: Consideration,
+    drift: Drift,
+    given_up: Collection[Edge],
+    symbol: Symbol,
+) -> Iterator[Edge]:
+    """The edges in states to which time alone leads that take as much: equal progress, all constraints."""
+    constraints = set(consideration.constraints.cubes)
+    for edge in ((source, target) for source in drift.states[1:] for target in automaton.successors[source]):
+        transition = automaton.transition(*edge)
+        if transition is not None and transition.guard == consideration.progress.cubes:
+            elsewhere = _elsewhere(automaton, edge, given_up, symbol)
+            if constraints <= {cube for each in elsewhere for cube in each.guard}:
+                yield edge
+
+
+def _elsewhere(
+    automaton: Automaton, edge: Edge, given_up: Collection[Edge], symbol: Symbol
+) -> Iterator[Transition]:
+    """What must not be taken on the way to an edge."""
+    source = edge[0]
+    idle = automaton.step_set({source}, symbol) & automaton.can_accept
+    for target in automaton.successors[source]:
+        transition = automaton.transition(source, target)
+        if (
+            transition is not None
+            and target not in edge
+            and target not in idle
+            and (source, target) not in given_up
+        ):
+            yield transition
 
 
 def _guards(automaton: Automaton, transitions: Iterable[Transition]) -> Guards:

@@ -31,7 +31,7 @@ class LoggedStep:
     Attributes:
         step: the decision, with all maps that it rests on.
         sample: what it was made on.
-        outcome: how its execution went; None where nothing was to be moved, or the log ends before.
+        outcome: how its execution or the wait went; None of what has none, or where the log ends before.
         end_ns: when it ended, if it did.
         travelled: points (x, y) that the object went through.
     """
@@ -92,7 +92,8 @@ class _Run:
         told = decision.outcome
         outcome = Outcome(told.succeeded, told.reason)
         self._observe_until(told.end_ns)
-        self._planner.conclude(outcome)
+        if step.kind == "execute":
+            self._planner.conclude(outcome)
         travelled = tuple(zip(told.travelled[::2], told.travelled[1::2], strict=True))
         return LoggedStep(step, sample, outcome, told.end_ns, travelled)
 

@@ -7,11 +7,12 @@ from dataclasses import replace
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compiling import automaton as automaton_of
-from spatial_replay.automata.moves import Transition
 from spatial_replay.errors import TraceError, UsageError
+from spatial_replay.planning.attempts import Attempts
 from spatial_replay.planning.candidates import Movables, with_choice
 from spatial_replay.planning.checks import kind_faults, refuse_faults
-from spatial_replay.planning.edges import consideration_of, why_no_path, worst_state
+from spatial_replay.planning.drift import drift_of
+from spatial_replay.planning.edges import consideration_of, twins_of, why_no_path, worst_state
 from spatial_replay.planning.observing import Observer, Symbol, refuse_template
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.step import Consideration, Edge, Kind, Outcome, Step
@@ -19,6 +20,7 @@ from spatial_replay.planning.subjects import refuse_delays, refuse_unknown
 from spatial_replay.planning.workspace import Workspace
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
+from spatial_replay.wording import counted
 
 
 class Planner:
@@ -28,14 +30,15 @@ class Planner:
 
         planner = Planner(specification)
         planner.observe(sample)
-        while (step := planner.next_step()).kind == "execute":
-            outcome = executor.execute(step)
+        while (step := planner.next_step()).kind in ("execute", "wait"):
+            outcome = executor.execute(step) if step.kind == "execute" else None
             planner.observe(sample)
-            planner.conclude(outcome)
+            if outcome is not None:
+                planner.conclude(outcome)
 
-    It observes every sample, during an execution too: each one moves the automaton. It comes to an end: each
-    step uses up one of the attempts that every edge of the automaton has. Equal samples and outcomes give
-    equal steps.
+    It observes every sample, during an execution too: each one moves the automaton. Motions come to an end:
+    an edge of the automaton is given up after so many attempts in vain, and after `MOST_MOTIONS` in all.
+    Equal samples and outcomes give equal steps.
 
     Attributes:
         automaton: of the specification.
@@ -69,9 +72,10 @@ class Planner:
         self._observer = Observer(self._formulas, specification.regions)
         self._symbol: Symbol = ()
         self._pruned: dict[Edge, str] = {}
-        self._tried: dict[Edge, int] = {}
-        self._failed: dict[tuple[Edge, str], tuple[tuple[float, float], ...]] = {}
+        self._attempts = Attempts()
         self._running: Step | None = None
+        self._waiting: Step | None = None
+        self._ahead: tuple[int, ...] = ()
         self._steps = 0
 
     @property
@@ -128,40 +132,31 @@ class Planner:
         self._sample = sample
         self._symbol = self._observer.symbol(sample)
         self._states = self.automaton.step_set(self._states, self._symbol)
+        # a wait goes on while time leads where it was to lead
+        self._ahead = self._ahead[1:] if not self._states.isdisjoint(self._ahead[:1]) else ()
 
     def next_step(self) -> Step:
         """Decide on what the samples observed so far say (Algorithm 1).
 
         Edges that no movable object can take now are pruned, and the next shortest path is tried, until one
-        can be taken or none is left.
+        can be taken or none is left. Where nothing is to be done but to let time pass, the same step comes
+        again and again until that is over.
 
         Raises:
             UsageError: nothing was observed yet, or a step is being executed and was not concluded.
         """
-        if self._sample is None:
-            raise UsageError("there is nothing to plan on; observe a sample first")
+        self._newest()
         if self._running is not None:
             raise UsageError(
                 f"step {self._running.number} is being executed; conclude it with its outcome first"
             )
-        if self._states <= self.automaton.accepting:
-            return self._decided("hold", (), "the specification is satisfied: hold")
-        if len(self._states) > 1 and None in self._symbol:
-            return self._decided("wait", (), f"not enough is seen: {self._unknown()} unknown")
-        state = worst_state(self.automaton, self.states)
-        if state is None:
-            reason = "no path left: the specification cannot be satisfied any more"
-            return self._decided("no path", (), reason)
-        if self.is_doubtful:
-            return self._decided("hold", (), "satisfied, unless it was violated while not enough was seen")
-        considered: list[Consideration] = []
-        movables = Movables(self._formulas, self._regions, self._sample, self.settings)
-        while (way := next(self.automaton.paths(state, self._pruned), None)) is not None:
-            considered.append(self._considered(way, movables))
-            if not considered[-1].pruned:
-                return self._running_step(considered)
-            self._pruned[considered[-1].edge] = considered[-1].pruned
-        return self._decided("no path", considered, why_no_path(self.automaton, state, self._pruned))
+        if self._waiting is not None and self._waits_on(self._waiting):
+            return self._waiting
+        step = self._next_step()
+        self._running = step if step.kind == "execute" else None
+        self._waiting = step if step.kind == "wait" else None
+        self._ahead = step.ahead
+        return step
 
     def conclude(self, outcome: Outcome) -> None:
         """Say how the execution of the last step went, once its samples were observed.
@@ -177,43 +172,86 @@ class Planner:
         if step is None or step.target is None or step.aim is None:
             raise UsageError("no step is being executed; call next_step() first")
         self._running = None
-        if not outcome.succeeded:
-            key = (step.aim.edge, step.target.name)
-            self._failed[key] = (*self._failed.get(key, ()), (step.target.x, step.target.y))
+        self._attempts.conclude(step.aim, step.target, outcome, self.states)
 
-    def _considered(self, way: tuple[Transition, ...], movables: Movables) -> Consideration:
-        """Look into the first edge of a path: what it takes, and which objects could do it."""
-        consideration = consideration_of(self.automaton, way, self._pruned)
-        edge = consideration.edge
-        tried = self._tried.get(edge, 0)
-        if tried >= self.settings.attempts:
-            return replace(consideration, pruned=f"tried {tried} times")
+    def _waits_on(self, step: Step) -> bool:
+        return bool(self._ahead) if step.ahead else self._is_blind()
+
+    def _is_blind(self) -> bool:
+        """Whether too little is seen to tell where the automaton is."""
+        is_accepting = self._states <= self.automaton.accepting
+        return len(self._states) > 1 and None in self._symbol and not is_accepting
+
+    def _next_step(self) -> Step:
+        if self._states <= self.automaton.accepting:
+            return self._decided("hold", (), "the specification is satisfied: hold")
+        if self._is_blind():
+            return self._decided("wait", (), f"not enough is seen: {self._unknown()} unknown")
+        state = worst_state(self.automaton, self.states)
+        if state is None:
+            reason = "no path left: the specification cannot be satisfied any more"
+            return self._decided("no path", (), reason)
+        if self.is_doubtful:
+            return self._decided("hold", (), "satisfied, unless it was violated while not enough was seen")
+        return self._step_from(state)
+
+    def _step_from(self, state: int) -> Step:
+        """The step for the first edge of a shortest path that can be taken."""
+        drift = drift_of(self.automaton, state, self._symbol)
+        movables = Movables(self._formulas, self._regions, self._newest(), self.settings)
+        considered: list[Consideration] = []
+        # what time alone does need not be given up
+        given_up = set(self._pruned) - drift.edges
+        while (way := next(self.automaton.paths(state, given_up), None)) is not None:
+            consideration = consideration_of(self.automaton, way, given_up, self._symbol)
+            if ahead := drift.along(way):
+                return self._waiting_step([*considered, consideration], ahead)
+            considered.append(self._considered(consideration, movables))
+            if not considered[-1].pruned:
+                return self._running_step(considered)
+            edge = consideration.edge
+            self._pruned[edge] = considered[-1].pruned
+            given_up |= {edge, *twins_of(self.automaton, consideration, drift, given_up, self._symbol)}
+        return self._decided("no path", considered, why_no_path(self.automaton, state, self._pruned))
+
+    def _considered(self, consideration: Consideration, movables: Movables) -> Consideration:
+        """Look into an edge: which objects could do what it takes."""
+        enough = self._attempts.why_enough(consideration.edge, self.settings.attempts)
+        if enough:
+            return replace(consideration, pruned=enough)
         candidates = [
-            movables.candidate(name, consideration, self._failed.get((edge, name), ()))
+            movables.candidate(name, consideration, self._attempts.failed(consideration, name))
             for name in movables.names_for(consideration.progress)
         ]
         return with_choice(consideration, candidates, self.settings)
+
+    def _waiting_step(self, considered: list[Consideration], ahead: tuple[int, ...]) -> Step:
+        reason = f"wait for {counted(len(ahead), 'sample')}: time alone leads on, to state {ahead[-1]}"
+        return replace(self._decided("wait", considered, reason), ahead=ahead)
 
     def _running_step(self, considered: list[Consideration]) -> Step:
         aim = considered[-1]
         (target,) = [each.target for each in aim.candidates if each.is_chosen]
         if target is None:
             raise UsageError("the chosen object has no target")
-        self._tried[aim.edge] = self._tried.get(aim.edge, 0) + 1
+        self._attempts.begin(aim.edge)
         verb = "push" if self.settings.skill == "push" else "place"
         reason = (
             f"{verb} {target.name} at ({target.x:.4g}, {target.y:.4g}) for the edge {aim.edge[0]} -> "
             f"{aim.edge[1]}: {aim.progress}"
         )
-        self._running = replace(self._decided("execute", considered, reason), target=target)
-        return self._running
+        return replace(self._decided("execute", considered, reason), target=target)
 
     def _decided(self, kind: Kind, considered: Iterable[Consideration], reason: str) -> Step:
-        if self._sample is None:
-            raise UsageError("there is nothing to plan on; observe a sample first")
         number, self._steps = self._steps, self._steps + 1
         pruned = tuple(sorted(self._pruned.items()))
-        return Step(number, self._sample.time_ns, kind, self.states, tuple(considered), None, pruned, reason)
+        time_ns = self._newest().time_ns
+        return Step(number, time_ns, kind, self.states, tuple(considered), None, pruned, reason)
+
+    def _newest(self) -> Sample:
+        if self._sample is None:
+            raise UsageError("there is nothing to plan on; observe a sample first")
+        return self._sample
 
     def _unknown(self) -> str:
         """The propositions that the newest sample says nothing about."""

@@ -129,24 +129,27 @@ class _Check:
         made: dict[str, list[bytes]] = {topic: [] for topic in _TOPICS}
         for payload in recorded[PLAN_DECISION]:
             try:
-                messages = self._made_again(payload)
+                messages = list(self._made_again(payload))
             except (SpatialReplayError, DecodeError) as error:
                 self._differences.append(f"at {ready[0][0]} ns: {error}")
                 return
-            for _, topic, own in _planned(messages):
+            for _, topic, own in messages:
                 made[topic].append(own)
         for topic in _TOPICS:
             self._compare(ready[0][0], topic, recorded[topic], made[topic])
 
-    def _made_again(self, payload: bytes) -> Messages:
+    def _made_again(self, payload: bytes) -> Iterator[tuple[int, str, bytes]]:
         """The messages of a decision, or of the outcome that the log tells of."""
         message = PlanDecision.FromString(payload)
-        if message.HasField("outcome"):
-            return self._box.conclude(Outcome(message.outcome.succeeded, message.outcome.reason))
-        step, messages = self._box.decide()
-        self._decisions += 1
-        self._maps += len(maps_of(step))
-        return messages
+        if not message.HasField("outcome"):
+            step, messages = self._box.decide()
+            self._decisions += 1
+            self._maps += len(maps_of(step))
+            yield from _planned(messages)
+        elif message.kind != PlanDecision.KIND_WAIT:
+            # what became of a wait comes with the decision after it
+            told = Outcome(message.outcome.succeeded, message.outcome.reason)
+            yield from _planned(self._box.conclude(told))
 
     def _compare(self, time_ns: int, topic: str, recorded: list[bytes], made: list[bytes]) -> None:
         if len(recorded) != len(made):

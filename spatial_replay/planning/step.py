@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 Kind: TypeAlias = Literal["execute", "hold", "wait", "no path"]
 """What is to be done: move an object; nothing, for the specification is satisfied; nothing yet, for too
-little is seen; nothing any more, for there is no path left."""
+little is seen or time has to pass; nothing any more, for there is no path left."""
 
 Edge: TypeAlias = tuple[int, int]
 """A transition of the automaton, from one state to another."""
@@ -115,10 +115,11 @@ class Step:
         time_ns: of the sample that it was made on.
         kind: what is to be done.
         states: where the automaton is; more than one where not enough is seen to tell.
-        considered: the edges looked into, in order; the last one is aimed at where there is a target.
+        considered: the edges looked into, in order; the last one is aimed at unless it was given up.
         target: what to move where, if anything.
         pruned: all edges given up so far, each with its reason.
         reason: the decision in words.
+        ahead: of a wait, the states to which time alone is to lead; none where too little is seen.
     """
 
     number: int
@@ -129,11 +130,12 @@ class Step:
     target: Target | None
     pruned: tuple[tuple[Edge, str], ...]
     reason: str
+    ahead: tuple[int, ...] = ()
 
     @property
     def aim(self) -> Consideration | None:
-        """The edge aimed at; None where nothing is to be moved."""
-        return self.considered[-1] if self.target is not None else None
+        """The edge aimed at; None where there is none."""
+        return self.considered[-1] if self.considered and not self.considered[-1].pruned else None
 
     @property
     def progress(self) -> Guards:
@@ -176,6 +178,15 @@ class Outcome:
 
     succeeded: bool
     reason: str = ""
+
+
+def wait_outcome(step: Step, states: tuple[int, ...]) -> Outcome:
+    """How a wait went that ended with the automaton in these states."""
+    if not step.ahead:
+        return Outcome(succeeded=True, reason="enough is seen")
+    if states == step.ahead[-1:]:
+        return Outcome(succeeded=True, reason="the time has passed")
+    return Outcome(succeeded=False, reason="what is seen has changed")
 
 
 class Executor(Protocol):

@@ -7,7 +7,7 @@ from collections.abc import Collection
 import numpy as np
 
 from spatial_replay.geometry.footprint import TrackedObject
-from spatial_replay.planning.maps import FREE, OUT_OF_REACH, REASONS, GradientMap
+from spatial_replay.planning.maps import CONSTRAINED, FREE, OUT_OF_REACH, REASONS, GradientMap
 from spatial_replay.planning.paths import Path, shortest_path
 from spatial_replay.planning.poses import centre_of
 from spatial_replay.planning.settings import Settings
@@ -71,11 +71,15 @@ def _nearest_cell(
 def _way_in(found: GradientMap, cell: tuple[int, int], settings: Settings) -> Path | None:
     """The way to the first free cell, over cells that are merely out of reach if it starts in such a one.
 
-    From where something must not be at all it goes straight to the nearest cell where it may.
+    From where a constraint would hold it goes over such cells, too, but not where anything stands; from
+    where something stands, straight to the nearest cell where nothing does.
     """
     free = found.blocked[0] == FREE
     is_reached = settings.workspace.within_reach(found.grid)[cell]
     passable = free if is_reached else free | (found.blocked[0] == OUT_OF_REACH)
+    if not passable[cell]:
+        empty = found.clearance[0] > settings.workspace.clearance
+        passable = passable | (empty & (found.blocked[0] == CONSTRAINED))
     return shortest_path(passable, cell if passable[cell] else _nearest(passable, cell), free)
 
 

@@ -13,14 +13,15 @@ from spatial_replay.trace.sample import Sample
 HOLDING_SAMPLES = 30
 """How long it has to stay satisfied before a run ends."""
 MOST_WAITING_SAMPLES = 150
-"""How long it waits for what it does not see, between two motions."""
+"""How long it waits between two motions for what it does not see, or while nothing comes of it."""
 
 
 class PlanLoop:
     """Lets a planner decide and an executor act until there is nothing more to do.
 
     Every sample goes to `observe`, during an execution too. The loop comes to an end: motions are bounded by
-    the attempts of the automaton's edges, waiting by a number of samples.
+    the attempts of the automaton's edges, waiting by a number of samples in which the automaton does not get
+    into another state.
 
     Attributes:
         executed: how many motions there were.
@@ -53,16 +54,17 @@ class PlanLoop:
     def run(self) -> Step:
         """Look, decide and act; the last decision."""
         self._look()
-        waited = 0
+        waited, reached = 0, {self._box.planner.states}
         while True:
             step = self._decide()
             if step.kind == "execute":
-                self.executed, waited = self.executed + 1, 0
                 outcome = self._executor.execute(step)
                 self._log.write_messages(self._box.conclude(outcome))
+                self.executed, waited, reached = self.executed + 1, 0, {self._box.planner.states}
             elif step.kind == "wait" and waited < MOST_WAITING_SAMPLES:
-                waited += 1
                 self._look()
+                waited += not step.ahead or self._box.planner.states in reached
+                reached.add(self._box.planner.states)
             elif step.kind != "hold" or self._holds():
                 return step
 

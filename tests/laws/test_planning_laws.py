@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
+from itertools import count, pairwise
 
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import spatial_replay as sr
+from spatial_replay.planning.attempts import MOST_MOTIONS
 from spatial_replay.planning.displacement import proposition_maps
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.poses import centre_of, moved_object
@@ -108,6 +109,9 @@ TASKS = (
     "F ({0} and X ({1}))",
     "G (({0}) -> F ({1}))",
     "F[0,3] ({0})",
+    "F[2,5] ({0})",
+    "X X F ({0})",
+    "(G[0,2] ({0})) and F ({1})",
 )
 
 
@@ -119,8 +123,8 @@ def tasks(draw):
         first, second = draw(st.permutations(THINGS))[:2]
         return draw(st.sampled_from(GOALS)).format(first, second)
 
-    count = draw(st.integers(1, 3))
-    parts = [f"({draw(st.sampled_from(TASKS)).format(goal(), goal())})" for _ in range(count)]
+    tasks = draw(st.lists(st.sampled_from(TASKS), min_size=1, max_size=3))
+    parts = [f"({task.format(goal(), goal())})" for task in tasks]
     return sr.parse_specification(f"region here = circle((3, 3), 2)\nspec s = {' and '.join(parts)}")
 
 
@@ -146,22 +150,30 @@ def settings_of_planners(draw):
 def test_a_planner_comes_to_an_end_and_says_what_it_gave_up(specification, options, seed):
     random = np.random.default_rng(seed)
     planner = Planner(specification, options)
-    most = 1 + options.attempts * len(planner.automaton.transitions)
     places = random.uniform(-5, 5, (len(THINGS), 2))
     shape = sr.TrackedObject(sr.Footprint.box(0, 0, 1, 1))
     scene = {name: moved_object(shape, *place) for name, place in zip(THINGS, places, strict=True)}
     planner.observe(sr.Sample(0, scene))
-    for time_ns in range(1, most + 1):
+    motions, waits = 0, set()
+    for time_ns in count(1):
         step = planner.next_step()
-        if step.kind != "execute":
+        if step.kind == "execute":
+            # now and then an object ends up anywhere
+            name, succeeds = step.target.name, random.random() < 0.7
+            x, y = (step.target.x, step.target.y) if succeeds else random.uniform(-5, 5, 2)
+            scene = {**scene, name: moved_object(scene[name], x, y)}
+            assert name in (options.movable or THINGS)
+            planner.observe(sr.Sample(time_ns, scene))
+            planner.conclude(Outcome(succeeds))
+            motions += 1
+        elif step.ahead:
+            planner.observe(sr.Sample(time_ns, scene))
+            waits.add(step.number)
+        else:
             break
-        # now and then an object ends up anywhere
-        name, succeeds = step.target.name, random.random() < 0.7
-        x, y = (step.target.x, step.target.y) if succeeds else random.uniform(-5, 5, 2)
-        scene = {**scene, name: moved_object(scene[name], x, y)}
-        planner.observe(sr.Sample(time_ns, scene))
-        planner.conclude(Outcome(succeeds))
-        assert name in (options.movable or THINGS)
+    edges = len(planner.automaton.transitions)
+    assert motions <= MOST_MOTIONS * edges
+    assert len(waits) <= (motions + 1) * edges
     assert step.kind != "execute"
     assert planner.is_accepting or step.kind != "hold" or len(planner.states) > 1
     if step.kind == "no path":
@@ -193,17 +205,25 @@ def test_a_target_is_free_and_holds_as_well_as_it_says(specification, options, s
         assert planner.states == (step.considered[-1].edge[1],)
 
 
-@given(st.integers(0, 2**32 - 1), st.sampled_from(["a leftof b", "a dist c <= 1", "a above b and a above c"]))
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from(["F", "F[0,1]", "F[0,40]", "F[3,40]", "X X F"]),
+    st.sampled_from(["a leftof b", "a dist c <= 1", "a above b and a above c"]),
+)
 @settings(max_examples=60)
-def test_what_is_pushed_touches_nothing_on_its_way(seed, goal):
+def test_what_is_pushed_touches_nothing_on_its_way_whatever_time_there_is(seed, when, goal):
     random = np.random.default_rng(seed)
     workspace = Workspace(Grid(-6.0, -6.0, 0.5, 24, 24), farthest=7.0, clearance=0.25)
     shape = sr.TrackedObject(sr.Footprint.box(0, 0, 1, 1))
     scene = {name: moved_object(shape, *random.uniform(-5, 5, 2)) for name in ("b", "c")}
     scene["a"] = moved_object(shape, *random.uniform(-10, 10, 2))
-    planner = Planner(sr.parse_specification(f"F ({goal})"), Settings(workspace, "push", movable=("a",)))
+    specification = sr.parse_specification(f"{when} ({goal})")
+    planner = Planner(specification, Settings(workspace, "push", movable=("a",)))
     planner.observe(sr.Sample(0, scene))
-    step = planner.next_step()
+    step, times_ns = planner.next_step(), count(1)
+    while step.kind == "wait":
+        planner.observe(sr.Sample(next(times_ns), scene))
+        step = planner.next_step()
     if step.target is None:
         return
     clear = sr.Monitor(sr.parse_specification("a dist b > 0.25 and a dist c > 0.25"))

@@ -60,10 +60,15 @@ def run(planner, objects, most=50, **options):
     table.look()
     steps = []
     while len(steps) < most:
-        steps.append(planner.next_step())
-        if steps[-1].kind != "execute":
+        step = planner.next_step()
+        if step in steps:
+            table.look()
+            continue
+        steps.append(step)
+        if step.kind == "execute":
+            planner.conclude(table.execute(step))
+        elif step.kind != "wait":
             return steps, table
-        planner.conclude(table.execute(steps[-1]))
     raise AssertionError(f"still planning after {most} steps")
 
 

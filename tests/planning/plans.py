@@ -47,9 +47,12 @@ def record_plan_of(
         table = Table(dict(objects), _Watched(box, log, seen_as), **options)
         table.look()
         steps = []
-        while not steps or steps[-1].kind == "execute":
+        while not steps or steps[-1].kind in ("execute", "wait"):
             step, messages = box.decide()
             log.write_messages(messages)
+            if step in steps:
+                table.look()
+                continue
             steps.append(step)
             if step.kind == "execute":
                 log.write_messages(box.conclude(table.execute(step)))

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import spatial_replay as sr
-from planning.kinematics import BLOCKS, PUSHING, block, run
+from planning.kinematics import BLOCKS, PUSHING, Table, block, run
 from spatial_replay.errors import TraceError, UsageError
+from spatial_replay.planning.attempts import MOST_MOTIONS
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.poses import moved_object
 from spatial_replay.planning.settings import Settings
@@ -297,3 +298,30 @@ def test_without_settings_it_plans_around_what_it_sees():
 def test_what_is_pushed_is_not_turned():
     with pytest.raises(UsageError, match="yaws"):
         Settings(Workspace(TABLE.workspace.grid, yaws=(0.0,)), "push")
+
+
+def test_what_succeeds_does_not_use_up_attempts():
+    one = planner("G F (cup dist plate <= 1)", replace(TABLE, movable=("cup",)))
+    table = Table(dict(THINGS), one)
+    for _ in range(2 * TABLE.attempts):
+        table.objects["cup"] = THINGS["cup"]
+        table.look()
+        step = one.next_step()
+        assert step.kind == "execute"
+        one.conclude(table.execute(step))
+        assert one.next_step().kind == "hold"
+
+
+def test_even_what_succeeds_comes_to_an_end():
+    one = planner("G F (cup dist plate <= 1)", replace(TABLE, movable=("cup",)))
+    table = Table(dict(THINGS), one)
+    table.look()
+    motions = 0
+    while (step := one.next_step()).kind == "execute":
+        one.conclude(table.execute(step))
+        motions += 1
+        table.objects["cup"] = THINGS["cup"]
+        table.look()
+    assert step.kind == "no path"
+    assert motions == MOST_MOTIONS
+    assert step.pruned[0][1] == f"tried {MOST_MOTIONS} times in all"

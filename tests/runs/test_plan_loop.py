@@ -70,7 +70,16 @@ def test_what_is_never_seen_ends_with_waiting(tmp_path):
     last, _, loop, _ = run(tmp_path / "run.mcap", text, lambda number, name: name == "fork")
     assert last.kind == "wait"
     assert loop.executed == 0
-    assert last.number == MOST_WAITING_SAMPLES
+    assert last.number == 0
+    assert len(sr.read_trace(tmp_path / "run.mcap")) == 1 + MOST_WAITING_SAMPLES
+
+
+def test_what_only_takes_time_is_waited_for(tmp_path):
+    text = f"F[{2 * MOST_WAITING_SAMPLES},{3 * MOST_WAITING_SAMPLES}] (cup enclosedin plate)"
+    last, _, loop, verdict = run(tmp_path / "run.mcap", text, lambda number, name: False)
+    assert (last.kind, verdict) == ("hold", "satisfied")
+    assert loop.executed == 1
+    assert last.number == 2
 
 
 def test_what_is_satisfied_is_watched_for_a_while(tmp_path):

@@ -177,7 +177,7 @@ def _decision_value(
         "states": list(decision.states),
         "reason": decision.reason,
         "edges": [
-            _edge_value(edge, decision.HasField("target") and edge is decision.considered[-1])
+            _edge_value(edge, edge is decision.considered[-1] and not edge.pruned)
             for edge in decision.considered
         ],
         "maps": maps,

@@ -22,7 +22,7 @@ DESCRIPTOR: google.protobuf.descriptor.FileDescriptor
 @typing.final
 class PlanDecision(google.protobuf.message.Message):
     """A decision of the planner, on the topic /plan/decision: once when it is made and, if something was to be
-    moved, once more, with its outcome, when that is done.
+    moved or waited for, once more, with its outcome, when that is done.
     """
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
@@ -39,7 +39,7 @@ class PlanDecision(google.protobuf.message.Message):
         KIND_HOLD: PlanDecision._Kind.ValueType  # 2
         """Nothing: the specification is satisfied."""
         KIND_WAIT: PlanDecision._Kind.ValueType  # 3
-        """Nothing yet: too little is seen to tell where the automaton is."""
+        """Nothing yet: too little is seen to tell where the automaton is, or time has to pass."""
         KIND_NO_PATH: PlanDecision._Kind.ValueType  # 4
         """Nothing any more: no way to satisfy the specification is left."""
 
@@ -52,7 +52,7 @@ class PlanDecision(google.protobuf.message.Message):
     KIND_HOLD: PlanDecision.Kind.ValueType  # 2
     """Nothing: the specification is satisfied."""
     KIND_WAIT: PlanDecision.Kind.ValueType  # 3
-    """Nothing yet: too little is seen to tell where the automaton is."""
+    """Nothing yet: too little is seen to tell where the automaton is, or time has to pass."""
     KIND_NO_PATH: PlanDecision.Kind.ValueType  # 4
     """Nothing any more: no way to satisfy the specification is left."""
 
@@ -81,8 +81,8 @@ class PlanDecision(google.protobuf.message.Message):
 
     @property
     def considered(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PlanEdge]:
-        """The edges of the automaton that were looked into, in order; the last one is aimed at if there is a
-        target.
+        """The edges of the automaton that were looked into, in order; the last one is aimed at unless it was given
+        up.
         """
 
     @property
@@ -356,7 +356,7 @@ global___PrunedEdge = PrunedEdge
 
 @typing.final
 class PlanOutcome(google.protobuf.message.Message):
-    """How the execution of a step went."""
+    """How the execution of a step went, or a wait."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -368,7 +368,9 @@ class PlanOutcome(google.protobuf.message.Message):
     end_ns: builtins.int
     """Time in nanoseconds of the last sample before its end."""
     succeeded: builtins.bool
-    """Whether the object is where it was to be, as far as its controller can tell."""
+    """Whether the object is where it was to be, as far as its controller can tell; whether a wait went on to its
+    end.
+    """
     reason: builtins.str
     """What happened, in words."""
     @property

@@ -46,7 +46,7 @@ function lookedInto({edges, maps: drawn}) {
 
 function inShort({kind, target}) {
   if (kind === "execute" && target) return `move ${target.object} to ${target.words}`;
-  return {hold: "nothing to do", wait: "wait to see more", "no path": "no way is left"}[kind] ?? kind;
+  return {hold: "nothing to do", wait: "wait", "no path": "no way is left"}[kind] ?? kind;
 }
 
 function outcomeWords(outcome) {

@@ -1,0 +1,119 @@
+"""Specifications for which time has to pass: `X`, and bounds in samples."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import spatial_replay as sr
+from planning.kinematics import BLOCKS, run
+from planning.plans import PUSH, record_plan_of
+from spatial_replay.logs.source import open_source
+from spatial_replay.planning import read_steps
+from spatial_replay.planning.planner import Planner
+from spatial_replay.planning.poses import moved_object
+from spatial_replay.planning.redo import redo_decisions
+from spatial_replay.planning.settings import Settings
+from spatial_replay.planning.told import read_decisions
+from spatial_replay.planning.workspace import Grid, Workspace
+
+DONE = "green rightof red"
+TIMED = {
+    f"X X X X X F ({DONE})": 4,
+    f"F[30,900] ({DONE})": 29,
+    f"(green dist red >= 0.03) U[30,900] ({DONE})": 29,
+    f"(G[0,60] (green leftof red)) and F ({DONE})": 60,
+}
+
+
+def planner(text, settings=PUSH):
+    return Planner(sr.parse_specification(f"use spatial_spec\n{text}"), settings)
+
+
+def verdict(text, samples):
+    specification = sr.parse_specification(f"use spatial_spec\n{text}")
+    return sr.evaluate(specification, sr.Trace.from_samples(samples)).verdict
+
+
+@pytest.mark.parametrize(("text", "samples"), TIMED.items())
+def test_it_waits_for_as_long_as_nothing_else_helps(text, samples):
+    steps, table = run(planner(text), BLOCKS)
+    assert [step.kind for step in steps] == ["wait", "execute", "hold"]
+    assert len(steps[0].ahead) == samples
+    assert f"wait for {samples} samples" in steps[0].reason
+    assert steps[0].aim.candidates == ()
+    assert verdict(text, table.samples) == "satisfied"
+
+
+def test_nothing_is_waited_for_before_a_deadline():
+    steps, table = run(planner(f"F[0,600] ({DONE})"), BLOCKS)
+    assert [step.kind for step in steps] == ["execute", "hold"]
+    assert steps[0].constraints.texts == ()
+    assert verdict(f"F[0,600] ({DONE})", table.samples) == "satisfied"
+
+
+def test_what_cannot_be_done_is_not_waited_for():
+    steps, _ = run(planner("F[0,600] (green rightof red and green leftof red)"), BLOCKS)
+    assert [step.kind for step in steps] == ["no path"]
+    assert len(steps[0].pruned) == 1
+
+
+def test_one_thing_is_done_after_the_other_before_a_deadline():
+    text = "(F[0,600] (green rightof blue)) and (F[0,600] (red leftof blue and red above blue))"
+    steps, table = run(planner(text), BLOCKS)
+    assert [step.kind for step in steps] == ["execute", "execute", "hold"]
+    assert verdict(text, table.samples) == "satisfied"
+
+
+def test_the_same_wait_goes_on_until_something_else_is_seen():
+    one = planner(f"(G[0,60] (green leftof red)) and F ({DONE})")
+    one.observe(sr.Sample(0, BLOCKS))
+    first = one.next_step()
+    one.observe(sr.Sample(1, BLOCKS))
+    assert one.next_step() is first
+    one.observe(sr.Sample(2, {**BLOCKS, "green": moved_object(BLOCKS["green"], 0.7, 0.0)}))
+    after = one.next_step()
+    assert (after.kind, after.number) == ("no path", 1)
+
+
+WALL = sr.TrackedObject(sr.Footprint.box(0.45, 0.3, 0.55, 0.7))
+TABLE = {
+    "puck": sr.TrackedObject(sr.Footprint.disc(0.1, 0.5, 0.05)),
+    "wall": WALL,
+    "goal": sr.TrackedObject(sr.Footprint.box(0.8, 0.4, 1.0, 0.6)),
+}
+AROUND = Settings(
+    Workspace(Grid.over(0, 0, 1.2, 1.0, cell_size=0.02), supports=frozenset({"goal"}), clearance=0.01),
+    "push",
+    movable=("puck",),
+)
+
+
+@pytest.mark.parametrize("samples", [1, 2, 50, 900])
+@pytest.mark.parametrize("always", ["", " and G (puck dist wall >= 0.02)"])
+def test_a_deadline_is_no_reason_to_go_through_a_wall(samples, always):
+    steps, _ = run(planner(f"(F[0,{samples}] (puck enclosedin goal)){always}", AROUND), TABLE)
+    points = [np.array(point) for point in steps[0].target.waypoints]
+    places = [a + share * (b - a) for a, b in pairwise(points) for share in np.linspace(0, 1, 40)]
+    seen = [
+        sr.Sample(time_ns, {**TABLE, "puck": moved_object(TABLE["puck"], *place)})
+        for time_ns, place in enumerate(places)
+    ]
+    assert verdict("G (puck dist wall >= 0)", seen) == "satisfied"
+
+
+@pytest.mark.parametrize("text", TIMED)
+def test_a_wait_is_told_once_with_its_outcome(tmp_path, text):
+    log = tmp_path / "run.mcap"
+    steps = record_plan_of(log, f"use spatial_spec\nspec task = {text}")
+    waits = [each for each in read_decisions(log).decisions if each.kind == each.KIND_WAIT]
+    (wait,) = waits
+    assert wait.outcome.succeeded
+    assert wait.outcome.reason == "the time has passed"
+    assert wait.outcome.end_ns == steps[1].time_ns
+    redone = redo_decisions(open_source(log))
+    assert redone.differences == ()
+    assert redone.decisions == len(steps)
+    assert [each.step.reason for each in read_steps(log)] == [each.reason for each in steps]
