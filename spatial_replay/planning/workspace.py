@@ -22,8 +22,8 @@ from spatial_replay.planning.checks import (
 )
 from spatial_replay.trace.sample import Sample
 
-MOST_CELLS = 4_000_000
-"""Cells of a grid, over all angles; beyond it a cell size was mistyped."""
+MOST_CELLS = 1_000_000
+"""Cells of a grid, over all angles: maps of so many take a gigabyte. Beyond it a cell size was mistyped."""
 
 CELLS_AROUND = 80
 """Cells along the longer side of a workspace that nobody gave."""
@@ -158,6 +158,7 @@ class Workspace:
             {f"yaws[{place}]": yaw for place, yaw in enumerate(self.yaws)}
         )
         yield from point_faults("base", self.base)
+        yield from self._size_faults()
         faults = number_faults({"nearest": self.nearest}, 0)
         yield from faults
         if not is_number(self.farthest):
@@ -167,6 +168,15 @@ class Workspace:
         yield from member_faults("obstacles", self.obstacles, tuple, Footprint, "a tuple of footprints")
         yield from member_faults("supports", self.supports, frozenset, str, "a frozenset of names")
         yield from number_faults({"clearance": self.clearance}, 0)
+
+    def _size_faults(self) -> Iterator[str]:
+        if isinstance(self.grid, Grid) and isinstance(self.yaws, tuple):
+            cells, angles = self.grid.columns * self.grid.rows, len(self.yaws)
+            if cells * angles > MOST_CELLS:
+                yield (
+                    f"a grid of {cells:,} cells in {angles:,} orientations; give at most {MOST_CELLS:,} cells "
+                    "over all of them"
+                )
 
     @classmethod
     def around(cls, sample: Sample) -> Workspace:

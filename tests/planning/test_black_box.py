@@ -230,6 +230,14 @@ def test_settings_are_read_back_as_they_were():
         assert settings_from_text(text_from_settings(settings)) == settings
 
 
+def test_settings_that_are_too_large_are_refused():
+    large = Settings(Workspace(Grid(0, 0, 1.0, 500, 500), yaws=(0.0, 1.0, 2.0, 3.0)))
+    told = json.loads(text_from_settings(large))
+    for change in ({"yaws": [*told["yaws"], 4.0]}, {"grid": [0.0, 0.0, 1.0, 1000, 1001], "yaws": []}):
+        with pytest.raises(LogError, match="give at most 1,000,000 cells"):
+            settings_from_text(json.dumps(told | change))
+
+
 @pytest.mark.parametrize("text", ["", "{}", "[1]", json.dumps({"grid": [0, 0, 0, 1, 1]})])
 def test_settings_that_cannot_be_read_are_refused(text):
     with pytest.raises(LogError, match="settings in the log cannot be read"):
