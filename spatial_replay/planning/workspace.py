@@ -174,8 +174,8 @@ class Workspace:
             cells, angles = self.grid.columns * self.grid.rows, len(self.yaws)
             if cells * angles > MOST_CELLS:
                 yield (
-                    f"a grid of {cells:,} cells in {angles:,} orientations; give at most {MOST_CELLS:,} cells "
-                    "over all of them"
+                    f"a grid of {cells:,} cells in {angles:,} orientations; give at most {MOST_CELLS:,} "
+                    "cells over all of them"
                 )
 
     @classmethod
