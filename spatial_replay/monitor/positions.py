@@ -29,6 +29,15 @@ def first_after(stamps: Integers, offset: int, last: int, position: int, distanc
 
 
 @piece
+def first_onward(stamps: Integers, offset: int, last: int, position: int, distance: int, before: int) -> int:
+    """`first_after`, sought step by step from what it was for a position before."""
+    origin = stamps[position - offset]
+    while before <= last and stamps[before - offset] - origin < distance:
+        before += 1
+    return before
+
+
+@piece
 def ahead(stamps: Integers, offset: int, last: int, position: int, unit: int, distance: int) -> int:
     """The first position at least so far ahead (it may lie after `last`)."""
     if unit == SAMPLES:

@@ -53,6 +53,7 @@ from spatial_replay.monitor.codes import (
     PAST_WINDOW_MAX,
     PAST_WINDOW_MIN,
     RELEASE,
+    SAMPLES,
     SHIFT,
     SIGNAL_CODE,
     SIGNAL_HIGH,
@@ -63,7 +64,15 @@ from spatial_replay.monitor.codes import (
     WINDOW_MIN,
 )
 from spatial_replay.monitor.memory import NUMBERS, Memory, Scratch
-from spatial_replay.monitor.positions import ahead, behind, first_behind, is_closed, last_ahead
+from spatial_replay.monitor.positions import (
+    ahead,
+    behind,
+    first_after,
+    first_behind,
+    first_onward,
+    is_closed,
+    last_ahead,
+)
 from spatial_replay.monitor.tables import corner_value, read_table
 
 
@@ -203,16 +212,22 @@ def _run_window(
     unit, near, far = node[NODE_UNIT], node[NODE_LOW], node[NODE_HIGH]
     is_ahead = node[NODE_CODE] in (PART_WINDOW_MAX, PART_WINDOW_MIN)
     sign = 1.0 if node[NODE_CODE] in (PART_WINDOW_MAX, PAST_WINDOW_MAX) else -1.0
+    nearest, beyond_farthest = (near, far + 1) if is_ahead else (-far, 1 - near)
     head = tail = entering = 0
+    start = after = offset
+    if unit != SAMPLES:
+        newest = last if is_ahead else low
+        start = first_after(stamps, offset, newest, low, nearest)
+        after = first_after(stamps, offset, newest, low, beyond_farthest)
     for position in range(low, high + 1):
-        if is_ahead:
-            start = ahead(stamps, offset, last, position, unit, near)
-            stop = last_ahead(stamps, offset, last, position, unit, far)
+        if unit == SAMPLES:
+            start, after = max(position + nearest, offset), min(position + beyond_farthest, last + 1)
         else:
-            start = first_behind(stamps, offset, position, unit, far)
-            stop = behind(stamps, offset, position, unit, near)
+            newest = last if is_ahead else position
+            start = first_onward(stamps, offset, newest, position, nearest, start)
+            after = first_onward(stamps, offset, newest, position, beyond_farthest, after)
         entering = max(entering, start)
-        while entering <= stop:
+        while entering < after:
             value = sign * source[entering - offset]
             while tail > head and sign * source[wedge[tail - 1] - offset] <= value:
                 tail -= 1
