@@ -10,11 +10,13 @@ equal inputs give equal bits in a monitor and in a replay.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
+from numba.core import event
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -51,3 +53,23 @@ def inlined(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
     """
     compiled = _compile(forceinline=True, _nrt=False, no_cpython_wrapper=True, no_cfunc_wrapper=True)
     return cast(Callable[_Arguments, _Result], compiled(function))
+
+
+class _Listener(event.Listener):
+    """Hears when the compiler begins."""
+
+    def __init__(self, hear: Callable[[], None]) -> None:
+        self._hear = hear
+
+    def on_start(self, event: object) -> None:
+        self._hear()
+
+    def on_end(self, event: object) -> None:
+        pass
+
+
+@contextmanager
+def compilations(hear: Callable[[], None]) -> Iterator[None]:
+    """Call `hear` for a while whenever a function is about to be compiled that no cache holds."""
+    with event.install_listener("numba:compile", _Listener(hear)):
+        yield

@@ -79,6 +79,7 @@ def planning_command(scenario: str) -> click.Command:
             f"wrote {output}: {counted(planned.samples, 'sample')} over {planned.seconds:.3f} s; "
             f"{counted(planned.steps, 'motion')}, {counted(planned.pruned, 'edge')} given up"
         )
+        click.echo(f"planning took {planned.planning_s:.2f} s", err=True)
         click.echo(f"the planner: {planned.reason}")
         if planned.ended == "no path":
             told = shlex.join(["spatial-replay", "info", str(output), "--decisions"])

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 PATIENCE_S = 1.0
 """Work that is done within this time shows no bar."""
+COMPILING = "compiling, once on this machine"
+"""What a bar says while the first run on a machine waits for the compiler."""
 
 Advance = Callable[[int], None]
 
@@ -22,7 +24,7 @@ def progress(label: str, total: int | None = None) -> Iterator[Advance]:
     """Show how far some work is: `with progress("reading", len(items)) as advance: ... advance(1)`.
 
     The bar goes to standard error if that is a terminal, once the work has taken a second, and is
-    gone when the work is done.
+    gone when the work is done. While code is compiled, it says so instead.
 
     Args:
         total: how many steps there are; None if nobody knows.
@@ -30,9 +32,13 @@ def progress(label: str, total: int | None = None) -> Iterator[Advance]:
     if not sys.stderr.isatty():
         yield lambda steps: None
         return
+    # who has work for a bar has work for the numerical libraries
+    from spatial_replay.compiled import compilations
+
     bar = _Bar(label, total)
     try:
-        yield bar.advance
+        with compilations(bar.tell_compiling):
+            yield bar.advance
     finally:
         bar.close()
 
@@ -44,7 +50,7 @@ class _Bar:
     """
 
     def __init__(self, label: str, total: int | None) -> None:
-        self._label = label
+        self._label = self._told = label
         self._total = total
         self._done = 0
         self._shown: Progress | None = None
@@ -54,11 +60,20 @@ class _Bar:
 
     def advance(self, steps: int) -> None:
         self._done += steps
+        self._told = self._label
+        self._update()
+
+    def tell_compiling(self) -> None:
+        """Say that code is compiled, until the next step is done."""
+        self._told = COMPILING
+        self._update()
+
+    def _update(self) -> None:
         if self._shown is not None:
-            self._shown.update(self._shown.task_ids[0], completed=self._done)
+            self._shown.update(self._shown.task_ids[0], description=self._told, completed=self._done)
 
     def _appear(self) -> None:
-        self._shown = _started(self._label, self._total, self._done)
+        self._shown = _started(self._told, self._total, self._done)
 
     def close(self) -> None:
         self._timer.cancel()

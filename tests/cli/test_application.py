@@ -153,3 +153,27 @@ def test_long_work_shows_nothing_in_a_pipe(tmp_path: Path) -> None:
         [sys.executable, "-c", _WORK.format(pause=0.4)], cwd=tmp_path, capture_output=True, check=False
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
+
+
+_COMPILED = """
+import time
+from spatial_replay.cli.progress import progress
+from spatial_replay.compiled import kernel
+
+@kernel
+def doubled(number):
+    return 2 * number
+
+with progress("samples") as advance:
+    doubled(1)
+    time.sleep(2)
+"""
+
+
+def test_the_bar_says_when_code_is_compiled(tmp_path: Path) -> None:
+    (tmp_path / "work.py").write_text(_COMPILED)
+    command = (sys.executable, "work.py")
+    assert "compiling, once on this machine" in standard_error_on_terminal(command, tmp_path, {})
+    said = standard_error_on_terminal(command, tmp_path, {})
+    assert "samples" in said
+    assert "compiling" not in said

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -27,9 +28,10 @@ def plan(folder: Path, text: str, *options: str) -> int:
 
 def test_what_is_satisfied_exits_with_0(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert plan(tmp_path, SATISFIED) == 0
-    said = capsys.readouterr().out
-    assert "0 motions, 0 edges given up" in said
-    assert "the planner: the specification is satisfied: hold\nthe log: calm is satisfied\n" in said
+    said = capsys.readouterr()
+    assert "0 motions, 0 edges given up" in said.out
+    assert "the planner: the specification is satisfied: hold\nthe log: calm is satisfied\n" in said.out
+    assert re.fullmatch(r"planning took \d+\.\d\d s\n", said.err)
 
 
 def test_where_no_path_is_left_it_exits_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
