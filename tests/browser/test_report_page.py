@@ -59,6 +59,21 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     )
     text = "spec apart = G (a dist b >= 0.1)\nspec meet = F (a dist b <= 0.01)\nspec s = apart and meet"
     report_of_trace(folder / "long.html", two_discs(100_000), text)
+    unseen = [
+        sr.Sample(
+            t * 10**8,
+            {"a": sr.Footprint.disc(0, 0, 1)} | ({"b": sr.Footprint.disc(5, 0, 1)} if t < 10 else {}),
+            signals={"battery": 1 - t / 40 if t < 20 else 0.4},
+        )
+        for t in range(21)
+    ]
+    text = "spec apart = G (a dist b >= 1)\nspec power = G (battery >= 0.5)"
+    report_of_samples(folder / "unseen.html", unseen, text)
+    meeting = [
+        sr.Sample(t * 10**8, {"a": sr.Footprint.disc(5 - t, 0, 1), "b": sr.Footprint.disc(0, 0, 1)})
+        for t in range(6)
+    ]
+    report_of_samples(folder / "reached.html", meeting, "spec meet = F (a ovlp b)")
     hostile = [
         sr.Sample(t * 10**8, {name: sr.Footprint.disc(3 * k, t, 1) for k, name in enumerate(HOSTILE)})
         for t in range(9)
@@ -261,9 +276,7 @@ def test_the_scene_changes_with_the_cursor(open_page: Open) -> None:
     page = open_page("violated")
     picture = "document.querySelector('.stage').toDataURL()"
     last = page.evaluate(picture)
-    expect(page.locator(".caption")).to_have_text("nothing is violated now")
     page.keyboard.press("Home")
-    expect(page.locator(".caption")).to_contain_text("what is violated most now, by 0.")
     first = page.evaluate(picture)
     assert first != last
     page.keyboard.press("n")
@@ -271,6 +284,25 @@ def test_the_scene_changes_with_the_cursor(open_page: Open) -> None:
         before = page.evaluate(picture)
         page.get_by_label(layer).uncheck()
         assert page.evaluate(picture) != before
+
+
+def test_the_scene_says_what_is_violated_now(open_page: Open) -> None:
+    caption = open_page("violated", at="#t=1").locator(".caption")
+    expect(caption).to_have_text("the arrow: spoon dist plate <= 0.08 of table_set fails by 0.6097 now")
+    caption = open_page("violated", at="#t=9.9").locator(".caption")
+    expect(caption).to_have_text("nothing is violated now; table_set was before")
+
+
+def test_what_no_arrow_can_point_at_is_told_too(open_page: Open) -> None:
+    for time, words in (
+        (0.5, "nothing is violated now"),
+        (1.2, "nothing that can be seen is violated now; a dist b >= 1 of apart is unknown"),
+        (2, "battery >= 0.5 of power fails by 0.1 now; no arrow can point at that"),
+    ):
+        caption = open_page("unseen", at=f"#t={time}").locator(".caption")
+        expect(caption).to_have_text(words)
+    caption = open_page("reached", at="#t=9").locator(".caption")
+    expect(caption).to_have_text("nothing more is asked of the objects: they are grey")
 
 
 def test_the_automaton_shows_where_the_run_is(open_page: Open) -> None:

@@ -19,7 +19,7 @@ _STYLES: Final = ("uplot/uPlot.min.css", "browser/page.css", "browser/panels.css
 _LIBRARY: Final = "uplot/uPlot.iife.min.js"
 _SCRIPTS: Final = (
     "run", "elements", "clock", "standing", "transport", "verdicts", "tree", "lanes", "blocks", "curves",
-    "gradient", "trails", "scene", "automaton", "events", "decisions", "page",
+    "gradient", "trails", "asked", "caption", "scene", "automaton", "events", "decisions", "page",
 )  # fmt: skip
 """Files of browser/, in the order in which they need each other."""
 

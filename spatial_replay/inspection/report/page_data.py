@@ -18,6 +18,7 @@ from spatial_replay.inspection.report.states import automaton_value
 from spatial_replay.inspection.report.thinning import Curves, kept_samples
 from spatial_replay.inspection.report.tree import (
     MOST_NODES,
+    concern_values,
     named_nodes,
     series_of,
     shown_nodes,
@@ -95,6 +96,7 @@ def _result_value(result: ReportedResult, kept: Integers, packing: Packing) -> M
         "first": int(np.searchsorted(kept, here[0])) if len(here) else 0,
         "samples": len(here),
         "nodes": tree_value(result.formula, result.robustness, result.final, result.relations),
+        "concerns": concern_values(result.formula, result.object),
         "series": packing.add(singles(series), "f4"),
         "automaton": None,
         "no_automaton": result.no_automaton,

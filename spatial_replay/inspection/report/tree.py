@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats
+from spatial_replay.inspection.involvement import concerns_of
 from spatial_replay.inspection.specification import unit_of
 from spatial_replay.inspection.words import number_text
 from spatial_replay.monitor.verdict import final_verdict
@@ -70,6 +71,26 @@ def tree_value(
         }
         for identifier, parent, node in iter_nodes(formula)
         if identifier in place
+    ]
+
+
+def concern_values(formula: Formula, object: str | None) -> list[Mapping[str, Any]]:
+    """What the formula asks of objects (see `involvement`), as far as the nodes for it are shown.
+
+    Args:
+        object: what the parameter of a template stands for.
+    """
+    place = {identifier: index for index, identifier in enumerate(shown_nodes(formula))}
+    return [
+        {
+            "node": place[concern.node],
+            "sign": concern.sign,
+            "duty": None if concern.duty is None else place[concern.duty.node],
+            "duty_sign": None if concern.duty is None else concern.duty.sign,
+        }
+        for concern in concerns_of(formula, object)
+        # a duty stands above its concern, and is shown where that is
+        if concern.node in place
     ]
 
 

@@ -26,28 +26,14 @@ function makeScene(clock) {
   let before = null;
   const show = () => {
     const frame = indexAt(film.times, clock.time);
-    const decision = decisionAt(clock.run, clock.time);
-    if (before && before[0] === frame && before[1] === decision) return;
-    before = [frame, decision];
+    const now = [frame, clock.sample, decisionAt(clock.run, clock.time)];
+    if (now.every((each, index) => each === before?.[index])) return;
+    before = now;
     redraw();
-    caption.textContent = worstWords(film, frame);
+    caption.replaceChildren(...captionOf(clock, film, frame));
   };
   clock.on("time", show);
   window.addEventListener("themechange", redraw);
-}
-
-function worstWords(film, frame) {
-  const pointed = film.witness.get(frame);
-  if (pointed) return `the arrow: what is violated most now, by ${pointed.label.replace("-", "")}`;
-  return film.entities.some((entity) => isViolated(entity, frame))
-    ? "something is violated now, at which no arrow can point" : "nothing is violated now";
-}
-
-// Whether an entity has a colour between grey and vermillion.
-function isViolated(entity, frame) {
-  if (entity.form[frame] === ABSENT) return false;
-  const place = 3 * entity.shown[frame];
-  return entity.colours[place] > entity.colours[place + 2];
 }
 
 function layerBox(label, name, layers, redraw) {
