@@ -6,13 +6,15 @@ import json
 from typing import Any
 
 import numpy as np
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.Point3_pb2 import Point3
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from spatial_replay.inspection.report.film import MOST_FRAMES, FilmMaker
+from spatial_replay.inspection.report.film import MOST_CORNERS, MOST_FRAMES, FilmMaker
 from spatial_replay.inspection.report.packing import json_text, singles
 from spatial_replay.inspection.report.thinning import Curves, kept_samples
 
@@ -79,17 +81,34 @@ def test_of_few_changes_of_sign_both_sides_are_kept(changes: np.ndarray) -> None
     assert {turn - 1 for turn in after.tolist()} <= kept
 
 
-@given(st.integers(1, 10_000), st.sampled_from([0, 40_000]))
-def test_frames_are_taken_at_equal_distances(count: int, size: int) -> None:
+@given(st.integers(1, 10_000), st.sampled_from([0, 7]))
+def test_frames_are_taken_at_equal_distances(count: int, corners: int) -> None:
     maker = FilmMaker()
-    payload = SceneUpdate(entities=[SceneEntity(id="x" * size)]).SerializeToString()
+    payload = scene(corners)
     for time_ns in range(count):
         maker.add(time_ns, payload)
     film = maker.film()
     assert film.times_ns.tolist() == list(range(0, count, film.stride))
     assert len(film.frames) == len(film.times_ns) <= MOST_FRAMES
-    assert len(film.frames) * size <= 24_000_000
-    assert film.stride == 1 or len(film.frames) > 200
+    assert film.stride == 1 or len(film.frames) >= MOST_FRAMES // 2
+
+
+def test_of_frames_with_many_corners_fewer_are_taken() -> None:
+    maker = FilmMaker()
+    payload = scene(MOST_CORNERS // 10)
+    for time_ns in range(25):
+        maker.add(time_ns, payload)
+    film = maker.film()
+    assert sum(frame.corners for frame in film.frames) <= MOST_CORNERS
+    assert film.times_ns.tolist() == list(range(0, 25, film.stride))
+    assert film.stride == 4
+
+
+def scene(corners: int) -> bytes:
+    """A message with one outline."""
+    points = [Point3(x=number) for number in range(corners)]
+    outline = LinePrimitive(points=points)
+    return SceneUpdate(entities=[SceneEntity(id="object/a", lines=[outline])]).SerializeToString()
 
 
 @given(arrays.arrays(np.float64, st.integers(0, 50), elements=st.floats(width=64)))

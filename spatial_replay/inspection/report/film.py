@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from foxglove_schemas_protobuf.ArrowPrimitive_pb2 import ArrowPrimitive
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
@@ -18,16 +17,47 @@ from spatial_replay.inspection.report.packing import Packing
 
 MOST_FRAMES: Final = 3_000
 """How many frames a page has at most."""
-_MOST_BYTES: Final = 24_000_000
-"""How many bytes the messages of the frames have at most."""
+MOST_CORNERS: Final = 2_000_000
+"""How many corners the outlines of all frames have at most, all together."""
 _ABSENT: Final = 65_535
 _STEPS: Final = 65_535
 """Into how many steps each side of the scene is divided: finer than any screen."""
 
 
+class Outlined(NamedTuple):
+    """What is drawn of an entity in one frame: rings, (n, 2) each, and a colour."""
+
+    rings: tuple[Floats, ...]
+    colour: tuple[int, int, int]
+
+
+class Pointed(NamedTuple):
+    """The arrow at the worst violation of one frame: from where to where it leads, (2, 2), and its number."""
+
+    ends: Floats
+    label: str
+
+
+class Frame(NamedTuple):
+    """What a page draws of one message.
+
+    Attributes:
+        outlined: by the ids of entities.
+        pointed: None where nothing is pointed at.
+    """
+
+    outlined: Mapping[str, Outlined]
+    pointed: Pointed | None
+
+    @property
+    def corners(self) -> int:
+        """How many corners its outlines have."""
+        return sum(len(ring) for each in self.outlined.values() for ring in each.rings)
+
+
 @dataclass(frozen=True, eq=False)
 class Film:
-    """Frames of a scene, each the whole message.
+    """Frames of a scene.
 
     Attributes:
         times_ns: (F,) int64.
@@ -35,7 +65,7 @@ class Film:
     """
 
     times_ns: Integers
-    frames: tuple[SceneUpdate, ...]
+    frames: tuple[Frame, ...]
     stride: int
 
 
@@ -43,40 +73,52 @@ class FilmMaker:
     """Takes frames from messages as they come, ever fewer of them if there are too many."""
 
     def __init__(self) -> None:
-        self._kept: list[tuple[int, bytes]] = []
-        self._seen, self._stride, self._size = 0, 1, 0
+        self._kept: list[tuple[int, Frame]] = []
+        self._seen, self._stride, self._corners = 0, 1, 0
 
     def add(self, time_ns: int, payload: bytes) -> None:
         """Take in the next message."""
         if self._seen % self._stride == 0:
-            self._kept.append((time_ns, payload))
-            self._size += len(payload)
+            frame = _frame(SceneUpdate.FromString(payload))
+            self._kept.append((time_ns, frame))
+            self._corners += frame.corners
         self._seen += 1
-        while len(self._kept) > MOST_FRAMES or (self._size > _MOST_BYTES and len(self._kept) > 2):
+        while len(self._kept) > MOST_FRAMES or (self._corners > MOST_CORNERS and len(self._kept) > 2):
             self._kept = self._kept[::2]
             self._stride *= 2
-            self._size = sum(len(kept) for _, kept in self._kept)
+            self._corners = sum(frame.corners for _, frame in self._kept)
 
     def film(self) -> Film:
         """What was taken so far."""
         times_ns = np.array([time_ns for time_ns, _ in self._kept], np.int64)
-        frames = tuple(SceneUpdate.FromString(payload) for _, payload in self._kept)
-        return Film(times_ns, frames, self._stride)
+        return Film(times_ns, tuple(frame for _, frame in self._kept), self._stride)
 
 
-class _Outlined(NamedTuple):
-    """What is drawn of an entity in one frame: rings, (n, 2) each, and a colour."""
+def _frame(message: SceneUpdate) -> Frame:
+    outlined = {entity.id: _outlined(entity) for entity in message.entities if entity.lines}
+    pointed = [_pointed(entity) for entity in message.entities if entity.id == WITNESS and entity.arrows]
+    return Frame(outlined, pointed[0] if pointed else None)
 
-    rings: list[Floats]
-    colour: tuple[int, int, int]
+
+def _outlined(entity: SceneEntity) -> Outlined:
+    rings = tuple(
+        np.array([(point.x, point.y) for point in line.points], np.float64) for line in entity.lines
+    )
+    colour = entity.lines[0].color
+    return Outlined(rings, (_byte(colour.r), _byte(colour.g), _byte(colour.b)))
 
 
-class _Pointed(NamedTuple):
-    """The arrow at the worst violation of one frame: from where to where it leads, (2, 2), and its number."""
+def _byte(share: float) -> int:
+    return round(255.0 * share)
 
-    frame: int
-    ends: Floats
-    label: str
+
+def _pointed(entity: SceneEntity) -> Pointed:
+    arrow = entity.arrows[0]
+    x, y = arrow.pose.position.x, arrow.pose.position.y
+    angle = 2.0 * math.atan2(arrow.pose.orientation.z, arrow.pose.orientation.w)
+    length = arrow.shaft_length + arrow.head_length
+    ends = np.array([(x, y), (x + length * math.cos(angle), y + length * math.sin(angle))])
+    return Pointed(ends, entity.texts[0].text.strip())
 
 
 class _Box(NamedTuple):
@@ -93,8 +135,9 @@ class _Box(NamedTuple):
 def film_value(film: Film, first_ns: int, packing: Packing) -> Mapping[str, Any]:
     """The film as the page reads it; coordinates are in steps of the box that everything lies in."""
     entities = _entities(film.frames)
-    pointed = list(_iter_pointed(film.frames))
-    box = _box(entities, pointed)
+    pointed = {number: frame.pointed for number, frame in enumerate(film.frames) if frame.pointed}
+    arrows = list(pointed.values())
+    box = _box(entities, arrows)
     return {
         "times": packing.add((film.times_ns - first_ns) / 1e9, "f8"),
         "stride": film.stride,
@@ -105,9 +148,9 @@ def film_value(film: Film, first_ns: int, packing: Packing) -> Mapping[str, Any]
             for identifier, shown in sorted(entities.items(), key=_drawing_order)
         ],
         "witness": {
-            "frames": packing.add(np.array([each.frame for each in pointed]), "i4"),
-            "points": packing.add(box.steps(_joined([each.ends for each in pointed])), "u2"),
-            "labels": [each.label for each in pointed],
+            "frames": packing.add(np.array(list(pointed)), "i4"),
+            "points": packing.add(box.steps(_joined([each.ends for each in arrows])), "u2"),
+            "labels": [each.label for each in arrows],
         },
     }
 
@@ -117,41 +160,16 @@ def _drawing_order(item: tuple[str, Any]) -> tuple[bool, str]:
     return not item[0].startswith(REGION), item[0]
 
 
-def _entities(frames: Sequence[SceneUpdate]) -> Mapping[str, dict[int, _Outlined]]:
+def _entities(frames: Sequence[Frame]) -> Mapping[str, dict[int, Outlined]]:
     """By entity and frame, what is drawn."""
-    found: dict[str, dict[int, _Outlined]] = {}
+    found: dict[str, dict[int, Outlined]] = {}
     for number, frame in enumerate(frames):
-        for entity in frame.entities:
-            if entity.lines:
-                found.setdefault(entity.id, {})[number] = _outlined(entity)
+        for identifier, outlined in frame.outlined.items():
+            found.setdefault(identifier, {})[number] = outlined
     return found
 
 
-def _outlined(entity: SceneEntity) -> _Outlined:
-    rings = [np.array([(point.x, point.y) for point in line.points], np.float64) for line in entity.lines]
-    colour = entity.lines[0].color
-    return _Outlined(rings, (_byte(colour.r), _byte(colour.g), _byte(colour.b)))
-
-
-def _byte(share: float) -> int:
-    return round(255.0 * share)
-
-
-def _iter_pointed(frames: Sequence[SceneUpdate]) -> Iterator[_Pointed]:
-    for number, frame in enumerate(frames):
-        for entity in frame.entities:
-            if entity.id == WITNESS and entity.arrows:
-                yield _Pointed(number, _ends(entity.arrows[0]), entity.texts[0].text.strip())
-
-
-def _ends(arrow: ArrowPrimitive) -> Floats:
-    x, y = arrow.pose.position.x, arrow.pose.position.y
-    angle = 2.0 * math.atan2(arrow.pose.orientation.z, arrow.pose.orientation.w)
-    length = arrow.shaft_length + arrow.head_length
-    return np.array([(x, y), (x + length * math.cos(angle), y + length * math.sin(angle))])
-
-
-def _box(entities: Mapping[str, Mapping[int, _Outlined]], pointed: Sequence[_Pointed]) -> _Box:
+def _box(entities: Mapping[str, Mapping[int, Outlined]], pointed: Sequence[Pointed]) -> _Box:
     rings = [ring for shown in entities.values() for each in shown.values() for ring in each.rings]
     everything = _joined([*rings, *(each.ends for each in pointed)])
     if not len(everything):
@@ -166,7 +184,7 @@ def _joined(points: Sequence[Floats]) -> Floats:
 
 
 def _entity_value(
-    identifier: str, shown: Mapping[int, _Outlined], frames: int, box: _Box, packing: Packing
+    identifier: str, shown: Mapping[int, Outlined], frames: int, box: _Box, packing: Packing
 ) -> Mapping[str, Any]:
     """One entity: in which form it is shown in each frame, and the points and colours of those frames."""
     forms: dict[tuple[int, ...], int] = {}
