@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
 
 from spatial_replay.inspection.report.decisions import MOST_CELLS, PlanMaker, plan_value
@@ -103,3 +104,44 @@ def test_no_more_cells_are_kept_than_there_is_room_for() -> None:
     value = value_of(decision(0, *(PlanMap(number=number) for number in range(3))), *grids)
     assert len(value["decisions"][0]["maps"]) == 2
     assert value["maps_left_out"] == 1
+
+
+def several(time_ns: int, first: int, chosen: int) -> PlanDecision:
+    """A decision with three candidates, each with a map, of which one is chosen."""
+    targets = [PlanTarget(object=f"cup{place}", robustness=1.0) for place in range(3)]
+    candidates = [
+        PlanCandidate(
+            object=f"cup{place}", maps=[PlanMap(number=first + place)], chosen=place == chosen, target=each
+        )
+        for place, each in enumerate(targets)
+    ]
+    return PlanDecision(
+        time_ns=time_ns,
+        number=first,
+        kind=PlanDecision.KIND_EXECUTE,
+        considered=[PlanEdge(path=[0, 1], candidates=candidates)],
+        target=targets[chosen],
+    )
+
+
+@pytest.mark.parametrize(("most_cells", "shown"), [(36, 6), (24, 4), (18, 3), (12, 2), (11, 1), (5, 0)])
+def test_where_room_is_short_the_maps_of_what_was_chosen_stay(most_cells: int, shown: int) -> None:
+    maker = PlanMaker()
+    for told in (several(0, 0, 1), several(10**9, 3, 2)):
+        maker.add_decision(told.SerializeToString())
+    for number in range(6):
+        maker.add_map(number, grid().SerializeToString())
+    value = plan_value(maker.plan(), 0, Packing(), most_cells)
+    kept = [[(each["title"], each["chosen"]) for each in told["maps"]] for told in value["decisions"]]
+    chosen = [[title for title, is_chosen in maps if is_chosen] for maps in kept]
+    assert chosen == [["cup1"] if shown else [], ["cup2"] if shown > 1 else []]
+    assert sum(map(len, kept)) == shown
+    assert value["maps_left_out"] == 6 - shown
+
+
+def test_the_only_map_of_a_decisions_time_is_the_chosen_one() -> None:
+    target = PlanTarget(object="cup", robustness=1.0)
+    (told,) = value_of(decision(5, target=target), grid(5))["decisions"]
+    assert [each["chosen"] for each in told["maps"]] == [True]
+    (told,) = value_of(decision(5, target=target), grid(5), grid(5))["decisions"]
+    assert [each["chosen"] for each in told["maps"]] == [False, False]

@@ -23,7 +23,7 @@ from spatial_replay.logs.messages.PlanDecision_pb2 import (
 )
 
 MOST_CELLS: Final = 1_500_000
-"""How many cells the maps of a page have at most, all together."""
+"""How many cells the maps of a page have at most, all together; those of what was chosen come first."""
 _MOST_GUARDS: Final = 4
 
 
@@ -81,35 +81,57 @@ class _Owner(NamedTuple):
     candidate: PlanCandidate
     turn: float
 
+    @property
+    def target(self) -> PlanTarget | None:
+        """Where the candidate is to go, if that was found on this map."""
+        candidate = self.candidate
+        return (
+            candidate.target if candidate.HasField("target") and candidate.target.turn == self.turn else None
+        )
+
 
 class _Drawn(NamedTuple):
-    """A gradient map as numbers: (rows, columns), NaN where blocked, and where its corners lie."""
+    """A gradient map as numbers.
+
+    Attributes:
+        values: (rows, columns), NaN where blocked.
+        low, high: where its corners lie.
+        owner: None where the log does not say.
+        is_chosen: whether the decision's target was found on it.
+    """
 
     values: Floats
     low: tuple[float, float]
     high: tuple[float, float]
+    owner: _Owner | None
+    is_chosen: bool
 
 
-def plan_value(plan: Plan, first_ns: int, packing: Packing) -> Mapping[str, Any]:
+def plan_value(
+    plan: Plan, first_ns: int, packing: Packing, most_cells: int = MOST_CELLS
+) -> Mapping[str, Any]:
     """The decisions as the page reads them, and how many maps there was no room for."""
-    decisions: list[Mapping[str, Any]] = []
-    cells = left_out = 0
-    for decision in plan.decisions:
-        maps: list[Mapping[str, Any]] = []
-        for owner, grid in _maps_of(plan, decision):
-            drawn = _drawn(grid)
-            if drawn is None:
-                continue
-            if cells + drawn.values.size > MOST_CELLS:
-                left_out += 1
-                continue
-            cells += drawn.values.size
-            maps.append(_map_value(drawn, owner, packing))
-        decisions.append(_decision_value(decision, maps, first_ns, packing))
-    return {"decisions": decisions, "maps_left_out": left_out}
+    drawn = [list(_maps_of(plan, decision)) for decision in plan.decisions]
+    kept = _kept([each for maps in drawn for each in maps], most_cells)
+    decisions = []
+    for decision, maps in zip(plan.decisions, drawn, strict=True):
+        values = [_map_value(each, packing) for each in maps if id(each) in kept]
+        decisions.append(_decision_value(decision, values, first_ns, packing))
+    return {"decisions": decisions, "maps_left_out": sum(map(len, drawn)) - len(kept)}
 
 
-def _maps_of(plan: Plan, decision: PlanDecision) -> Iterator[tuple[_Owner | None, Grid]]:
+def _kept(maps: Sequence[_Drawn], most_cells: int) -> set[int]:
+    """Which maps there is room for, by identity: those of what was chosen, then the others, in order."""
+    kept: set[int] = set()
+    cells = 0
+    for each in sorted(maps, key=lambda each: not each.is_chosen):
+        if cells + each.values.size <= most_cells:
+            cells += each.values.size
+            kept.add(id(each))
+    return kept
+
+
+def _maps_of(plan: Plan, decision: PlanDecision) -> Iterator[_Drawn]:
     """The maps that a decision rests on; of a log that does not say whose they are, those of its time."""
     owners = {
         named.number: _Owner(edge, place, candidate, named.turn)
@@ -117,15 +139,32 @@ def _maps_of(plan: Plan, decision: PlanDecision) -> Iterator[tuple[_Owner | None
         for place, candidate in enumerate(considered.candidates)
         for named in candidate.maps
     }
-    if owners:
-        yield from ((owners[number], plan.maps[number]) for number in sorted(owners) if number in plan.maps)
-        return
-    for _, grid in sorted(plan.maps.items()):
-        if grid.timestamp.ToNanoseconds() == decision.time_ns:
-            yield None, grid
+    found: list[tuple[_Owner | None, Grid]] = [
+        (owner, plan.maps[number]) for number, owner in sorted(owners.items()) if number in plan.maps
+    ]
+    if not owners:
+        found = [(None, grid) for _, grid in sorted(plan.maps.items()) if _is_of_time(grid, decision)]
+    for owner, grid in found:
+        drawn = _drawn(grid, owner, _is_chosen(owner, decision, len(found)))
+        if drawn is not None:
+            yield drawn
 
 
-def _drawn(grid: Grid) -> _Drawn | None:
+def _is_of_time(grid: Grid, decision: PlanDecision) -> bool:
+    return grid.timestamp.ToNanoseconds() == decision.time_ns
+
+
+def _is_chosen(owner: _Owner | None, decision: PlanDecision, maps: int) -> bool:
+    """Whether a decision's target was found on a map; where maps have no owners, on the only one."""
+    if not decision.HasField("target"):
+        return False
+    if owner is None:
+        return maps == 1
+    is_last = owner.edge == len(decision.considered) - 1
+    return is_last and owner.candidate.chosen and owner.target is not None
+
+
+def _drawn(grid: Grid, owner: _Owner | None, is_chosen: bool) -> _Drawn | None:
     """A map's robustness; None of a message whose sizes do not fit together, or make no rectangle."""
     columns, cell, row = grid.column_count, grid.cell_stride, grid.row_stride
     rows = len(grid.data) // row if row else 0
@@ -137,10 +176,10 @@ def _drawn(grid: Grid) -> _Drawn | None:
     high = x + columns * grid.cell_size.x, y + rows * grid.cell_size.y
     if not np.isfinite([x, y, *high]).all() or high[0] <= x or high[1] <= y:
         return None
-    return _Drawn(numbers.astype(np.float64), (x, y), high)
+    return _Drawn(numbers.astype(np.float64), (x, y), high, owner, is_chosen)
 
 
-def _map_value(drawn: _Drawn, owner: _Owner | None, packing: Packing) -> Mapping[str, Any]:
+def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
     known = drawn.values[np.isfinite(drawn.values)]
     value: dict[str, Any] = {
         "columns": drawn.values.shape[1],
@@ -148,21 +187,22 @@ def _map_value(drawn: _Drawn, owner: _Owner | None, packing: Packing) -> Mapping
         "high": drawn.high,
         "scale": float(np.abs(known).max(initial=0.0)),
         "values": packing.add(singles(drawn.values), "f4"),
+        "chosen": drawn.is_chosen,
         "edge": None,
         "candidate": None,
         "title": "",
         "target": None,
     }
+    owner = drawn.owner
     if owner is None:
         return value
     candidate = owner.candidate
-    has_target = candidate.HasField("target") and candidate.target.turn == owner.turn
     turned = f", turned by {math.degrees(owner.turn):.3g}°" if len(candidate.maps) > 1 else ""
     return value | {
         "edge": owner.edge,
         "candidate": owner.place,
         "title": f"{candidate.object}{turned}",
-        "target": _target_value(candidate.target) if has_target else None,
+        "target": None if owner.target is None else _target_value(owner.target),
     }
 
 

@@ -28,13 +28,18 @@ function makeDecision(clock, decision) {
   `state ${decision.states.join(", ")}: ${inShort(decision)}`);
   const tried = decision.edges.map((edge, number) => makeEdge(clock, decision, edge, number));
   const unnamed = decision.maps.filter((map) => map.edge === null);
-  const meant = decision.target ? decision.maps.at(-1) : null;
+  const meant = chosenMap(decision);
   const said = element("div", {}, title, element("p", {}, sentence(decision.reason)),
     decision.outcome ? element("p", {}, outcomeWords(decision.outcome)) : null);
   return element("li", {class: "card"},
     element("div", {class: "said"}, said, meant ? makeMap(clock, meant, false) : null),
     tried.length ? element("details", {}, element("summary", {}, lookedInto(decision)), ...tried,
       element("div", {class: "candidates"}, ...unnamed.map((map) => makeMap(clock, map, false)))) : null);
+}
+
+// The map that a decision's target was found on, if the page has it.
+function chosenMap({maps: drawn}) {
+  return drawn.find((map) => map.chosen) ?? null;
 }
 
 function lookedInto({edges, maps: drawn}) {

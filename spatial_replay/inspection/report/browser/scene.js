@@ -93,7 +93,7 @@ function drawScene(context, clock, film, layers, width, height) {
   const frame = indexAt(film.times, clock.time);
   const at = projection(film.low, film.high, width, height, 18);
   const decision = decisionAt(clock.run, clock.time);
-  const map = decision?.maps.at(-1);
+  const map = decision && chosenMap(decision);
   if (layers.map && map) drawMap(context, clock.run, map, at);
   if (layers.trails) drawTrails(context, film, frame, at);
   const labels = [];
