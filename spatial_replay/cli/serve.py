@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING
 import click
 
 from spatial_replay.cli.evaluating import Request, evaluation_options, prepared, report_reading
+from spatial_replay.cli.exit_codes import ExitCode
 from spatial_replay.cli.failures import say
+from spatial_replay.cli.options import semantics_option
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.verdicts import print_verdicts
 
 if TYPE_CHECKING:
-    from spatial_replay.replay.tuning import Tuning
+    from spatial_replay.monitor.semantics import Semantics
+    from spatial_replay.replay.tuning import Tuned
 
 
 @click.command()
@@ -37,7 +40,10 @@ if TYPE_CHECKING:
     "--play", is_flag=True, help="Play at once, rather than wait at the start for a viewer to do so."
 )
 @click.option("--layout", is_flag=True, help="Print the layout to import in the viewer, and serve nothing.")
-def serve(request: Request, port: int, host: str, play: bool, layout: bool) -> None:
+@semantics_option
+def serve(
+    request: Request, port: int, host: str, play: bool, layout: bool, semantics: Semantics
+) -> ExitCode | None:
     """Replay a log to Foxglove or Lichtblick, over WebSocket.
 
     In the viewer, open a connection to the address that is printed. There, play, pause, seek and change the
@@ -52,14 +58,23 @@ def serve(request: Request, port: int, host: str, play: bool, layout: bool) -> N
       spatial-replay serve run.mcap --spec blocks.spatial
       spatial-replay serve run.mcap --spec blocks.spatial --layout > live.json
     """
+    tuned = _tuned(request, semantics)
+    if layout:
+        click.echo(tuned.layout.data)
+        return None
+    report_reading(tuned.replayed)
+    try:
+        _serve(tuned, host, port, play)
+    except KeyboardInterrupt:
+        # this is how it ends
+        return ExitCode.INTERRUPTED
+    return None
+
+
+def _serve(tuned: Tuned, host: str, port: int, play: bool) -> None:
     # the numerical libraries load when there is work for them
     from spatial_replay.runs.live.serving import serving
 
-    tuned = _tuning(request).evaluate()
-    if layout:
-        click.echo(tuned.layout.data)
-        return
-    report_reading(tuned.replayed)
     with serving(tuned, host=host, port=port, play=play) as server:
         print_verdicts(tuned.replayed, None)
         if not _is_loopback(host):
@@ -70,14 +85,22 @@ def serve(request: Request, port: int, host: str, play: bool, layout: bool) -> N
         server.wait()
 
 
-def _tuning(request: Request) -> Tuning:
+def _tuned(request: Request, semantics: Semantics) -> Tuned:
     from spatial_replay.replay.annotated import check_parameters
     from spatial_replay.replay.tuning import Tuning
 
     task = prepared(request)
     check_parameters(task.files, task.each)
     with progress("samples") as advance:
-        return Tuning(task.source, task.files, window=task.window, each=task.each, advance=advance)
+        tuning = Tuning(
+            task.source,
+            task.files,
+            window=task.window,
+            each=task.each,
+            semantics=semantics,
+            advance=advance,
+        )
+    return tuning.evaluate()
 
 
 def _is_loopback(host: str) -> bool:
