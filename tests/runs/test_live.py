@@ -241,6 +241,23 @@ def test_values_that_make_no_sense_change_nothing(
     watch(server, looking)
 
 
+def test_a_change_that_fails_later_brings_the_old_values_back() -> None:
+    text = "const wide = 1\nregion goal = box(0, 0, wide, 1)\nspec reach = F (cube ovlp goal)\n"
+    tuning = Tuning(PiecewiseSource(run(5), 7), [sr.parse_specification(text)])
+    with serving(tuning.evaluate(), port=0) as server:
+
+        async def looking(own: Viewer) -> None:
+            await own.send(op="subscribeParameterUpdates", parameterNames=["wide"])
+            await own.set(wide=1e300)
+            assert "1e+300" in await own.note("constants")
+            await own.next_of(dict, lambda each: [of["value"] for of in each.get("parameters", ())] == [1])
+            assert await own.constants() == {"wide": 1}
+            assert await own.set(wide=2) == {"wide": 2}
+            await own.note("verdict", "(wide = 2)")
+
+        watch(server, looking)
+
+
 def test_of_many_changes_the_last_one_counts(server: Serving) -> None:
     async def looking(own: Viewer) -> None:
         for number in range(50):
@@ -415,6 +432,14 @@ def test_a_log_that_cannot_be_read_any_more_is_told(tmp_path: Path) -> None:
             assert await own.constants() == {"far": 0.5, "soon": "10s"}
 
         watch(server, looking)
+
+
+@pytest.mark.parametrize("host", ["8.8.8.8", "no.such.host.invalid", "a..b", "::2", ""])
+def test_an_address_of_others_is_told(host: str) -> None:
+    tuning = Tuning(PiecewiseSource(run(3), 7), [specification()])
+    expected = f"cannot listen at {host or 'no address'}: .*; choose an address of this machine with --host"
+    with pytest.raises(UsageError, match=expected), serving(tuning.evaluate(), host=host, port=0):
+        pass
 
 
 def test_a_port_that_is_taken_is_told(server: Serving) -> None:

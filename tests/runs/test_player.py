@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from queue import SimpleQueue
 
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import spatial_replay as sr
 from replay.runs import STEP_NS, PiecewiseSource, run
@@ -20,12 +25,14 @@ from spatial_replay.logs.block import Messages
 from spatial_replay.logs.topics import ROBUSTNESS
 from spatial_replay.replay.playback import Playback
 from spatial_replay.replay.tuning import Tuning
-from spatial_replay.runs.live.outlet import Note
-from spatial_replay.runs.live.player import MOST_TIMES, Player
+from spatial_replay.runs.live.outlet import Level, Note
+from spatial_replay.runs.live.pace import MOST_LATE_S
+from spatial_replay.runs.live.player import MOST_A_SECOND, Player
 from spatial_replay.runs.live.session import Session
 from spatial_replay.runs.live.transport import State, Status
 
 PATIENCE_S = 10.0
+MOST_SAMPLES = math.ceil(MOST_A_SECOND * MOST_LATE_S)
 TEXT = 'const far = 0.5\nspec apart = F (cube dist "cup 物" >= far)\n'
 
 
@@ -33,7 +40,9 @@ TEXT = 'const far = 0.5\nspec apart = F (cube dist "cup 物" >= far)\n'
 class Kept:
     """An outlet that keeps what it is told, in order."""
 
-    told: SimpleQueue[Messages | State | Note | int] = field(default_factory=SimpleQueue)
+    told: SimpleQueue[Messages | State | Note | Mapping[str, float | str] | int] = field(
+        default_factory=SimpleQueue
+    )
 
     def wants(self, topic: str) -> bool:
         return True
@@ -46,6 +55,9 @@ class Kept:
 
     def tell_time(self, time_ns: int) -> None:
         self.told.put(time_ns)
+
+    def tell_values(self, values: Mapping[str, float | str]) -> None:
+        self.told.put(values)
 
     def tell(self, note: Note) -> None:
         self.told.put(note)
@@ -67,10 +79,13 @@ class Clock:
         return self.now
 
 
+def tuning_of(count: int, step_ns: int = STEP_NS) -> Tuning:
+    trace = replace(run(count), times_ns=np.arange(count) * step_ns)
+    return Tuning(PiecewiseSource(trace, 1_000), [sr.parse_specification(TEXT, filename="blocks.spatial")])
+
+
 @contextmanager
-def playing(count: int, clock: Clock) -> Iterator[tuple[Session, Kept]]:
-    specification = sr.parse_specification(TEXT, filename="blocks.spatial")
-    tuning = Tuning(PiecewiseSource(run(count), 1_000), [specification])
+def playing(tuning: Tuning, clock: Clock) -> Iterator[tuple[Session, Kept]]:
     playback = Playback(tuning.evaluate())
     playback.seek(0)
     session = Session(tuning, playback.start_ns, playback.end_ns, clock=clock)
@@ -98,36 +113,75 @@ def is_over(told: object) -> bool:
     return isinstance(told, State) and told.status is Status.ENDED
 
 
+def play_to_the_end(session: Session, clock: Clock, waits: list[float]) -> None:
+    """Turn the clock, each time the player has had a turn, until the log is over."""
+    for wait_s in itertools.cycle(waits):
+        clock.now += wait_s
+        state = session.ask(lambda tuned: session.state)
+        if state.status is Status.ENDED:
+            return
+
+
 def test_what_passes_by_the_clock_is_sent_once_and_in_order() -> None:
     clock = Clock()
-    with playing(30, clock) as (session, outlet):
-        session.control(is_playing=True, speed=1.0)
+    with playing(tuning_of(30), clock) as (session, outlet):
+        session.control(is_playing=True, speed=4.0)
         sent = []
         for step in range(1, 5):
-            clock.now = step * 0.5
+            clock.now = step * 0.125
             session.show_again("/nothing")  # wakes the player
-            sent += outlet.until(lambda told, now=clock.now: told == round(now * 1e9))
+            sent += outlet.until(lambda told, now=clock.now: told == round(4.0 * now * 1e9))
         assert sorted(set(robustness_times(sent))) == [index * STEP_NS for index in range(1, 9)]
 
 
-def test_a_clock_that_runs_away_is_followed_in_pieces() -> None:
+RATES = [
+    (1e9 / MOST_A_SECOND, 1.0),
+    (1e9 / MOST_A_SECOND, 0.3),
+    (100e9 / MOST_A_SECOND, 100.0),
+    (19e9 / MOST_A_SECOND, 19.0),
+    (STEP_NS, 100.0),
+]
+"""From sample to sample in nanoseconds, and speeds that play at most the samples a second that are sent."""
+
+
+@pytest.mark.parametrize(("step_ns", "speed"), RATES)
+@settings(max_examples=10, deadline=None)
+@given(waits=st.lists(st.floats(0.001, 5.0), min_size=1, max_size=6))
+def test_no_sample_is_lost_however_late_a_turn_comes(
+    step_ns: float, speed: float, waits: list[float]
+) -> None:
+    clock, step_ns = Clock(), math.ceil(step_ns)
+    with playing(tuning_of(300, step_ns), clock) as (session, outlet):
+        session.control(is_playing=True, speed=speed)
+        play_to_the_end(session, clock, [*waits, 0.2])
+        counts = Counter(robustness_times(outlet.until(is_over)))
+        assert counts == {index * step_ns: 1 for index in range(1, 300)}
+
+
+def test_what_plays_faster_is_thinned_to_what_viewers_take() -> None:
+    clock, step_ns = Clock(), 1_000_000
+    with playing(tuning_of(2_000, step_ns), clock) as (session, outlet):
+        session.control(is_playing=True, speed=4.0)
+        play_to_the_end(session, clock, [0.03125])
+        sent = robustness_times(outlet.until(is_over))
+        assert 0.5 * MOST_A_SECOND <= len(sent) <= 0.55 * MOST_A_SECOND
+        assert sent[-1] == 1_999 * step_ns
+        assert max(np.diff(sent)) <= 8 * step_ns
+
+
+def test_a_playback_that_is_late_falls_behind() -> None:
     clock = Clock()
-    with playing(6_000, clock) as (session, outlet):
-        session.control(is_playing=True, speed=1.0, seek_ns=0)
-        outlet.until(lambda told: told == 0)
+    with playing(tuning_of(6_000), clock) as (session, outlet):
+        session.control(is_playing=True, speed=100.0)
         clock.now = 1e6
-        first, second = (outlet.until(lambda told: isinstance(told, int) and told > 0) for _ in range(2))
-        # the first piece is as long as it may be; by the clock the second begins where that ended
-        assert len(robustness_times(first)) == MOST_TIMES
-        clock.now = 2e6
-        told = second + outlet.until(is_over)
-        times = [each for each in told if isinstance(each, int)]
-        assert times == sorted(times)
-        assert times[-1] == 5_999 * STEP_NS
+        assert session.state.time_ns == round(100.0 * MOST_LATE_S * 1e9)
+        found = outlet.until(lambda told: isinstance(told, int) and told > 0)
+        assert len(robustness_times(found)) <= MOST_SAMPLES
+        assert session.state.time_ns == found[-1]
 
 
 def test_curves_are_sent_again_while_it_plays() -> None:
-    with playing(40, Clock()) as (session, outlet):
+    with playing(tuning_of(40), Clock()) as (session, outlet):
         session.control(is_playing=True, speed=1.0)
         told = outlet.until(
             lambda told: isinstance(told, Messages) and CURVES_CHANNEL in told.channels.values()
@@ -136,14 +190,14 @@ def test_curves_are_sent_again_while_it_plays() -> None:
 
 
 def test_nobody_is_answered_after_the_end() -> None:
-    with playing(5, Clock()) as (session, _):
+    with playing(tuning_of(5), Clock()) as (session, _):
         assert session.ask(lambda tuned: tuned.verdict) == "satisfied"
     with pytest.raises(UsageError, match="stopping"):
         session.ask(lambda tuned: tuned.verdict)
 
 
 def test_an_error_in_an_answer_is_that_of_who_asked() -> None:
-    with playing(5, Clock()) as (session, _):
+    with playing(tuning_of(5), Clock()) as (session, _):
         with pytest.raises(ZeroDivisionError):
             session.ask(lambda tuned: 1 // 0)
         assert session.ask(lambda tuned: 1) == 1
@@ -151,14 +205,29 @@ def test_an_error_in_an_answer_is_that_of_who_asked() -> None:
 
 def test_a_change_while_it_plays_loses_no_sample() -> None:
     clock = Clock()
-    with playing(40, clock) as (session, outlet):
-        session.control(is_playing=True, speed=1.0, seek_ns=0)
+    with playing(tuning_of(40), clock) as (session, outlet):
+        session.control(is_playing=True, speed=20.0, seek_ns=0)
         sent = outlet.until(lambda told: told == 0)
-        clock.now = 2.0
+        clock.now = 0.1
         sent += outlet.until(lambda told: told == 2_000_000_000)
         session.change({"far": 1.0})
         session.ask(lambda tuned: None)  # it is done by then
-        clock.now = 4.0
+        clock.now = 0.2
         sent += outlet.until(lambda told: told == 4_000_000_000 or is_over(told))
         counts = Counter(robustness_times(sent))
         assert set(counts) == {index * STEP_NS for index in range(17)}
+
+
+def test_a_change_that_cannot_be_evaluated_brings_the_old_values_back() -> None:
+    text = "const wide = 1\nregion goal = box(0, 0, wide, 1)\nspec reach = F (cube ovlp goal)\n"
+    tuning = Tuning(PiecewiseSource(run(5), 5), [sr.parse_specification(text, filename="blocks.spatial")])
+    with playing(tuning, Clock()) as (session, outlet):
+        session.change({"wide": 1e300})
+        *_, note, values = outlet.until(lambda told: isinstance(told, Mapping))
+        assert isinstance(note, Note)
+        assert (note.about, note.level) == ("constants", Level.ERROR)
+        assert "1e+300" in note.text
+        assert values == session.values == {"wide": 1}
+        session.change({"wide": 2})
+        told = outlet.until(lambda told: isinstance(told, Note))
+        assert "(wide = 2)" in told[-1].text

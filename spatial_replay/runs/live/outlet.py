@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import Enum, auto
 from typing import NamedTuple, Protocol
 
@@ -39,6 +40,9 @@ class Outlet(Protocol):
 
     def tell_time(self, time_ns: int) -> None:
         """Say at which time of the log the playback is."""
+
+    def tell_values(self, values: Mapping[str, float | str]) -> None:
+        """Say what the constants are, where that is not the answer to a viewer."""
 
     def tell(self, note: Note) -> None:
         """Show a note."""

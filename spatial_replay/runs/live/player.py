@@ -2,29 +2,31 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from typing import Final
 
 import numpy as np
 
-from spatial_replay.errors import LogError
+from spatial_replay.errors import SpatialReplayError
 from spatial_replay.inspection.annotator import messages_of
 from spatial_replay.inspection.curves import CURVES_CHANNEL
 from spatial_replay.logs.block import Messages
 from spatial_replay.logs.merging import select
 from spatial_replay.logs.topics import CURVES_TOPIC
 from spatial_replay.replay.playback import Playback
+from spatial_replay.replay.tuning import values_of
 from spatial_replay.runs.live.outlet import Level, Note, Outlet
 from spatial_replay.runs.live.session import Session
 from spatial_replay.runs.live.thinning import thinned
 from spatial_replay.runs.live.wishes import Values, Wishes
-from spatial_replay.runs.live.words import LOG, verdict_note
+from spatial_replay.runs.live.words import CONSTANTS, LOG, verdict_note
 
 PERIOD_S: Final = 1 / 30
 """From one stretch that is sent to the next."""
 
-MOST_TIMES: Final = 20
-"""Samples of a stretch that are sent, so that a fast playback is no more than viewers take."""
+MOST_A_SECOND: Final = 600
+"""Samples that are sent, so that a fast playback is no more than viewers take."""
 
 _CURVES_EVERY: Final = 60
 """Stretches after which the curves are sent again: some viewers forget them while they open their panels."""
@@ -49,7 +51,7 @@ class Player:
                 try:
                     self._fulfil(wishes)
                     self._play_on()
-                except LogError as error:
+                except SpatialReplayError as error:
                     self._outlet.tell(Note(LOG, Level.ERROR, str(error)))
                     self._outlet.tell_state(self._session.pause())
         finally:
@@ -66,8 +68,17 @@ class Player:
         self._session.answer(self._playback.tuned)
 
     def _evaluate(self, values: Values, time_ns: int) -> None:
-        """Evaluate the whole log with other constants; what was shown before is out of date."""
-        self._playback.tuned = self._playback.tuned.tuning.evaluate(values)
+        """Evaluate the whole log with other constants; what was shown before is out of date.
+
+        Where that cannot be done, the old values come back.
+        """
+        before = self._playback.tuned
+        try:
+            self._playback.tuned = before.tuning.evaluate(values)
+        except SpatialReplayError as error:
+            self._outlet.tell(Note(CONSTANTS, Level.ERROR, str(error)))
+            self._outlet.tell_values(self._session.take_back(values_of(before.constants)))
+            return
         self._outlet.tell_state(self._session.state._replace(time_ns=time_ns, did_seek=True))
         self._outlet.tell(verdict_note(self._playback.tuned))
 
@@ -96,10 +107,12 @@ class Player:
 
     def _play_on(self) -> None:
         """Send what has come since the last stretch, if it plays."""
-        time_ns = self._session.play_up_to(self._playback.reach_ns(_MOST_SAMPLES))
-        if time_ns is None:
+        passage = self._session.play_up_to(self._playback.reach_ns(_MOST_SAMPLES))
+        if passage is None:
             return
-        self._outlet.publish(thinned(self._playback.advance_to(time_ns), MOST_TIMES))
+        time_ns = passage.time_ns
+        most = max(1, math.ceil(MOST_A_SECOND * passage.lasted_s))
+        self._outlet.publish(thinned(self._playback.advance_to(time_ns), most))
         self._outlet.tell_time(time_ns)
         self._stretches += 1
         if self._stretches % _CURVES_EVERY == 0:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import ipaddress
 import json
 import logging
-from collections.abc import Sequence
+import socket
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from functools import partial
 from reprlib import repr as shortened
 from threading import Thread
@@ -21,6 +23,7 @@ from spatial_replay.logs.block import Channel, Messages, Schema
 from spatial_replay.runs.live.answers import SERVICES, answer
 from spatial_replay.runs.live.assets import asset
 from spatial_replay.runs.live.outlet import Level, Note
+from spatial_replay.runs.live.questions import Questions
 from spatial_replay.runs.live.session import Session
 from spatial_replay.runs.live.transport import State, Status
 from spatial_replay.runs.live.words import CONSTANTS
@@ -63,36 +66,33 @@ class LiveServer:
     A viewer that does not take what it is sent loses the oldest of it, and is let go when it takes nothing.
     """
 
-    def __init__(self, session: Session, channels: Sequence[Channel], host: str, port: int) -> None:
+    def __init__(
+        self, session: Session, questions: Questions, channels: Sequence[Channel], host: str, port: int
+    ) -> None:
         """Listen.
 
         Args:
+            questions: answers those of viewers.
             channels: all that there can be messages of.
             port: 0 for any that is free.
 
         Raises:
             UsageError: nothing can listen there.
         """
-        self._session = session
+        self._session, self._questions = session, questions
         self._context = foxglove.Context()
         self._channels = self._sent(channels)
         self._host = f"[{host}]" if _is_v6(host) else host
+        self._started: Future[protocol.WebSocketServer] = Future()
         try:
-            self._server = foxglove.start_server(
-                name=f"spatial-replay: {session.name}",
-                host=self._host,
-                port=port,
-                capabilities=list(_CAPABILITIES),
-                server_listener=_Listener(session, self),
-                services=[self._service(name) for name in SERVICES],
-                asset_handler=lambda uri: session.ask(partial(asset, uri=uri)),
-                context=self._context,
-                playback_time_range=session.span_ns,
-            )
+            self._started.set_result(self._start(port))
         except RuntimeError as error:
             reason = str(error).rpartition("bind port: ")[2].partition(" (os error")[0]
             raise UsageError(
                 f"cannot listen at {host}, port {port}: {reason}; choose another with --port, 0 for any"
+                if _is_own(host)
+                else f"cannot listen at {host or 'no address'}: {reason}; choose an address of this machine "
+                "with --host, 127.0.0.1 for programs on it alone, 0.0.0.0 for all of its addresses"
             ) from None
 
     @property
@@ -132,6 +132,10 @@ class LiveServer:
         """See `Outlet.tell_time`."""
         self._server.broadcast_time(time_ns)
 
+    def tell_values(self, values: Mapping[str, float | str]) -> None:
+        """See `Outlet.tell_values`."""
+        self._server.publish_parameter_values(_parameters(values))
+
     def tell(self, note: Note) -> None:
         """See `Outlet.tell`."""
         self._server.publish_status(note.text[:_LONGEST_NOTE], _LEVELS[note.level], note.about)
@@ -139,6 +143,24 @@ class LiveServer:
     def withdraw(self, about: str) -> None:
         """Show the note about something no longer."""
         self._server.remove_status([about])
+
+    @property
+    def _server(self) -> protocol.WebSocketServer:
+        """The server; a fast viewer asks for something before it is known here."""
+        return self._started.result()
+
+    def _start(self, port: int) -> protocol.WebSocketServer:
+        return foxglove.start_server(
+            name=f"spatial-replay: {self._session.name}",
+            host=self._host,
+            port=port,
+            capabilities=list(_CAPABILITIES),
+            server_listener=_Listener(self._session, self),
+            services=[self._service(name) for name in SERVICES],
+            asset_handler=lambda uri: self._session.ask(partial(asset, uri=uri)),
+            context=self._context,
+            playback_time_range=self._session.span_ns,
+        )
 
     def _sent(self, channels: Sequence[Channel]) -> dict[Channel, foxglove.Channel]:
         """What is offered to viewers: what can be read without a schema of its own, or has one."""
@@ -175,7 +197,7 @@ class LiveServer:
         )
 
         def handle(asked: ServiceRequest) -> bytes:
-            return self._session.ask(lambda tuned: answer(name, tuned, asked.payload))
+            return self._questions.ask(lambda tuned: answer(name, tuned, asked.payload))
 
         return Service(
             name, schema=foxglove.ServiceSchema(name, request=request, response=response), handler=handle
@@ -195,18 +217,18 @@ class _Listener(protocol.ServerListener):
     def on_get_parameters(
         self, client: protocol.Client, param_names: list[str], request_id: str | None = None
     ) -> list[Parameter]:
-        chosen = _parameters(self._session)
+        chosen = _parameters(self._session.values)
         return [each for each in chosen if each.name in param_names] if param_names else chosen
 
     def on_set_parameters(
         self, client: protocol.Client, parameters: list[Parameter], request_id: str | None = None
     ) -> list[Parameter]:
+        self._server.withdraw(CONSTANTS)
         try:
             self._session.change({each.name: _value(each) for each in parameters})
-            self._server.withdraw(CONSTANTS)
         except SpatialReplayError as error:
             self._server.tell(Note(CONSTANTS, Level.ERROR, str(error)))
-        return _parameters(self._session)
+        return _parameters(self._session.values)
 
     def on_playback_control_request(
         self, playback_control_request: protocol.PlaybackControlRequest
@@ -224,8 +246,8 @@ def _playback_state(state: State, request: str | None) -> protocol.PlaybackState
     return protocol.PlaybackState(_STATUS[state.status], state.time_ns, state.speed, state.did_seek, request)
 
 
-def _parameters(session: Session) -> list[Parameter]:
-    return [Parameter(name, value=value) for name, value in session.values.items()]
+def _parameters(values: Mapping[str, float | str]) -> list[Parameter]:
+    return [Parameter(name, value=value) for name, value in values.items()]
 
 
 def _value(parameter: Parameter) -> float | str:
@@ -248,3 +270,14 @@ def _is_v6(host: str) -> bool:
         return ipaddress.ip_address(host).version == 6
     except ValueError:
         return False
+
+
+def _is_own(host: str) -> bool:
+    """Whether something can listen at an address, at a port that is free."""
+    try:
+        family, kind, number, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, number) as probe:
+            probe.bind(address)
+    except (OSError, UnicodeError):
+        return False
+    return True

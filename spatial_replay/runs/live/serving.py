@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -11,12 +11,17 @@ from spatial_replay.errors import UsageError
 from spatial_replay.inspection.curves import CURVES_CHANNEL
 from spatial_replay.replay.playback import Playback
 from spatial_replay.replay.tuning import Tuned
+from spatial_replay.runs.live.background import in_background
 from spatial_replay.runs.live.player import Player
+from spatial_replay.runs.live.questions import Questions
 from spatial_replay.runs.live.session import Session
 
 LOOPBACK = "127.0.0.1"
 PORT = 8765
 """Where viewers look for a server unless told otherwise."""
+
+_FAREWELL_S = 0.25
+"""How long an evaluation that is at work is waited for in the end."""
 
 
 @dataclass(frozen=True)
@@ -58,13 +63,16 @@ def serving(tuned: Tuned, *, host: str = LOOPBACK, port: int = PORT, play: bool 
     playback = Playback(tuned)
     playback.seek(playback.start_ns)
     session = Session(tuned.tuning, playback.start_ns, playback.end_ns)
-    server = LiveServer(session, (*playback.channels, CURVES_CHANNEL), host, port)
-    with ThreadPoolExecutor(1, "player") as thread:
-        loop = thread.submit(Player(playback, session, server).run)
-        try:
-            if play:
-                session.control(is_playing=True, speed=1.0)
-            yield Serving(server.address, loop)
-        finally:
-            session.stop()
-            server.stop()
+    questions = Questions(session)
+    server = LiveServer(session, questions, (*playback.channels, CURVES_CHANNEL), host, port)
+    loop = in_background(Player(playback, session, server).run, "player")
+    answering = in_background(questions.run, "questions")
+    try:
+        if play:
+            session.control(is_playing=True, speed=1.0)
+        yield Serving(server.address, loop)
+    finally:
+        session.stop()
+        questions.stop()
+        wait([loop, answering], _FAREWELL_S)
+        server.stop()

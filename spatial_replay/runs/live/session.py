@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from threading import Condition
-from typing import Final, TypeVar
+from typing import NamedTuple, TypeVar
 
 from spatial_replay.errors import UsageError
 from spatial_replay.replay.tuning import Tuned, Tuning, values_of
+from spatial_replay.runs.live.pace import Pace
 from spatial_replay.runs.live.transport import State, Status, Transport
-from spatial_replay.runs.live.wishes import Question, Wishes
-
-_OVER: Final = "the server is stopping"
+from spatial_replay.runs.live.wishes import OVER, Question, Values, Wishes
 
 _Answer = TypeVar("_Answer")
+
+
+class Passage(NamedTuple):
+    """What is to be played now: up to which time of the log, in place of how many seconds of waiting."""
+
+    time_ns: int
+    lasted_s: float
 
 
 class Session:
@@ -34,11 +39,11 @@ class Session:
             clock: seconds by which it plays.
         """
         self._tuning = tuning
-        self._clock = clock
+        self._pace = Pace(clock)
         self._transport = Transport(start_ns, end_ns)
         self._values = values_of(tuning.constants)
         self._wishes = Wishes()
-        self._questions: deque[Question] = deque()
+        self._questions: list[Question] = []
         self._wished = Condition()
         self._is_over = False
 
@@ -61,7 +66,7 @@ class Session:
     def state(self) -> State:
         """Where it is, and what it does."""
         with self._wished:
-            return self._transport.state(self._clock())
+            return self._transport.state(self._pace.now())
 
     # --------------------------------------------------------------------------- what viewers want
 
@@ -71,7 +76,7 @@ class Session:
         What plays on from the end begins again.
         """
         with self._wished:
-            now = self._clock()
+            now = self._pace.now()
             if seek_ns is None and is_playing and self._transport.state(now).status is Status.ENDED:
                 seek_ns = self._transport.start_ns
             self._transport.set_speed(speed, now)
@@ -111,14 +116,15 @@ class Session:
         question = Question(work)
         with self._wished:
             if self._is_over:
-                raise UsageError(_OVER)
+                raise UsageError(OVER)
             self._questions.append(question)
             self._wished.notify()
         answer: _Answer = question.answer.result()
         return answer
 
     def stop(self) -> None:
-        """End `run`."""
+        """Be over, and let whoever does the work know."""
+        self.end()
         with self._wished:
             self._wishes.stop = True
             self._wished.notify()
@@ -128,48 +134,61 @@ class Session:
     def next_wishes(self, patience_s: float) -> Wishes:
         """What is wanted by now, or once something is; while it plays, that is waited for so long only."""
         with self._wished:
-            is_playing = self._transport.state(self._clock()).status is Status.PLAYING
+            is_playing = self._transport.state(self._pace.now()).status is Status.PLAYING
             self._wished.wait_for(lambda: self._wishes or self._questions, patience_s if is_playing else None)
             wishes, self._wishes = self._wishes, Wishes()
             return wishes
 
-    def play_up_to(self, reach_ns: int) -> int | None:
-        """Up to where to play now; None if it does not play, or is to go on from elsewhere first.
+    def play_up_to(self, reach_ns: int) -> Passage | None:
+        """What to play now; None if it does not play, or is to go on from elsewhere first.
 
         Args:
             reach_ns: as far as can be played at once; it falls behind the clock rather than go farther.
         """
         with self._wished:
-            now = self._clock()
+            lasted_s = self._pace.next_turn()
+            now = self._pace.now()
             state = self._transport.state(now)
             if state.status is not Status.PLAYING or self._wishes.sought_ns is not None:
                 return None
             if reach_ns < state.time_ns:
                 self._transport.move_to(reach_ns, now)
-            return min(state.time_ns, reach_ns)
+            return Passage(min(state.time_ns, reach_ns), lasted_s)
 
     def go_on_from(self, time_ns: int) -> None:
         """Play from what was just shown, which takes no time, unless somebody wants to be elsewhere."""
         with self._wished:
             if self._wishes.sought_ns is None:
-                self._transport.move_to(time_ns, self._clock())
+                self._transport.move_to(time_ns, self._pace.now())
+
+    def take_back(self, values: Values) -> Mapping[str, float | str]:
+        """Give the constants the values that they had, unless somebody wants others; what they are then."""
+        with self._wished:
+            if self._wishes.values is None:
+                self._values = values
+            return self._values
 
     def pause(self) -> State:
         """Stay here, unless somebody wants to be elsewhere."""
         with self._wished:
-            now = self._clock()
+            now = self._pace.now()
             if self._wishes.sought_ns is None:
                 self._transport.pause(now)
             return self._transport.state(now)
 
     def answer(self, tuned: Tuned) -> None:
         """Settle what was asked so far."""
-        while self._questions:
-            self._questions.popleft().settle(tuned)
+        for question in self._taken():
+            question.settle(tuned)
 
     def end(self) -> None:
         """Leave no question open, and take no more."""
         with self._wished:
             self._is_over = True
-        for question in self._questions:
-            question.answer.set_exception(UsageError(_OVER))
+        for question in self._taken():
+            question.refuse()
+
+    def _taken(self) -> list[Question]:
+        with self._wished:
+            taken, self._questions = self._questions, []
+            return taken

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
+from spatial_replay.errors import UsageError
 from spatial_replay.replay.tuning import Tuned
 
 Values = dict[str, float | str]
 """Numbers and, as texts, durations, by the names of constants."""
+
+OVER: Final = "the server is stopping"
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,10 @@ class Question:
             self.answer.set_result(self.work(tuned))
         except Exception as error:
             self.answer.set_exception(error)
+
+    def refuse(self) -> None:
+        """Say that it comes too late."""
+        self.answer.set_exception(UsageError(OVER))
 
 
 @dataclass
