@@ -28,8 +28,8 @@ def verify(log: Path, source: Path | None, decisions: bool, reading: Reading) ->
     """Compute a log's certificate again, and compare it with the one in the log.
 
     The log is evaluated with its own specifications and options. With --decisions, every decision of a
-    planner is made again from the recorded samples, with all its maps, and compared bit for bit. Exits with 0
-    if all is equal, else with 1.
+    planner is made again from the recorded samples, with all its maps, and compared bit for bit; with
+    --source, those in the source. Exits with 0 if all is equal, else with 1.
 
     \b
     Examples:
@@ -48,21 +48,23 @@ def verify(log: Path, source: Path | None, decisions: bool, reading: Reading) ->
     made_of = None if source is None else open_source(source, **reading)
     with progress("samples") as advance:
         verified = verify_certificate(own, made_of, advance)
-    faults, differences = list(verified.faults), list(verified.differences)
+    faults = list(verified.faults)
+    differences = [f"{log.name}: {each}" for each in verified.differences]
     if verified.recorded and not differences:
         click.echo(f"{log.name}: samples, messages, specifications and results are as recorded")
     if decisions:
+        planned = own if made_of is None else made_of
         with progress("samples") as advance:
-            redone = redo_decisions(own, advance)
+            redone = redo_decisions(planned, advance)
         faults += redone.faults
-        differences += redone.differences
+        differences += [f"{planned.name}: {each}" for each in redone.differences]
         if not redone.differences:
             click.echo(
-                f"{log.name}: {counted(redone.decisions, 'decision')} made again on "
+                f"{planned.name}: {counted(redone.decisions, 'decision')} made again on "
                 f"{counted(redone.maps, 'map')}, all as recorded"
             )
     for fault in dict.fromkeys(faults):
         say("warning", fault, colour="yellow")
     for difference in differences:
-        click.echo(f"{log.name}: {difference}")
+        click.echo(difference)
     return ExitCode.VIOLATED if differences else ExitCode.SATISFIED

@@ -29,6 +29,9 @@ PLAN_PATH = "/plan/path"
 METADATA = "spatial_replay"
 """The metadata record that comes first: who wrote the log, from what, with which options."""
 
+ENDING = "spatial_replay_ending"
+"""The metadata record at the end of a recording: how many samples it holds, and how it came to its end."""
+
 CERTIFICATE = "spatial_replay_certificate"
 """The metadata record that comes last: hashes of what went in and what came out."""
 

@@ -14,12 +14,14 @@ from spatial_replay.logs.reading import read_blocks
 from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_DECISION, PLAN_PATH, RECORDED_PREFIX
 from spatial_replay.planning.black_box import PLAN_METADATA, BlackBox
+from spatial_replay.planning.extent import extent_of
 from spatial_replay.planning.map_message import maps_of
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings_text import settings_from_text
-from spatial_replay.planning.step import Outcome
+from spatial_replay.planning.step import Outcome, Step
 from spatial_replay.spec import parse_specification
 from spatial_replay.trace.sample import Sample
+from spatial_replay.wording import counted
 
 _TOPICS = (PLAN_DECISION, GRADIENT_MAP, PLAN_PATH)
 
@@ -44,22 +46,30 @@ class Redone:
 def redo_decisions(source: Source, advance: Callable[[int], None] = lambda samples: None) -> Redone:
     """Make every decision of a planned run again, from its samples alone, and compare all messages' bytes.
 
-    Outcomes are the controller's, and taken from the log.
+    Outcomes are the controller's, and taken from the log. That a log to the proper end of its run tells no
+    decision after a motion, or none at all, is a difference, too.
 
     Args:
         advance: told how many more samples are done.
 
     Raises:
-        UsageError: the log holds no plan.
+        UsageError: the log holds no plan, or begins within the run.
         LogError: what the plan was made with cannot be read.
     """
-    check = _Check(BlackBox(planner_of(source)))
+    extent, check = extent_of(source), _Check(BlackBox(planner_of(source)))
     faults: list[str] = []
+    samples = 0
     for block in read_blocks(source):
         faults += block.trace.faults
         check.run(list(block.trace.samples()), list(_planned(block.messages)))
+        samples += len(block.trace)
         advance(len(block.trace))
-    return check.end(tuple(faults))
+    if not faults and extent.is_part(samples) and (extent.is_cut or check.began_within):
+        raise UsageError(
+            f"{source.name} begins within the run, and decisions rest on all samples before; verify the log "
+            "that it was made of, or name that: --source SOURCE"
+        )
+    return check.end(tuple(faults), is_whole=not faults and extent.is_whole(samples))
 
 
 def planner_of(source: Source) -> Planner:
@@ -99,7 +109,10 @@ class _Check:
     """One pass over a log."""
 
     def __init__(self, box: BlackBox) -> None:
+        self.began_within = False
         self._box = box
+        self._last: Step | None = None
+        self._is_moving = False
         self._waiting: list[tuple[int, str, bytes]] = []
         self._decisions = self._maps = 0
         self._differences: list[str] = []
@@ -113,10 +126,16 @@ class _Check:
         if samples:
             self._compare_until(samples[-1].time_ns + 1)
 
-    def end(self, faults: tuple[str, ...]) -> Redone:
-        """What came of it, with what was lost meanwhile."""
+    def end(self, faults: tuple[str, ...], *, is_whole: bool) -> Redone:
+        """What came of it, with what was lost meanwhile.
+
+        Args:
+            is_whole: the log goes on to the proper end of the run.
+        """
         if self._waiting:
             self._compare_until(self._waiting[-1][0] + 1)
+        if is_whole and not self._differences:
+            self._differences += self._what_is_missing()
         return Redone(self._decisions, self._maps, tuple(self._differences), faults)
 
     def _compare_until(self, end_ns: int) -> None:
@@ -126,12 +145,13 @@ class _Check:
         recorded = {topic: [payload for _, name, payload in ready if name == topic] for topic in _TOPICS}
         if not ready or self._differences:
             return
+        self.began_within |= self._last is None and not recorded[PLAN_DECISION]
         made: dict[str, list[bytes]] = {topic: [] for topic in _TOPICS}
         for payload in recorded[PLAN_DECISION]:
             try:
                 messages = list(self._made_again(payload))
-            except (SpatialReplayError, DecodeError) as error:
-                self._differences.append(f"at {ready[0][0]} ns: {error}")
+            except SpatialReplayError as error:
+                self._differences.append(f"at {_seconds(ready[0][0])}: {error}")
                 return
             for _, topic, own in messages:
                 made[topic].append(own)
@@ -140,25 +160,67 @@ class _Check:
 
     def _made_again(self, payload: bytes) -> Iterator[tuple[int, str, bytes]]:
         """The messages of a decision, or of the outcome that the log tells of."""
-        message = PlanDecision.FromString(payload)
-        if not message.HasField("outcome"):
-            step, messages = self._box.decide()
-            self._decisions += 1
-            self._maps += len(maps_of(step))
-            yield from _planned(messages)
+        message = _decision(payload)
+        has_ended = message.HasField("outcome")
+        if self._last is None and (has_ended or message.number):
+            self.began_within = True
+        if not has_ended:
+            yield from self._decided_again(message.number)
         elif message.kind != PlanDecision.KIND_WAIT:
             # what became of a wait comes with the decision after it
+            if not self._is_moving:
+                raise LogError(f"the log tells how decision {message.number} went, and not of the decision")
+            self._is_moving = False
             told = Outcome(message.outcome.succeeded, message.outcome.reason)
             yield from _planned(self._box.conclude(told))
 
+    def _decided_again(self, number: int) -> Iterator[tuple[int, str, bytes]]:
+        if self._is_moving and self._last is not None:
+            raise LogError(f"the log tells of decision {number}, and not how {self._last.number} went before")
+        self._last, messages = self._box.decide()
+        self._is_moving = self._last.kind == "execute"
+        self._decisions += 1
+        self._maps += len(maps_of(self._last))
+        yield from _planned(messages)
+
+    def _what_is_missing(self) -> Iterator[str]:
+        """What has to be told at the proper end of a run, and is not."""
+        if self._last is None:
+            yield "the log tells no decision, and a planned run has one at least"
+            return
+        which = f"decision {self._last.number} at {_seconds(self._last.time_ns)}"
+        if self._is_moving:
+            yield f"the log does not tell how {which} went"
+        elif not _is_final(self._last, self._box.planner):
+            yield f"the log tells nothing after {which}, which did not end the run"
+
     def _compare(self, time_ns: int, topic: str, recorded: list[bytes], made: list[bytes]) -> None:
         if len(recorded) != len(made):
-            self._differences.append(
-                f"at {time_ns} ns: {len(recorded)} messages on {topic}, made again {len(made)}"
-            )
+            messages = counted(len(recorded), "message")
+            self._differences.append(f"at {_seconds(time_ns)}: {messages} on {topic}, {len(made)} made again")
         for old, new in zip(recorded, made, strict=False):
             if old != new:
-                self._differences.append(f"at {time_ns} ns: {topic} differs{_difference(topic, old, new)}")
+                self._differences.append(
+                    f"at {_seconds(time_ns)}: {topic} differs{_difference(topic, old, new)}"
+                )
+
+
+def _decision(payload: bytes) -> PlanDecision:
+    try:
+        return PlanDecision.FromString(payload)
+    except DecodeError as error:
+        raise LogError(f"a message on {PLAN_DECISION} cannot be read") from error
+
+
+def _is_final(step: Step, planner: Planner) -> bool:
+    """Whether a decision can be the last one of a run that came to its proper end."""
+    if step.kind == "hold":
+        return planner.is_accepting or planner.is_doubtful
+    return step.kind == "no path" or (step.kind == "wait" and planner.next_step() is step)
+
+
+def _seconds(time_ns: int) -> str:
+    return f"{time_ns / 1e9:.3f} s"
 
 
 def _difference(topic: str, recorded: bytes, made: bytes) -> str:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from spatial_replay.logs.topics import ENDING
 from spatial_replay.recording.recorder import Recorder
-from spatial_replay.recording.recording import ENDING, Recording
+from spatial_replay.recording.recording import Recording
 from spatial_replay.recording.tracks import Recorded, record_source
 
 __all__ = ["ENDING", "Recorded", "Recorder", "Recording", "record_source"]

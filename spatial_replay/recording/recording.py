@@ -30,6 +30,7 @@ from spatial_replay.logs.sink import Sink
 from spatial_replay.logs.topics import (
     AUTOMATA,
     CERTIFICATE,
+    ENDING,
     METADATA,
     OBJECTS,
     RECORDED_PREFIX,
@@ -68,7 +69,7 @@ class Recording:
         self._evaluation = AnnotatedEvaluation(
             files, [find_instances(file, {}, (), 0, FOREVER) for file in files], known=known
         )
-        self._samples = 0
+        self._samples = self._end_ns = 0
         self._topics: set[str] = set()
         hashing = Hashing()
         self._sample_hash, self._message_hash = SampleHash(hashing), MessageHash(hashing)
@@ -117,6 +118,8 @@ class Recording:
             self._topics.update(channel.topic for channel in beside.channels.values())
         derived = self._evaluation.messages(trace, stretches)
         self._sink.write_messages(merge([own, *derived]))
+        if len(own):
+            self._end_ns = int(own.log_time_ns[-1])
         self._samples += len(trace)
         self._sample_hash.add(trace)
         self._message_hash.add(own)
@@ -130,15 +133,13 @@ class Recording:
             "dropped": str(dropped),
             "interrupted": json.dumps(interrupted),
         }
+        if self._samples:
+            self._sink.write_messages(self._evaluation.end(self._end_ns))
         layout = self._evaluation.layout(self._topics)
         self._sink.add_attachment(layout.name, layout.media_type, layout.data)
         self._sink.add_metadata(ENDING, ending)
         hashes = certificate(self._sample_hash, self._message_hash, self._files, self._result_hash)
         self._sink.add_metadata(CERTIFICATE, hashes)
-
-
-ENDING = "spatial_replay_ending"
-"""The metadata record at the end of a recording: how many samples it holds, and how it came to its end."""
 
 
 def _metadata(files: Sequence[Specification], about: Mapping[str, str]) -> dict[str, str]:

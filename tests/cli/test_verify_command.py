@@ -81,6 +81,18 @@ def test_decisions_that_differ_are_named(tmp_path: Path) -> None:
     assert "of decision 0" in said
 
 
+def test_decisions_are_those_of_the_source(tmp_path: Path) -> None:
+    record_plan_of(tmp_path / "run.mcap")
+    call("replay", tmp_path / "run.mcap", "-o", tmp_path / "layer.mcap", "--layer")
+    call("replay", tmp_path / "run.mcap", "-o", tmp_path / "cut.mcap", "--from", "50ms")
+    for name in ("layer.mcap", "cut.mcap"):
+        code, said = call("verify", tmp_path / name, "--decisions", "--source", tmp_path / "run.mcap")
+        assert code == 0
+        assert "run.mcap: 3 decisions made again on 9 maps" in said
+    with pytest.raises(sr.UsageError, match="begins within the run"):
+        call("verify", tmp_path / "cut.mcap", "--decisions")
+
+
 def test_decisions_are_told_step_by_step(tmp_path: Path) -> None:
     record_plan_of(tmp_path / "run.mcap", slips=1)
     code, said = call("info", tmp_path / "run.mcap", "--decisions")

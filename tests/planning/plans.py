@@ -31,13 +31,21 @@ class _Watched:
 
 
 def record_plan_of(
-    path, text=PUSHING, objects=BLOCKS, settings=PUSH, told=None, seen_as=lambda sample: sample, **options
+    path,
+    text=PUSHING,
+    objects=BLOCKS,
+    settings=PUSH,
+    told=None,
+    seen_as=lambda sample: sample,
+    most_told=None,
+    **options,
 ):
     """A planned run in a log.
 
     Args:
         told: the settings that the log tells of, if they are not those that were planned with.
         seen_as: the sample that the log holds of each sample.
+        most_told: how many decisions and outcomes the log holds, the first ones; all if it is None.
     """
     specification = replace(sr.parse_specification(text), filename="task.spatial")
     box = BlackBox(Planner(specification, settings))
@@ -46,14 +54,20 @@ def record_plan_of(
         log.add_metadata(PLAN_METADATA, {**kept, "settings": text_from_settings(told or settings)})
         table = Table(dict(objects), _Watched(box, log, seen_as), **options)
         table.look()
-        steps = []
+        steps, said = [], []
+
+        def tell(messages):
+            said.append(messages)
+            if most_told is None or len(said) <= most_told:
+                log.write_messages(messages)
+
         while not steps or steps[-1].kind in ("execute", "wait"):
             step, messages = box.decide()
-            log.write_messages(messages)
             if step in steps:
                 table.look()
                 continue
+            tell(messages)
             steps.append(step)
             if step.kind == "execute":
-                log.write_messages(box.conclude(table.execute(step)))
+                tell(box.conclude(table.execute(step)))
     return steps

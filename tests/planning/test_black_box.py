@@ -24,8 +24,9 @@ from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.settings_text import settings_from_text, text_from_settings
 from spatial_replay.planning.told import read_decisions
 from spatial_replay.planning.workspace import Grid, Workspace
-from spatial_replay.replay import run_replay
+from spatial_replay.replay import load_files, run_replay
 from spatial_replay.replay.verification import verify_certificate
+from spatial_replay.replay.window import Window
 from spatial_replay.spec import load_specification
 
 RECORDED = Path(__file__).resolve().parents[2] / "recordings" / "push.mcap"
@@ -75,6 +76,49 @@ def test_a_sample_that_was_changed_shows(tmp_path):
 
     record_plan_of(tmp_path / "run.mcap", seen_as=seen_as)
     assert redo_decisions(open_source(tmp_path / "run.mcap")).differences
+
+
+@pytest.mark.parametrize(
+    ("most_told", "missing"),
+    [
+        (0, "the log tells no decision"),
+        (1, "the log does not tell how decision 0 at 0.000 s went"),
+        (2, "the log tells nothing after decision 0 at 0.000 s"),
+        (3, "the log does not tell how decision 1 at 0.100 s went"),
+        (4, "the log tells nothing after decision 1 at 0.100 s"),
+    ],
+)
+def test_decisions_that_are_not_told_show(tmp_path, most_told, missing):
+    record_plan_of(tmp_path / "run.mcap", most_told=most_told)
+    (difference,) = redo_decisions(open_source(tmp_path / "run.mcap")).differences
+    assert difference.startswith(missing)
+
+
+def test_a_wait_whose_end_is_not_told_shows(tmp_path):
+    text = "F[30,900] (green rightof red)"
+    record_plan_of(tmp_path / "run.mcap", f"use spatial_spec\nspec late = {text}", most_told=1)
+    (difference,) = redo_decisions(open_source(tmp_path / "run.mcap")).differences
+    assert difference.startswith("the log tells nothing after decision 0")
+
+
+def cut(log, to, window):
+    """Copy some samples of a log."""
+    source = open_source(log)
+    run_replay(source, load_files((), source), output=to, window=window)
+
+
+def test_what_is_left_of_a_run_is_enough_if_it_is_the_beginning(tmp_path):
+    record_plan_of(tmp_path / "run.mcap", slips=1)
+    first, second, *_ = read_decisions(tmp_path / "run.mcap").decisions
+    cut(tmp_path / "run.mcap", tmp_path / "begun.mcap", Window(end_ns=second.time_ns + 1))
+    redone = redo_decisions(open_source(tmp_path / "begun.mcap"))
+    assert redone.differences == ()
+    assert redone.decisions == second.number + 1
+    cut(tmp_path / "run.mcap", tmp_path / "cut.mcap", Window(start_ns=first.time_ns + 1))
+    cut(tmp_path / "cut.mcap", tmp_path / "copy.mcap", Window())
+    for name in ("cut.mcap", "copy.mcap"):
+        with pytest.raises(UsageError, match=f"{name} begins within the run"):
+            redo_decisions(open_source(tmp_path / name))
 
 
 def test_a_replay_keeps_what_was_decided(tmp_path):
