@@ -161,7 +161,7 @@ class Planner:
     def conclude(self, outcome: Outcome) -> None:
         """Say how the execution of the last step went, once its samples were observed.
 
-        A place where an object could not be brought is avoided when the same edge is tried again.
+        A place where an object could not be brought is avoided when the same progress is tried for again.
 
         Raises:
             UsageError: what is no outcome, or no step is being executed.
