@@ -23,11 +23,13 @@ class Explanation:
     """Why one node has its verdict.
 
     Attributes:
+        time_ns: of the sample that decides.
         sentences: in words.
         document: as a value that JSON can hold.
     """
 
     verdict: Verdict
+    time_ns: int
     sentences: tuple[str, ...]
     document: Mapping[str, Any]
 
@@ -93,7 +95,7 @@ def explanation_of(
         "may_change": is_open,
         "explanation": list(sentences),
     }
-    return Explanation(witness.verdict, sentences, document)
+    return Explanation(witness.verdict, witness.time_ns, sentences, document)
 
 
 def _since(value: Floats, lower: Floats, upper: Floats) -> int | None:

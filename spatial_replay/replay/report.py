@@ -15,7 +15,7 @@ from spatial_replay.logs.source import Source
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.replay.annotated import check_parameters
 from spatial_replay.replay.explanation import explanation_of
-from spatial_replay.replay.found import Replayed, ReplayedSpec
+from spatial_replay.replay.found import Replayed
 from spatial_replay.replay.replay import Replay
 from spatial_replay.replay.window import Window
 from spatial_replay.spec.formula import Specification
@@ -88,6 +88,7 @@ def _results(replay: Replay, replayed: Replayed, collector: Collector) -> Iterat
     for index, result in enumerate(replayed.results):
         tree, kept = replay.trees[index], replay.automata[index]
         unseen = np.empty((len(result.robustness), 4, 0))
+        why = explanation_of(result, first_ns=replayed.first_ns) if index in explained else None
         yield ReportedResult(
             name=result.name,
             object=result.object,
@@ -99,7 +100,8 @@ def _results(replay: Replay, replayed: Replayed, collector: Collector) -> Iterat
             first_satisfied_ns=result.first_satisfied_ns,
             times_ns=np.empty(0, np.int64) if result.times_ns is None else result.times_ns,
             series=unseen if result.series is None else result.series,
-            sentences=_sentences(result, replayed.first_ns) if index in explained else (),
+            sentences=() if why is None else why.sentences,
+            decided_ns=None if why is None else why.time_ns,
             automaton=kept.automaton,
             no_automaton=kept.reason,
             path=collector.path(tree.name, tree.object),
@@ -111,7 +113,3 @@ def _explained(replayed: Replayed) -> frozenset[int]:
     if replayed.semantics != "ltlf":
         return frozenset()
     return frozenset(worst_results([result.verdict for result in replayed.results]))
-
-
-def _sentences(result: ReplayedSpec, first_ns: int) -> tuple[str, ...]:
-    return explanation_of(result, first_ns=first_ns).sentences

@@ -131,8 +131,18 @@ def colour_of(page: Page, locator: Locator) -> str:
     return str(locator.evaluate("each => getComputedStyle(each).color"))
 
 
-def test_the_run_is_first_shown_as_it_ended(open_page: Open) -> None:
+def test_the_run_is_first_shown_where_it_went_wrong(open_page: Open) -> None:
     page = open_page("violated")
+    expect(readout(page)).to_have_text("4.000 s / 9.967 s")
+    expect(page.locator(".caption")).to_contain_text("fails by")
+    page = open_page("violated", at="#t=2")
+    expect(readout(page)).to_have_text("2.000 s / 9.967 s")
+    expect(readout(open_page("satisfied"))).to_have_text("9.967 s / 9.967 s")
+
+
+def test_when_the_run_has_ended_the_tree_tells_verdicts(open_page: Open) -> None:
+    page = open_page("violated")
+    page.keyboard.press("End")
     expect(readout(page)).to_have_text("9.967 s / 9.967 s")
     expect(row(page, "laid").locator(".mark")).to_have_class("mark is-violated")
     expect(row(page, "served").locator(".mark")).to_have_class("mark is-satisfied")
@@ -140,7 +150,7 @@ def test_the_run_is_first_shown_as_it_ended(open_page: Open) -> None:
 
 
 def test_the_tree_shows_how_things_stand_at_the_cursor(open_page: Open) -> None:
-    page = open_page("violated")
+    page = open_page("violated", at="#t=9")
     mark = row(page, "plate_first").locator(".mark")
     satisfied = colour_of(page, mark)
     page.keyboard.press("Home")
@@ -172,7 +182,7 @@ def test_what_is_violated_is_explained_at_once(open_page: Open) -> None:
 
 
 def test_a_time_in_an_explanation_leads_there(open_page: Open) -> None:
-    page = open_page("violated")
+    page = open_page("violated", at="#t=9")
     page.locator(".verdict").first.get_by_role("button", name="4.000 s").click()
     expect(readout(page)).to_have_text("4.000 s / 9.967 s")
     expect(page.locator("#tree .which")).to_contain_text("table_set at 4.000 s")
@@ -340,6 +350,7 @@ def test_each_object_of_a_template_can_be_looked_into(open_page: Open) -> None:
     expect(page.locator("button.lane-name")).to_have_count(6)
     page.locator(".lane-name", has_text="calm(p0)").click()
     # it left long before the run ended, and stands as it did then
+    page.keyboard.press("End")
     expect(page.locator("#tree .which")).to_contain_text("calm(p0)")
     expect(page.locator(".tree .row .number").nth(1)).to_have_text("")
     page.keyboard.press("Home")

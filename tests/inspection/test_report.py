@@ -291,6 +291,20 @@ def test_a_large_run_keeps_less_and_says_so(tmp_path: Path) -> None:
     assert page.within("section#verdicts").count("robustness") >= 60
 
 
+def test_the_sample_that_made_a_result_violated_is_kept(tmp_path: Path) -> None:
+    parts = " and ".join(f"(a dist b >= {k / 1000})" for k in range(100))
+    page = report_of_trace(
+        tmp_path / "run.html", two_discs(12_000), f"spec s = G ({parts} and a dist b >= 0.5)"
+    )
+    (result,) = page.facts["results"]
+    times = page.numbers(page.facts["times"])
+    assert len(times) < 12_000
+    assert result["fault"] in times
+    assert f"at {result['fault']:.3f} s" in page.within("section#verdicts")
+    satisfied = report_of_trace(tmp_path / "run.html", two_discs(9), "spec s = G (a dist b >= 0)")
+    assert satisfied.facts["results"][0]["fault"] is None
+
+
 def test_of_a_large_tree_the_uppermost_nodes_are_shown(tmp_path: Path) -> None:
     deep = " and ".join(f"(F (a dist b >= {k}) or G (a dist b <= {k}))" for k in range(150))
     page = report_of_samples(tmp_path / "run.html", moving(3), f"spec s = {deep}")

@@ -34,6 +34,7 @@ class ReportedResult:
         first_satisfied_ns: the first sample with a value of at least 0, or None.
         times_ns, series: (T,) and (N, 4, T): value, now, lower, upper of each node.
         sentences: why its verdict is what it is; none where that was not asked.
+        decided_ns: the sample that decided that; None where that was not asked.
         automaton: None if it has none.
         no_automaton: why not.
         path: where the run is in it.
@@ -50,6 +51,7 @@ class ReportedResult:
     times_ns: Integers
     series: Floats
     sentences: tuple[str, ...]
+    decided_ns: int | None
     automaton: Automaton | None
     no_automaton: str
     path: StatePath
@@ -57,6 +59,11 @@ class ReportedResult:
     @property
     def title(self) -> str:
         return self.name if self.object is None else f"{self.name}({self.object})"
+
+    @property
+    def fault_ns(self) -> int | None:
+        """The sample that made it violated, or unknown."""
+        return None if self.verdict is Verdict.SATISFIED else self.decided_ns
 
     @property
     def robustness_text(self) -> str:

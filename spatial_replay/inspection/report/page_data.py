@@ -53,7 +53,9 @@ def page_data(report: Report) -> PageData:
         np.concatenate([report.film.times_ns, *(result.times_ns for result in drawn)]).astype(np.int64)
     )
     curves = [_curves(each) for each in drawn if len(each.times_ns)]
-    kept = times_ns[kept_samples(times_ns, curves, _room(drawn, len(times_ns)))]
+    faults_ns = [each.fault_ns for each in drawn if each.fault_ns is not None]
+    room = _room(drawn, len(times_ns)) - len(faults_ns)
+    kept = np.union1d(times_ns[kept_samples(times_ns, curves, room)], np.array(faults_ns, np.int64))
     plan = plan_value(report.plan, report.first_ns, packing)
     facts = {
         "settles": report.semantics == "ltlf",
@@ -65,7 +67,7 @@ def page_data(report: Report) -> PageData:
             # without those of the signs
             "curves": CURVES[2:],
         },
-        "results": [_result_value(each, kept, packing) for each in drawn],
+        "results": [_result_value(each, kept, report.first_ns, packing) for each in drawn],
         "film": film_value(report.film, report.first_ns, packing),
         "events": event_values(report.events, report.first_ns),
         "decisions": plan["decisions"],
@@ -84,7 +86,9 @@ def _curves(result: ReportedResult) -> Curves:
     return Curves(result.times_ns, result.series[list(named_nodes(result.formula))])
 
 
-def _result_value(result: ReportedResult, kept: Integers, packing: Packing) -> Mapping[str, Any]:
+def _result_value(
+    result: ReportedResult, kept: Integers, first_ns: int, packing: Packing
+) -> Mapping[str, Any]:
     samples = np.flatnonzero(np.isin(result.times_ns, kept))
     here = result.times_ns[samples]
     series = series_of(result.series, result.formula, samples)
@@ -93,6 +97,7 @@ def _result_value(result: ReportedResult, kept: Integers, packing: Packing) -> M
         "name": result.name,
         "object": result.object,
         "verdict": str(result.verdict),
+        "fault": None if result.fault_ns is None else (result.fault_ns - first_ns) / 1e9,
         "first": int(np.searchsorted(kept, here[0])) if len(here) else 0,
         "samples": len(here),
         "nodes": tree_value(result.formula, result.robustness, result.final, result.relations),

@@ -6,10 +6,10 @@ class Clock {
     this.times = run.times;
     this.start = run.times.length ? run.times[0] : 0;
     this.end = run.times.length ? run.times[run.times.length - 1] : 0;
-    this.time = this.end;
     this.view = [this.start, this.end];
     this.worst = worstOf(run.results);
     this.result = this.worst;
+    this.time = this.opening;
     this.speed = 1;
     this.isPlaying = false;
     this.watchers = {time: [], view: [], result: [], play: []};
@@ -27,6 +27,11 @@ class Clock {
 
   get sample() {
     return indexAt(this.times, this.time);
+  }
+
+  // The time at which the chosen result is first shown: where it went wrong, or the end.
+  get opening() {
+    return this.run.results[this.result]?.fault ?? this.end;
   }
 
   get isAtEnd() {
@@ -119,7 +124,8 @@ function worstOf(results) {
 function keepInAddress(clock) {
   const given = new URLSearchParams(location.hash.slice(1));
   if (given.has("r")) clock.choose(Number(given.get("r")));
-  if (given.has("t") && Number.isFinite(Number(given.get("t")))) clock.seek(Number(given.get("t")));
+  const time = given.has("t") ? Number(given.get("t")) : NaN;
+  clock.seek(Number.isFinite(time) ? time : clock.opening);
   let waiting = null, before = [clock.time, clock.result];
   const write = () => {
     waiting = null;
