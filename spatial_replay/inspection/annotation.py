@@ -8,6 +8,7 @@ from functools import cached_property, partial
 from pathlib import PurePath
 
 from spatial_replay.errors import SpecificationError
+from spatial_replay.geometry.arrays import Floats
 from spatial_replay.inspection.annotator import Annotator
 from spatial_replay.inspection.automata import (
     KeptAutomaton,
@@ -19,6 +20,7 @@ from spatial_replay.inspection.scene import SceneState
 from spatial_replay.inspection.specification import reported_trees
 from spatial_replay.inspection.viewer import layout_attachment
 from spatial_replay.logs.block import Messages
+from spatial_replay.logs.merging import merge
 from spatial_replay.logs.sink import Attachment
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.semantics import Semantics, instance_evaluation
@@ -72,8 +74,21 @@ class AnnotatedEvaluation:
         """What to write beside samples, from the stretches that `extend` gave for them."""
         return self._annotator.messages(trace, stretches)
 
+    @property
+    def finals(self) -> list[Floats]:
+        """For each of `trees` (N, 2), lower and upper end of each node's value if the log ends here."""
+        return [stream.final for stream in self.streams]
+
+    def end(self, time_ns: int) -> Messages:
+        """What to write after everything else of a log.
+
+        Args:
+            time_ns: that of its last sample or message, whichever is later.
+        """
+        return merge(self._annotator.end(time_ns, self.finals))
+
     def layout(self, beside: Collection[str] = ()) -> Attachment:
-        """How to open the log in a viewer, once all samples are written.
+        """How to open the log in a viewer, once everything else is written.
 
         Args:
             beside: topics of messages of others in it.

@@ -9,7 +9,7 @@ from foxglove_schemas_protobuf.Event_pb2 import Event
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-from spatial_replay.geometry.arrays import Integers
+from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.inspection.automata import KeptAutomaton
 from spatial_replay.inspection.automaton import AutomatonRun
 from spatial_replay.inspection.events import EventTeller, Told
@@ -117,13 +117,28 @@ class Annotator:
                 run.pass_over(stretch)
         return self._events(self._told(stretches))
 
+    def end(self, time_ns: int, finals: Sequence[Floats]) -> list[Messages]:
+        """What to write when the samples have ended: the verdicts that samples after them could have changed.
+
+        Args:
+            time_ns: when the log ends, the last sample's time or later.
+            finals: for each tree, (N, 2), lower and upper end of each node's value over the finished log.
+        """
+        return self._events(
+            [
+                each
+                for teller, final in zip(self._tellers, finals, strict=True)
+                for each in teller.end(time_ns, final)
+            ]
+        )
+
     def specification(self) -> bytes:
         """The message that says what was evaluated."""
         propositions = [() if run is None else run.propositions for run in self._runs]
         return encode_specification(self._files, self._trees, propositions=propositions)
 
     def contents(self, beside: Collection[str] = ()) -> Contents:
-        """What there is to be shown, once all samples are written.
+        """What there is to be shown, once everything else is written.
 
         Args:
             beside: topics of messages of others in the log.

@@ -57,7 +57,7 @@ def leaves_below(formula: Formula, leaves: Sequence[Formula]) -> list[LeavesBelo
         if isinstance(node, Atom | Quantified):
             found[identifier] = {(numbers[_key(node)], 1): None}
         for place, operand in enumerate(operands[identifier]):
-            for sign in _signs(node, place):
+            for sign in signs_of(node, place):
                 found[identifier].update(dict.fromkeys((leaf, own * sign) for leaf, own in found[operand]))
     return [_columns(list(each)) for each in found]
 
@@ -85,7 +85,7 @@ def _columns(entries: Sequence[tuple[int, int]]) -> LeavesBelow:
     return LeavesBelow(pairs[:, 0], pairs[:, 1].astype(np.float64))
 
 
-def _signs(node: Formula, operand: int) -> tuple[int, ...]:
+def signs_of(node: Formula, operand: int) -> tuple[int, ...]:
     """In which signs an operand's number can become that of the node."""
     match node:
         case Boolean(operator="not"):

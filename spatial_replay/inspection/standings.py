@@ -83,6 +83,16 @@ class Standings:
         """Whether no node can change any more."""
         return bool((self.integers[:, _CODE] >= SATISFIED).all())
 
+    @property
+    def pending(self) -> list[int]:
+        """The nodes that can still change."""
+        return np.flatnonzero(self.integers[:, _CODE] < SATISFIED).tolist()
+
+    def period(self, node: int) -> Period:
+        """How a node stands, up to the last sample at which it stood so; its worst is carried."""
+        code, since, until = self.integers[node, [_CODE, _SINCE, _UNTIL]].tolist()
+        return Period(code, since, until, float(self.worst[node, 0]), OF_STANDING)
+
 
 class Followed(NamedTuple):
     """What a stretch did to some nodes.

@@ -16,6 +16,12 @@ def merge(streams: Sequence[Messages]) -> Messages:
     Numbers of channels mean nothing outside their log, so channels are ordered by what they are: the same
     messages come out in the same order from whichever log they were read.
     """
+    joined = join(streams)
+    return select(joined, np.lexsort((joined.sequence, joined.channel, joined.log_time_ns)))
+
+
+def join(streams: Sequence[Messages]) -> Messages:
+    """All messages, one stream after the other."""
     channels = sorted(
         {
             (_rank(channel), id(channel)): channel
@@ -29,19 +35,13 @@ def merge(streams: Sequence[Messages]) -> Messages:
         if not merged or _rank(merged[len(merged) - 1]) != rank:
             merged[len(merged)] = channel
         number[identity] = len(merged) - 1
-    numbers = _joined([_renumbered(stream, number) for stream in streams])
-    sequence = _joined([stream.sequence for stream in streams])
-    log_time_ns = _joined([stream.log_time_ns for stream in streams])
-    publish_time_ns = _joined([stream.publish_time_ns for stream in streams])
-    payloads = [payload for stream in streams for payload in stream.payloads]
-    order = np.lexsort((sequence, numbers, log_time_ns))
     return Messages(
         channels=merged,
-        channel=numbers[order],
-        sequence=sequence[order],
-        log_time_ns=log_time_ns[order],
-        publish_time_ns=publish_time_ns[order],
-        payloads=[payloads[index] for index in order.tolist()],
+        channel=_joined([_renumbered(stream, number) for stream in streams]),
+        sequence=_joined([stream.sequence for stream in streams]),
+        log_time_ns=_joined([stream.log_time_ns for stream in streams]),
+        publish_time_ns=_joined([stream.publish_time_ns for stream in streams]),
+        payloads=[payload for stream in streams for payload in stream.payloads],
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from spatial_replay.inspection.scene import SceneState
 from spatial_replay.logs.block import Channel, Messages
-from spatial_replay.logs.merging import merge, select
+from spatial_replay.logs.merging import join, merge, select
 from spatial_replay.replay.own_messages import Reading, standing
 from spatial_replay.replay.tuning import Tuned
 
@@ -31,20 +31,21 @@ class Playback:
 
     Attributes:
         tuned: what an evaluation says; another one of the same log may take its place before a `seek`.
-        start_ns, end_ns: the first and the last time that there is something at.
+        start_ns, end_ns: from the first sample to the last sample or message of the log.
         time_ns: up to where messages were taken, that included.
     """
 
     def __init__(self, tuned: Tuned) -> None:
         """Begin before the first message; `seek` first."""
         own = tuned.tuning.own
-        self.start_ns, self.end_ns = own.start_ns, own.end_ns
+        self._times_ns = tuned.tuning.inside.times_ns
+        self.start_ns, self.end_ns = int(self._times_ns[0]), own.end_ns
         self.time_ns = self.start_ns
         self.tuned = tuned
-        self._times_ns = tuned.tuning.inside.times_ns
         self._annotator = tuned.annotator(SceneState(scale=_scale(tuned)))
         self._reading = Reading(own, self.start_ns)
         self._next = 0
+        self._has_ended = False
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -67,10 +68,11 @@ class Playback:
         self._next = int(np.searchsorted(self._times_ns, self.time_ns, side="right"))
         shown = max(self._next - 1, 0)
         self._annotator = self.tuned.annotator(replace(self._annotator.scene, written_ns=None))
-        told = merge(self._annotator.pass_over(*self.tuned.part(0, shown)))
-        last = select(told, np.arange(max(0, len(told) - _MOST_EVENTS), len(told)))
+        self._has_ended = False
+        told = _last(merge(self._annotator.pass_over(*self.tuned.part(0, shown))))
         derived = self._annotator.messages(*self.tuned.part(shown, self._next))
-        return merge([last, *derived, self._seek_own(int(self._times_ns[shown]))])
+        found = merge([told, *derived, self._seek_own(int(self._times_ns[shown]))])
+        return join([found, _last(self._end())])
 
     def advance_to(self, time_ns: int) -> Messages:
         """What comes after the messages taken so far, up to a time, that included.
@@ -82,20 +84,32 @@ class Playback:
         begin = self._next
         self._next = int(np.searchsorted(self._times_ns, self.time_ns, side="right"))
         derived = self._annotator.messages(*self.tuned.part(begin, self._next))
-        return merge([*derived, self._reading.take_before(self.time_ns + 1)])
+        coming = merge([*derived, self._reading.take_before(self.time_ns + 1)])
+        return join([coming, self._end()])
 
     def reach_ns(self, samples: int) -> int:
         """The time of the sample that comes so many after the last one taken, or the end."""
         index = self._next + samples - 1
         return int(self._times_ns[index]) if index < len(self._times_ns) else self.end_ns
 
+    def _end(self) -> Messages:
+        """What comes last of all, if that was not taken yet and the end is reached."""
+        if self._has_ended or self.time_ns < self.end_ns:
+            return Messages()
+        self._has_ended = True
+        return merge(self._annotator.end(self.end_ns, self.tuned.evaluation.finals))
+
     def _seek_own(self, sample_ns: int) -> Messages:
         """The log's own messages that stand at the present time, and those at that time."""
         own = self.tuned.tuning.own
-        since_ns = max(min(self.time_ns - _STANDS_NS, sample_ns), self.start_ns)
+        since_ns = max(min(self.time_ns - _STANDS_NS, sample_ns), own.start_ns)
         self._reading = Reading(own, since_ns)
         found = merge([own.few_before(since_ns), self._reading.take_before(self.time_ns + 1)])
         return standing(found, self.time_ns)
+
+
+def _last(told: Messages) -> Messages:
+    return select(told, np.arange(max(0, len(told) - _MOST_EVENTS), len(told)))
 
 
 def _scale(tuned: Tuned) -> float | None:

@@ -78,11 +78,13 @@ class Replay:
         self._topics: set[str] = set()
         self._names: set[str] = set()
         self._signals: set[str] = set()
-        self._samples = self._unreadable = self._encoded = 0
+        self._samples = self._unreadable = self._encoded = self._end_ns = 0
         self._times: list[int] = []
 
     def iter_messages(self, *, annotate: bool = False, layer: bool = False) -> Iterator[tuple[Messages, int]]:
         """Evaluate the whole source, yielding for each block what an annotated log holds, and its samples.
+
+        What the end of the log brings comes last, with no samples.
 
         Args:
             annotate: yield messages; without it, nothing.
@@ -100,6 +102,8 @@ class Replay:
             derived = self._evaluation.messages(inside, stretches) if annotate else []
             written = [*derived, *([] if layer else [own])]
             yield (merge(written) if annotate else Messages()), len(inside)
+        if annotate and self._samples:
+            yield self._evaluation.end(self._end_ns), 0
 
     def result(self) -> Replayed:
         """What was found, once all of `iter_messages` was taken.
@@ -156,6 +160,8 @@ class Replay:
         self._unreadable += trace.unreadable_count
         if len(trace):
             self._times = [*self._times[:1], int(trace.times_ns[0]), int(trace.times_ns[-1])]
+        if len(own):
+            self._end_ns = max(self._end_ns, int(own.log_time_ns[-1]))
         self._sample_hash.add(trace)
         self._message_hash.add(own)
         for index, stretch in enumerate(stretches):

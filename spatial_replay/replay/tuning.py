@@ -237,6 +237,7 @@ class Tuned:
         annotator = self.annotator()
         annotator.messages(*self.part(0, 1))
         annotator.pass_over(*self.part(1, len(self.tuning.inside)))
+        annotator.end(self.tuning.own.end_ns, self.evaluation.finals)
         return live_layout_attachment(annotator.contents({each.topic for each in self.tuning.own.channels}))
 
     def annotator(self, scene: SceneState | None = None) -> Annotator:

@@ -13,25 +13,36 @@ from mcap.records import Message
 
 import spatial_replay as sr
 from spatial_replay.logs.source import MemorySource
-from spatial_replay.replay import run_replay
+from spatial_replay.replay import Window, run_replay
 
 STEP_NS = 10**8
 
 
-def told(
-    tmp_path: Path, text: str, *charges: float | None, **options: object
-) -> list[tuple[int, Event, Log]]:
-    """The events and sentences of a run of batteries, with the number of the sample they are logged at."""
-    samples = [
+Found = list[tuple[int, Event, Log]]
+END = "for the log has ended"
+
+
+def told(tmp_path: Path, text: str, *charges: float | None, **options: object) -> Found:
+    """The events and sentences of a run of batteries, with the number of the sample they are logged at, but
+    for what its end brings."""
+    found = written(tmp_path, text, batteries(*charges), **options)
+    return [each for each in found if END not in each[2].message]
+
+
+def told_at_end(tmp_path: Path, text: str, *charges: float | None, **options: object) -> Found:
+    """What the end of such a run brings."""
+    found = written(tmp_path, text, batteries(*charges), **options)
+    return [each for each in found if END in each[2].message]
+
+
+def batteries(*charges: float | None) -> list[sr.Sample]:
+    return [
         sr.Sample(10**9 + t * STEP_NS, {}, {} if charge is None else {"battery": charge})
         for t, charge in enumerate(charges)
     ]
-    return written(tmp_path, text, samples, **options)
 
 
-def written(
-    tmp_path: Path, text: str, samples: list[sr.Sample], **options: object
-) -> list[tuple[int, Event, Log]]:
+def written(tmp_path: Path, text: str, samples: list[sr.Sample], **options: object) -> Found:
     output = tmp_path / "annotated.mcap"
     files = [sr.parse_specification(text, filename="battery.spatial")]
     run_replay(MemorySource.from_samples(samples), files, output=output, **options)
@@ -133,7 +144,7 @@ def test_a_template_says_for_whom(tmp_path):
         for t in range(6)
     ]
     found = written(tmp_path, "spec near(x) = G x closeto[2] a", samples, each={"x": "all"})
-    [(_, event, line)] = found
+    [(_, event, line)] = [each for each in found if END not in each[2].message]
     assert facts(event)["object"] == "b"
     assert line.message.startswith("`near` for b is violated, whatever comes: `b closeto[2] a` fails by 1.")
 
@@ -157,3 +168,96 @@ def test_events_come_in_the_order_of_time(tmp_path, semantics):
     numbers = [number for number, *_ in told(tmp_path, text, *charges, semantics=semantics)]
     assert len(numbers) >= 5
     assert all(first <= second for first, second in pairwise(numbers))
+
+
+def test_what_is_pending_is_decided_by_the_end(tmp_path):
+    charges = [-3.0, -1.0, -2.0, -5.0]
+    [(number, event, line)] = told_at_end(tmp_path, "spec full = F battery >= 0", *charges)
+    assert number == 3
+    assert event.start_time == event.end_time == line.timestamp
+    assert line.timestamp.ToNanoseconds() == 10**9 + 3 * STEP_NS
+    assert facts(event) == {
+        "specification": "full",
+        "node": "0",
+        "name": "full",
+        "verdict": "violated",
+        "sign": "negative",
+        "robustness": "-1.0",
+        "witness": "`battery >= 0` fails by 1",
+        "verdict_before": "pending",
+        "sign_before": "negative",
+        "robustness_before": "-3.0",
+        "witness_before": "`battery >= 0` failed by 3",
+        "start_ns_before": "1000000000",
+        "end_ns_before": "1300000000",
+        "message": line.message,
+    }
+    assert line.message == (
+        "`full` is violated, for the log has ended: `battery >= 0` fails by 1. "
+        "Before, it failed for 0.300 s; its worst was that `battery >= 0` failed by 3."
+    )
+    assert (line.level, line.name, line.file, line.line) == (Log.ERROR, "full", "battery.spatial", 1)
+
+
+def test_what_no_sample_could_change_is_not_told_again_at_the_end(tmp_path):
+    text = "spec full = F battery >= 5\nspec kept = G battery >= 0\nspec both = full or kept"
+    assert [line.message for *_, line in told_at_end(tmp_path, text, 1.0, 6.0, 2.0)] == [
+        "`kept` in `both` is satisfied, for the log has ended: `battery >= 0` holds by 1. "
+        "Before, it held for 0.200 s; its worst was that `battery >= 0` held by 1."
+    ]
+
+
+def test_the_end_finds_the_witness_in_whichever_part_decides(tmp_path):
+    text = "spec both = not F battery >= 5 and (G battery >= -4 or F (battery <= -8 and F battery >= 9))"
+    [(_, event, _)] = told_at_end(tmp_path, text, 1.0, 3.0, -2.0, 4.0, 0.0)
+    assert facts(event)["robustness"] == "1.0"
+    assert facts(event)["witness"] == "`battery >= 5` fails by 1"
+
+
+def test_without_a_witness_the_end_tells_the_number(tmp_path):
+    # the first sample decides; that it does is known from the second one on
+    text = "spec later = F (battery <= 2 and F battery >= 8)"
+    [(_, event, line)] = told_at_end(tmp_path, text, 3.0, 9.0, 9.0)
+    assert "witness" not in facts(event)
+    assert line.message.startswith("`later` is violated by 1, for the log has ended. Before, ")
+
+
+def test_what_stays_unknown_is_said_at_the_end(tmp_path):
+    [(number, event, line)] = told_at_end(tmp_path, "spec kept = G battery >= 0", 1.0, None, 2.0)
+    assert number == 2
+    assert facts(event)["verdict"] == "unknown"
+    assert not {"sign", "robustness", "witness"} & set(facts(event))
+    assert line.level == Log.WARNING
+    assert line.message.startswith("`kept` is unknown, for the log has ended: robustness between -inf and 1.")
+
+
+def test_a_run_of_one_sample_has_nothing_before_its_end(tmp_path):
+    [(_, event, line)] = told_at_end(tmp_path, "spec full = F battery >= 0", -1.0)
+    assert not any(key.endswith("_before") for key in facts(event))
+    assert line.message == "`full` is violated, for the log has ended: `battery >= 0` fails by 1."
+
+
+def test_under_the_paper_semantics_the_end_tells_every_verdict(tmp_path):
+    text = "spec kept = G battery >= 0\nspec full = F battery >= 3"
+    found = told_at_end(tmp_path, text, 2.0, -1.0, 1.0, semantics="paper")
+    assert [facts(event)["verdict"] for _, event, _ in found] == ["violated", "violated"]
+    assert [facts(event)["witness"] for _, event, _ in found] == [
+        "`battery >= 0` fails by 1",
+        "`battery >= 3` fails by 1",
+    ]
+
+
+def test_the_end_of_a_window_is_an_end(tmp_path):
+    window = Window(end_ns=10**9 + 3 * STEP_NS)
+    [(number, *_)] = told_at_end(tmp_path, "spec full = F battery >= 5", *range(6), window=window)
+    assert number == 2
+
+
+def test_the_verdict_of_an_object_that_left_is_told_at_the_end_and_is_of_its_time(tmp_path):
+    box = sr.Footprint.box(0, 0, 1, 1)
+    samples = [sr.Sample(10**9 + t * STEP_NS, {"a": box, **({"b": box} if t < 3 else {})}) for t in range(6)]
+    found = written(tmp_path, "spec away(x) = F not x closeto[2] a", samples, each={"x": "all"})
+    [(number, event, line)] = [each for each in found if facts(each[1]).get("object") == "b"]
+    assert number == 5
+    assert event.end_time.ToNanoseconds() == 10**9 + 2 * STEP_NS
+    assert line.message.startswith("`away` for b is violated, for the log has ended: ")

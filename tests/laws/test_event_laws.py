@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -11,10 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laws.strategies_monitor import Recording, cuts, recordings, specifications
+from spatial_replay.errors import UsageError
 from spatial_replay.inspection.events import EventTeller, Told
 from spatial_replay.inspection.specification import reported_trees
 from spatial_replay.inspection.standings import LASTING, SATISFIED, START, Standings, follow
+from spatial_replay.monitor.evaluation import evaluate
 from spatial_replay.monitor.instances import find_instances
+from spatial_replay.monitor.semantics import Semantics, checked_semantics, instance_evaluation
 from spatial_replay.monitor.stream import EvaluationStream
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.specification import parse_specification
@@ -78,14 +83,21 @@ def test_a_verdict_counts_at_once_and_a_sign_when_it_lasts(series: np.ndarray, d
     assert found == _told(series)
 
 
-def _all_told(spec: Specification, recording: Recording, ends: list[int]) -> list[Told]:
+def _choices(spec: Specification) -> dict[str, str]:
+    return {one.parameter: "all" for one in spec.results if one.parameter is not None}
+
+
+def _all_told(
+    spec: Specification, recording: Recording, ends: list[int], semantics: Semantics = "ltlf"
+) -> list[Told]:
+    """What is told of each result, one after the other, its end included."""
     trace = recording.trace()
-    each = {one.parameter: "all" for one in spec.results if one.parameter is not None}
-    instances = find_instances(spec, each, [trace], 0, 2**63 - 1)
-    evaluation = EvaluationStream(instances, spec.regions)
+    instances = find_instances(spec, _choices(spec), [trace], 0, 2**63 - 1)
+    begin_one = partial(instance_evaluation, semantics=semantics)
+    evaluation = EvaluationStream(instances, spec.regions, begin_one)
     trees = reported_trees([spec], [instances])
     tellers = [
-        EventTeller(tree, stream.instance, spec)
+        EventTeller(tree, stream.instance, spec, semantics)
         for tree, stream in zip(trees, evaluation.streams, strict=True)
     ]
     told: list[list[Told]] = [[] for _ in tellers]
@@ -94,7 +106,14 @@ def _all_told(spec: Specification, recording: Recording, ends: list[int]) -> lis
             told, tellers, evaluation.extend(trace.slice(begin, end)), strict=True
         ):
             own += teller.tell(stretch)
+    last_ns = int(trace.times_ns[-1])
+    for own, teller, stream in zip(told, tellers, evaluation.streams, strict=True):
+        own += teller.end(last_ns, stream.final)
     return [one for own in told for one in sorted(own, key=lambda each: each.time_ns)]
+
+
+def _facts(told: Told) -> dict[str, str]:
+    return {pair.key: pair.value for pair in Event.FromString(told.event).metadata}
 
 
 @settings(max_examples=60)
@@ -108,11 +127,26 @@ def test_how_a_run_is_cut_changes_no_event(
     assert _all_told(spec, recording, data.draw(cuts(count))) == whole
 
 
+@settings(max_examples=60)
+@given(specifications(), recordings(max_size=12), st.sampled_from(["ltlf", "paper"]))
+def test_what_is_told_last_of_a_result_is_its_verdict(
+    spec: Specification, recording: Recording, semantics: Semantics
+) -> None:
+    with contextlib.suppress(UsageError):
+        checked_semantics(semantics, [spec])
+        result = evaluate(spec, recording.trace(), each=_choices(spec), semantics=semantics)
+        told = map(_facts, _all_told(spec, recording, [0, len(recording.trace())], semantics))
+        last = {(each["name"], each.get("object")): each["verdict"] for each in told if each["node"] == "0"}
+        assert last == {(each.name, each.object): each.verdict for each in result.results}
+
+
 @settings(max_examples=40)
 @given(recordings(max_size=12))
 def test_the_witness_of_a_change_has_its_number(recording: Recording) -> None:
     spec = parse_specification("spec s = F battery >= 0.5\nspec t = G not battery >= 0.75")
     for told in _all_told(spec, recording, [0, len(recording.trace())]):
-        facts = {pair.key: pair.value for pair in Event.FromString(told.event).metadata}
+        facts = _facts(told)
+        if facts["verdict"] == "unknown":
+            continue
         number = abs(float(facts["robustness"]))
         assert facts["witness"].endswith("just holds" if number == 0 else f"by {number:.6g}")

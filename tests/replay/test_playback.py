@@ -21,11 +21,23 @@ from inspection.message_paths import values
 from replay.runs import STEP_NS, PiecewiseSource, content_of, record, run, sample
 from spatial_replay.inspection.annotator import messages_of
 from spatial_replay.inspection.curves import CURVES_CHANNEL
-from spatial_replay.logs.block import Messages
+from spatial_replay.logs.block import Channel, Messages
 from spatial_replay.logs.mcap_writer import LogWriter
+from spatial_replay.logs.merging import merge
+from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.objects import encode_objects
 from spatial_replay.logs.output import open_output
 from spatial_replay.logs.source import Source, open_source
-from spatial_replay.logs.topics import CURVES_TOPIC, OBJECTS, ROBUSTNESS, SCENE, SPECIFICATION
+from spatial_replay.logs.topics import (
+    CURVES_TOPIC,
+    EVENT_LOG,
+    EVENTS,
+    OBJECTS,
+    ROBUSTNESS,
+    SCENE,
+    SPECIFICATION,
+    protobuf_channel,
+)
 from spatial_replay.replay import Window, run_replay
 from spatial_replay.replay.playback import Playback
 from spatial_replay.replay.tuning import Tuning
@@ -148,6 +160,44 @@ def test_messages_of_others_are_played_and_stand_after_a_seek(tmp_path: Path) ->
     for topic in others:
         before = [each for each in whole if each[0] == topic and each[1] <= middle_ns]
         assert [each for each in found if each[0] == topic] == before[-1:]
+
+
+def talking(path: Path) -> Path:
+    """A log in which others speak before its first sample, at 1 s, and after its last one."""
+    trace = run(COUNT).slice(4, COUNT)
+    times_ns = np.array([0, STEP_NS, COUNT * STEP_NS])
+    words = messages_of(Channel("/words", "json", None), times_ns, [b"1", b"2", b"3"], 0)
+    objects = messages_of(protobuf_channel(OBJECTS, ObjectStates), trace.times_ns, encode_objects(trace), 0)
+    with open_output(path) as stream:
+        writer = LogWriter(stream)
+        writer.write_messages(merge([words, objects]))
+        writer.close()
+    return path
+
+
+def test_it_starts_at_the_first_sample_with_what_stands_there(tmp_path: Path) -> None:
+    source = open_source(talking(tmp_path / "talking.mcap"))
+    expected = annotated(source, tmp_path / "annotated.mcap")
+    player = playback(source)
+    assert player.start_ns == 4 * STEP_NS
+    found = sent(player.seek(0))
+    assert [data for topic, _, data in found if topic == "/words"] == [b"2"]
+    assert {SPECIFICATION, OBJECTS, ROBUSTNESS, SCENE} <= {topic for topic, *_ in found}
+    found += sent(player.advance_to(player.end_ns))
+    assert found[1:] == [each for each in expected if each[1] >= player.start_ns]
+
+
+def test_the_end_of_the_log_comes_last_and_once(tmp_path: Path) -> None:
+    source = open_source(talking(tmp_path / "talking.mcap"))
+    expected = annotated(source, tmp_path / "annotated.mcap")
+    assert [(topic, time_ns) for topic, time_ns, _ in expected[-3:]] == [
+        ("/words", COUNT * STEP_NS),
+        (EVENTS, COUNT * STEP_NS),
+        (EVENT_LOG, COUNT * STEP_NS),
+    ]
+    player = playback(source)
+    assert sent(player.seek(player.end_ns))[-2:] == expected[-2:]
+    assert not len(player.advance_to(player.end_ns))
 
 
 def test_other_numbers_are_shown_where_it_is() -> None:
