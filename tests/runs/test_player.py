@@ -7,10 +7,11 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from queue import SimpleQueue
+from threading import Event
 
 import numpy as np
 import pytest
@@ -24,10 +25,11 @@ from spatial_replay.inspection.curves import CURVES_CHANNEL
 from spatial_replay.logs.block import Messages
 from spatial_replay.logs.topics import ROBUSTNESS
 from spatial_replay.replay.playback import Playback
-from spatial_replay.replay.tuning import Tuning
+from spatial_replay.replay.tuning import Tuned, Tuning
 from spatial_replay.runs.live.outlet import Level, Note
 from spatial_replay.runs.live.pace import MOST_LATE_S
 from spatial_replay.runs.live.player import MOST_A_SECOND, Player
+from spatial_replay.runs.live.questions import MOST_OPEN, Questions
 from spatial_replay.runs.live.session import Session
 from spatial_replay.runs.live.transport import State, Status
 
@@ -231,3 +233,76 @@ def test_a_change_that_cannot_be_evaluated_brings_the_old_values_back() -> None:
         session.change({"wide": 2})
         told = outlet.until(lambda told: isinstance(told, Note))
         assert "(wide = 2)" in told[-1].text
+
+
+@contextmanager
+def answering(session: Session) -> Iterator[Questions]:
+    questions = Questions(session)
+    with ThreadPoolExecutor(1) as thread:
+        running = thread.submit(questions.run)
+        try:
+            yield questions
+        finally:
+            questions.stop()
+            running.result(PATIENCE_S)
+
+
+def test_a_long_question_holds_up_nobody_who_looks() -> None:
+    clock, is_asked, may_answer = Clock(), Event(), Event()
+
+    def long_work(tuned: Tuned) -> str:
+        is_asked.set()
+        may_answer.wait(PATIENCE_S)
+        return str(tuned.verdict)
+
+    with (
+        playing(tuning_of(30), clock) as (session, outlet),
+        answering(session) as questions,
+        ThreadPoolExecutor(MOST_OPEN) as asking,
+    ):
+        asked = [asking.submit(questions.ask, long_work) for _ in range(MOST_OPEN)]
+        assert is_asked.wait(PATIENCE_S)
+        session.control(is_playing=True, speed=100.0)
+        play_to_the_end(session, clock, [0.1])
+        assert max(robustness_times(outlet.until(is_over))) == 29 * STEP_NS
+        may_answer.set()
+        assert [each.result(PATIENCE_S) for each in asked] == ["satisfied"] * MOST_OPEN
+
+
+def test_the_end_leaves_no_question_open() -> None:
+    is_asked, may_end = Event(), Event()
+
+    def long_work(tuned: Tuned) -> bool:
+        is_asked.set()
+        return may_end.wait(PATIENCE_S)
+
+    with (
+        playing(tuning_of(5), Clock()) as (session, _),
+        answering(session) as questions,
+        ThreadPoolExecutor(2) as asking,
+    ):
+        asked = [asking.submit(questions.ask, long_work) for _ in range(2)]
+        assert is_asked.wait(PATIENCE_S)
+        questions.stop()
+        for each in asked:
+            with pytest.raises(UsageError, match="stopping"):
+                each.result(PATIENCE_S)
+        may_end.set()
+
+
+def test_only_so_many_questions_can_be_open() -> None:
+    may_answer = Event()
+    with (
+        playing(tuning_of(5), Clock()) as (session, _),
+        answering(session) as questions,
+        ThreadPoolExecutor(MOST_OPEN + 1) as asking,
+    ):
+        asked = [
+            asking.submit(questions.ask, lambda tuned: may_answer.wait(PATIENCE_S))
+            for _ in range(MOST_OPEN + 1)
+        ]
+        refused = next(as_completed(asked, PATIENCE_S))
+        with pytest.raises(UsageError, match="open already"):
+            refused.result()
+        may_answer.set()
+        assert sum(each.exception(PATIENCE_S) is None for each in asked) == MOST_OPEN

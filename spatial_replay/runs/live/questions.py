@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from queue import Full, Queue
+from queue import SimpleQueue
 from threading import Lock
 from typing import Final, TypeVar
 
@@ -12,7 +12,7 @@ from spatial_replay.replay.tuning import Tuned
 from spatial_replay.runs.live.session import Session
 from spatial_replay.runs.live.wishes import OVER, Question
 
-_MOST_WAITING: Final = 8
+MOST_OPEN: Final = 8
 
 _Answer = TypeVar("_Answer")
 
@@ -22,27 +22,26 @@ class Questions:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._waiting: Queue[tuple[Question, Tuned] | None] = Queue(_MOST_WAITING)
-        self._asking = Lock()
+        self._waiting: SimpleQueue[tuple[Question, Tuned] | None] = SimpleQueue()
+        self._open: list[Question] = []
+        self._changing = Lock()
         self._is_over = False
 
     def ask(self, work: Callable[[Tuned], _Answer]) -> _Answer:
         """Work something out from what is shown now, in turn; what `work` raises is raised here.
 
         Raises:
-            UsageError: too many questions are waiting, or the session is over.
+            UsageError: too many questions are open, or the session is over.
         """
         question = Question(work)
         tuned = self._session.ask(lambda tuned: tuned)
-        with self._asking:
+        with self._changing:
             if self._is_over:
                 raise UsageError(OVER)
-            try:
-                self._waiting.put_nowait((question, tuned))
-            except Full:
-                raise UsageError(
-                    f"{_MOST_WAITING} questions are waiting already; ask again when they are answered"
-                ) from None
+            if len(self._open) >= MOST_OPEN:
+                raise UsageError(f"{MOST_OPEN} questions are open already; ask again when they are answered")
+            self._open.append(question)
+            self._waiting.put((question, tuned))
         answer: _Answer = question.answer.result()
         return answer
 
@@ -51,12 +50,13 @@ class Questions:
         while (next_one := self._waiting.get()) is not None:
             question, tuned = next_one
             question.settle(tuned)
+            with self._changing:
+                self._open.remove(question)
 
     def stop(self) -> None:
-        """Leave no question open but the one that is worked on, and take no more."""
-        with self._asking:
+        """Leave no question open, and take no more."""
+        with self._changing:
             self._is_over = True
-            while not self._waiting.empty():
-                if (next_one := self._waiting.get_nowait()) is not None:
-                    next_one[0].refuse()
-            self._waiting.put_nowait(None)
+            for question in self._open:
+                question.refuse()
+            self._waiting.put(None)

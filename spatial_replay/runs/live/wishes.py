@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, InvalidStateError
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -24,17 +25,19 @@ class Question:
     answer: Future[Any] = field(default_factory=Future)
 
     def settle(self, tuned: Tuned) -> None:
-        """Work it out, unless whoever asked is gone."""
-        if not self.answer.set_running_or_notify_cancel():
+        """Work it out, unless it comes too late."""
+        if self.answer.done():
             return
-        try:
-            self.answer.set_result(self.work(tuned))
-        except Exception as error:
-            self.answer.set_exception(error)
+        with suppress(InvalidStateError):  # it was refused meanwhile
+            try:
+                self.answer.set_result(self.work(tuned))
+            except Exception as error:
+                self.answer.set_exception(error)
 
     def refuse(self) -> None:
-        """Say that it comes too late."""
-        self.answer.set_exception(UsageError(OVER))
+        """Say that it comes too late, also if it is being worked out."""
+        with suppress(InvalidStateError):
+            self.answer.set_exception(UsageError(OVER))
 
 
 @dataclass
