@@ -78,11 +78,12 @@ def test_messages_metadata_and_attachments_of_others_stay_as_they_are(foreign: P
     assert output.read_bytes() == again.read_bytes()
 
 
-def test_messages_come_by_time_then_topic(foreign: Path, tmp_path: Path) -> None:
+def test_messages_come_by_time_then_topic_and_what_the_end_brings_last(foreign: Path, tmp_path: Path) -> None:
     output = tmp_path / "out.mcap"
     run_replay(open_source(foreign), [SPEC], output=output)
-    order = [(time_ns, topic) for topic, time_ns, *_ in content_of(output).messages]
+    *order, event, sentence = [(time_ns, topic) for topic, time_ns, *_ in content_of(output).messages]
     assert order == sorted(order)
+    assert [event, sentence] == [(order[-1][0], "/spatial/events"), (order[-1][0], "/spatial/log")]
 
 
 def test_our_metadata_comes_first_and_the_certificate_last(log: Path, tmp_path: Path) -> None:
