@@ -42,7 +42,15 @@ class MissingFileError(UsageError):
 
 
 class NoAutomatonError(UsageError):
-    """A formula that has no automaton, or one that is too large."""
+    """A formula that has no automaton, or one that is too large.
+
+    Attributes:
+        reason: why not, without place and remedy.
+    """
+
+    def __init__(self, message: str, reason: str | None = None) -> None:
+        super().__init__(message)
+        self.reason = message if reason is None else reason
 
 
 class Diagnosis(Protocol):

@@ -34,7 +34,8 @@ def refuse_operators(formula: Formula, source: Source | None) -> None:
             message = f"`{written(node)}` counts seconds, an automaton counts samples"
             faults.append(obstacle(source, node, message, "for an automaton, bound it in samples"))
     if faults:
-        raise NoAutomatonError("\n".join(dict.fromkeys(map(str, faults))))
+        told, reasons = dict.fromkeys(map(str, faults)), dict.fromkeys(fault.reason for fault in faults)
+        raise NoAutomatonError("\n".join(told), "; ".join(reasons))
 
 
 def no_automaton(spec: NamedSpec, source: Source | None, reason: str) -> NoAutomatonError:
@@ -51,8 +52,8 @@ def obstacle(source: Source | None, node: Formula | None, message: str, remedy: 
     """The error for what stands at a node; where the source is known, with its place."""
     hint = f"it is evaluated all the same{'; ' if remedy else ''}{remedy}"
     if source is None or node is None:
-        return NoAutomatonError(f"{message}; {hint}")
-    return NoAutomatonError(str(source.diagnostic("error", node.span, message, hint)))
+        return NoAutomatonError(f"{message}; {hint}", message)
+    return NoAutomatonError(str(source.diagnostic("error", node.span, message, hint)), message)
 
 
 def written(node: Formula) -> str:

@@ -29,6 +29,7 @@ class KeptAutomaton:
         name: the name that the spec is reported under.
         automaton: None if it has none.
         reason: why not.
+        details: the same, with the place in the specification and the remedy where those are known.
     """
 
     name: str
@@ -36,12 +37,13 @@ class KeptAutomaton:
     spec: NamedSpec
     automaton: Automaton | None
     reason: str = ""
+    details: str = ""
 
     @property
     def summary(self) -> str:
         """What there is, in a few words."""
         if self.automaton is None:
-            return f"none: {self.reason}"
+            return f"none: {self.details or self.reason}"
         return size_words(self.automaton)
 
 
@@ -107,4 +109,4 @@ def _kept(
     try:
         return KeptAutomaton(name, file, spec, automaton(file, spec.name, stored=stored))
     except NoAutomatonError as error:
-        return KeptAutomaton(name, file, spec, None, str(error))
+        return KeptAutomaton(name, file, spec, None, error.reason, str(error))
