@@ -31,7 +31,7 @@ class Page(HTMLParser):
         self.text = text
         self.elements: list[tuple[str, dict[str, str | None]]] = []
         self._open: list[str] = []
-        self._texts: list[tuple[tuple[str, ...], str]] = []
+        self.texts: list[tuple[tuple[str, ...], str]] = []
         self.feed(text)
         self.close()
         self.facts = json.loads(self.script("facts"))
@@ -46,7 +46,7 @@ class Page(HTMLParser):
         assert self._open.pop().startswith(f"{tag}#")
 
     def handle_data(self, data: str) -> None:
-        self._texts.append((tuple(self._open), data))
+        self.texts.append((tuple(self._open), data))
 
     def tags(self, tag: str) -> list[dict[str, str | None]]:
         """The attributes of every element of a kind."""
@@ -57,11 +57,11 @@ class Page(HTMLParser):
 
     def within(self, element: str) -> str:
         """All text within elements of a kind and an id: "section#verdicts"."""
-        return "".join(text for inside, text in self._texts if element in inside)
+        return "".join(text for inside, text in self.texts if element in inside)
 
     def scripts(self) -> list[str]:
         """The scripts that a browser runs."""
-        return [text for inside, text in self._texts if inside and inside[-1] == "script#"]
+        return [text for inside, text in self.texts if inside and inside[-1] == "script#"]
 
     def numbers(self, reference: dict[str, Any]) -> np.ndarray:
         return np.frombuffer(

@@ -115,7 +115,9 @@ def test_below_a_temporal_operator_a_node_is_asked_at_every_sample(tmp_path: Pat
 def test_events_are_those_of_an_annotated_log(violated: Page) -> None:
     events = violated.facts["events"]
     assert [event["time"] for event in events] == sorted(event["time"] for event in events)
-    found = next(event for event in events if event["text"].startswith("`table_set` is violated"))
+    found = next(
+        event for event in events if event["parts"][1] == "table_set" and "is violated" in event["parts"][2]
+    )
     assert (found["time"], found["standing"], found["specification"]) == (4.0, "violated", "table_set")
 
 
@@ -164,7 +166,7 @@ def test_the_automaton_is_drawn_as_it_leads_on(planned: Page) -> None:
 def test_a_result_without_automaton_says_why(violated: Page) -> None:
     result = violated.facts["results"][0]
     assert result["automaton"] is None
-    assert "an automaton counts samples" in result["no_automaton"]
+    assert result["no_automaton"] == ["", "F[0s, 4s]", " counts seconds, an automaton counts samples"]
 
 
 def test_decisions_come_with_their_maps(planned: Page) -> None:
@@ -213,6 +215,7 @@ def test_under_the_papers_semantics_nothing_is_explained(tmp_path: Path) -> None
     assert not page.facts["settles"]
     assert "What decides" not in page.within("section#verdicts")
     assert "semantics paper" in page.within("header#")
+    assert "Explanations are given under the semantics ltlf alone." in page.within("header#")
 
 
 # ------------------------------------------------------------------------------- what the page is made of
@@ -233,12 +236,32 @@ def test_texts_of_logs_and_specifications_stay_texts(tmp_path: Path) -> None:
         assert "\u2028" not in page.script("facts")
 
 
+def test_signs_that_do_not_show_give_way_to_spaces(tmp_path: Path) -> None:
+    text = 'spec s = F ("left\u202eright" ovlp b)\n'
+    page = report_of_samples(tmp_path / "run.html", moving(6, "left\u202eright"), text)
+    assert "left right" in page.within("section#verdicts")
+    assert "\u202e" not in page.text
+    assert 'spec s = F ("left right" ovlp b)\n' in page.within("footer#")
+
+
+@pytest.mark.parametrize("name", ["a`b", "`", "a` b", "a `b", "`a`", '"`', "`, "])
+def test_backquotes_in_names_leave_text_and_code_apart(tmp_path: Path, name: str) -> None:
+    quoted = '"' + name.replace('"', '\\"') + '"'
+    page = report_of_samples(tmp_path / "run.html", moving(6, name), f"spec s = F ({quoted} dist b <= -9)")
+    codes = [text for inside, text in page.texts if "section#verdicts" in inside and inside[-1] == "code#"]
+    assert codes[:2] == ["s", f"{quoted} dist b <= -9"]
+    assert " is violated: robustness " in page.within("section#verdicts")
+    parts = next(each["parts"] for each in page.facts["events"] if "violated" in each["parts"][2])
+    assert parts[1] == "s"
+    assert f"{quoted} dist b <= -9" in parts
+
+
 def test_a_file_name_that_is_no_text_is_shown_as_far_as_it_is_one(tmp_path: Path) -> None:
     log = tmp_path / os.fsdecode(b"run\xff.jsonl")
     log.write_bytes((RECORDINGS / "table.jsonl").read_bytes())
     source = open_source(log)
     write_report(source, load_files([RECORDINGS / "table.spatial"], source), tmp_path / "run.html")
-    assert "run?.jsonl" in page_of(tmp_path / "run.html").within("header#")
+    assert "run .jsonl" in page_of(tmp_path / "run.html").within("header#")
 
 
 def test_nothing_is_loaded_and_nothing_else_may_run(violated: Page) -> None:

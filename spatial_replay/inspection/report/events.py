@@ -7,6 +7,8 @@ from typing import Any, Final, NamedTuple
 
 from foxglove_schemas_protobuf.Event_pb2 import Event
 
+from spatial_replay.inspection.report.sentences import sentence_parts
+
 MOST_EVENTS: Final = 2_000
 """How many events a page lists at most: the first ones."""
 
@@ -39,7 +41,7 @@ def event_values(events: Sequence[ReportedEvent], first_ns: int) -> list[Mapping
             "standing": _standing(each.facts),
             "specification": each.facts.get("specification", ""),
             "object": each.facts.get("object"),
-            "text": each.facts.get("message", ""),
+            "parts": sentence_parts(each.facts.get("message", "")),
         }
         for each in ordered[:MOST_EVENTS]
     ]

@@ -45,8 +45,7 @@ def page(report: Report) -> bytes:
         f"<script>{library}</script>",
         f"<script>{script}</script></body></html>\n",
     ]
-    # the name of a file need not be a text
-    return "".join(parts).encode("utf-8", "replace")
+    return "".join(parts).encode("utf-8")
 
 
 def _asset(name: str) -> str:

@@ -14,6 +14,7 @@ from spatial_replay.inspection.report.decisions import plan_value
 from spatial_replay.inspection.report.events import MOST_EVENTS, event_values
 from spatial_replay.inspection.report.film import film_value
 from spatial_replay.inspection.report.packing import Packing, singles
+from spatial_replay.inspection.report.sentences import sentence_parts
 from spatial_replay.inspection.report.states import automaton_value
 from spatial_replay.inspection.report.thinning import Curves, kept_samples
 from spatial_replay.inspection.report.tree import (
@@ -59,6 +60,7 @@ def page_data(report: Report) -> PageData:
     plan = plan_value(report.plan, report.first_ns, packing)
     facts = {
         "settles": report.semantics == "ltlf",
+        "is_thinned": len(kept) < len(times_ns),
         "times": packing.add((kept - report.first_ns) / 1e9, "f8"),
         "palette": {
             "positive": hexadecimal(POSITIVE),
@@ -104,7 +106,7 @@ def _result_value(
         "concerns": concern_values(result.formula, result.object),
         "series": packing.add(singles(series), "f4"),
         "automaton": None,
-        "no_automaton": result.no_automaton,
+        "no_automaton": sentence_parts(result.no_automaton),
     }
     if result.automaton is not None:
         inside = np.searchsorted(result.path.times_ns, here)

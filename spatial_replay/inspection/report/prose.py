@@ -9,9 +9,10 @@ from typing import Final
 
 from spatial_replay import __version__
 from spatial_replay.inspection.report.contents import Report, ReportedResult, worst_first
+from spatial_replay.inspection.report.sentences import sentence_parts
 from spatial_replay.inspection.words import time_text
 from spatial_replay.markup import Html, element
-from spatial_replay.wording import counted
+from spatial_replay.wording import counted, printable
 
 _CALENDAR_NS: Final = 500_000_000 * 10**9
 """Times of logs from here on count from 1970; other clocks began when something was switched on."""
@@ -45,10 +46,9 @@ def panels(report: Report) -> Html:
         _panel("scene", "Scene"),
         _panel("tree", "Specification"),
         _panel("timeline", "Over time"),
+        _panel("automaton", "Automaton"),
+        _panel("events", "Events"),
     ]
-    if any(result.automaton is not None for result in report.drawn):
-        sections.append(_panel("automaton", "Automaton"))
-    sections.append(_panel("events", "Events"))
     if report.plan.decisions:
         sections.append(_panel("decisions", "Decisions"))
     return element("main", *sections, id="main", tabindex="-1")
@@ -69,8 +69,8 @@ def footer(report: Report) -> Html:
 
 
 def text(words: str) -> Html:
-    """A text of any length, escaped."""
-    return Html(escape(words))
+    """A text of any length, escaped; within its lines, signs that do not show give way to spaces."""
+    return Html("\n".join(escape(printable(line, len(line))) for line in words.split("\n")))
 
 
 def _about(report: Report) -> Iterator[str]:
@@ -94,6 +94,8 @@ def _notices(report: Report, omissions: Sequence[str]) -> Iterator[Html]:
         yield _notice("note", what, report.remarks)
     elif report.remarks:
         yield _notice("note", "The log says of its samples:", report.remarks)
+    if report.semantics != "ltlf" and report.results:
+        yield _notice("note", "Explanations are given under the semantics ltlf alone.", ())
     if omissions:
         yield _notice("note", "The run is large, and the page leaves something out:", omissions)
 
@@ -143,8 +145,8 @@ def _summary(result: ReportedResult, first_ns: int) -> Html:
 
 
 def _with_code(sentence: str) -> Iterator[Html]:
-    """A sentence whose parts between backquotes are code."""
-    for number, part in enumerate(sentence.split("`")):
+    """A sentence whose quoted parts are code."""
+    for number, part in enumerate(sentence_parts(sentence)):
         yield element("code", text(part)) if number % 2 else text(part)
 
 

@@ -6,7 +6,6 @@ const HIGHEST = 84;
 
 function makeAutomaton(clock) {
   const place = body("automaton");
-  if (!place) return;
   const drawing = element("div", {class: "drawing"});
   const words = element("div", {class: "moves"});
   place.append(drawing, words);
@@ -34,7 +33,7 @@ function makeAutomaton(clock) {
 
 function whyNone(result) {
   if (!result) return ["Nothing was evaluated."];
-  return [element("p", {}, `${result.title} has no automaton.`), element("pre", {}, result.no_automaton)];
+  return [element("p", {}, `${result.title} has no automaton: `, ...withCode(result.no_automaton), ".")];
 }
 
 function drawAutomaton(automaton) {

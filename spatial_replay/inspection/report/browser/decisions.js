@@ -32,7 +32,7 @@ function makeDecision(clock, decision) {
   const said = element("div", {}, title, element("p", {}, sentence(decision.reason)),
     decision.outcome ? element("p", {}, outcomeWords(decision.outcome)) : null);
   return element("li", {class: "card"},
-    element("div", {class: "said"}, said, meant ? makeMap(clock, meant, false) : null),
+    said, meant ? makeMap(clock, meant, false) : null,
     tried.length ? element("details", {}, element("summary", {}, lookedInto(decision)), ...tried,
       element("div", {class: "candidates"}, ...unnamed.map((map) => makeMap(clock, map, false)))) : null);
 }

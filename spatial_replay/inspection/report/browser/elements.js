@@ -25,9 +25,9 @@ function body(name) {
   return document.getElementById(`${name}-body`);
 }
 
-// A sentence whose parts between backquotes are code.
-function withCode(sentence) {
-  return sentence.split("`").map((part, number) => number % 2 ? element("code", {}, part) : part);
+// A sentence whose parts are text and code, in turn.
+function withCode(parts) {
+  return parts.map((part, number) => number % 2 ? element("code", {}, part) : part);
 }
 
 function secondsText(seconds) {

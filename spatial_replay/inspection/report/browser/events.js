@@ -13,7 +13,7 @@ function makeEvents(clock) {
       goTo(clock, event);
     }}, mark(event.standing), element("time", {}, secondsText(event.time)),
     element("span", {class: "hidden"}, STANDINGS[event.standing].words),
-    element("span", {class: "sentence"}, ...withCode(event.text)));
+    element("span", {class: "sentence"}, ...withCode(event.parts)));
     return row;
   });
   const list = element("ol", {class: "list"}, ...rows.map((row) => element("li", {}, row)));

@@ -68,7 +68,7 @@ function hatch(context, left, top, width, height) {
   context.beginPath();
   context.rect(left, top, width, height);
   context.clip();
-  context.strokeStyle = colour("grid");
+  context.strokeStyle = colour("neutral");
   context.lineWidth = 1;
   context.beginPath();
   for (let x = left - height; x < left + width; x += 7) {

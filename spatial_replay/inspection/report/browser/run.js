@@ -6,7 +6,7 @@ const ARRAYS = {
 const VALUE = 0, NOW = 1, LOWER = 2, UPPER = 3;
 
 async function readRun() {
-  const facts = JSON.parse(document.getElementById("facts").textContent);
+  const facts = JSON.parse(document.getElementById("facts").textContent, (_, value) => printable(value));
   const buffer = await unpacked(document.getElementById("numbers").textContent);
   const numbers = ({kind, offset, length}) => new ARRAYS[kind](buffer, offset, length);
   const times = numbers(facts.times);
@@ -16,6 +16,11 @@ async function readRun() {
     times,
     results: facts.results.map((result) => readResult(result, numbers, times)),
   };
+}
+
+// A text with spaces for what does not show as it stands, such as signs that turn the direction of what follows.
+function printable(value) {
+  return typeof value === "string" ? value.replace(/[\p{C}\p{Z}]/gu, " ") : value;
 }
 
 async function unpacked(text) {

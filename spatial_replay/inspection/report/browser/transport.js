@@ -2,9 +2,9 @@
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10, 50];
 const STEPS = 1000;
-const KEYS = [
+const keysOf = (run) => [
   ["Space", "play, pause"],
-  ["← →", "a sample back, on"],
+  ["← →", `a ${run.is_thinned ? "kept sample" : "sample"} back, on`],
   ["Shift ← →", "a second back, on"],
   ["Home End", "first, last sample"],
   ["N P", "next, previous event"],
@@ -20,7 +20,7 @@ function makeTransport(clock, events) {
   const now = element("output", {class: "now", "aria-live": "off"});
   const speed = element("select", {"aria-label": "Speed", onchange: () => { clock.speed = Number(speed.value); }},
     ...SPEEDS.map((each) => element("option", {value: each, selected: each === 1}, `${each}×`)));
-  const help = element("p", {class: "keys", id: "keys", hidden: true}, ...KEYS.flatMap(([key, does]) => [
+  const help = element("p", {class: "keys", id: "keys", hidden: true}, ...keysOf(clock.run).flatMap(([key, does]) => [
     element("kbd", {}, key), ` ${does} `]));
   const helper = button("Keys", "help", () => {
     help.hidden = !help.hidden;
