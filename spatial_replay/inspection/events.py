@@ -75,9 +75,10 @@ class Told(NamedTuple):
 
 
 class EventTeller:
-    """Tells the changes of one result's root and of the specs that it is made of.
+    """Tells what becomes of one result's root and of the specs that it is made of, up to the end of the log.
 
-    What it keeps from one stretch of samples to the next is a few numbers for each of these.
+    What it keeps from one stretch of samples to the next is a few numbers for each of these, and for each of
+    their parts those of the leaves at one sample.
     """
 
     def __init__(
@@ -117,15 +118,6 @@ class EventTeller:
         self._carried = carried
         return told
 
-    def _attained(self, node: int, period: Period, stretch: Stretch) -> Attained | None:
-        """The leaf that a period's worst number is that of, if it is one's at the sample in which it came."""
-        if period.place < 0:
-            return self._carried.get((node, period.place))
-        leaves = stretch.leaves[:, :, period.place]
-        low, high = low_and_high(len(leaves), wide=period.code in (SATISFIED, VIOLATED))
-        ends = leaves[low], leaves[high]
-        return attained(self._watched[node].below, ends, period.worst, low=period.code != VIOLATED)
-
     def end(self, time_ns: int, final: Floats) -> list[Told]:
         """What the end of the log makes of the nodes that samples after it could still change.
 
@@ -136,6 +128,15 @@ class EventTeller:
         if self._last_ns is None:
             return []
         return [self._told_at_end(node, time_ns, self._last_ns, final) for node in self._standings.pending]
+
+    def _attained(self, node: int, period: Period, stretch: Stretch) -> Attained | None:
+        """The leaf that a period's worst number is that of, if it is one's at the sample in which it came."""
+        if period.place < 0:
+            return self._carried.get((node, period.place))
+        leaves = stretch.leaves[:, :, period.place]
+        low, high = low_and_high(len(leaves), wide=period.code in (SATISFIED, VIOLATED))
+        ends = leaves[low], leaves[high]
+        return attained(self._watched[node].below, ends, period.worst, low=period.code != VIOLATED)
 
     def _told(self, change: Change, stretch: Stretch) -> Told:
         watched, after, before = self._watched[change.node], change.after, change.before
