@@ -52,7 +52,8 @@ def test_it_says_its_verdict_and_its_address_and_ends_when_it_is_told_to(number:
 
         asyncio.run(looking())
         process.send_signal(number)
-        assert process.wait(60) == 130
+        _, warned = process.communicate(timeout=60)
+        assert (process.returncode, warned) == (130, "")
 
 
 def test_it_plays_at_once_if_asked_to() -> None:
@@ -74,6 +75,19 @@ def test_it_warns_when_others_can_connect() -> None:
     assert "anyone who reaches ws://0.0.0.0" in warned
 
 
+def test_it_evaluates_with_the_semantics_asked_for(tmp_path: Path) -> None:
+    with running("--port", "0", "--semantics", "paper") as (process, address, _):
+
+        async def looking() -> None:
+            async with viewer(address) as own:
+                assert (await own.call("evaluate", {}))["semantics"] == "paper"
+                with pytest.raises(ValueError, match="semantics"):
+                    await own.call("explain", {})
+
+        asyncio.run(looking())
+        process.send_signal(signal.SIGINT)
+
+
 def test_it_prints_its_layout(tmp_path: Path) -> None:
     done = run_program(*TABLE, "--layout", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
@@ -84,6 +98,9 @@ def test_it_prints_its_layout(tmp_path: Path) -> None:
     ("options", "said"),
     [
         (("--host", "no.such.host.invalid"), "cannot listen at no.such.host.invalid"),
+        (("--host", "8.8.8.8"), "choose an address of this machine with --host"),
+        (("--host", ""), "cannot listen at no address"),
+        (("--semantics", "stl"), "stl"),
         (("--port", "70000"), "70000"),
         (("--from", "99s"), "no sample in the window"),
     ],
