@@ -59,6 +59,8 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     )
     text = "spec apart = G (a dist b >= 0.1)\nspec meet = F (a dist b <= 0.01)\nspec s = apart and meet"
     report_of_trace(folder / "long.html", two_discs(100_000), text)
+    parts = " and ".join(f"(a dist b >= {k / 1000})" for k in range(100))
+    report_of_trace(folder / "thinned.html", two_discs(12_000), f"spec s = F[0s, 1s] ({parts})")
     unseen = [
         sr.Sample(
             t * 10**8,
@@ -303,6 +305,13 @@ def test_the_scene_says_what_is_violated_now(open_page: Open) -> None:
     expect(caption).to_have_text("nothing is violated now; table_set was before")
 
 
+def test_of_a_run_that_is_thinned_the_keys_go_through_what_is_kept(open_page: Open) -> None:
+    for name, words in (("thinned", "a kept sample back, on"), ("violated", "a sample back, on")):
+        page = open_page(name)
+        page.get_by_role("button", name="Keys").click()
+        expect(page.locator(".keys")).to_contain_text(words)
+
+
 def test_what_no_arrow_can_point_at_is_told_too(open_page: Open) -> None:
     for time, words in (
         (0.5, "nothing is violated now"),
@@ -324,6 +333,12 @@ def test_the_automaton_shows_where_the_run_is(open_page: Open) -> None:
     expect(here).to_have_count(1)
     assert here.text_content() != last
     expect(page.locator(".move.ahead").first).to_be_attached()
+
+
+def test_a_result_without_an_automaton_says_why(open_page: Open) -> None:
+    expect(open_page("violated").locator("#automaton")).to_contain_text(
+        "table_set has no automaton: F[0s, 4s] counts seconds, an automaton counts samples."
+    )
 
 
 def test_decisions_show_what_was_tried_and_lead_to_their_time(open_page: Open) -> None:

@@ -41,12 +41,13 @@ def header(report: Report, omissions: Sequence[str]) -> Html:
 
 def panels(report: Report) -> Html:
     """The verdicts, and a place for everything that is drawn."""
+    has_automaton = any(result.automaton is not None for result in report.drawn)
     sections = [
         _panel("verdicts", "Verdicts", *_verdicts(report)),
         _panel("scene", "Scene"),
         _panel("tree", "Specification"),
         _panel("timeline", "Over time"),
-        _panel("automaton", "Automaton"),
+        _panel("automaton", "Automaton", kind="panel" if has_automaton else "panel wide"),
         _panel("events", "Events"),
     ]
     if report.plan.decisions:
@@ -105,12 +106,10 @@ def _notice(role: str, what: str, details: Sequence[str]) -> Html:
     return element("div", element("strong", what), listed, role=role, **{"class": f"notice {role}"})
 
 
-def _panel(name: str, title: str, *content: Html) -> Html:
+def _panel(name: str, title: str, *content: Html, kind: str = "panel") -> Html:
     heading = element("h2", title, id=f"{name}-title")
     body = element("div", *content, id=f"{name}-body")
-    return element(
-        "section", heading, body, id=name, **{"class": "panel", "aria-labelledby": f"{name}-title"}
-    )
+    return element("section", heading, body, id=name, **{"class": kind, "aria-labelledby": f"{name}-title"})
 
 
 def _verdicts(report: Report) -> Iterator[Html]:
