@@ -16,6 +16,7 @@ from hypothesis.extra import numpy as arrays
 
 from spatial_replay.inspection.report.film import MOST_CORNERS, MOST_FRAMES, FilmMaker
 from spatial_replay.inspection.report.packing import json_text, singles
+from spatial_replay.inspection.report.sentences import sentence_parts
 from spatial_replay.inspection.report.thinning import Curves, kept_samples
 
 NUMBERS = st.one_of(
@@ -125,3 +126,13 @@ def test_json_in_a_page_reads_back_and_has_no_sign_of_html(value: Any) -> None:
     assert json.loads(text) == value
     assert text.isascii()
     assert not set("<>&") & set(text)
+
+
+@given(st.lists(st.text(), min_size=1, max_size=4))
+def test_names_with_any_signs_leave_code_whole(names: list[str]) -> None:
+    quoted = ['"' + name.replace("\\", "\\\\").replace('"', '\\"') + '"' for name in names]
+    codes = [f"{name} dist b <= -9" for name in quoted]
+    sentence = " fails, and ".join(f"`{code}`" for code in codes) + f" fails: {names[0]} and b touch."
+    parts = sentence_parts(sentence)
+    assert parts[1 : 2 * len(codes) : 2] == codes
+    assert all(text == " fails, and " for text in parts[2 : 2 * len(codes) : 2])
