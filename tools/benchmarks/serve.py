@@ -6,6 +6,8 @@ import itertools
 import json
 import os
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,8 @@ from spatial_replay.runs.live.serving import serving
 from spatial_replay.trace.trace import Trace
 
 SAMPLES = 100_000
+WINDOWS = (60, 600)
+"""Samples of windows that make a change expensive."""
 PATIENCE_S = 60.0
 
 
@@ -31,6 +35,7 @@ class Viewer:
     def __init__(self, connection: ClientConnection) -> None:
         self._connection = connection
         self._channels: dict[str, int] = {}
+        self._values = itertools.count(20)
         while not self._channels:
             match json.loads(connection.recv(PATIENCE_S)):
                 case {"op": "advertise", "channels": channels}:
@@ -43,8 +48,11 @@ class Viewer:
     def unsubscribe(self, topic: str) -> None:
         self._send(op="unsubscribe", subscriptionIds=[self._channels[topic]])
 
-    def set(self, name: str, value: float) -> None:
-        self._send(op="setParameters", parameters=[{"name": name, "value": value, "type": "float64"}])
+    def change(self, topic: str) -> None:
+        """Give the constant `near` a value that it did not have, and wait for what comes of it."""
+        value = float(next(self._values))
+        self._send(op="setParameters", parameters=[{"name": "near", "value": value, "type": "float64"}])
+        self.wait_for(topic)
 
     def wait_for(self, topic: str) -> None:
         head = struct.pack("<BI", 1, self._channels[topic])
@@ -59,23 +67,11 @@ class Viewer:
 
 def bench_serve(measure: Any) -> None:
     """The block-pushing specification over its camera recording, again and again to 100,000 samples."""
-    data = Path(os.environ.get("SPATIAL_REPLAY_DATA", "")) / "paper"
+    data = _data()
     if not data.is_dir():
         return
     text = json.loads((data / "expected.json").read_text())["blocks_moving_passage"]["spec"]
-    specification = sr.parse_specification("const near = 70\n" + text.replace("closeto ", "closeto[near] "))
-    trace = _long(sr.read_trace(data / "blocks_moving_passage.jsonl.gz"))
-    tuning = Tuning(MemorySource(trace), [specification])
-    values = itertools.count(20)
-    with (
-        serving(tuning.evaluate(), port=0) as server,
-        connect(server.address, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None) as connection,
-    ):
-        viewer = Viewer(connection)
-
-        def change(topic: str) -> None:
-            viewer.set("near", float(next(values)))
-            viewer.wait_for(topic)
+    with viewing(_trace(data), text.replace("closeto ", "closeto[near] ")) as viewer:
 
         def look() -> None:
             viewer.subscribe(SCENE)
@@ -85,10 +81,44 @@ def bench_serve(measure: Any) -> None:
         measure("subscribe to first scene", lambda _: look(), unit="viewer", limit_s=0.1)
         viewer.subscribe(CURVES_TOPIC)
         viewer.wait_for(CURVES_TOPIC)
-        measure("change to curves of all", lambda _: change(CURVES_TOPIC), unit="change", limit_s=0.1)
+        measure("change to curves of all", lambda _: viewer.change(CURVES_TOPIC), unit="change", limit_s=0.1)
         viewer.subscribe(SCENE)
         viewer.wait_for(SCENE)
-        measure("change to scene", lambda _: change(SCENE), unit="change")
+        measure("change to scene", lambda _: viewer.change(SCENE), unit="change")
+
+
+def bench_serve_windows(measure: Any) -> None:
+    """A window below another temporal operator, over the same samples."""
+    data = _data()
+    if not data.is_dir():
+        return
+    for samples in WINDOWS:
+        text = f"spec passed = G (red1 closeto[near] blue1 -> F[0, {samples}] red1 below blue1)"
+        with viewing(_trace(data), text) as viewer:
+            viewer.subscribe(CURVES_TOPIC)
+            viewer.wait_for(CURVES_TOPIC)
+            measure(
+                f"change, window of {samples}", lambda _: viewer.change(CURVES_TOPIC), unit="change", runs=3
+            )
+
+
+@contextmanager
+def viewing(trace: Trace, text: str) -> Iterator[Viewer]:
+    """A viewer of a log and a specification with the constant `near`."""
+    tuning = Tuning(MemorySource(trace), [sr.parse_specification(f"const near = 70\n{text}")])
+    with (
+        serving(tuning.evaluate(), port=0) as server,
+        connect(server.address, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None) as connection,
+    ):
+        yield Viewer(connection)
+
+
+def _data() -> Path:
+    return Path(os.environ.get("SPATIAL_REPLAY_DATA", "")) / "paper"
+
+
+def _trace(data: Path) -> Trace:
+    return _long(sr.read_trace(data / "blocks_moving_passage.jsonl.gz"))
 
 
 def _long(trace: Trace) -> Trace:
