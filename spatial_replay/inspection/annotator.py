@@ -19,7 +19,7 @@ from spatial_replay.inspection.robustness import encode_robustness
 from spatial_replay.inspection.scene import SceneEncoder, SceneState
 from spatial_replay.inspection.specification import ReportedTree, encode_specification
 from spatial_replay.inspection.viewer import Contents, Extent
-from spatial_replay.logs.block import Channel, Messages
+from spatial_replay.logs.block import Channel, Messages, messages_of
 from spatial_replay.logs.messages.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.messages.Robustness_pb2 import Robustness
 from spatial_replay.logs.messages.Specification_pb2 import Specification as SpecificationMessage
@@ -206,18 +206,6 @@ class Annotator:
         first = self._written[channel.topic]
         self._written[channel.topic] += len(payloads)
         return messages_of(channel, times_ns, payloads, first)
-
-
-def messages_of(channel: Channel, times_ns: Integers, payloads: Sequence[bytes], first: int) -> Messages:
-    """Messages of one channel, published when they are logged, numbered from `first`."""
-    return Messages(
-        channels={0: channel},
-        channel=np.zeros(len(payloads), np.int64),
-        sequence=np.arange(first, first + len(payloads), dtype=np.int64),
-        log_time_ns=times_ns,
-        publish_time_ns=times_ns,
-        payloads=payloads,
-    )
 
 
 def shown_regions(files: Sequence[Specification]) -> Mapping[str, Outline]:

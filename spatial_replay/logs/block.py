@@ -68,6 +68,18 @@ class Messages:
         return len(self.payloads)
 
 
+def messages_of(channel: Channel, times_ns: Integers, payloads: Sequence[bytes], first: int) -> Messages:
+    """Messages of one channel, published when they are logged, numbered from `first`."""
+    return Messages(
+        channels={0: channel},
+        channel=np.zeros(len(payloads), np.int64),
+        sequence=np.arange(first, first + len(payloads), dtype=np.int64),
+        log_time_ns=times_ns,
+        publish_time_ns=times_ns,
+        payloads=payloads,
+    )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
     """A stretch of a log.

@@ -12,7 +12,7 @@ from google.protobuf.message import Message
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import TrackedObject
-from spatial_replay.logs.block import Channel, Messages
+from spatial_replay.logs.block import Messages, messages_of
 from spatial_replay.logs.merging import merge
 from spatial_replay.logs.messages.PlanDecision_pb2 import PlanDecision
 from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_DECISION, PLAN_PATH, protobuf_channel
@@ -123,17 +123,6 @@ class BlackBox:
             first = self._written[channel]
             self._written[channel] += len(messages)
             payloads = [message.SerializeToString(deterministic=True) for message in messages]
-            streams.append(_stream(channel, time_ns, payloads, first))
+            times_ns = np.full(len(payloads), time_ns, np.int64)
+            streams.append(messages_of(channel, times_ns, payloads, first))
         return merge(streams)
-
-
-def _stream(channel: Channel, time_ns: int, payloads: list[bytes], first: int) -> Messages:
-    times = np.full(len(payloads), time_ns, np.int64)
-    return Messages(
-        channels={0: channel},
-        channel=np.zeros(len(payloads), np.int64),
-        sequence=np.arange(first, first + len(payloads), dtype=np.int64),
-        log_time_ns=times,
-        publish_time_ns=times,
-        payloads=payloads,
-    )

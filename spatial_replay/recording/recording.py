@@ -12,7 +12,6 @@ from spatial_replay.inspection.annotation import (
     kept_files,
     specification_attachments,
 )
-from spatial_replay.inspection.annotator import messages_of
 from spatial_replay.inspection.automata import KeptAutomaton
 from spatial_replay.inspection.certificate import (
     MessageHash,
@@ -22,7 +21,7 @@ from spatial_replay.inspection.certificate import (
     described,
 )
 from spatial_replay.inspection.hashing import Hashing
-from spatial_replay.logs.block import Messages
+from spatial_replay.logs.block import Messages, messages_of
 from spatial_replay.logs.merging import merge
 from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.objects import encode_objects

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spatial_replay.errors import LogError, SpecificationError, UsageError
-from spatial_replay.inspection.annotator import messages_of
-from spatial_replay.logs.block import Block, Messages
+from spatial_replay.logs.block import Block, Messages, messages_of
 from spatial_replay.logs.merging import merge, select
 from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.objects import encode_objects

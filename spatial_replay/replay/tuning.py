@@ -45,6 +45,7 @@ class Tuning:
         trace: every sample that counts, those that are only looked back at included.
         inside: those in the window.
         own: the messages of the log itself.
+        semantics: what the formulas mean.
         faults, remarks: what was lost while reading, and what else the source says.
     """
 
@@ -69,7 +70,7 @@ class Tuning:
             UsageError: no sample in the window, an operator that the semantics lacks.
             SpecificationError: names that the log never has.
         """
-        self._semantics = checked_semantics(semantics, files)
+        self.semantics = checked_semantics(semantics, files)
         self._source, self._each = source, dict(each or {})
         self._files = tuple(files)
         selection = Selection(source, window or Window(), self._files)
@@ -124,7 +125,7 @@ class Tuning:
         held = Selection(MemorySource(self.trace, self.name), replace(self.window, every=1), files)
         kept = kept_files(files)
         instances = [held.instances(file, self._each) for file in kept]
-        evaluation = AnnotatedEvaluation(kept, instances, self._semantics, self._source.attachments)
+        evaluation = AnnotatedEvaluation(kept, instances, self.semantics, self._source.attachments)
         self._check_size(evaluation)
         return Tuned(
             self, tuple(kept), self._constants(files), evaluation, tuple(evaluation.extend(self.trace)), held
@@ -144,7 +145,7 @@ class Tuning:
             unreadable=self.inside.unreadable_count,
             results=tuple(results),
             certificate=MappingProxyType({}),
-            semantics=self._semantics,
+            semantics=self.semantics,
         )
 
     def _constants(self, files: Sequence[Specification]) -> Mapping[str, Constant]:
@@ -210,7 +211,7 @@ class Tuned:
                     stream,
                     Evidence(stream.instance, self.files[tree.file].regions, self.selection.iter_traces),
                     stretch,
-                    self.tuning.replayed(()).semantics,
+                    self.tuning.semantics,
                     has_series=True,
                     has_leaves=True,
                 )

@@ -19,9 +19,8 @@ import spatial_replay as sr
 from inspection.layouts import panels, paths_of
 from inspection.message_paths import values
 from replay.runs import STEP_NS, PiecewiseSource, content_of, record, run, sample
-from spatial_replay.inspection.annotator import messages_of
 from spatial_replay.inspection.curves import CURVES_CHANNEL
-from spatial_replay.logs.block import Channel, Messages
+from spatial_replay.logs.block import Channel, Messages, messages_of
 from spatial_replay.logs.mcap_writer import LogWriter
 from spatial_replay.logs.merging import merge
 from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates

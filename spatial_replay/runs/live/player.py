@@ -9,9 +9,8 @@ from typing import Final
 import numpy as np
 
 from spatial_replay.errors import SpatialReplayError
-from spatial_replay.inspection.annotator import messages_of
 from spatial_replay.inspection.curves import CURVES_CHANNEL
-from spatial_replay.logs.block import Messages
+from spatial_replay.logs.block import Messages, messages_of
 from spatial_replay.logs.merging import select
 from spatial_replay.logs.topics import CURVES_TOPIC
 from spatial_replay.replay.playback import Playback
