@@ -22,16 +22,16 @@ from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
     from spatial_replay.automata.automaton import Automaton
-    from spatial_replay.automata.compiling import automaton
+    from spatial_replay.automata.compile import automaton
     from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
-    from spatial_replay.logs.source import read_trace
-    from spatial_replay.monitor.evaluation import Evaluation, evaluate
+    from spatial_replay.monitor.evaluate import Evaluation, evaluate
     from spatial_replay.monitor.monitor import Monitor
     from spatial_replay.monitor.verdict import Verdict
     from spatial_replay.planning.planner import Planner
     from spatial_replay.recording.recorder import Recorder
+    from spatial_replay.sources.open_log import read_trace
     from spatial_replay.spec.formula import Specification
-    from spatial_replay.spec.specification import load_specification, parse_specification
+    from spatial_replay.spec.load import load_specification, parse_specification
     from spatial_replay.trace.sample import Sample
     from spatial_replay.trace.trace import Trace
 
@@ -70,7 +70,7 @@ __all__ = [
 _HOMES = {
     "Automaton": "spatial_replay.automata.automaton",
     "ConvexPart": "spatial_replay.geometry.footprint",
-    "Evaluation": "spatial_replay.monitor.evaluation",
+    "Evaluation": "spatial_replay.monitor.evaluate",
     "Footprint": "spatial_replay.geometry.footprint",
     "Monitor": "spatial_replay.monitor.monitor",
     "Planner": "spatial_replay.planning.planner",
@@ -80,11 +80,11 @@ _HOMES = {
     "Trace": "spatial_replay.trace.trace",
     "TrackedObject": "spatial_replay.geometry.footprint",
     "Verdict": "spatial_replay.monitor.verdict",
-    "automaton": "spatial_replay.automata.compiling",
-    "evaluate": "spatial_replay.monitor.evaluation",
-    "load_specification": "spatial_replay.spec.specification",
-    "parse_specification": "spatial_replay.spec.specification",
-    "read_trace": "spatial_replay.logs.source",
+    "automaton": "spatial_replay.automata.compile",
+    "evaluate": "spatial_replay.monitor.evaluate",
+    "load_specification": "spatial_replay.spec.load",
+    "parse_specification": "spatial_replay.spec.load",
+    "read_trace": "spatial_replay.sources.open_log",
 }
 
 __getattr__, __dir__ = loaded_when_used(globals(), _HOMES)

@@ -1,4 +1,4 @@
-"""Names of a package that are loaded when they are first used."""
+"""What is loaded when it is first used: names of a package, pictures of a value."""
 
 from __future__ import annotations
 
@@ -27,3 +27,30 @@ def loaded_when_used(
         return sorted({*package, *package["__all__"]})
 
     return load, names
+
+
+class Displayed:
+    """A value that `spatial_replay.notebook` knows how to show.
+
+    The pictures stand above the values in the order of imports, so they are looked up by name when a
+    notebook asks for them.
+    """
+
+    __slots__ = ()
+
+    def plot(self, *args: Any, **options: Any) -> Any:
+        """Draw it with matplotlib; see `spatial_replay.notebook.plot` for the options of each type."""
+        return _notebook().plot(self, *args, **options)
+
+    def _repr_html_(self) -> str:
+        return str(_notebook().html(self))
+
+
+def _notebook() -> Any:
+    return import_module("spatial_replay.notebook")
+
+
+def drawn_as_svg(value: Displayed) -> str | None:
+    """Return a value as SVG, or None if it cannot be drawn here."""
+    drawing: str | None = _notebook().svg(value)
+    return drawing

@@ -11,8 +11,7 @@ from pathlib import Path
 import click
 import pytest
 
-from spatial_replay.cli.application import application
-from spatial_replay.cli.commands import COMMANDS
+from spatial_replay.cli.application import COMMANDS, application
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted(

@@ -32,9 +32,9 @@ def test_without_the_library_pages_are_shown():
     "used",
     [
         "spatial_replay.automata.automaton",
-        "spatial_replay.monitor.evaluation",
+        "spatial_replay.monitor.evaluate",
         "spatial_replay.planning.planner",
-        "spatial_replay.spec.specification",
+        "spatial_replay.spec.load",
     ],
 )
 def test_the_library_loads_when_something_is_drawn(used):

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from spatial_replay.cli.application import run as run_in_process
-from spatial_replay.logs.source import read_trace
-from spatial_replay.monitor.evaluation import evaluate
+from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.spec.specification import load_specification
+from spatial_replay.sources.open_log import read_trace
+from spatial_replay.spec.load import load_specification
 
 ROOT = Path(__file__).resolve().parent.parent
 RECORDINGS = ROOT / "recordings"

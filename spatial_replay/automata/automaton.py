@@ -1,21 +1,33 @@
-"""The automaton of a specification, as a value."""
+"""The automaton of a specification, as a value.
+
+Runs of an automaton over many samples at once.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Self
+from typing import Self, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
 
 from spatial_replay.automata.diagrams import LEAF
-from spatial_replay.automata.guards import guard_words
-from spatial_replay.automata.machine import Machine
-from spatial_replay.automata.moves import Moves, Transition, moves_of, successors_of, transitions_of
+from spatial_replay.automata.guards import (
+    Moves,
+    Transition,
+    guard_words,
+    moves_of,
+    successors_of,
+    transitions_of,
+)
+from spatial_replay.automata.minimise import Machine
 from spatial_replay.automata.propositions import Proposition
+from spatial_replay.compiled import kernel
 from spatial_replay.errors import UsageError
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from spatial_replay.geometry.arrays import Flags, Integers
+from spatial_replay.lazy import Displayed, drawn_as_svg
 
 MAX_PROPOSITIONS = 64
 """How many propositions an automaton reads at most."""
@@ -25,7 +37,7 @@ MAX_ROWS = 200_000
 
 
 @dataclass(frozen=True)
-class Automaton:
+class Automaton(Displayed):
     """The least deterministic automaton of a formula over finite runs; equal ones accept the same runs.
 
     It has a move from every state for every symbol. State 0 stands before the first sample, and may be one
@@ -194,31 +206,18 @@ class Automaton:
         """What lets a transition be taken, as a sentence of the specification language."""
         return guard_words(transition.guard, self.propositions)
 
-    def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw it with matplotlib; see `picture.draw_automaton`."""
-        from spatial_replay.automata.picture import draw_automaton
-
-        return draw_automaton(self, ax)
-
-    def _repr_html_(self) -> str:
-        from spatial_replay.automata.picture import automaton_html
-
-        return automaton_html(self)
-
     def _repr_svg_(self) -> str | None:
-        from spatial_replay.automata.picture import automaton_svg
-
-        return automaton_svg(self)
+        return drawn_as_svg(self)
 
     def to_dot(self) -> str:
         """The automaton in the language of Graphviz; see `drawing.dot_text`."""
-        from spatial_replay.automata.drawing import dot_text
+        from spatial_replay.automata.dot_hoa import dot_text
 
         return dot_text(self)
 
     def to_hoa(self) -> str:
         """The automaton in the Hanoi format for tools of automata theory; see `drawing.hoa_text`."""
-        from spatial_replay.automata.drawing import hoa_text
+        from spatial_replay.automata.dot_hoa import hoa_text
 
         return hoa_text(self)
 
@@ -283,3 +282,94 @@ def automaton_of(machine: Machine, name: str, propositions: Sequence[Proposition
     entries = tuple(place(node) for node in machine.moves)
     accepting = frozenset(state for state, accepts in enumerate(machine.accepting) if accepts)
     return Automaton(name, tuple(propositions), accepting, entries, tuple(decisions))
+
+
+FALSE, TRUE, UNKNOWN = 0, 1, -1
+"""Values of propositions."""
+
+StateSet: TypeAlias = NDArray[np.bool_]
+"""(S,), which states a run may be in."""
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """The moves of an automaton for the kernels.
+
+    Attributes:
+        entries: (S,), as in `Automaton`.
+        decisions: (D, 3), as in `Automaton`.
+    """
+
+    entries: Integers
+    decisions: Integers
+
+    @classmethod
+    def of(cls, automaton: Automaton) -> Table:
+        """The table of an automaton."""
+        decisions = np.array(automaton.decisions, np.int64).reshape(-1, 3)
+        return cls(np.array(automaton.entries, np.int64), decisions)
+
+    def states(self, state: int, values: Flags) -> Integers:
+        """The state (T,) after each sample, where every proposition is known.
+
+        Args:
+            state: that before the first sample.
+            values: (P, T), 0 or 1.
+        """
+        result = np.empty(values.shape[1], np.int64)
+        _walk(self.entries, self.decisions, state, values, result)
+        return result
+
+    def state_sets(self, states: StateSet, values: Flags) -> NDArray[np.bool_]:
+        """The states (T, S) that are possible after each sample.
+
+        Args:
+            states: (S,), those before the first sample.
+            values: (P, T), 0, 1 or -1 where it is not known.
+        """
+        result = np.zeros((values.shape[1], len(self.entries)), np.bool_)
+        _spread(self.entries, self.decisions, states, values, result)
+        return result
+
+
+@kernel
+def _walk(entries: Integers, decisions: Integers, state: int, values: Flags, result: Integers) -> None:
+    for t in range(values.shape[1]):
+        place = entries[state]
+        while place >= 0:
+            place = decisions[place, 1 + values[decisions[place, 0], t]]
+        state = ~place
+        result[t] = state
+
+
+@kernel
+def _spread(
+    entries: Integers, decisions: Integers, states: StateSet, values: Flags, result: NDArray[np.bool_]
+) -> None:
+    seen = np.full(decisions.shape[0], -1, np.int64)
+    stack = np.empty(decisions.shape[0] + 2, np.int64)
+    before = states
+    for t in range(values.shape[1]):
+        after = result[t]
+        for state in range(before.shape[0]):
+            if not before[state]:
+                continue
+            stack[0] = entries[state]
+            height = 1
+            while height > 0:
+                height -= 1
+                place = stack[height]
+                if place < 0:
+                    after[~place] = True
+                    continue
+                if seen[place] == t:
+                    continue
+                seen[place] = t
+                value = values[decisions[place, 0], t]
+                if value != 1:
+                    stack[height] = decisions[place, 1]
+                    height += 1
+                if value != 0:
+                    stack[height] = decisions[place, 2]
+                    height += 1
+        before = after

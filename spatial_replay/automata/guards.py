@@ -1,11 +1,16 @@
-"""Guards: what lets a transition be taken, as a few cubes."""
+"""The moves of an automaton: which states lead to which others, and under what guards.
+
+Guards: what lets a transition be taken, as a few cubes.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
 
-from spatial_replay.automata.diagrams import NO, YES, Diagrams
+from spatial_replay.automata.diagrams import LEAF, NO, YES, Diagrams
+from spatial_replay.automata.minimise import nodes_of
 from spatial_replay.automata.propositions import Proposition
 from spatial_replay.errors import NoAutomatonError
 
@@ -94,3 +99,121 @@ def guard_words(guard: Guard, propositions: Sequence[Proposition]) -> str:
 def _cube_words(cube: Cube, propositions: Sequence[Proposition], *, alone: bool) -> str:
     text = " and ".join(propositions[number].literal(value) for number, value in cube)
     return text if alone or len(cube) == 1 else f"({text})"
+
+
+MAX_VISITS = 25_000_000
+"""How many decisions are looked at to find all moves, each for every state that it may matter to."""
+
+
+@dataclass(frozen=True)
+class Transition:
+    """A move from one state to another.
+
+    Attributes:
+        guard: cubes of literals (proposition's number, whether it is true), of which one has to hold; no cube
+            and no literal of one can be left out.
+    """
+
+    source: int
+    guard: Guard
+    target: int
+
+
+class Moves(NamedTuple):
+    """Moves as diagrams with states as leaves.
+
+    Attributes:
+        nodes: for each state.
+    """
+
+    diagrams: Diagrams
+    nodes: tuple[int, ...]
+
+
+def moves_of(entries: Sequence[int], decisions: Sequence[tuple[int, int, int]]) -> Moves:
+    """The moves of an automaton with such `entries` and `decisions`."""
+    diagrams = Diagrams()
+    nodes: list[int] = []
+
+    def node(place: int) -> int:
+        return diagrams.leaf(~place) if place < 0 else nodes[place]
+
+    for proposition, low, high in decisions:
+        nodes.append(diagrams.decide(proposition, node(low), node(high)))
+    return Moves(diagrams, tuple(node(place) for place in entries))
+
+
+def successors_of(moves: Moves) -> tuple[tuple[int, ...], ...]:
+    """For each state, those that one sample can lead to.
+
+    Raises:
+        NoAutomatonError: finding them takes more than `MAX_VISITS`.
+    """
+    diagrams = moves.diagrams
+    found: dict[int, tuple[int, ...]] = {}
+    visits = 0
+    for node in moves.nodes:
+        if node not in found:
+            below = nodes_of(diagrams, node)
+            visits = _counted(visits, len(below))
+            leaves = [diagrams[each].low for each in below if diagrams[each].variable == LEAF]
+            found[node] = tuple(sorted(leaves))
+    return tuple(found[node] for node in moves.nodes)
+
+
+def transitions_of(moves: Moves, successors: Sequence[Sequence[int]]) -> tuple[Transition, ...]:
+    """All transitions, by source and target.
+
+    Args:
+        successors: those of the moves.
+
+    Raises:
+        NoAutomatonError: finding them takes more than `MAX_VISITS`, or their guards more than `MAX_CUBES`.
+    """
+    count = sum(map(len, successors))
+    if count > MAX_CUBES:
+        raise NoAutomatonError(f"the automaton has {count} transitions, at most {MAX_CUBES} are kept")
+    covers = Covers(moves.diagrams)
+    leading = _Leading(moves.diagrams)
+    return tuple(
+        Transition(source, covers.guard(leading.to(target, node)), target)
+        for source, node in enumerate(moves.nodes)
+        for target in successors[source]
+    )
+
+
+class _Leading:
+    """Whether moves lead to a state, as functions of the propositions."""
+
+    def __init__(self, diagrams: Diagrams) -> None:
+        self._diagrams = diagrams
+        self._known: dict[int, dict[int, int]] = {}
+        self._visits = 0
+
+    def to(self, target: int, node: int) -> int:
+        """Where a node leads to a state.
+
+        Raises:
+            NoAutomatonError: that, and what was asked before, takes more than `MAX_VISITS`.
+        """
+        known = self._known.setdefault(target, {})
+        before = len(known)
+        result = self._copied(target, node, known)
+        self._visits = _counted(self._visits, len(known) - before)
+        return result
+
+    def _copied(self, target: int, node: int, known: dict[int, int]) -> int:
+        if node not in known:
+            variable, low, high = self._diagrams[node]
+            if variable == LEAF:
+                known[node] = YES if low == target else NO
+            else:
+                branches = self._copied(target, low, known), self._copied(target, high, known)
+                known[node] = self._diagrams.decide(variable, *branches)
+        return known[node]
+
+
+def _counted(visits: int, more: int) -> int:
+    if visits + more > MAX_VISITS:
+        raise NoAutomatonError(f"finding the automaton's moves takes more than {MAX_VISITS} steps")
+    return visits + more

@@ -1,19 +1,52 @@
-"""`spatial-replay check`: is this specification right, and how is it read?"""
+"""`spatial-replay check`: is this specification right, and how is it read?
+
+`check --dfa`: automata on standard output, or in a file of the kind that its name says.
+
+The tree of a formula as lines of text, and as rows for machines.
+"""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import click
 
-from spatial_replay.cli.failures import say
-from spatial_replay.cli.options import Reading, profile_option, reading_options
+from spatial_replay.automata.automaton import Automaton
+from spatial_replay.automata.compile import automaton, chosen_spec
+from spatial_replay.automata.dot_hoa import dot_text, hoa_text, size_words, svg_text, words_text
+from spatial_replay.cli.application import say
+from spatial_replay.cli.options import Reading, profile_option, reading_options, refuse_several
 from spatial_replay.cli.progress import progress
-from spatial_replay.cli.tree import iter_tree_lines, node_rows
-from spatial_replay.errors import SpecificationError, UsageError
+from spatial_replay.errors import NoAutomatonError, SpecificationError, UsageError
+from spatial_replay.logs.output_file import refuse_inputs, replacing
 from spatial_replay.spec import check_names, load_specification
-from spatial_replay.spec.formula import Diagnostic, NamedSpec, Specification
+from spatial_replay.spec.format import format_formula, iter_branches, label_of
+from spatial_replay.spec.formula import Diagnostic, Formula, NamedSpec, Specification, iter_nodes, operator_of
+
+
+def iter_tree_lines(formula: Formula) -> Iterator[str]:
+    """One line for each node: its id, branches down to it, its name and what it is."""
+    branches = list(iter_branches(formula))
+    width = len(str(len(branches) - 1))
+    for identifier, stem, node in branches:
+        yield f"{identifier:>{width}}  {stem}{label_of(node)}"
+
+
+def node_rows(formula: Formula) -> list[dict[str, object]]:
+    """The nodes as rows of a table: id, parent, operator, name, text."""
+    return [
+        {
+            "id": identifier,
+            "parent": parent,
+            "operator": operator_of(node),
+            "name": node.name,
+            "text": format_formula(node),
+        }
+        for identifier, parent, node in iter_nodes(formula)
+    ]
 
 
 @click.command()
@@ -57,7 +90,6 @@ def check(
     inputs = [specification] if log is None else [specification, log]
     if dfa is not None:
         # a mere check does without what compiles and writes
-        from spatial_replay.cli.automata import refuse_automata
 
         refuse_automata(parsed, of, dfa, inputs)
     remarks = [*parsed.warnings, *(_compared_with_log(parsed, log, reading) if log is not None else ())]
@@ -69,14 +101,12 @@ def check(
         raise SpecificationError(faults)
     click.echo(_json_of(parsed, remarks) if as_json else _text_of(parsed))
     if dfa is not None:
-        from spatial_replay.cli.automata import show_automata
-
         show_automata(parsed, of, dfa, inputs, quiet=as_json)
 
 
 def _compared_with_log(specification: Specification, log: Path, reading: Reading) -> tuple[Diagnostic, ...]:
     # readers of logs load the numerical libraries, which a mere check does without
-    from spatial_replay.logs.source import open_source
+    from spatial_replay.sources.open_log import open_source
 
     names: set[str] = set()
     signals: set[str] = set()
@@ -119,3 +149,76 @@ def _json_of(specification: Specification, remarks: list[Diagnostic]) -> str:
         indent=2,
         ensure_ascii=False,
     )
+
+
+STANDARD_OUTPUT = "-"
+
+_TEXTS: MappingProxyType[str, Callable[[Automaton], str]] = MappingProxyType(
+    {".dot": dot_text, ".hoa": hoa_text, ".svg": svg_text}
+)
+
+
+def show_automata(
+    specification: Specification,
+    name: str | None,
+    file: str,
+    inputs: Sequence[Path] = (),
+    *,
+    quiet: bool = False,
+) -> None:
+    """Write the automaton of a spec to a file; to standard output, in words, those of all results.
+
+    What is asked for has passed `refuse_automata`.
+
+    Args:
+        name: which spec.
+        file: "-", or a file that ends in .dot, .hoa or .svg.
+        inputs: files that the output must not be.
+        quiet: leave standard output to others.
+
+    Raises:
+        NoAutomatonError: one has none; if several are shown, after the others.
+        UsageError: there is no Graphviz to draw with.
+        OutputError: the file cannot be written.
+    """
+    if file == STANDARD_OUTPUT:
+        _show(specification, [name] if name else [spec.name for spec in specification.results])
+        return
+    path = Path(file)
+    chosen = automaton(specification, name)
+    text = _TEXTS[path.suffix](chosen)
+    with replacing(path, inputs) as stream:
+        stream.write(text.encode())
+    click.echo(f"wrote {path}: {size_words(chosen)}", err=quiet)
+
+
+def refuse_automata(
+    specification: Specification, name: str | None, file: str, inputs: Sequence[Path] = ()
+) -> None:
+    """That `show_automata` can do what it is asked for, as far as options tell.
+
+    Raises:
+        UsageError: a file of another ending or one that is an input, no such spec, several to choose from.
+    """
+    if name is not None:
+        chosen_spec(specification, name)
+    if file == STANDARD_OUTPUT:
+        return
+    path = Path(file)
+    if path.suffix not in _TEXTS:
+        raise UsageError(
+            f"{file}: write an automaton to a file that ends in .dot, .hoa or .svg, or in words to -"
+        )
+    refuse_several(specification, name)
+    refuse_inputs(path, inputs)
+
+
+def _show(specification: Specification, names: Sequence[str]) -> None:
+    faults = []
+    for name in names:
+        try:
+            click.echo("\n" + words_text(automaton(specification, name)))
+        except NoAutomatonError as error:
+            faults.append(str(error))
+    if faults:
+        raise NoAutomatonError("\n".join(faults))

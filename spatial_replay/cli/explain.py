@@ -7,11 +7,18 @@ from dataclasses import replace
 
 import click
 
-from spatial_replay.cli.evaluating import Request, Task, evaluation_options, prepared, report_reading
-from spatial_replay.cli.exit_codes import exit_code_from_verdicts
-from spatial_replay.cli.failures import say
+from spatial_replay.cli.application import exit_code_from_verdicts, say
+from spatial_replay.cli.options import (
+    Request,
+    Task,
+    evaluation_options,
+    prepared,
+    read_for,
+    report_reading,
+    text_from_duration_ns,
+    time_point_from_text,
+)
 from spatial_replay.cli.progress import progress
-from spatial_replay.cli.times import read_for, text_from_duration_ns, time_point_from_text
 from spatial_replay.errors import UsageError
 
 

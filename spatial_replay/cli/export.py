@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spatial_replay.cli.exit_codes import ExitCode
-from spatial_replay.cli.failures import say
+from spatial_replay.cli.application import ExitCode, say
 from spatial_replay.cli.options import output_option
 from spatial_replay.cli.progress import progress
-from spatial_replay.wording import counted
+from spatial_replay.text import counted
 
 if TYPE_CHECKING:
     from spatial_replay.replay.table import Quantity
@@ -38,8 +37,8 @@ def export(annotated: Path, output: Path, quantity: Quantity) -> int:
       spatial-replay export annotated.mcap -o run.csv
     """
     # the numerical libraries load when there is work for them
-    from spatial_replay.logs.source import open_source
     from spatial_replay.replay.table import export_table
+    from spatial_replay.sources.open_log import open_source
 
     source = open_source(annotated)
     with progress("rows") as advance:

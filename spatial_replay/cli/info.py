@@ -13,19 +13,17 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spatial_replay.cli.decisions import decision_lines, decision_rows
-from spatial_replay.cli.exit_codes import ExitCode
-from spatial_replay.cli.failures import say
+from spatial_replay.cli.application import ExitCode, say
 from spatial_replay.cli.options import Reading, reading_options
+from spatial_replay.cli.output import decision_lines, decision_rows
 from spatial_replay.cli.progress import progress
 from spatial_replay.errors import UsageError
-from spatial_replay.wording import counted
+from spatial_replay.text import counted
 
 if TYPE_CHECKING:
-    from spatial_replay.logs.foreign.messages import MessageReader
-    from spatial_replay.logs.mcap_info import LogSummary
-    from spatial_replay.logs.overview import Overview
-    from spatial_replay.logs.survey import Survey
+    from spatial_replay.bags.reader import MessageReader
+    from spatial_replay.logs.mcap.summary import LogSummary
+    from spatial_replay.sources.overview import Overview, Survey
 
 _EPOCH_LIKELY_NS = 10**18
 """Clocks beyond this count from 1970 (2001 or later); others count from the start of something."""
@@ -62,9 +60,8 @@ def info(
     if decisions:
         return _decisions(log, as_json)
     # the numerical libraries load when there is work for them
-    from spatial_replay.logs.overview import overview_of, overview_of_survey
-    from spatial_replay.logs.source import open_source
-    from spatial_replay.logs.survey import messages_in, survey
+    from spatial_replay.sources.open_log import open_source
+    from spatial_replay.sources.overview import messages_in, overview_of, overview_of_survey, survey
 
     reader = messages_in(log)
     if suggest_mapping:
@@ -91,7 +88,7 @@ def info(
 
 def _decisions(log: Path, as_json: bool) -> int:
     """Print what was decided in a planned run."""
-    from spatial_replay.planning.told import read_decisions
+    from spatial_replay.planning.read import read_decisions
 
     told = read_decisions(log)
     for warning in told.faults:
@@ -108,8 +105,8 @@ def _decisions(log: Path, as_json: bool) -> int:
 
 def _print_layout(log: Path) -> int:
     """Print the layout that is kept in a log."""
-    from spatial_replay.inspection.viewer import LAYOUT
-    from spatial_replay.logs.source import open_source
+    from spatial_replay.annotate.foxglove_layout import LAYOUT
+    from spatial_replay.sources.open_log import open_source
 
     source = open_source(log)
     for attachment in source.attachments():
@@ -123,8 +120,8 @@ def _print_layout(log: Path) -> int:
 
 def _suggest(log: Path, reader: MessageReader | None, as_json: bool) -> int:
     """Print a mapping file for a log of messages."""
-    from spatial_replay.logs.source import open_source
-    from spatial_replay.logs.survey import survey
+    from spatial_replay.sources.open_log import open_source
+    from spatial_replay.sources.overview import survey
 
     if as_json:
         raise UsageError("--suggest-mapping prints YAML; leave --json out")

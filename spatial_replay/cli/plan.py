@@ -7,11 +7,11 @@ from pathlib import Path
 
 import click
 
-from spatial_replay.cli.exit_codes import exit_code_from_verdicts
+from spatial_replay.cli.application import exit_code_from_verdicts
 from spatial_replay.cli.options import output_option, profile_option, refuse_several
 from spatial_replay.cli.progress import progress
-from spatial_replay.cli.simulated import SCENARIOS, Simulating, injections_from, simulation_options
-from spatial_replay.wording import counted
+from spatial_replay.cli.record import SCENARIOS, Simulating, injections_from, simulation_options
+from spatial_replay.text import counted
 
 
 @click.group()

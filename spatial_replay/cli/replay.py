@@ -7,12 +7,19 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spatial_replay.cli.evaluating import Request, evaluation_options, prepared, report_reading
-from spatial_replay.cli.exit_codes import exit_code_from_verdicts
-from spatial_replay.cli.options import output_option, semantics_option
+from spatial_replay.cli.application import exit_code_from_verdicts
+from spatial_replay.cli.options import (
+    Request,
+    duration_ns_from_text,
+    evaluation_options,
+    output_option,
+    prepared,
+    read_for,
+    report_reading,
+    semantics_option,
+)
+from spatial_replay.cli.output import print_verdicts, write_document
 from spatial_replay.cli.progress import progress
-from spatial_replay.cli.times import duration_ns_from_text, read_for
-from spatial_replay.cli.verdicts import print_verdicts, write_document
 from spatial_replay.errors import UsageError
 
 if TYPE_CHECKING:
@@ -108,7 +115,7 @@ def _width_ns(text: str) -> int:
 
 def _check_outputs(output: Path | None, json_file: str | None, inputs: tuple[Path, ...]) -> None:
     """Refuse before the work what would fail after it."""
-    from spatial_replay.logs.output import refuse_inputs
+    from spatial_replay.logs.output_file import refuse_inputs
 
     if output is not None:
         refuse_inputs(output, inputs)

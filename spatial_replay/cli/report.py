@@ -7,11 +7,17 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spatial_replay.cli.evaluating import Request, evaluation_options, prepared, report_reading
-from spatial_replay.cli.exit_codes import exit_code_from_verdicts
-from spatial_replay.cli.options import output_option, semantics_option
+from spatial_replay.cli.application import exit_code_from_verdicts
+from spatial_replay.cli.options import (
+    Request,
+    evaluation_options,
+    output_option,
+    prepared,
+    report_reading,
+    semantics_option,
+)
+from spatial_replay.cli.output import print_verdicts
 from spatial_replay.cli.progress import progress
-from spatial_replay.cli.verdicts import print_verdicts
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.semantics import Semantics
@@ -35,8 +41,8 @@ def report(request: Request, output: Path, semantics: Semantics) -> int:
       spatial-replay report people.jsonl --spec social.spatial --each ego=class:pedestrian -o people.html
     """
     # the numerical libraries load when there is work for them
-    from spatial_replay.logs.output import refuse_inputs
-    from spatial_replay.replay.report import write_report
+    from spatial_replay.logs.output_file import refuse_inputs
+    from spatial_replay.report.write import write_report
 
     refuse_inputs(output, request.inputs)
     task = prepared(request)

@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spatial_replay.cli.evaluating import Request, evaluation_options, prepared, report_reading
-from spatial_replay.cli.exit_codes import ExitCode
-from spatial_replay.cli.failures import say
-from spatial_replay.cli.options import semantics_option
+from spatial_replay.cli.application import ExitCode, say
+from spatial_replay.cli.options import Request, evaluation_options, prepared, report_reading, semantics_option
+from spatial_replay.cli.output import print_verdicts
 from spatial_replay.cli.progress import progress
-from spatial_replay.cli.verdicts import print_verdicts
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.semantics import Semantics
@@ -73,7 +71,7 @@ def serve(
 
 def _serve(tuned: Tuned, host: str, port: int, play: bool) -> None:
     # the numerical libraries load when there is work for them
-    from spatial_replay.runs.live.serving import serving
+    from spatial_replay.serve.serving import serving
 
     with serving(tuned, host=host, port=port, play=play) as server:
         print_verdicts(tuned.replayed, None)

@@ -6,12 +6,11 @@ from pathlib import Path
 
 import click
 
-from spatial_replay.cli.exit_codes import ExitCode
-from spatial_replay.cli.failures import say
+from spatial_replay.cli.application import ExitCode, say
 from spatial_replay.cli.options import Reading, reading_options
 from spatial_replay.cli.progress import progress
 from spatial_replay.errors import UsageError
-from spatial_replay.wording import counted
+from spatial_replay.text import counted
 
 
 @click.command()
@@ -38,9 +37,9 @@ def verify(log: Path, source: Path | None, decisions: bool, reading: Reading) ->
       spatial-replay verify push.mcap --decisions
     """
     # the numerical libraries load when there is work for them
-    from spatial_replay.logs.source import open_source
-    from spatial_replay.planning.redo import redo_decisions
+    from spatial_replay.planning.recompute import redo_decisions
     from spatial_replay.replay.verification import verify_certificate
+    from spatial_replay.sources.open_log import open_source
 
     if source is None and reading["mapping"] is not None:
         raise UsageError("--mapping is about the log's source; add --source SOURCE")

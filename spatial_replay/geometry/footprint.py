@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 
 from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.arrays import Floats, read_only_floats
-from spatial_replay.geometry.decompose import convex_hull, convex_pieces
-from spatial_replay.geometry.outline import NOT_CONVEX, SOUND, normalise_polygons
+from spatial_replay.geometry.outline import NOT_CONVEX, SOUND, convex_hull, convex_pieces, normalise_polygons
 
 Concave: TypeAlias = Literal["decompose", "hull"]
 """What becomes of a non-convex polygon: convex parts that cover exactly it, or its convex hull."""

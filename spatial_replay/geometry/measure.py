@@ -1,7 +1,11 @@
-"""Measurements between footprints over many samples, in one kernel call."""
+"""Measurements between footprints over many samples, in one kernel call.
+
+Orientation in the plane.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -9,6 +13,7 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
+from spatial_replay.compiled import inlined, kernel
 from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.batch import FootprintBatch
@@ -118,3 +123,28 @@ def _check_request(request: Request, operand_count: int) -> None:
             raise GeometryError(
                 f"{request.quantity} asks for operand {index}; there are {operand_count}, from 0"
             )
+
+
+@inlined
+def misalignment_of(first: float, second: float) -> float:
+    """`misalignment` of two angles, for kernels."""
+    x = math.cos(first) - math.cos(second)
+    y = math.sin(first) - math.sin(second)
+    return 0.5 * (x * x + y * y)
+
+
+@kernel
+def _misalignment(first: Floats, second: Floats, result: Floats) -> None:
+    for k in range(len(first)):
+        result[k] = misalignment_of(first[k], second[k])
+
+
+def misalignment(first: Floats, second: Floats) -> Floats:
+    """Half the squared distance of the unit vectors at two angles (Def. 10, 11): 1 - cos of their difference.
+
+    Args:
+        first, second: (T,) radians; NaN where there is none, and then the result is NaN.
+    """
+    result = np.empty(len(first))
+    _misalignment(first, second, result)
+    return result

@@ -5,7 +5,7 @@ from __future__ import annotations
 from google.protobuf.message import Message
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from spatial_replay.logs.block import Channel, Schema
+from spatial_replay.logs.messages import Channel, Schema
 
 OBJECTS = "/spatial/objects"
 SCENE = "/spatial/scene"

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from spatial_replay.errors import UsageError
-from spatial_replay.monitor.operands import Bindings
-from spatial_replay.monitor.program import Program, compile_formula
+from spatial_replay.monitor.atoms.terms import Bindings
+from spatial_replay.monitor.online.program import Program, compile_formula
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification
 from spatial_replay.trace.trace import ABSENT, Trace, window_of
 

@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.monitor.evaluation import no_such_node, require_time
-from spatial_replay.monitor.live import ROOM
+from spatial_replay.monitor.evaluate import no_such_node, require_time
 from spatial_replay.monitor.semantics import checked_semantics, live_evaluation
+from spatial_replay.monitor.stream import ROOM
 from spatial_replay.monitor.verdict import Verdict, online_verdict, worst_verdict
 from spatial_replay.spec.formula import NamedSpec, Specification, iter_nodes
-from spatial_replay.spec.specification import require_specification
+from spatial_replay.spec.load import require_specification
 from spatial_replay.trace.sample import Sample
 
 

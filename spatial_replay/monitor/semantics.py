@@ -7,11 +7,9 @@ from typing import Literal, TypeAlias, cast, get_args
 
 from spatial_replay.errors import UsageError
 from spatial_replay.monitor.instances import Instance
-from spatial_replay.monitor.live import LiveEvaluation, LiveRuns
-from spatial_replay.monitor.paper.live import PaperRuns
-from spatial_replay.monitor.paper.stream import PaperStream, check_operators
-from spatial_replay.monitor.program import compile_formula
-from spatial_replay.monitor.stream import InstanceEvaluation, InstanceStream
+from spatial_replay.monitor.online.program import compile_formula
+from spatial_replay.monitor.paper.evaluator import PaperRuns, PaperStream, check_operators
+from spatial_replay.monitor.stream import InstanceEvaluation, InstanceStream, LiveEvaluation, LiveRuns
 from spatial_replay.spec.formula import Specification
 
 Semantics: TypeAlias = Literal["ltlf", "paper"]

@@ -13,13 +13,11 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.planning.displacement import proposition_maps
-    from spatial_replay.planning.logged_step import LoggedStep, read_steps
-    from spatial_replay.planning.maps import GradientMap, gradient_map
+    from spatial_replay.planning.decisions import Candidate, Executor, Outcome, Step, Target
+    from spatial_replay.planning.gradient_map import GradientMap, gradient_map, moved_object, proposition_maps
     from spatial_replay.planning.planner import Planner
-    from spatial_replay.planning.poses import moved_object
+    from spatial_replay.planning.read import LoggedStep, read_steps
     from spatial_replay.planning.settings import Settings
-    from spatial_replay.planning.step import Candidate, Executor, Outcome, Step, Target
     from spatial_replay.planning.workspace import Grid, Workspace
 
 __all__ = [
@@ -42,21 +40,21 @@ __all__ = [
 
 _HOMES: Mapping[str, str] = MappingProxyType(
     {
-        "Candidate": "spatial_replay.planning.step",
-        "Executor": "spatial_replay.planning.step",
-        "GradientMap": "spatial_replay.planning.maps",
+        "Candidate": "spatial_replay.planning.decisions",
+        "Executor": "spatial_replay.planning.decisions",
+        "GradientMap": "spatial_replay.planning.gradient_map",
         "Grid": "spatial_replay.planning.workspace",
-        "LoggedStep": "spatial_replay.planning.logged_step",
-        "Outcome": "spatial_replay.planning.step",
+        "LoggedStep": "spatial_replay.planning.read",
+        "Outcome": "spatial_replay.planning.decisions",
         "Planner": "spatial_replay.planning.planner",
         "Settings": "spatial_replay.planning.settings",
-        "Step": "spatial_replay.planning.step",
-        "Target": "spatial_replay.planning.step",
+        "Step": "spatial_replay.planning.decisions",
+        "Target": "spatial_replay.planning.decisions",
         "Workspace": "spatial_replay.planning.workspace",
-        "gradient_map": "spatial_replay.planning.maps",
-        "moved_object": "spatial_replay.planning.poses",
-        "proposition_maps": "spatial_replay.planning.displacement",
-        "read_steps": "spatial_replay.planning.logged_step",
+        "gradient_map": "spatial_replay.planning.gradient_map",
+        "moved_object": "spatial_replay.planning.gradient_map",
+        "proposition_maps": "spatial_replay.planning.gradient_map",
+        "read_steps": "spatial_replay.planning.read",
     }
 )
 

@@ -1,15 +1,92 @@
-"""Edges of an automaton as a planner sees them: what has to hold, what must not, what is left of them."""
+"""Edges of an automaton as a planner sees them: what has to hold, what must not, what is left of them.
+
+Where time alone leads: `X` and bounds in samples move an automaton while nothing else changes.
+
+What samples say of propositions.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Final
+from itertools import pairwise, takewhile
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.moves import Transition
-from spatial_replay.planning.drift import Drift
-from spatial_replay.planning.observing import Symbol
-from spatial_replay.planning.step import Consideration, Edge, Guards
+from spatial_replay.automata.guards import Transition
+from spatial_replay.errors import UsageError
+from spatial_replay.monitor.atoms.live import SampleLeaves
+from spatial_replay.planning.decisions import Consideration, Edge, Guards
+from spatial_replay.spec.formula import Formula, Outline, Specification
+from spatial_replay.trace.sample import Sample
+
+Symbol: TypeAlias = tuple[bool | None, ...]
+"""For each proposition whether it is true; None where that is not known."""
+
+
+class Observer:
+    """Propositions in sample after sample: true where their robustness is at least 0.
+
+    As for a `value`, uncertainty does not count: a robot acts on what is most likely.
+    """
+
+    def __init__(self, formulas: Sequence[Formula], regions: Mapping[str, Outline]) -> None:
+        # what evaluates leaves takes all formulas without temporal operators
+        leaves: list[Any] = list(formulas)
+        self._leaves = SampleLeaves([leaves], regions)
+
+    def symbol(self, sample: Sample) -> Symbol:
+        """What a sample says of each proposition."""
+        values = self._leaves.values(self._leaves.look_at(sample))
+        lower, upper = values[0, :, 0].tolist(), values[min(1, len(values) - 1), :, 0].tolist()
+        return tuple(
+            None if low < 0.0 <= high else low >= 0.0 for low, high in zip(lower, upper, strict=True)
+        )
+
+
+def refuse_template(specification: Specification, name: str) -> None:
+    """That a spec is about objects that are known.
+
+    Raises:
+        UsageError: a template, since it stands for objects that only a whole log has.
+    """
+    for spec in specification.specs:
+        if spec.name == name and spec.parameter is not None:
+            raise UsageError(
+                f"{name}({spec.parameter}) in {specification.filename} is a template: it stands for objects "
+                "that are not known before the end; plan for a spec that names its objects"
+            )
+
+
+class Drift(NamedTuple):
+    """The states that an automaton goes through if all samples to come say what the newest one does.
+
+    Attributes:
+        states: the present one, and each once; it stays in the last one, or nobody knows where it goes.
+    """
+
+    states: tuple[int, ...]
+
+    @property
+    def edges(self) -> frozenset[Edge]:
+        """The moves that time alone makes."""
+        return frozenset(pairwise(self.states))
+
+    def along(self, way: Sequence[Transition]) -> tuple[int, ...]:
+        """The states to which time alone leads on a way, one after the other; none if its first is not."""
+        steps = zip(way, self.states[1:], strict=False)
+        return tuple(state for _, state in takewhile(lambda step: step[0].target == step[1], steps))
+
+
+def drift_of(automaton: Automaton, state: int, symbol: Symbol) -> Drift:
+    """Where time alone leads from a state."""
+    seen = {state: None}
+    after = automaton.step_set({state}, symbol)
+    while len(after) == 1 and not after <= seen.keys():
+        (state,) = after
+        seen[state] = None
+        after = automaton.step_set({state}, symbol)
+    return Drift(tuple(seen))
+
 
 _LISTED: Final = 4
 """Edges that are named for a reason; others are counted."""

@@ -1,16 +1,175 @@
-"""Shortest paths over the free cells of a map."""
+"""Shortest paths over the free cells of a map.
+
+Jump-point search over a grid of cells (Harabor and Grastien, 2011), without cutting corners.
+
+A step goes to one of the eight neighbours; a diagonal one only where both cells beside it are free, too. Of
+all shortest paths between two cells that differ only in the order of their steps, the search follows the one
+that goes diagonally first; it stops where a path has to turn, or where a goal is.
+"""
 
 from __future__ import annotations
 
+import heapq
 import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spatial_replay.compiled import kernel, piece
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Booleans, Integers, read_only_integers
-from spatial_replay.planning.path_kernel import search
+from spatial_replay.geometry.arrays import Booleans, Flags, Integers, read_only_integers
+
+ROOT_2 = math.sqrt(2.0)
+
+
+@piece
+def _jump_straight(free: Flags, goals: Flags, row: int, column: int, down: int, right: int) -> int:
+    """Steps to the next cell along a row or column where a path may have to turn or ends; 0 for none."""
+    steps = 0
+    while True:
+        row += down
+        column += right
+        steps += 1
+        if not free[row, column]:
+            return 0
+        if goals[row, column]:
+            return steps
+        for side in (-1, 1):
+            beside_row, beside_column = row + side * right, column + side * down
+            # the cell beside is free and the one before it is not: no shorter way leads there
+            if free[beside_row, beside_column] and not free[beside_row - down, beside_column - right]:
+                return steps
+
+
+@piece
+def _jump_diagonal(free: Flags, goals: Flags, row: int, column: int, down: int, right: int) -> int:
+    """The same along a diagonal."""
+    steps = 0
+    while True:
+        if not (free[row + down, column] and free[row, column + right] and free[row + down, column + right]):
+            return 0
+        row += down
+        column += right
+        steps += 1
+        if goals[row, column]:
+            return steps
+        if _jump_straight(free, goals, row, column, down, 0):
+            return steps
+        if _jump_straight(free, goals, row, column, 0, right):
+            return steps
+
+
+@piece
+def _directions(free: Flags, row: int, column: int, down: int, right: int, found: Integers) -> int:
+    """Fill in where a path may go on from a cell that it reached in a direction; returns how many ways."""
+    if down != 0 and right != 0:
+        found[0, 0], found[0, 1] = down, 0
+        found[1, 0], found[1, 1] = 0, right
+        found[2, 0], found[2, 1] = down, right
+        return 3
+    found[0, 0], found[0, 1] = down, right
+    count = 1
+    for side in (-1, 1):
+        aside_down, aside_right = side * right, side * down
+        beside_row, beside_column = row + aside_down, column + aside_right
+        if free[beside_row, beside_column] and not free[beside_row - down, beside_column - right]:
+            found[count, 0], found[count, 1] = aside_down, aside_right
+            found[count + 1, 0], found[count + 1, 1] = down + aside_down, right + aside_right
+            count += 2
+    return count
+
+
+@piece
+def _at_least(row: int, column: int, box: Integers) -> float:
+    """A lower bound of the way from a cell to the goals: that to the box around them, nothing in between."""
+    rows = max(box[0] - row, row - box[1], 0)
+    columns = max(box[2] - column, column - box[3], 0)
+    return float(abs(rows - columns) + ROOT_2 * min(rows, columns))
+
+
+@kernel
+def search(free: Flags, goals: Flags, box: Integers, start_row: int, start_column: int) -> Integers:
+    """The shortest path from a cell to any goal.
+
+    Args:
+        free: (R, C), 1 where a path may go; a border of zeros around all.
+        goals: (R, C), 1 where it may end; only free cells.
+        box: (4,): first and last row, first and last column with a goal.
+
+    Returns:
+        (K, 2), the cells where it turns, from the start to the goal; (0, 2) where there is no path.
+    """
+    rows, columns = free.shape
+    straight = np.full(rows * columns, -1, np.int64)
+    diagonal = np.zeros(rows * columns, np.int64)
+    parent = np.full(rows * columns, -1, np.int64)
+    closed = np.zeros(rows * columns, np.bool_)
+    ways = np.zeros((8, 2), np.int64)
+    first = start_row * columns + start_column
+    straight[first] = 0
+    waiting = [(_at_least(start_row, start_column, box), np.int64(first))]
+    while len(waiting) > 0:
+        current = heapq.heappop(waiting)[1]
+        if closed[current]:
+            continue
+        closed[current] = True
+        row, column = current // columns, current % columns
+        if goals[row, column]:
+            return _turns(parent, current, columns)
+        if parent[current] < 0:
+            count = 0
+            for down in range(-1, 2):
+                for right in range(-1, 2):
+                    if down != 0 or right != 0:
+                        ways[count, 0], ways[count, 1] = down, right
+                        count += 1
+        else:
+            down = _sign(row - parent[current] // columns)
+            right = _sign(column - parent[current] % columns)
+            count = _directions(free, row, column, down, right, ways)
+        for way in range(count):
+            down, right = ways[way, 0], ways[way, 1]
+            is_diagonal = down != 0 and right != 0
+            if is_diagonal:
+                steps = _jump_diagonal(free, goals, row, column, down, right)
+            else:
+                steps = _jump_straight(free, goals, row, column, down, right)
+            if steps == 0:
+                continue
+            there = (row + steps * down) * columns + column + steps * right
+            new_straight = straight[current] + (0 if is_diagonal else steps)
+            new_diagonal = diagonal[current] + (steps if is_diagonal else 0)
+            # lengths from whole numbers of steps: equal ways are equal to the bit
+            length = new_straight + ROOT_2 * new_diagonal
+            if straight[there] >= 0 and straight[there] + ROOT_2 * diagonal[there] <= length:
+                continue
+            straight[there], diagonal[there] = new_straight, new_diagonal
+            parent[there] = current
+            ahead = _at_least(row + steps * down, column + steps * right, box)
+            heapq.heappush(waiting, (length + ahead, np.int64(there)))
+    return np.zeros((0, 2), np.int64)
+
+
+@piece
+def _sign(value: int) -> int:
+    return (value > 0) - (value < 0)
+
+
+@piece
+def _turns(parent: Integers, last: np.int64, columns: int) -> Integers:
+    """(K, 2): the cells from the start to the last one."""
+    count = 1
+    at = last
+    while parent[at] >= 0:
+        at = parent[at]
+        count += 1
+    cells = np.empty((count, 2), np.int64)
+    at = last
+    for k in range(count - 1, -1, -1):
+        cells[k, 0], cells[k, 1] = at // columns, at % columns
+        at = parent[at]
+    return cells
 
 
 @dataclass(frozen=True, eq=False)

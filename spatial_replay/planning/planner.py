@@ -1,26 +1,71 @@
-"""Algorithm 1 of the paper: an edge of the automaton at a time, by moving one object at a time."""
+"""Algorithm 1 of the paper: an edge of the automaton at a time, by moving one object at a time.
+
+What was tried for each edge of the automaton, and where that failed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import Final
 
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.compiling import automaton as automaton_of
+from spatial_replay.automata.compile import automaton as automaton_of
 from spatial_replay.errors import TraceError, UsageError
-from spatial_replay.planning.attempts import Attempts
 from spatial_replay.planning.candidates import Movables, with_choice
-from spatial_replay.planning.checks import kind_faults, refuse_faults
-from spatial_replay.planning.drift import drift_of
-from spatial_replay.planning.edges import consideration_of, twins_of, why_no_path, worst_state
-from spatial_replay.planning.observing import Observer, Symbol, refuse_template
+from spatial_replay.planning.decisions import Consideration, Edge, Kind, Outcome, Step, Target
+from spatial_replay.planning.edges import (
+    Observer,
+    Symbol,
+    consideration_of,
+    drift_of,
+    refuse_template,
+    twins_of,
+    why_no_path,
+    worst_state,
+)
+from spatial_replay.planning.gradient_map import Cubes, refuse_delays, refuse_unknown
 from spatial_replay.planning.settings import Settings
-from spatial_replay.planning.step import Consideration, Edge, Kind, Outcome, Step
-from spatial_replay.planning.subjects import refuse_delays, refuse_unknown
-from spatial_replay.planning.workspace import Workspace
+from spatial_replay.planning.workspace import Workspace, kind_faults, refuse_faults
 from spatial_replay.spec.formula import Specification
+from spatial_replay.text import counted
 from spatial_replay.trace.sample import Sample
-from spatial_replay.wording import counted
+
+MOST_MOTIONS: Final = 100
+"""How many motions an edge gets in all, however often they succeed."""
+
+
+class Attempts:
+    """The motions of a run."""
+
+    def __init__(self) -> None:
+        self._in_vain: Counter[Edge] = Counter()
+        self._in_all: Counter[Edge] = Counter()
+        self._places: dict[tuple[Cubes, str], tuple[tuple[float, float], ...]] = {}
+
+    def why_enough(self, edge: Edge, most_in_vain: int) -> str:
+        """Why an edge is not to be tried again, or ""."""
+        if self._in_vain[edge] >= most_in_vain:
+            return f"tried {self._in_vain[edge]} times"
+        return f"tried {MOST_MOTIONS} times in all" if self._in_all[edge] >= MOST_MOTIONS else ""
+
+    def begin(self, edge: Edge) -> None:
+        """Count a motion for an edge, in vain so far."""
+        self._in_vain[edge] += 1
+        self._in_all[edge] += 1
+
+    def conclude(self, aim: Consideration, target: Target, outcome: Outcome, states: Sequence[int]) -> None:
+        """Take in how a motion went, and where the automaton is then."""
+        if not outcome.succeeded:
+            key = (aim.progress.cubes, target.name)
+            self._places[key] = (*self._places.get(key, ()), (target.x, target.y))
+        elif tuple(states) == aim.edge[1:]:
+            del self._in_vain[aim.edge]
+
+    def failed(self, aim: Consideration, name: str) -> tuple[tuple[float, float], ...]:
+        """The places (x, y) where an object could not be brought for equal progress."""
+        return self._places.get((aim.progress.cubes, name), ())
 
 
 class Planner:

@@ -1,26 +1,78 @@
-"""Where objects can be put: a grid of positions, how they may be turned, what stands in the way."""
+"""Where objects can be put: a grid of positions, how they may be turned, what stands in the way.
+
+What is wrong with the values of settings, in words: all of it at once.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.planning.checks import (
-    count_faults,
-    is_number,
-    kind_faults,
-    member_faults,
-    number_faults,
-    point_faults,
-    refuse_faults,
-)
 from spatial_replay.trace.sample import Sample
+
+
+def refuse_faults(faults: Iterable[str]) -> None:
+    """That there are no faults.
+
+    Raises:
+        UsageError: with each of them on a line.
+    """
+    told = "\n".join(faults)
+    if told:
+        raise UsageError(told)
+
+
+def is_number(value: object) -> bool:
+    """Whether a value is a number but NaN; truth values are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
+
+
+def number_faults(values: Mapping[str, Any], least: float = -math.inf) -> list[str]:
+    """Values by name, to be finite numbers of at least so much."""
+    wanted = "a finite number" if least == -math.inf else f"a finite number of at least {least:g}"
+    return [
+        f"{name} is {value!r}; give {wanted}"
+        for name, value in values.items()
+        if not (is_number(value) and math.isfinite(value) and value >= least)
+    ]
+
+
+def point_faults(name: str, value: Any) -> list[str]:
+    """A value to be a point (x, y) of finite numbers."""
+    if not isinstance(value, tuple) or len(value) != 2:
+        return [f"{name} is {value!r}; give (x, y)"]
+    return number_faults({f"{name}[{place}]": number for place, number in enumerate(value)})
+
+
+def count_faults(values: Mapping[str, Any]) -> list[str]:
+    """Values by name, to be whole numbers of at least 1."""
+    return [
+        f"{name} is {value!r}; give a whole number of at least 1"
+        for name, value in values.items()
+        if not isinstance(value, int) or isinstance(value, bool) or value < 1
+    ]
+
+
+def kind_faults(name: str, value: object, kind: type, wanted: str) -> list[str]:
+    """A value to be of a kind."""
+    return [] if isinstance(value, kind) else [f"{name} is {value!r}; give {wanted}"]
+
+
+def member_faults(
+    name: str, members: Collection[Any], collection: type, member: type, wanted: str
+) -> list[str]:
+    """A value to be a collection of members of one kind."""
+    return kind_faults(name, members, collection, wanted) or [
+        f"{name} has {each!r}; give {wanted}" for each in members if not isinstance(each, member)
+    ]
+
 
 MOST_CELLS = 1_000_000
 """Cells of a grid, over all angles: maps of so many take a gigabyte. Beyond it a cell size was mistyped."""

@@ -1,4 +1,9 @@
-"""A recorder in the loop: the caller hands over samples, a thread of its own writes them."""
+"""A recorder in the loop: the caller hands over samples, a thread of its own writes them.
+
+Compiled code loaded before the first sample, so that no sample waits for it.
+
+Compiled code loaded before the first sample, so that no decision waits for it.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +17,66 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+import numpy as np
+
+from spatial_replay.annotate.automaton_state import KeptAutomaton
 from spatial_replay.errors import OutputError, TraceError, UsageError
-from spatial_replay.logs.mcap_writer import LogWriter
-from spatial_replay.logs.output import open_output, refuse_inputs
+from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.contact import contacts
+from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.geometry.measure import Operand
+from spatial_replay.logs.mcap.writer import LogWriter
+from spatial_replay.logs.messages import MemorySink
+from spatial_replay.logs.output_file import open_output, refuse_inputs
+from spatial_replay.planning.decision_log import BlackBox
+from spatial_replay.planning.planner import Planner
+from spatial_replay.planning.settings import Settings
+from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.recording.interruption import terminable, uninterrupted
 from spatial_replay.recording.recording import Recording, refuse_templates
-from spatial_replay.recording.warm_up import warm_up
+from spatial_replay.spec import object_names, parse_specification, signal_names
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
+
+
+def warm_up(files: Sequence[Specification], automata: Sequence[KeptAutomaton]) -> None:
+    """Record some samples into nothing, as the specifications will have it done.
+
+    With nothing in the compiler's cache this takes many seconds, otherwise a fraction of one.
+
+    Args:
+        automata: those of the specifications.
+    """
+    recording = Recording(MemorySink(), files, known=automata)
+    objects = ["object", *(name for file in files for name in object_names(file))]
+    signals = {name: 0.0 for file in files for name in signal_names(file)}
+    samples = [
+        Sample(
+            time_s * 10**9,
+            {
+                name: _tracked(index + time_s, 0.1 * index + time_s)
+                for index, name in enumerate(dict.fromkeys(objects))
+            },
+            signals,
+        )
+        for time_s in range(4)
+    ]
+    recording.add(Trace.from_samples(samples[:1]))
+    recording.add(Trace.from_samples(samples[1:]))
+    # nothing is known: what may be takes code of its own
+    recording.add(Trace.from_samples([Sample(10**10, {})]))
+    recording.end()
+    # what draws an arrow at a violation, of which these samples may have none
+    shapes = FootprintBatch.from_footprints([Footprint.box(x, 0, x + 1, 1) for x in range(2)])
+    contacts(shapes, *(Operand(np.array([[row]])) for row in range(2)), is_protrusion=False)
+
+
+def _tracked(kind: int, x: float) -> TrackedObject:
+    box, disc = Footprint.box(x, 0, x + 1, 1), Footprint.disc(x + 0.5, 0.5, 0.5)
+    footprint = (box, disc, Footprint((*box.parts, *disc.parts)))[kind % 3]
+    return TrackedObject(footprint, class_name="thing", yaw=x, height=(0.0, 1.0), uncertainty=0.01)
+
 
 FLUSH_S = 0.4
 """A sample is handed to the operating system at most about this long after it was written."""
@@ -221,3 +277,19 @@ class Recorder:
     def _raise_failure(self) -> None:
         if self._failure is not None:
             raise self._failure
+
+
+def warm_up_planner() -> None:
+    """Decide on a push that nobody makes.
+
+    With nothing in the compiler's cache this takes many seconds, otherwise a fraction of one.
+    """
+    task = parse_specification("F (cup leftof jug and cup dist jug >= 1)")
+    workspace = Workspace(Grid(0.0, 0.0, 1.0, 8, 8), obstacles=(Footprint.box(0, 0, 1, 1),))
+    box = BlackBox(Planner(task, Settings(workspace, "push")))
+    things = {
+        "cup": TrackedObject(Footprint.box(6, 6, 7, 7), yaw=0.0, height=(0.0, 1.0)),
+        "jug": TrackedObject(Footprint.disc(4, 4, 1), height=(0.0, 1.0)),
+    }
+    box.observe(Sample(0, things))
+    box.decide()

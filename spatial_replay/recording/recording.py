@@ -6,26 +6,20 @@ import json
 from collections.abc import Mapping, Sequence
 
 from spatial_replay import __version__
-from spatial_replay.errors import UsageError
-from spatial_replay.inspection.annotation import (
-    AnnotatedEvaluation,
-    kept_files,
-    specification_attachments,
-)
-from spatial_replay.inspection.automata import KeptAutomaton
-from spatial_replay.inspection.certificate import (
+from spatial_replay.annotate.annotator import AnnotatedEvaluation, kept_files, specification_attachments
+from spatial_replay.annotate.automaton_state import KeptAutomaton
+from spatial_replay.annotate.certificate import (
+    Hashing,
     MessageHash,
     ResultHash,
     SampleHash,
     certificate,
     described,
 )
-from spatial_replay.inspection.hashing import Hashing
-from spatial_replay.logs.block import Messages, messages_of
-from spatial_replay.logs.merging import merge
-from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.objects import encode_objects
-from spatial_replay.logs.sink import Sink
+from spatial_replay.errors import UsageError
+from spatial_replay.logs.messages import Messages, Sink, merge, messages_of
+from spatial_replay.logs.objects.encode import encode_objects
+from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import (
     AUTOMATA,
     CERTIFICATE,
@@ -38,7 +32,7 @@ from spatial_replay.logs.topics import (
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.spec.formula import Specification
-from spatial_replay.trace.times import FOREVER
+from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
 
 

@@ -8,14 +8,13 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from spatial_replay import __version__
+from spatial_replay.annotate.certificate import described
+from spatial_replay.annotate.foxglove_layout import LAYOUT
 from spatial_replay.errors import UsageError
-from spatial_replay.inspection.certificate import described
-from spatial_replay.inspection.viewer import LAYOUT
-from spatial_replay.logs.mcap_writer import LogWriter
-from spatial_replay.logs.output import replacing
-from spatial_replay.logs.reading import reading_options
-from spatial_replay.logs.sink import Sink
-from spatial_replay.logs.source import Source
+from spatial_replay.logs.mcap.writer import LogWriter
+from spatial_replay.logs.messages import Sink
+from spatial_replay.logs.output_file import replacing
+from spatial_replay.logs.source import Source, reading_options
 from spatial_replay.logs.topics import (
     AUTOMATA,
     AUTOMATA_PREFIX,
@@ -25,9 +24,8 @@ from spatial_replay.logs.topics import (
     REPLAYED_PREFIX,
 )
 from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.replay.found import Replayed
-from spatial_replay.replay.replay import Replay
-from spatial_replay.replay.window import Window
+from spatial_replay.replay.engine import Replay, Replayed
+from spatial_replay.replay.selection import Window
 from spatial_replay.spec import load_specification, parse_specification
 from spatial_replay.spec.formula import Specification
 

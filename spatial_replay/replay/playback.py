@@ -7,10 +7,9 @@ from typing import Final
 
 import numpy as np
 
-from spatial_replay.inspection.scene import SceneState
-from spatial_replay.logs.block import Channel, Messages
-from spatial_replay.logs.merging import join, merge, select
-from spatial_replay.replay.own_messages import Reading, standing
+from spatial_replay.annotate.scene_update import SceneState
+from spatial_replay.logs.messages import Channel, Messages, join, merge, select
+from spatial_replay.replay.selection import Reading, standing
 from spatial_replay.replay.tuning import Tuned
 
 _STANDS_NS: Final = 2_000_000_000

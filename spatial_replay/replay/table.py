@@ -13,11 +13,11 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
+from spatial_replay.annotate.robustness import RobustnessSeries, decode_robustness
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.inspection.robustness import RobustnessSeries, decode_robustness
-from spatial_replay.logs.mcap_reader import McapSource
-from spatial_replay.logs.output import replacing
+from spatial_replay.logs.mcap.reader import McapSource
+from spatial_replay.logs.output_file import replacing
 from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import ROBUSTNESS
 

@@ -9,24 +9,21 @@ from pathlib import PurePath
 from types import MappingProxyType
 from typing import Final
 
+from spatial_replay.annotate.annotator import AnnotatedEvaluation, Annotator, kept_files
+from spatial_replay.annotate.curves import CurvedResult, encode_curves
+from spatial_replay.annotate.foxglove_layout import live_layout_attachment
+from spatial_replay.annotate.scene_update import SceneState
 from spatial_replay.errors import UsageError
-from spatial_replay.inspection.annotation import AnnotatedEvaluation, kept_files
-from spatial_replay.inspection.annotator import Annotator
-from spatial_replay.inspection.curves import CurvedResult, encode_curves
-from spatial_replay.inspection.scene import SceneState
-from spatial_replay.inspection.viewer import live_layout_attachment
-from spatial_replay.logs.sink import Attachment
+from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.source import MemorySource, Source
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
 from spatial_replay.monitor.stream import Stretch
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
-from spatial_replay.monitor.witness.evidence import Evidence
-from spatial_replay.replay.found import Replayed, ReplayedSpec, replayed_spec
-from spatial_replay.replay.own_messages import OwnMessages
-from spatial_replay.replay.selection import Selection
-from spatial_replay.replay.window import Window, first_sample_ns
+from spatial_replay.monitor.witness.path import Evidence
+from spatial_replay.replay.engine import Replayed, ReplayedSpec, replayed_spec
+from spatial_replay.replay.selection import OwnMessages, Selection, Window, first_sample_ns
 from spatial_replay.spec import parse_specification
-from spatial_replay.spec.faults import nearest_hint
+from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_duration
 from spatial_replay.spec.formula import Constant, Specification, iter_nodes
 from spatial_replay.trace.trace import Trace

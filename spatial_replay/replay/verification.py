@@ -13,7 +13,7 @@ from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import CERTIFICATE, METADATA
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.replay.annotated import load_files, run_replay
-from spatial_replay.replay.window import Window
+from spatial_replay.replay.selection import Window
 from spatial_replay.spec.formula import Specification
 
 _HASHES: Mapping[str, str] = MappingProxyType(

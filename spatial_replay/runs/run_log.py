@@ -6,11 +6,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from spatial_replay.inspection.automata import KeptAutomaton
-from spatial_replay.logs.block import Messages
-from spatial_replay.logs.mcap_writer import LogWriter
-from spatial_replay.logs.merging import merge
-from spatial_replay.logs.output import open_output, refuse_inputs
+from spatial_replay.annotate.automaton_state import KeptAutomaton
+from spatial_replay.logs.mcap.writer import LogWriter
+from spatial_replay.logs.messages import Messages, merge
+from spatial_replay.logs.output_file import open_output, refuse_inputs
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.recording import Recording
 from spatial_replay.recording.interruption import leaving, terminable, uninterrupted

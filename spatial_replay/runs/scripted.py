@@ -1,22 +1,41 @@
-"""A simulated world whose robot follows a script, recorded."""
+"""A simulated world whose robot follows a script, recorded.
+
+Names in specifications, compared with what a simulated world has.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from spatial_replay.errors import UsageError
-from spatial_replay.runs.names import refuse_unknown_names
+from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.runs.run_log import RunLog, run_log
 from spatial_replay.simulation.injection import Injection
 from spatial_replay.simulation.tabletop import Tabletop
 from spatial_replay.simulation.world import Execution
 from spatial_replay.simulation.worlds import default_specification, make_world
+from spatial_replay.spec import check_names
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
+
+
+def refuse_unknown_names(files: Iterable[Specification], sample: Sample) -> None:
+    """That a world has what specifications name.
+
+    Args:
+        sample: of the world, which always shows everything that it has.
+
+    Raises:
+        SpecificationError: with every name that it does not have.
+    """
+    objects, signals = sorted(sample.objects), sorted(sample.signals)
+    remarks = [remark for file in files for remark in check_names(file, objects, signals, where="world")]
+    missing = [remark for remark in remarks if remark.severity == "error"]
+    if missing:
+        raise SpecificationError(missing)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.simulation.engine import STEPS_PER_S, Engine
+from spatial_replay.simulation.bullet import STEPS_PER_S, Engine
 from spatial_replay.simulation.kinematics import REST, downwards, joints_for, tool_frame
 
 TICKS_PER_S = 60

@@ -13,7 +13,7 @@ from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.geometry.measure import Operand, Request, measure
 from spatial_replay.simulation.arm import Arm
-from spatial_replay.simulation.engine import Engine
+from spatial_replay.simulation.bullet import Engine
 from spatial_replay.simulation.shapes import Pose, footprint, height
 from spatial_replay.simulation.world import Body
 

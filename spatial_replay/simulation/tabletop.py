@@ -1,4 +1,7 @@
-"""A table with a robot and bodies on it: the world of every scenario."""
+"""A table with a robot and bodies on it: the world of every scenario.
+
+Errors of detection, drawn from a seed.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +16,29 @@ import numpy as np
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.simulation.arm import STEPS_PER_TICK, TICKS_PER_S, Arm
-from spatial_replay.simulation.engine import Engine
+from spatial_replay.simulation.bullet import Engine
 from spatial_replay.simulation.injection import Injection
-from spatial_replay.simulation.noise import displacements
 from spatial_replay.simulation.pushing import pushing
 from spatial_replay.simulation.scenario import Scenario
 from spatial_replay.simulation.scene import Scene
 from spatial_replay.simulation.shapes import Box, Pose, footprint, height
 from spatial_replay.simulation.world import Body, Execution, Skill, Workspace
 from spatial_replay.trace.sample import Sample
+
+
+def displacements(radius_m: float, seed: int, sample: int, count: int) -> list[tuple[float, float]]:
+    """How far detection is off for each of `count` bodies in a sample, in metres along x and y.
+
+    Each is drawn evenly from a disc, so that no error is greater than its radius. They depend on nothing
+    but the arguments: a sample looked at twice shows the same.
+    """
+    if radius_m == 0:
+        return [(0.0, 0.0)] * count
+    drawn = np.random.default_rng([seed, sample, 1]).random((count, 2))
+    radii = (radius_m * np.sqrt(drawn[:, 0])).tolist()
+    angles = (2 * math.pi * drawn[:, 1]).tolist()
+    return [(r * math.cos(a), r * math.sin(a)) for r, a in zip(radii, angles, strict=True)]
+
 
 SAMPLES_PER_S = 30
 """Samples in a simulated second."""

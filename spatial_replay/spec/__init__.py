@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
+    from spatial_replay.spec.checks import check_names, instantiate, object_names, signal_names
     from spatial_replay.spec.format import format_formula, format_specification
-    from spatial_replay.spec.objects import check_names, instantiate, object_names, signal_names
-    from spatial_replay.spec.specification import load_specification, parse_specification
+    from spatial_replay.spec.load import load_specification, parse_specification
 
 __all__ = [
     "check_names",
@@ -29,14 +29,14 @@ __all__ = [
 
 _HOMES: Mapping[str, str] = MappingProxyType(
     {
-        "check_names": "spatial_replay.spec.objects",
+        "check_names": "spatial_replay.spec.checks",
         "format_formula": "spatial_replay.spec.format",
         "format_specification": "spatial_replay.spec.format",
-        "instantiate": "spatial_replay.spec.objects",
-        "load_specification": "spatial_replay.spec.specification",
-        "object_names": "spatial_replay.spec.objects",
-        "parse_specification": "spatial_replay.spec.specification",
-        "signal_names": "spatial_replay.spec.objects",
+        "instantiate": "spatial_replay.spec.checks",
+        "load_specification": "spatial_replay.spec.load",
+        "object_names": "spatial_replay.spec.checks",
+        "parse_specification": "spatial_replay.spec.load",
+        "signal_names": "spatial_replay.spec.checks",
     }
 )
 

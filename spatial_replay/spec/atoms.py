@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import get_args
 
 from spatial_replay.errors import UsageError
-from spatial_replay.spec.faults import Faults
+from spatial_replay.spec.diagnostics import Faults
 from spatial_replay.spec.format import format_number, format_relation
 from spatial_replay.spec.formula import (
     Atom,
@@ -25,9 +25,8 @@ from spatial_replay.spec.formula import (
     as_expression,
     minimum,
 )
-from spatial_replay.spec.namespace import kind_of
 from spatial_replay.spec.relations import THREE_TERM_RELATIONS, Relation, compare
-from spatial_replay.spec.resolve import Resolver, Scope
+from spatial_replay.spec.resolve import Resolver, Scope, kind_of
 from spatial_replay.spec.syntax import (
     BrokenStatement,
     ComparisonSyntax,
@@ -36,7 +35,7 @@ from spatial_replay.spec.syntax import (
     Quantity,
     RelationSyntax,
 )
-from spatial_replay.spec.terms import base_of, iter_expressions, terms_of
+from spatial_replay.spec.walks import base_of, iter_expressions, terms_of
 
 _MIRRORED = MappingProxyType({">=": "<=", ">": "<"})
 _AXES: tuple[str, ...] = get_args(Axis)

@@ -16,10 +16,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from spatial_replay.lazy import Displayed
 
 Axis: TypeAlias = Literal["x", "y", "z"]
 Side: TypeAlias = Literal["min", "max"]
@@ -433,7 +432,7 @@ class Constant:
 
 
 @dataclass(frozen=True)
-class Specification:
+class Specification(Displayed):
     """All specs of one text, parsed: macros, constants and named quantifiers expanded.
 
     Two specifications are equal when they mean the same: the source text, its file name, its constants and
@@ -465,17 +464,6 @@ class Specification:
     def results(self) -> tuple[NamedSpec, ...]:
         """The specs that no other spec uses: what an evaluation reports on."""
         return tuple(spec for spec in self.specs if spec.is_result)
-
-    def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw the trees of the results; see `draw_specification`."""
-        from spatial_replay.spec.picture import draw_specification
-
-        return draw_specification(self, ax)
-
-    def _repr_html_(self) -> str:
-        from spatial_replay.spec.picture import specification_html
-
-        return specification_html(self)
 
 
 @dataclass(frozen=True, slots=True)

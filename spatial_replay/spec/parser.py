@@ -14,7 +14,7 @@ from lark.exceptions import UnexpectedToken
 from lark.lexer import Lexer
 
 from spatial_replay.spec.builder import MAX_DEPTH, StatementError, TreeBuilder
-from spatial_replay.spec.faults import Faults, nearest_hint
+from spatial_replay.spec.diagnostics import Faults, nearest_hint
 from spatial_replay.spec.formula import Span
 from spatial_replay.spec.syntax import BrokenStatement, FormulaSyntax, Name, SpecStatement, Statement
 from spatial_replay.spec.tokens import BINARY_TYPES, KEYWORDS, STATEMENT_TYPES, quoted, span_of

@@ -12,7 +12,7 @@ from types import MappingProxyType
 
 from lark import Token
 
-from spatial_replay.spec.faults import Faults
+from spatial_replay.spec.diagnostics import Faults
 from spatial_replay.spec.formula import Span
 
 STATEMENT_TYPES: frozenset[str] = frozenset({"USE", "CONST", "REGION", "GROUP", "DEF", "SPEC"})

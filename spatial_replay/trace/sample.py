@@ -1,4 +1,7 @@
-"""One sample: what was known at one time."""
+"""One sample: what was known at one time.
+
+The times that samples can have: whole nanoseconds that fit a signed 64-bit number.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,12 @@ from types import MappingProxyType
 
 from spatial_replay.errors import TraceError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.trace.times import LATEST_NS
+
+LATEST_NS = 2**63 - 1
+"""The latest time of a sample."""
+
+FOREVER = LATEST_NS + 1
+"""A time after every sample."""
 
 
 @dataclass(frozen=True, slots=True)

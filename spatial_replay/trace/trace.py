@@ -13,7 +13,7 @@ from spatial_replay.errors import TraceError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.trace.memo import Memo
+from spatial_replay.trace.measurement_cache import Memo
 from spatial_replay.trace.sample import Sample
 
 ABSENT = -1

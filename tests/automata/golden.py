@@ -9,8 +9,8 @@ import json
 from pathlib import Path
 
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.compiling import automaton
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.automata.compile import automaton
+from spatial_replay.spec.load import parse_specification
 
 FILE = Path(__file__).with_name("golden.json")
 FORMULAS = (

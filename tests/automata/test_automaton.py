@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.compiling import automaton
-from spatial_replay.automata.drawing import dot_text, hoa_text, words_text
-from spatial_replay.automata.moves import Transition
+from spatial_replay.automata.compile import automaton
+from spatial_replay.automata.dot_hoa import dot_text, hoa_text, words_text
+from spatial_replay.automata.guards import Transition
 from spatial_replay.errors import UsageError
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.spec.load import parse_specification
 
 TASK = """\
 spec safe = not (robot ovlp hand)

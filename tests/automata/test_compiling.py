@@ -9,10 +9,10 @@ import pytest
 import spatial_replay as sr
 from automata.golden import FILE, FORMULAS, as_values
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.compiling import automaton
+from spatial_replay.automata.compile import automaton
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.simulation.worlds import default_specification
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.spec.load import parse_specification
 
 GOLDEN = json.loads(FILE.read_text())
 

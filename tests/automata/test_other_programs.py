@@ -16,12 +16,11 @@ from hypothesis import given, settings
 from automata.golden import FORMULAS
 from laws.strategies_automaton import compiled, formulas_with_automata
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.compiling import automaton
-from spatial_replay.automata.drawing import svg_text
-from spatial_replay.automata.stored import automaton_from, stored_text
+from spatial_replay.automata.compile import automaton, automaton_from, stored_text
+from spatial_replay.automata.dot_hoa import svg_text
 from spatial_replay.errors import NoAutomatonError, OutputError, UsageError
 from spatial_replay.recording import Recorder
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.spec.load import parse_specification
 from spatial_replay.trace.sample import Sample
 
 needs_mona = pytest.mark.skipif(shutil.which("mona") is None, reason="MONA is not installed")

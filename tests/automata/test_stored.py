@@ -7,9 +7,8 @@ import json
 import pytest
 
 from automata.golden import FORMULAS
-from spatial_replay.automata.compiling import MAX_ROWS, automaton
-from spatial_replay.automata.stored import automaton_from, stored_text
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.automata.compile import MAX_ROWS, automaton, automaton_from, stored_text
+from spatial_replay.spec.load import parse_specification
 
 SPECIFICATION = parse_specification("G ((p >= 0) -> F q >= 0)")
 SPEC = SPECIFICATION.specs[0]

@@ -18,9 +18,9 @@ from inspection.report_pages import (
     report_of_trace,
     two_discs,
 )
-from spatial_replay.logs.source import open_source
 from spatial_replay.replay import load_files
-from spatial_replay.replay.report import write_report
+from spatial_replay.report.write import write_report
+from spatial_replay.sources.open_log import open_source
 
 Open = Callable[..., Page]
 HOSTILE = (

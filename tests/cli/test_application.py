@@ -12,7 +12,7 @@ import pytest
 
 import spatial_replay
 from cli.program import PROGRAM, environment, run_program, standard_error_on_terminal
-from spatial_replay.cli.commands import COMMANDS
+from spatial_replay.cli.application import COMMANDS
 
 
 def test_version_and_help_answer_on_standard_output(tmp_path: Path) -> None:

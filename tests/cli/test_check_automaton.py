@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from spatial_replay.cli.application import run
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.spec.load import parse_specification
 
 TEXT = "spec reach = F (cube enclosedin tray)\nspec calm = G (battery >= 0.2)\nspec done = reach and calm\n"
 

@@ -11,8 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from spatial_replay import errors
-from spatial_replay.cli.exit_codes import ExitCode, exit_code_from_verdicts, gravest
-from spatial_replay.cli.failures import exit_code_of, message_of
+from spatial_replay.cli.application import (
+    ExitCode,
+    exit_code_from_verdicts,
+    exit_code_of,
+    gravest,
+    message_of,
+)
 from spatial_replay.spec.formula import Diagnostic
 
 FAULT = Diagnostic("error", "unknown relation 'ovlap'", "a.spatial", 1, 3, "a ovlap b", 5)

@@ -10,7 +10,7 @@ from cli.program import run_program
 from replay.runs import SPECIFICATION, PiecewiseSource, record, run
 from spatial_replay.cli.application import run as run_in_process
 from spatial_replay.replay import run_replay
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.spec.load import parse_specification
 
 
 @pytest.fixture

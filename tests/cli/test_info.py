@@ -10,9 +10,9 @@ import pytest
 from replay.runs import SPECIFICATION, PiecewiseSource
 from replay.runs import run as recorded_run
 from spatial_replay.cli.application import run
-from spatial_replay.logs.mapping.load import parse_mapping
+from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.replay import run_replay
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.spec.load import parse_specification
 
 CUBE = '{"name": "cube", "class": "block", "polygon": [[0, 0], [1, 0], [1, 1]]}'
 LOST_CUBE = '{"name": "cube", "class": "block", "polygon": [[NaN, 0], [1, 0], [1, 1]]}'

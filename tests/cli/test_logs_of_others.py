@@ -10,7 +10,7 @@ import pytest
 from mcap.writer import Writer
 
 from spatial_replay.cli.application import run
-from spatial_replay.logs.source import read_trace
+from spatial_replay.sources.open_log import read_trace
 
 TURTLES = """\
 sample: {topic: /turtle2/pose}    # the later of the two: no sample without the other

@@ -11,7 +11,7 @@ from cli.interruptions import MANY, interrupted, write_many
 from cli.program import PROGRAM, run_program
 from replay.runs import content_of, run, write_tracks
 from spatial_replay.cli.application import run as run_in_process
-from spatial_replay.logs.source import read_trace
+from spatial_replay.sources.open_log import read_trace
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from cli.interruptions import interrupted
 from cli.program import PROGRAM, environment, run_program
 from replay.runs import content_of
 from spatial_replay.cli.application import run
-from spatial_replay.logs.source import read_trace
+from spatial_replay.sources.open_log import read_trace
 
 LONG = ("record", "push", "-o", "run.mcap", "--duration", "3000s")
 

@@ -10,8 +10,8 @@ import pytest
 
 from cli.program import run_program
 from replay.runs import SPECIFICATION, content_of, record, run, write_tracks
+from spatial_replay.annotate.robustness import decode_robustness
 from spatial_replay.cli.application import run as run_in_process
-from spatial_replay.inspection.robustness import decode_robustness
 from spatial_replay.logs.topics import METADATA, ROBUSTNESS
 
 REPLAY = ("replay", "run.jsonl", "--spec", "blocks.spatial")

@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spatial_replay.cli.times import (
+from spatial_replay.cli.options import (
     TimePoint,
     duration_ns_from_text,
     text_from_duration_ns,
     time_point_from_text,
 )
 from spatial_replay.errors import UsageError
-from spatial_replay.trace.times import LATEST_NS
+from spatial_replay.trace.sample import LATEST_NS
 
 times_ns = st.integers(0, LATEST_NS)
 zones = st.integers(-14 * 60, 14 * 60).map(lambda minutes: timezone(timedelta(minutes=minutes)))

@@ -14,9 +14,10 @@ import numpy as np
 
 import spatial_replay as sr
 from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.logs.source import MemorySource, open_source
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.replay import load_files
-from spatial_replay.replay.report import write_report
+from spatial_replay.report.write import write_report
+from spatial_replay.sources.open_log import open_source
 from spatial_replay.trace.trace import Trace
 
 RECORDINGS = Path(__file__).parent.parent.parent / "recordings"

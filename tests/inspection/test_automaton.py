@@ -10,18 +10,17 @@ import pytest
 
 from replay.runs import PiecewiseSource, content_of
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.compiling import automaton
+from spatial_replay.automata.compile import automaton, stored_text
 from spatial_replay.automata.propositions import Propositions
-from spatial_replay.automata.stored import stored_text
 from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.logs.messages import AutomatonState_pb2
-from spatial_replay.logs.messages.AutomatonState_pb2 import AutomatonState
-from spatial_replay.logs.messages.Specification_pb2 import Specification as SpecificationMessage
-from spatial_replay.logs.sink import Attachment, MemorySink
-from spatial_replay.logs.source import open_source
+from spatial_replay.logs.messages import Attachment, MemorySink
+from spatial_replay.logs.schemas import AutomatonState_pb2
+from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
+from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
 from spatial_replay.recording import Recorder, Recording
 from spatial_replay.replay import run_replay
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.sources.open_log import open_source
+from spatial_replay.spec.load import parse_specification
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 

@@ -10,7 +10,7 @@ import pytest
 from replay.runs import SPECIFICATION, PiecewiseSource, run, sample
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.replay import run_replay
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.spec.load import parse_specification
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 

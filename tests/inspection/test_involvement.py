@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spatial_replay.inspection.involvement import (
+from spatial_replay.annotate.requirements import (
     Concern,
     Evaluated,
     OpenGroup,

@@ -23,9 +23,9 @@ from inspection.report_pages import (
     two_discs,
 )
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.source import open_source
 from spatial_replay.replay import Window, load_files, run_replay
-from spatial_replay.replay.report import write_report
+from spatial_replay.report.write import write_report
+from spatial_replay.sources.open_log import open_source
 
 HOSTILE = (
     "</script><img src=x onerror=alert(1)>",

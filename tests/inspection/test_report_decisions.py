@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
 
-from spatial_replay.inspection.report.decisions import MOST_CELLS, PlanMaker, plan_value
-from spatial_replay.inspection.report.packing import Packing, json_text
-from spatial_replay.logs.messages.PlanDecision_pb2 import (
+from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanCandidate,
     PlanDecision,
     PlanEdge,
     PlanMap,
     PlanTarget,
 )
+from spatial_replay.report.compact import Packing, json_text
+from spatial_replay.report.decision_panel import MOST_CELLS, PlanMaker, plan_value
 
 
 def grid(time_ns: int = 0, *, rows: int = 2, columns: int = 3, value: float = 1.0) -> Grid:

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from spatial_replay.annotate.robustness import VERDICTS, decode_robustness, encode_robustness
 from spatial_replay.errors import LogError
-from spatial_replay.inspection.robustness import VERDICTS, decode_robustness, encode_robustness
-from spatial_replay.logs.messages.Robustness_pb2 import Robustness
+from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
 from spatial_replay.monitor.verdict import online_verdict
 
 NAMES = st.lists(st.none() | st.text(min_size=1, max_size=5), min_size=1, max_size=6)

@@ -12,9 +12,10 @@ from mcap.writer import Writer
 import spatial_replay as sr
 from inspection.layouts import layout_of, panels, paths_of
 from inspection.message_paths import split, values
-from spatial_replay.inspection.viewer import Contents, layout_for_live
-from spatial_replay.logs.source import MemorySource, open_source
+from spatial_replay.annotate.foxglove_layout import Contents, layout_for_live
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.replay import run_replay
+from spatial_replay.sources.open_log import open_source
 
 TEXT = "spec near = F a closeto[2] b\nspec apart = G a farfrom[0] b"
 

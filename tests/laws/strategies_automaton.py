@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from laws.strategies_monitor import LEAVES
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.compiling import Compiler, automaton
+from spatial_replay.automata.compile import Compiler, automaton
 from spatial_replay.spec.formula import Boolean, Bound, Formula, NamedSpec, Specification, Temporal, Truth
 
 _leaves = st.one_of(st.sampled_from(LEAVES), st.sampled_from(LEAVES), st.builds(Truth, st.booleans()))

@@ -12,7 +12,7 @@ from laws.strategies_geometry import convex_parts
 from laws.strategies_spec import Vocabulary, formula_texts
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.spec.formula import Atom, Boolean, Bound, Signal, Temporal, Truth
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.spec.load import parse_specification
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 

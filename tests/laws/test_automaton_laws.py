@@ -13,10 +13,8 @@ from hypothesis import strategies as st
 from laws.reference import Prefix
 from laws.strategies_automaton import compiled, formulas_and_symbols, formulas_with_automata
 from laws.strategies_monitor import leaf_runs
-from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.compiling import automaton
-from spatial_replay.automata.stepping import Table
-from spatial_replay.automata.stored import automaton_from, stored_text
+from spatial_replay.automata.automaton import Automaton, Table
+from spatial_replay.automata.compile import automaton, automaton_from, stored_text
 from spatial_replay.spec.formula import NamedSpec, Specification
 
 known = st.booleans()

@@ -9,8 +9,7 @@ from hypothesis import given
 
 from laws.strategies_geometry import footprints, radii
 from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.contact import contact, enlarged, protrusion_contact
-from spatial_replay.geometry.contacts import contacts
+from spatial_replay.geometry.contact import contact, contacts, enlarged, protrusion_contact
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.geometry.measure import Operand, Request, measure
 

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from laws.reference import Prefix
 from laws.strategies_monitor import formulas_of_leaves, leaf_runs
-from spatial_replay.monitor.finished import finished, full_signal, window_signal
-from spatial_replay.monitor.program import compile_formula
+from spatial_replay.monitor.offline import finished, full_signal, window_signal
+from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.spec.formula import iter_nodes
 
 

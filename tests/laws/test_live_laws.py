@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from laws.strategies_monitor import NAMES, WORDS, specifications, tracked_objects
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.monitor.evaluation import evaluate
+from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.monitor import Monitor
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.spec.load import parse_specification
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 

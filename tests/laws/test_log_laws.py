@@ -15,14 +15,15 @@ from hypothesis import strategies as st
 
 from laws.strategies_trace import traces
 from spatial_replay.errors import LogError
-from spatial_replay.logs.block import Messages
-from spatial_replay.logs.mcap_info import summarise_mcap
-from spatial_replay.logs.mcap_writer import LogWriter
-from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.objects import decode_objects, encode_objects
-from spatial_replay.logs.source import MemorySource, open_source, read_trace
+from spatial_replay.logs.mcap.summary import summarise_mcap
+from spatial_replay.logs.mcap.writer import LogWriter
+from spatial_replay.logs.messages import Messages
+from spatial_replay.logs.objects.encode import decode_objects, encode_objects
+from spatial_replay.logs.objects.wire import Template
+from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
-from spatial_replay.logs.wire import Template
+from spatial_replay.sources.open_log import open_source, read_trace
 from spatial_replay.trace.trace import Trace
 
 CHANNEL = protobuf_channel(OBJECTS, ObjectStates)

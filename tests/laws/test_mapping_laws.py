@@ -9,13 +9,11 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.geometry.decompose import convex_hull
 from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.logs.mapping.fields import style_of
-from spatial_replay.logs.mapping.frames import FrameTree, Transforms
-from spatial_replay.logs.mapping.paths import FieldError, Path, getter, walk
-from spatial_replay.logs.mapping.rotation import matrices_from_quaternions, slerp
-from spatial_replay.logs.mapping.solids import BOX, Solids, footprints_from_solids
+from spatial_replay.geometry.outline import convex_hull
+from spatial_replay.mapping.field_paths import FieldError, FieldPath, getter, style_of, walk
+from spatial_replay.mapping.footprints import BOX, Solids, footprints_from_solids
+from spatial_replay.mapping.transforms import FrameTree, Transforms, matrices_from_quaternions, slerp
 
 coordinates = st.floats(-100, 100, allow_subnormal=False)
 quaternions = (
@@ -135,7 +133,7 @@ def test_a_compiled_path_finds_what_a_step_by_step_walk_finds(tree: object, step
     text = f"{first if isinstance(first, str) else 'x'}" + "".join(
         f".{step}" if isinstance(step, str) else f"[{step}]" for step in rest
     )
-    path = Path.of(text)
+    path = FieldPath.of(text)
     get = getter(path, style_of(tree))
     try:
         expected = walk(path, tree)

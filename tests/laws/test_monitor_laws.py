@@ -27,15 +27,15 @@ from laws.strategies_monitor import (
     tracked_objects,
     widened,
 )
-from spatial_replay.monitor.evaluation import evaluate
+from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.monitor import Monitor
-from spatial_replay.monitor.program import compile_formula
-from spatial_replay.monitor.run import Run
+from spatial_replay.monitor.online.program import compile_formula
+from spatial_replay.monitor.online.step import Run
 from spatial_replay.monitor.stream import EvaluationStream
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
 from spatial_replay.spec.formula import Boolean, Temporal, Truth
-from spatial_replay.trace.times import FOREVER
+from spatial_replay.trace.sample import FOREVER
 
 VALUE, NOW, LOWER, UPPER = range(4)
 

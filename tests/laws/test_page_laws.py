@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 import spatial_replay as sr
 from laws.strategies_spec import specification_texts
 from pages import shown
-from spatial_replay.markup import element
-from spatial_replay.spec.tree import iter_branches, label_of
-from spatial_replay.wording import printable
+from spatial_replay.notebook.figures import element
+from spatial_replay.spec.format import iter_branches, label_of
+from spatial_replay.text import printable
 
 
 @given(st.text())

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from laws.strategies_monitor import LEAVES, WORDS, bounds, cuts, recordings, specifications
 from spatial_replay.errors import UsageError
-from spatial_replay.monitor.evaluation import evaluate
+from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.monitor import Monitor
-from spatial_replay.monitor.paper.run import PaperRun
+from spatial_replay.monitor.paper.evaluator import PaperRun
 from spatial_replay.spec.formula import Atom, Boolean, Formula, Temporal, Truth, iter_nodes
 
 LOST, LEFT_OUT = "lost", "left out"

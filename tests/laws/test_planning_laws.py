@@ -10,12 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import spatial_replay as sr
-from spatial_replay.planning.attempts import MOST_MOTIONS
-from spatial_replay.planning.displacement import proposition_maps
-from spatial_replay.planning.planner import Planner
-from spatial_replay.planning.poses import centre_of, moved_object
+from spatial_replay.planning.decisions import Outcome
+from spatial_replay.planning.gradient_map import centre_of, moved_object, proposition_maps
+from spatial_replay.planning.planner import MOST_MOTIONS, Planner
 from spatial_replay.planning.settings import Settings
-from spatial_replay.planning.step import Outcome
 from spatial_replay.planning.workspace import Grid, Workspace
 
 TEXTS = (

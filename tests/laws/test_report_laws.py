@@ -14,10 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from spatial_replay.inspection.report.film import MOST_CORNERS, MOST_FRAMES, FilmMaker
-from spatial_replay.inspection.report.packing import json_text, singles
-from spatial_replay.inspection.report.sentences import sentence_parts
-from spatial_replay.inspection.report.thinning import Curves, kept_samples
+from spatial_replay.report.compact import json_text, sentence_parts, singles
+from spatial_replay.report.data import Curves, kept_samples
+from spatial_replay.report.scene_panel import MOST_CORNERS, MOST_FRAMES, FilmMaker
 
 NUMBERS = st.one_of(
     st.floats(-10, 10), st.sampled_from([np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-300, -1e-300])

@@ -18,7 +18,7 @@ from spatial_replay.spec import (
     parse_specification,
 )
 from spatial_replay.spec.formula import Formula, Variable, operands_of
-from spatial_replay.spec.terms import base_of, iter_formulas
+from spatial_replay.spec.walks import base_of, iter_formulas
 
 
 def formula_of(text: str) -> Formula:

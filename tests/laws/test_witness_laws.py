@@ -12,15 +12,14 @@ from hypothesis import strategies as st
 from laws.strategies_monitor import formulas_of_leaves, leaf_runs, recordings, specifications
 from laws.strategies_spec import Vocabulary
 from laws.test_monitor_laws import observed_in
-from spatial_replay.inspection.words import sentences_of
-from spatial_replay.monitor.evaluation import evaluate
-from spatial_replay.monitor.finished import finished
-from spatial_replay.monitor.program import compile_formula
+from spatial_replay.annotate.sentences import sentences_of
+from spatial_replay.monitor.evaluate import evaluate
+from spatial_replay.monitor.offline import finished
+from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.monitor.witness.extremum import End
-from spatial_replay.monitor.witness.path import deciding_path
+from spatial_replay.monitor.witness.path import End, deciding_path
 from spatial_replay.spec.formula import Number, iter_nodes
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.spec.load import parse_specification
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 

@@ -15,14 +15,15 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from spatial_replay.errors import LogError, OutputError, UsageError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.logs.block import BLOCK_SAMPLES, Channel, Messages
-from spatial_replay.logs.mcap_info import summarise_mcap
-from spatial_replay.logs.mcap_reader import McapSource
-from spatial_replay.logs.mcap_writer import CHUNK_BYTES, LogWriter
-from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.objects import encode_objects
-from spatial_replay.logs.source import MemorySource, open_source, read_trace
+from spatial_replay.logs.mcap.reader import McapSource
+from spatial_replay.logs.mcap.summary import summarise_mcap
+from spatial_replay.logs.mcap.writer import CHUNK_BYTES, LogWriter
+from spatial_replay.logs.messages import BLOCK_SAMPLES, Channel, Messages
+from spatial_replay.logs.objects.encode import encode_objects
+from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.logs.topics import OBJECTS, ROBUSTNESS, protobuf_channel
+from spatial_replay.sources.open_log import open_source, read_trace
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from spatial_replay.errors import OutputError, UsageError
-from spatial_replay.logs.output import open_output, refuse_inputs, replacing
+from spatial_replay.logs.output_file import open_output, refuse_inputs, replacing
 
 
 def test_an_output_appears_when_it_is_whole(tmp_path: Path) -> None:

@@ -13,11 +13,11 @@ import pytest
 
 from spatial_replay.errors import LogError, SpatialReplayError, UsageError
 from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.logs.block import BLOCK_SAMPLES
-from spatial_replay.logs.source import open_source, read_trace
-from spatial_replay.monitor.evaluation import evaluate
+from spatial_replay.logs.messages import BLOCK_SAMPLES
+from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.recording import record_source
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.sources.open_log import open_source, read_trace
+from spatial_replay.spec.load import parse_specification
 
 Write = Callable[..., Path]
 

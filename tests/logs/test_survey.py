@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
-from spatial_replay.logs.foreign.messages import MessageReader
-from spatial_replay.logs.mapping.load import parse_mapping
-from spatial_replay.logs.survey import messages_in, survey
+from spatial_replay.bags.reader import MessageReader
+from spatial_replay.mapping.mapping_file import parse_mapping
+from spatial_replay.sources.overview import messages_in, survey
 
 Write = Callable[[dict[str, Sequence[object]]], MessageReader]
 

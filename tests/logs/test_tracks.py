@@ -10,9 +10,9 @@ import pytest
 
 from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.logs.block import BLOCK_SAMPLES
-from spatial_replay.logs.faults import KEPT_IN_FULL
-from spatial_replay.logs.source import open_source, read_trace
+from spatial_replay.logs.messages import BLOCK_SAMPLES
+from spatial_replay.logs.read_options import KEPT_IN_FULL
+from spatial_replay.sources.open_log import open_source, read_trace
 from spatial_replay.trace.trace import Trace
 
 SQUARE = [[0, 0], [1, 0], [1, 1], [0, 1]]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.monitor.evaluation import evaluate
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.monitor.evaluate import evaluate
+from spatial_replay.spec.load import parse_specification
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 

@@ -9,12 +9,12 @@ import pytest
 
 from monitor.scenes import SECOND, judged, numbers, points, root
 from spatial_replay.errors import UsageError
-from spatial_replay.monitor.evaluation import evaluate
-from spatial_replay.monitor.leaf_code import MAX_BINDINGS
+from spatial_replay.monitor.atoms.instructions import MAX_BINDINGS
+from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.monitor import Monitor
-from spatial_replay.monitor.part_table import MAX_VARIABLES
+from spatial_replay.monitor.online.operators import MAX_VARIABLES
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict, worst_verdict
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.spec.load import parse_specification
 from spatial_replay.trace.trace import Trace
 
 TWO_SPECS = """\

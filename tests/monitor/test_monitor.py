@@ -11,7 +11,7 @@ from monitor.scenes import SECOND
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.monitor.monitor import Monitor
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.spec.load import parse_specification
 from spatial_replay.trace.sample import Sample
 
 

@@ -11,12 +11,12 @@ import pytest
 from monitor.scenes import SECOND, judged, numbers, points, root
 from monitor.test_published import SCENES, TOLERANCE, sample_from_frame
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.source import read_trace
-from spatial_replay.monitor.evaluation import evaluate
+from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.monitor import Monitor
-from spatial_replay.monitor.paper.run import PaperRun
+from spatial_replay.monitor.paper.evaluator import PaperRun
+from spatial_replay.sources.open_log import read_trace
 from spatial_replay.spec.formula import Atom, Signal, Temporal
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.spec.load import parse_specification
 from spatial_replay.trace.trace import Trace
 
 

@@ -10,9 +10,8 @@ from spatial_replay.errors import TraceError
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.stream import EvaluationStream, look_back
-from spatial_replay.spec.specification import parse_specification
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.times import FOREVER
+from spatial_replay.spec.load import parse_specification
+from spatial_replay.trace.sample import FOREVER, Sample
 from spatial_replay.trace.trace import Trace
 
 

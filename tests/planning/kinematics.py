@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass, field
 
 import spatial_replay as sr
-from spatial_replay.planning.poses import moved_object
-from spatial_replay.planning.step import Outcome
+from spatial_replay.planning.decisions import Outcome
+from spatial_replay.planning.gradient_map import moved_object
 
 
 @dataclass

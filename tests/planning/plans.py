@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, PUSHING, Table
-from spatial_replay.planning.black_box import PLAN_METADATA, BlackBox
+from spatial_replay.planning.decision_log import PLAN_METADATA, BlackBox
 from spatial_replay.planning.planner import Planner
-from spatial_replay.planning.settings import Settings
-from spatial_replay.planning.settings_text import text_from_settings
+from spatial_replay.planning.settings import Settings, text_from_settings
 from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.runs.run_log import run_log
 

@@ -15,18 +15,17 @@ import spatial_replay as sr
 from planning.kinematics import BLOCKS, block
 from planning.plans import PUSH, record_plan_of
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.logs.messages.AutomatonState_pb2 import AutomatonState
-from spatial_replay.logs.source import open_source
+from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_PATH
-from spatial_replay.planning.map_message import CELL
-from spatial_replay.planning.redo import planner_of, redo_decisions
-from spatial_replay.planning.settings import Settings
-from spatial_replay.planning.settings_text import settings_from_text, text_from_settings
-from spatial_replay.planning.told import read_decisions
+from spatial_replay.planning.decision_log import CELL
+from spatial_replay.planning.read import read_decisions
+from spatial_replay.planning.recompute import planner_of, redo_decisions
+from spatial_replay.planning.settings import Settings, settings_from_text, text_from_settings
 from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.replay import load_files, run_replay
+from spatial_replay.replay.selection import Window
 from spatial_replay.replay.verification import verify_certificate
-from spatial_replay.replay.window import Window
+from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec import load_specification
 
 RECORDED = Path(__file__).resolve().parents[2] / "recordings" / "push.mcap"

@@ -7,15 +7,15 @@ import pytest
 
 import spatial_replay as sr
 from spatial_replay.errors import UsageError
-from spatial_replay.planning.displacement import proposition_maps
-from spatial_replay.planning.maps import (
+from spatial_replay.planning.gradient_map import (
     CONSTRAINED,
     FREE,
     OCCUPIED,
     OUT_OF_REACH,
+    centre_of,
     gradient_map,
+    proposition_maps,
 )
-from spatial_replay.planning.poses import centre_of
 from spatial_replay.planning.workspace import Grid, Workspace
 
 CUP = sr.TrackedObject(sr.Footprint.box(0, 0, 1, 1))

@@ -10,14 +10,14 @@ import pytest
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, run
 from planning.plans import PUSH, record_plan_of
-from spatial_replay.logs.source import open_source
 from spatial_replay.planning import read_steps
+from spatial_replay.planning.gradient_map import moved_object
 from spatial_replay.planning.planner import Planner
-from spatial_replay.planning.poses import moved_object
-from spatial_replay.planning.redo import redo_decisions
+from spatial_replay.planning.read import read_decisions
+from spatial_replay.planning.recompute import redo_decisions
 from spatial_replay.planning.settings import Settings
-from spatial_replay.planning.told import read_decisions
 from spatial_replay.planning.workspace import Grid, Workspace
+from spatial_replay.sources.open_log import open_source
 
 DONE = "green rightof red"
 TIMED = {

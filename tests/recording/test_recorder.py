@@ -18,11 +18,11 @@ from mcap.stream_reader import StreamReader
 
 from replay.runs import PAST, SPECIFICATION, content_of, run, sample
 from spatial_replay.errors import OutputError, TraceError, UsageError
-from spatial_replay.logs.source import open_source, read_trace
 from spatial_replay.recording import ENDING, Recorder
 from spatial_replay.replay import load_files, run_replay
+from spatial_replay.sources.open_log import open_source, read_trace
 from spatial_replay.spec import format_specification
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.spec.load import parse_specification
 
 SPEC = parse_specification(SPECIFICATION, filename="blocks.spatial")
 

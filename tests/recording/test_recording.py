@@ -6,9 +6,9 @@ import pytest
 
 from replay.runs import SPECIFICATION, run
 from spatial_replay.errors import TraceError
-from spatial_replay.logs.sink import MemorySink
+from spatial_replay.logs.messages import MemorySink
 from spatial_replay.recording import ENDING, Recording
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.spec.load import parse_specification
 
 
 def test_what_describes_the_log_comes_before_the_samples() -> None:

@@ -13,11 +13,11 @@ import pytest
 
 from replay.runs import SPECIFICATION, PiecewiseSource, content_of, run, write_tracks
 from spatial_replay.errors import LogError, OutputError, UsageError
-from spatial_replay.logs.block import Block
-from spatial_replay.logs.source import open_source, read_trace
+from spatial_replay.logs.messages import Block
 from spatial_replay.recording import ENDING, record_source
 from spatial_replay.replay import run_replay
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.sources.open_log import open_source, read_trace
+from spatial_replay.spec.load import parse_specification
 from spatial_replay.trace.trace import Trace
 
 

@@ -11,8 +11,7 @@ from typing import Any
 from mcap.reader import make_reader
 
 from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
-from spatial_replay.logs.block import Block
-from spatial_replay.logs.sink import Attachment
+from spatial_replay.logs.messages import Attachment, Block
 from spatial_replay.logs.source import within
 from spatial_replay.recording import record_source
 from spatial_replay.trace.sample import Sample

@@ -9,7 +9,7 @@ import pytest
 
 from replay.runs import SPECIFICATION, PiecewiseSource, run
 from spatial_replay.replay import document, run_replay
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.spec.load import parse_specification
 
 
 @pytest.fixture

@@ -19,14 +19,13 @@ import spatial_replay as sr
 from inspection.layouts import panels, paths_of
 from inspection.message_paths import values
 from replay.runs import STEP_NS, PiecewiseSource, content_of, record, run, sample
-from spatial_replay.inspection.curves import CURVES_CHANNEL
-from spatial_replay.logs.block import Channel, Messages, messages_of
-from spatial_replay.logs.mcap_writer import LogWriter
-from spatial_replay.logs.merging import merge
-from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.objects import encode_objects
-from spatial_replay.logs.output import open_output
-from spatial_replay.logs.source import Source, open_source
+from spatial_replay.annotate.curves import CURVES_CHANNEL
+from spatial_replay.logs.mcap.writer import LogWriter
+from spatial_replay.logs.messages import Channel, Messages, merge, messages_of
+from spatial_replay.logs.objects.encode import encode_objects
+from spatial_replay.logs.output_file import open_output
+from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import (
     CURVES_TOPIC,
     EVENT_LOG,
@@ -40,6 +39,7 @@ from spatial_replay.logs.topics import (
 from spatial_replay.replay import Window, run_replay
 from spatial_replay.replay.playback import Playback
 from spatial_replay.replay.tuning import Tuning
+from spatial_replay.sources.open_log import open_source
 
 ROOT = Path(__file__).parents[2]
 TEXT = """\

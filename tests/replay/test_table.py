@@ -11,10 +11,10 @@ import pytest
 
 from replay.runs import SPECIFICATION, PiecewiseSource, record, run
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.source import open_source
 from spatial_replay.replay import Replayed, run_replay
 from spatial_replay.replay.table import QUANTITIES, export_table
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay.sources.open_log import open_source
+from spatial_replay.spec.load import parse_specification
 
 
 @pytest.fixture

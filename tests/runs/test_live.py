@@ -18,17 +18,16 @@ from websockets.exceptions import WebSocketException
 import spatial_replay as sr
 from replay.runs import STEP_NS, PiecewiseSource, content_of, record, run
 from runs.viewer import ENDED, PATIENCE_S, PAUSED, PLAYING, PROTOCOL, Message, State, Viewer, viewer
+from spatial_replay.annotate.curves import MOST_POINTS
 from spatial_replay.errors import UsageError
-from spatial_replay.inspection.curves import MOST_POINTS
-from spatial_replay.logs.block import Channel, Schema
-from spatial_replay.logs.mcap_writer import LogWriter
-from spatial_replay.logs.messages.Curves_pb2 import Curves
-from spatial_replay.logs.messages.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.messages.Robustness_pb2 import Robustness
-from spatial_replay.logs.messages.Specification_pb2 import Specification
-from spatial_replay.logs.objects import encode_objects
-from spatial_replay.logs.output import open_output
-from spatial_replay.logs.source import open_source
+from spatial_replay.logs.mcap.writer import LogWriter
+from spatial_replay.logs.messages import Channel, Schema
+from spatial_replay.logs.objects.encode import encode_objects
+from spatial_replay.logs.output_file import open_output
+from spatial_replay.logs.schemas.Curves_pb2 import Curves
+from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
+from spatial_replay.logs.schemas.Specification_pb2 import Specification
 from spatial_replay.logs.topics import (
     CURVES_TOPIC,
     OBJECTS,
@@ -39,7 +38,8 @@ from spatial_replay.logs.topics import (
 )
 from spatial_replay.replay import run_replay
 from spatial_replay.replay.tuning import Tuning
-from spatial_replay.runs.live.serving import Serving, serving
+from spatial_replay.serve.serving import Serving, serving
+from spatial_replay.sources.open_log import open_source
 
 TEXT = """\
 const far = 0.5

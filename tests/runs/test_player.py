@@ -20,18 +20,15 @@ from hypothesis import strategies as st
 
 import spatial_replay as sr
 from replay.runs import STEP_NS, PiecewiseSource, run
+from spatial_replay.annotate.curves import CURVES_CHANNEL
 from spatial_replay.errors import UsageError
-from spatial_replay.inspection.curves import CURVES_CHANNEL
-from spatial_replay.logs.block import Messages
+from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.topics import ROBUSTNESS
 from spatial_replay.replay.playback import Playback
 from spatial_replay.replay.tuning import Tuned, Tuning
-from spatial_replay.runs.live.outlet import Level, Note
-from spatial_replay.runs.live.pace import MOST_LATE_S
-from spatial_replay.runs.live.player import MOST_A_SECOND, Player
-from spatial_replay.runs.live.questions import MOST_OPEN, Questions
-from spatial_replay.runs.live.session import Session
-from spatial_replay.runs.live.transport import State, Status
+from spatial_replay.serve.player import MOST_A_SECOND, Level, Note, Player
+from spatial_replay.serve.services import MOST_OPEN, Questions
+from spatial_replay.serve.session import MOST_LATE_S, Session, State, Status
 
 PATIENCE_S = 10.0
 MOST_SAMPLES = math.ceil(MOST_A_SECOND * MOST_LATE_S)

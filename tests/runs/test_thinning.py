@@ -8,9 +8,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spatial_replay.logs.block import Channel, Messages
+from spatial_replay.logs.messages import Channel, Messages
 from spatial_replay.logs.topics import EVENTS, ROBUSTNESS, SCENE
-from spatial_replay.runs.live.thinning import thinned
+from spatial_replay.serve.player import thinned
 
 CHANNELS = {
     number: Channel(topic, "protobuf", None) for number, topic in enumerate((EVENTS, ROBUSTNESS, SCENE))

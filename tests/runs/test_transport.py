@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spatial_replay.runs.live.transport import FASTEST, SLOWEST, Status, Transport
+from spatial_replay.serve.session import FASTEST, SLOWEST, Status, Transport
 
 START_NS, END_NS = 5_000_000_000, 65_000_000_000
 SECOND_NS = 1_000_000_000

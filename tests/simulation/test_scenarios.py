@@ -7,7 +7,7 @@ import math
 import pytest
 
 from simulation.worlds import off, world
-from spatial_replay.monitor.evaluation import evaluate
+from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.simulation.worlds import default_specification
 from spatial_replay.trace.trace import Trace
 

@@ -11,7 +11,7 @@ import pytest
 
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.spec import check_names, load_specification, parse_specification
-from spatial_replay.spec.faults import MAX_FAULTS
+from spatial_replay.spec.diagnostics import MAX_FAULTS
 
 
 def faults_of(text: str) -> list[str]:

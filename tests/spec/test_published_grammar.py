@@ -9,7 +9,7 @@ import pytest
 
 from spatial_replay.spec import format_formula, format_specification, parse_specification
 from spatial_replay.spec.formula import FUTURE_OPERATORS, Temporal
-from spatial_replay.spec.terms import iter_formulas
+from spatial_replay.spec.walks import iter_formulas
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from spatial_replay.spec import parse_specification
+from spatial_replay.spec.load import MAX_LENGTH
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.resolve import MAX_SIZE
-from spatial_replay.spec.specification import MAX_LENGTH
 from spatial_replay.spec.tokens import KEYWORDS, MAX_TOKENS
 
 REFERENCE = (Path(__file__).parents[2] / "docs" / "language.md").read_text(encoding="utf-8")

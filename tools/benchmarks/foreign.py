@@ -24,7 +24,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from spatial_replay.logs.source import open_source
+from spatial_replay.sources.open_log import open_source
 
 SECOND = 1_000_000_000
 START_NS = 1_700_000_000 * SECOND

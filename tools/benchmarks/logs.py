@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.logs.block import Block
-from spatial_replay.logs.source import open_source
+from spatial_replay.logs.messages import Block
 from spatial_replay.recording import record_source
+from spatial_replay.sources.open_log import open_source
 from spatial_replay.trace.trace import Trace
 
 OBJECTS = ("blue1", "blue2", "green1", "green2", "red1", "red2")

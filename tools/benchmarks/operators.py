@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 import spatial_replay as sr
-from spatial_replay.monitor.finished import full_signal
-from spatial_replay.monitor.program import compile_formula
+from spatial_replay.monitor.offline import full_signal
+from spatial_replay.monitor.online.program import compile_formula
 
 MILLION = 1_000_000
 WIDTHS = (10, 1000, 100_000)

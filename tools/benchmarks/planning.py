@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 import spatial_replay as sr
-from spatial_replay.automata.compiling import automaton
+from spatial_replay.automata.compile import automaton
 from spatial_replay.planning import Grid, Workspace, gradient_map, proposition_maps
+from spatial_replay.planning.gradient_map import moved_object
 from spatial_replay.planning.paths import shortest_path
-from spatial_replay.planning.poses import moved_object
 
 PUSHING = """
 use spatial_spec

@@ -20,7 +20,7 @@ import spatial_replay as sr
 from spatial_replay.logs.source import MemorySource
 from spatial_replay.logs.topics import CURVES_TOPIC, SCENE
 from spatial_replay.replay.tuning import Tuning
-from spatial_replay.runs.live.serving import serving
+from spatial_replay.serve.serving import serving
 from spatial_replay.trace.trace import Trace
 
 SAMPLES = 100_000

@@ -14,17 +14,6 @@ import numpy as np
 from spatial_replay.compiled import kernel, piece
 from spatial_replay.geometry.arrays import Flags, Floats, Integers
 from spatial_replay.monitor.paper.scans import (
-    combine,
-    least,
-    most,
-    pick,
-    scan,
-    scan_until,
-    scan_until_by_last,
-    scan_until_by_pairs,
-    total,
-)
-from spatial_replay.monitor.paper.table import (
     ALWAYS,
     CODE,
     COLUMN,
@@ -41,6 +30,15 @@ from spatial_replay.monitor.paper.table import (
     NEXT,
     PAIRS,
     TRUTH,
+    combine,
+    least,
+    most,
+    pick,
+    scan,
+    scan_until,
+    scan_until_by_last,
+    scan_until_by_pairs,
+    total,
 )
 
 

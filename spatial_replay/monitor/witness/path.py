@@ -2,20 +2,120 @@
 
 Robustness is made of minima and maxima alone, so each number is that of one leaf at one sample, perhaps with
 its sign turned. The way to it follows one end of the interval (see `extremum.End`).
+
+Which operand a minimum or a maximum takes its number from.
+
+The samples that an instance was evaluated over, to be looked at again.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum
+from typing import TypeVar
 
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.finished import Finished
-from spatial_replay.monitor.witness.extremum import End, Interval, Operand, chosen, extremum_of
-from spatial_replay.spec.formula import Boolean, Formula, Temporal, iter_nodes
+from spatial_replay.monitor.atoms.measurements import leaf_values
+from spatial_replay.monitor.atoms.terms import Scene
+from spatial_replay.monitor.instances import Instance
+from spatial_replay.monitor.offline import Finished
+from spatial_replay.monitor.online.codes import in_channels
+from spatial_replay.monitor.stream import look_back, tail
+from spatial_replay.spec.formula import Boolean, Formula, Outline, Temporal, TrackedName, iter_nodes
+from spatial_replay.spec.walks import substitute
+from spatial_replay.trace.trace import Trace, window_of
+
+_Number = TypeVar("_Number")
+
+Interval = tuple[float, float]
+
+
+class End(Enum):
+    """Which end of an interval decides.
+
+    The low end shows why a formula is satisfied (it is at least 0), the high end why it is violated. Where
+    neither is so, the formula is `OPEN`: followed along the low ends of minima and the high ends of maxima,
+    it leads to an operand that is itself open.
+    """
+
+    LOW = "low"
+    HIGH = "high"
+    OPEN = "open"
+
+    @property
+    def turned(self) -> End:
+        """That of the operand of a negation."""
+        return {End.LOW: End.HIGH, End.HIGH: End.LOW, End.OPEN: End.OPEN}[self]
+
+    def of_minimum(self, low: _Number, high: _Number) -> _Number:
+        """The end by which a minimum chooses its operand."""
+        return high if self is End.HIGH else low
+
+    def of_maximum(self, low: _Number, high: _Number) -> _Number:
+        """The end by which a maximum chooses its operand."""
+        return low if self is End.LOW else high
+
+
+@dataclass(frozen=True, slots=True)
+class Operand:
+    """What enters a minimum or a maximum: number `index` of something, as it is or negated."""
+
+    index: int
+    negated: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Extremum:
+    """A minimum or a maximum of operands, or of others."""
+
+    is_minimum: bool
+    operands: tuple[Operand | Extremum, ...]
+
+
+def extremum_of(operator: str, operands: Sequence[int]) -> Extremum:
+    """A Boolean operator over operands of the given numbers, as minima and maxima."""
+    plain = tuple(Operand(index) for index in operands)
+    first, last = plain[0], plain[-1]
+    not_first, not_last = Operand(first.index, True), Operand(last.index, True)
+    match operator:
+        case "not":
+            return Extremum(True, (not_first,))
+        case "and" | "spec":
+            return Extremum(True, plain)
+        case "or":
+            return Extremum(False, plain)
+        case "->":
+            return Extremum(False, (not_first, last))
+        case "xor":
+            return Extremum(False, (Extremum(True, (first, not_last)), Extremum(True, (not_first, last))))
+    return Extremum(True, (Extremum(False, (not_first, last)), Extremum(False, (not_last, first))))
+
+
+def chosen(part: Operand | Extremum, end: End, interval: Callable[[int], Interval]) -> list[Operand]:
+    """The operands that a part takes its number from: one, or several equal ones in their order.
+
+    Args:
+        interval: low and high end of each operand, not negated.
+    """
+    if isinstance(part, Operand):
+        return [part]
+    choose = end.of_minimum if part.is_minimum else end.of_maximum
+    keys = [choose(*_interval(each, interval)) for each in part.operands]
+    best = min(keys) if part.is_minimum else max(keys)
+    taken = [each for each, key in zip(part.operands, keys, strict=True) if key == best]
+    return [operand for each in taken for operand in chosen(each, end, interval)]
+
+
+def _interval(part: Operand | Extremum, interval: Callable[[int], Interval]) -> Interval:
+    if isinstance(part, Operand):
+        low, high = interval(part.index)
+        return (-high, -low) if part.negated else (low, high)
+    lows, highs = zip(*(_interval(each, interval) for each in part.operands), strict=True)
+    return (min(lows), min(highs)) if part.is_minimum else (max(lows), max(highs))
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,3 +287,61 @@ def _least_between(column: Floats, *, is_ahead: bool) -> Floats:
     ordered = column if is_ahead else column[::-1]
     least = np.minimum.accumulate(np.concatenate([[np.inf], ordered[:-1]]))
     return least if is_ahead else least[::-1]
+
+
+class Evidence:
+    """The samples of one instance, read again whenever something is asked about them."""
+
+    def __init__(
+        self, instance: Instance, regions: Mapping[str, Outline], traces: Callable[[], Iterable[Trace]]
+    ) -> None:
+        """
+        Args:
+            traces: begins the samples anew, from what may be looked back at, in stretches of any length.
+        """
+        self.instance = instance
+        self._regions = regions
+        self._traces = traces
+        self._reach = look_back([instance.formula])
+
+    def bound(self, formula: Formula) -> Formula:
+        """A formula of the instance, with the object that it is about in place of its variable."""
+        return substitute(
+            formula, {variable: TrackedName(name) for variable, name in self.instance.bindings.items()}
+        )
+
+    def scene(self, time_ns: int) -> Scene:
+        """The one sample of that time, with those before it that it may look back at.
+
+        Raises:
+            LookupError: there is none; the log changed since it was evaluated.
+        """
+        for scene in self._scenes():
+            trace = scene.trace
+            at, end = window_of(trace.times_ns, time_ns, time_ns + 1)
+            if at < end:
+                past = tail(trace.slice(0, at), *self._reach) if at else trace.slice(0, 0)
+                return Scene(Trace.concatenate([past, trace.slice(at, end)]), self._regions, len(past))
+        raise LookupError(f"there is no sample at {time_ns} ns any more")
+
+    def columns(self, formulas: Sequence[Formula]) -> Floats:
+        """(C, K, T): what K formulas without temporal operators are in each sample (see `leaf_values`)."""
+        parts: list[Floats] = []
+        for scene in self._scenes():
+            times_ns = scene.trace.times_ns[scene.skip :]
+            begin, end = window_of(times_ns, self.instance.start_ns, self.instance.end_ns)
+            parts.append(leaf_values(scene, formulas, self.instance.bindings)[:, :, begin:end])
+        channels = max(map(len, parts))
+        return np.concatenate([in_channels(part, channels) for part in parts], axis=2)
+
+    def _scenes(self) -> Iterator[Scene]:
+        """The samples, in stretches, each with what it may look back at."""
+        past: Trace | None = None
+        for trace in self._traces():
+            skip = 0
+            if past is not None and self._reach != (0, 0):
+                recent = tail(past, *self._reach)
+                skip = len(recent)
+                trace = Trace.concatenate([recent, trace])
+            past = trace if len(trace) else past
+            yield Scene(trace, self._regions, skip)

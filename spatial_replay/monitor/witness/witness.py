@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.finished import finished
+from spatial_replay.monitor.offline import finished
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom, deciding_atom
-from spatial_replay.monitor.witness.evidence import Evidence
-from spatial_replay.monitor.witness.extremum import End
-from spatial_replay.monitor.witness.path import deciding_path
+from spatial_replay.monitor.witness.path import End, Evidence, deciding_path
 from spatial_replay.monitor.witness.threshold import Obstacle, Threshold, threshold_of
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Atom, Formula, Quantified, iter_nodes, operator_of

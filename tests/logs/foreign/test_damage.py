@@ -20,9 +20,9 @@ from logs.foreign.bag_files import (
     write_ros1,
     write_ros2,
 )
+from spatial_replay.bags.open import open_messages
+from spatial_replay.bags.reader import Message
 from spatial_replay.errors import LogError
-from spatial_replay.logs.foreign.messages import Message
-from spatial_replay.logs.foreign.opening import open_messages
 
 SENT = drive(60)
 

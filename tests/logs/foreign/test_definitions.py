@@ -8,15 +8,15 @@ from typing import Any
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from spatial_replay.errors import LogError
-from spatial_replay.logs.block import Schema
-from spatial_replay.logs.foreign.definitions import (
+from spatial_replay.bags.ros_definitions import (
     check_definitions,
     definitions_from_msg,
     full_type_name,
     msg_from_definitions,
 )
-from spatial_replay.logs.foreign.ros_types import ros_decoder, ros_definitions, standard_schema
+from spatial_replay.bags.ros_types import ros_decoder, ros_definitions, standard_schema
+from spatial_replay.errors import LogError
+from spatial_replay.logs.messages import Schema
 
 SEPARATOR = "=" * 80
 

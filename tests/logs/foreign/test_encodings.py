@@ -23,8 +23,8 @@ from logs.foreign.bag_files import (
     write_json_mcap,
     write_mcap,
 )
+from spatial_replay.bags.open import open_messages
 from spatial_replay.errors import LogError
-from spatial_replay.logs.foreign.opening import open_messages
 
 POSES = build_file_descriptor_set(PosesInFrame).SerializeToString()
 

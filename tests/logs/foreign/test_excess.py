@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
+from spatial_replay.bags.decoders import decoder_of
+from spatial_replay.bags.reader import Topic
 from spatial_replay.errors import LogError
-from spatial_replay.logs.block import Schema
-from spatial_replay.logs.foreign.decoders import decoder_of
-from spatial_replay.logs.foreign.messages import Topic
+from spatial_replay.logs.messages import Schema
 
 LINE = "=" * 80
 

@@ -28,12 +28,13 @@ from logs.foreign.bag_files import (
     write_ros1,
     write_ros2,
 )
+from spatial_replay.annotate.certificate import SampleHash
 from spatial_replay.cli.application import run
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.inspection.certificate import SampleHash
-from spatial_replay.logs.block import Block
-from spatial_replay.logs.source import open_source, read_trace, within
+from spatial_replay.logs.messages import Block
+from spatial_replay.logs.source import within
+from spatial_replay.sources.open_log import open_source, read_trace
 from spatial_replay.trace.trace import Trace
 
 MAPPING = """\

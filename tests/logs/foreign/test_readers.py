@@ -20,9 +20,9 @@ from logs.foreign.bag_files import (
     write_ros1,
     write_ros2,
 )
+from spatial_replay.bags.open import open_messages
+from spatial_replay.bags.reader import MessageReader, Topic
 from spatial_replay.errors import LogError, MissingFileError
-from spatial_replay.logs.foreign.messages import MessageReader, Topic
-from spatial_replay.logs.foreign.opening import open_messages
 
 Write = Callable[[Path, list[Sent]], Path]
 

@@ -10,10 +10,10 @@ from typing import Any
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from spatial_replay.logs.foreign.messages import Decoder, Message, Topic
-from spatial_replay.logs.mapping.assembler import Assembler
-from spatial_replay.logs.mapping.load import parse_mapping
-from spatial_replay.logs.mapping.plan import Plan
+from spatial_replay.bags.reader import Decoder, Message, Topic
+from spatial_replay.mapping.assemble import Assembler
+from spatial_replay.mapping.mapping_file import parse_mapping
+from spatial_replay.mapping.reading_plan import Plan
 from spatial_replay.trace.trace import Trace
 
 SECOND = 10**9

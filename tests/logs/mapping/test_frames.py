@@ -10,7 +10,7 @@ import pytest
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 
 from logs.mapping.feeding import SECOND, Feed, make, pose_stamped, tf, transform
-from spatial_replay.logs.mapping.frames import FrameTree
+from spatial_replay.mapping.transforms import FrameTree
 
 MS = 10**6
 QUARTER = (0.0, 0.0, sin(pi / 4), cos(pi / 4))

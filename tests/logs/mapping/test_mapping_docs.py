@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from spatial_replay.logs.mapping.load import parse_mapping
-from spatial_replay.logs.mapping.readings import BUILT_IN
+from spatial_replay.mapping.mapping_file import parse_mapping
+from spatial_replay.mapping.message_types import BUILT_IN
 
 ROOT = Path(__file__).parents[3]
 PAGE = (ROOT / "docs/mapping.md").read_text(encoding="utf-8")
@@ -23,7 +23,7 @@ def test_every_example_is_a_mapping(text: str) -> None:
 
 
 def test_every_key_is_told() -> None:
-    schema = json.loads(files("spatial_replay.logs.mapping").joinpath("mapping.schema.json").read_text())
+    schema = json.loads(files("spatial_replay.mapping").joinpath("mapping.schema.json").read_text())
     keys = [
         *schema["properties"],
         *schema["$defs"]["topic"]["properties"],

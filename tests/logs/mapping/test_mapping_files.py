@@ -10,12 +10,12 @@ import pytest
 from jsonschema import Draft202012Validator
 
 from logs.mapping.feeding import Feed, make, pose_stamped
+from spatial_replay.bags.reader import Topic
 from spatial_replay.errors import MissingFileError, UsageError
-from spatial_replay.logs.foreign.messages import Topic
-from spatial_replay.logs.mapping import schema
-from spatial_replay.logs.mapping.load import load_mapping, parse_mapping
-from spatial_replay.logs.mapping.model import FOREVER_NS, Sampling, Shape, Signal, Uncertainty
-from spatial_replay.logs.mapping.plan import Plan
+from spatial_replay.mapping import mapping_file as schema
+from spatial_replay.mapping.mapping_file import load_mapping, parse_mapping
+from spatial_replay.mapping.model import FOREVER_NS, Sampling, Shape, Signal, Uncertainty
+from spatial_replay.mapping.reading_plan import Plan
 
 EXAMPLE = """
 fixed_frame: world
@@ -144,7 +144,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
 
 
 def test_the_published_schema_is_the_one_that_is_used() -> None:
-    used = files("spatial_replay.logs.mapping").joinpath(schema.SCHEMA_FILE).read_text(encoding="utf-8")
+    used = files("spatial_replay.mapping").joinpath(schema.SCHEMA_FILE).read_text(encoding="utf-8")
     Draft202012Validator.check_schema(json.loads(used))
     published = Path(__file__).parents[3] / "schemas" / schema.SCHEMA_FILE
     assert published.read_text(encoding="utf-8") == used

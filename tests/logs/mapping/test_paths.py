@@ -9,10 +9,19 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from logs.mapping.feeding import pose_stamped, tf, transform
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.mapping.fields import field_names, style_of
-from spatial_replay.logs.mapping.naming import Codes, Namer
-from spatial_replay.logs.mapping.paths import FieldError, Path, getter, iter_elements, tuple_getter, walk
-from spatial_replay.logs.mapping.templates import Template, name_from_topic
+from spatial_replay.mapping.field_paths import (
+    FieldError,
+    FieldPath,
+    Template,
+    field_names,
+    getter,
+    iter_elements,
+    name_from_topic,
+    style_of,
+    tuple_getter,
+    walk,
+)
+from spatial_replay.mapping.names import Codes, Namer
 
 
 def scene() -> SceneUpdate:
@@ -32,7 +41,7 @@ MESSAGES: list[tuple[Any, str, Any]] = [
 
 @pytest.mark.parametrize(("message", "text", "value"), MESSAGES)
 def test_a_path_finds_the_same_in_messages_of_every_kind(message: Any, text: str, value: Any) -> None:
-    path = Path.of(text)
+    path = FieldPath.of(text)
     assert walk(path, message) == value
     assert getter(path, style_of(message))(message) == value
     assert tuple_getter([path, path], style_of(message))(message) == (value, value)
@@ -40,9 +49,9 @@ def test_a_path_finds_the_same_in_messages_of_every_kind(message: Any, text: str
 
 def test_every_element_of_lists_in_lists() -> None:
     message = {"rows": [{"cells": [1, 2]}, {"cells": []}, {"cells": [3]}]}
-    assert list(iter_elements(Path.of("rows[*].cells[*]"), message)) == [1, 2, 3]
-    entities = iter_elements(Path.of("entities[*]"), scene())
-    assert [walk(Path.of("id"), entity) for entity in entities] == ["cup", "plate"]
+    assert list(iter_elements(FieldPath.of("rows[*].cells[*]"), message)) == [1, 2, 3]
+    entities = iter_elements(FieldPath.of("entities[*]"), scene())
+    assert [walk(FieldPath.of("id"), entity) for entity in entities] == ["cup", "plate"]
 
 
 @pytest.mark.parametrize(
@@ -67,7 +76,7 @@ def test_every_element_of_lists_in_lists() -> None:
 )
 def test_a_path_that_leads_nowhere_says_what_is_there(message: Any, text: str, what: str) -> None:
     with pytest.raises(FieldError, match=what):
-        walk(Path.of(text), message)
+        walk(FieldPath.of(text), message)
 
 
 @pytest.mark.parametrize(
@@ -75,7 +84,7 @@ def test_a_path_that_leads_nowhere_says_what_is_there(message: Any, text: str, w
 )
 def test_what_is_no_path(text: str) -> None:
     with pytest.raises(UsageError, match="is no field path"):
-        Path.of(text)
+        FieldPath.of(text)
 
 
 def test_fields_of_messages_of_every_kind() -> None:

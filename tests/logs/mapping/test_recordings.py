@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from spatial_replay.bags.open import open_messages
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.logs.foreign.opening import open_messages
-from spatial_replay.logs.mapping.assembler import Assembler
-from spatial_replay.logs.mapping.load import parse_mapping
-from spatial_replay.logs.mapping.plan import Plan
+from spatial_replay.mapping.assemble import Assembler
+from spatial_replay.mapping.mapping_file import parse_mapping
+from spatial_replay.mapping.reading_plan import Plan
 from spatial_replay.trace.trace import Trace
 
 TURTLES = ("two_turtles.bag", "two_turtles_lz4.bag", "two_turtles_mcap", "two_turtles_sqlite3")

@@ -6,17 +6,17 @@ from typing import Any
 
 import pytest
 
-from spatial_replay.logs.foreign.messages import Topic
-from spatial_replay.logs.mapping.load import parse_mapping
-from spatial_replay.logs.mapping.model import Mapping, Shape
-from spatial_replay.logs.mapping.suggest import suggest_mapping
+from spatial_replay.bags.reader import Topic
+from spatial_replay.mapping.mapping_file import parse_mapping
+from spatial_replay.mapping.model import LogMapping, Shape
+from spatial_replay.mapping.suggest import suggest_mapping
 
 POINT = {"x": 1.0, "y": 2.0, "z": 0.0}
 TURN = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
 STAMP = {"sec": 0, "nanosec": 0}
 
 
-def suggested(**examples: Any) -> tuple[str, Mapping]:
+def suggested(**examples: Any) -> tuple[str, LogMapping]:
     """What is suggested for topics with one example each, as text and as read."""
     topics = [Topic(f"/{name}", f"a/msg/{name.title()}", "json") for name in examples]
     text = suggest_mapping("run.bag", topics, {f"/{name}": [each] for name, each in examples.items()})

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from logs.mapping.feeding import SECOND, Feed, header, make, pose_stamped, ros
+from spatial_replay.bags.columns import MessageColumns
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.logs.foreign.columns import MessageColumns
-from spatial_replay.logs.mapping.assembler import Assembler
-from spatial_replay.logs.mapping.load import parse_mapping
-from spatial_replay.logs.mapping.plan import Plan
+from spatial_replay.mapping.assemble import Assembler
+from spatial_replay.mapping.mapping_file import parse_mapping
+from spatial_replay.mapping.reading_plan import Plan
 from spatial_replay.trace.trace import Trace
 
 MS = 10**6

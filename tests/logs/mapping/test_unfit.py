@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from logs.mapping.feeding import SECOND, Feed, make, pose_stamped
+from spatial_replay.bags.reader import Topic
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.foreign.messages import Topic
-from spatial_replay.logs.mapping.assembler import Assembler
-from spatial_replay.logs.mapping.load import parse_mapping
-from spatial_replay.logs.mapping.plan import Plan
+from spatial_replay.mapping.assemble import Assembler
+from spatial_replay.mapping.mapping_file import parse_mapping
+from spatial_replay.mapping.reading_plan import Plan
 
 HUGE = 10**400
 

@@ -1,0 +1,368 @@
+"""Specifications evaluated over samples, with all that a log says of that.
+
+What is written beside the samples of a log: the specification, its robustness, the scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
+from pathlib import PurePath
+
+import numpy as np
+from foxglove_schemas_protobuf.Event_pb2 import Event
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+from spatial_replay.annotate.automaton_state import (
+    AutomatonRun,
+    KeptAutomaton,
+    automata_attachments,
+    automata_metadata,
+    automata_of,
+)
+from spatial_replay.annotate.events import EventTeller, Told
+from spatial_replay.annotate.foxglove_layout import Contents, Extent, layout_attachment
+from spatial_replay.annotate.requirements import Evaluated, concerns_of
+from spatial_replay.annotate.robustness import encode_robustness
+from spatial_replay.annotate.scene_update import SceneEncoder, SceneState
+from spatial_replay.annotate.specification import ReportedTree, encode_specification, reported_trees
+from spatial_replay.annotate.violations import Judged, pointing_of
+from spatial_replay.errors import SpecificationError
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.logs.messages import Attachment, Channel, Messages, merge, messages_of
+from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
+from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
+from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
+from spatial_replay.logs.topics import (
+    AUTOMATON,
+    DERIVED,
+    EVENT_LOG,
+    EVENTS,
+    ROBUSTNESS,
+    SCENE,
+    SPECIFICATION,
+    protobuf_channel,
+)
+from spatial_replay.monitor.instances import Instance
+from spatial_replay.monitor.semantics import Semantics, instance_evaluation
+from spatial_replay.monitor.stream import EvaluationStream, Stretch
+from spatial_replay.spec import format_specification, parse_specification
+from spatial_replay.spec.formula import Outline, Specification, iter_nodes
+from spatial_replay.trace.trace import Trace
+
+
+class Annotator:
+    """Says in messages what an evaluation found, sample after sample.
+
+    Into how many stretches the samples are cut changes no message.
+    """
+
+    def __init__(
+        self,
+        files: Sequence[Specification],
+        trees: Sequence[ReportedTree],
+        instances: Sequence[Instance],
+        automata: Sequence[KeptAutomaton],
+        semantics: Semantics,
+        scene: SceneState | None = None,
+    ) -> None:
+        """Start before the first sample.
+
+        Args:
+            instances, automata: one for each of `trees`.
+            scene: what a viewer shows already, if it goes on with it.
+        """
+        self._files = files
+        self._trees = trees
+        self._concerns = [concerns_of(tree.formula, tree.object) for tree in trees]
+        self._names = [[node.name for _, _, node in iter_nodes(tree.formula)] for tree in trees]
+        self._pointing = [
+            pointing_of(instance, concerns, files[tree.file].regions)
+            for tree, instance, concerns in zip(trees, instances, self._concerns, strict=True)
+        ]
+        self._tellers = [
+            EventTeller(tree, instance, files[tree.file], semantics)
+            for tree, instance in zip(trees, instances, strict=True)
+        ]
+        self._runs = [
+            None
+            if kept.automaton is None
+            else AutomatonRun(tree.name, tree.object, kept.automaton, tree.formula, instance.program.leaves)
+            for tree, instance, kept in zip(trees, instances, automata, strict=True)
+        ]
+        self._encoder = SceneEncoder(shown_regions(files))
+        self._scene = scene or SceneState()
+        self._extent: Extent | None = None
+        self._written = dict.fromkeys(DERIVED, 0)
+
+    @property
+    def scene(self) -> SceneState:
+        """What a viewer shows after the messages so far."""
+        return self._scene
+
+    def messages(self, trace: Trace, stretches: Sequence[Stretch]) -> list[Messages]:
+        """What to write beside the next samples.
+
+        Args:
+            stretches: what the evaluation says of them, one for each tree.
+        """
+        if not len(trace):
+            return []
+        self._extent = Extent.of(trace, self._extent)
+        messages = []
+        if self._trees and not self._written[SPECIFICATION]:
+            messages.append(self._messages(_SPECIFICATION, trace.times_ns[:1], [self.specification()]))
+        messages.append(self._robustness(stretches))
+        messages.append(self._automaton_states(stretches))
+        messages += self._events(self._told(stretches))
+        messages.append(self._drawn(trace, stretches))
+        return messages
+
+    def pass_over(self, trace: Trace, stretches: Sequence[Stretch]) -> list[Messages]:
+        """Take in the next samples and write nothing of them but the events."""
+        if not len(trace):
+            return []
+        self._extent = Extent.of(trace, self._extent)
+        for run, stretch in zip(self._runs, stretches, strict=True):
+            if run is not None:
+                run.pass_over(stretch)
+        return self._events(self._told(stretches))
+
+    def end(self, time_ns: int, finals: Sequence[Floats]) -> list[Messages]:
+        """What to write when the samples have ended: the verdicts that samples after them could have changed.
+
+        Args:
+            time_ns: when the log ends, the last sample's time or later.
+            finals: for each tree, (N, 2), lower and upper end of each node's value over the finished log.
+        """
+        return self._events(
+            [
+                each
+                for teller, final in zip(self._tellers, finals, strict=True)
+                for each in teller.end(time_ns, final)
+            ]
+        )
+
+    def specification(self) -> bytes:
+        """The message that says what was evaluated."""
+        propositions = [() if run is None else run.propositions for run in self._runs]
+        return encode_specification(self._files, self._trees, propositions=propositions)
+
+    def contents(self, beside: Collection[str] = ()) -> Contents:
+        """What there is to be shown, once everything else is written.
+
+        Args:
+            beside: topics of messages of others in the log.
+        """
+        written = {topic for topic, count in self._written.items() if count}
+        has_states = [bool(self._written[AUTOMATON]) and run is not None for run in self._runs]
+        return Contents(self._trees, has_states, self._extent, written | set(beside))
+
+    def _robustness(self, stretches: Sequence[Stretch]) -> Messages:
+        """One message per sample and result."""
+        encoded = [
+            encode_robustness(tree.name, tree.object, names, stretch.times_ns, stretch.series)
+            for tree, names, stretch in zip(self._trees, self._names, stretches, strict=True)
+        ]
+        return self._in_order(_ROBUSTNESS, stretches, encoded)
+
+    def _told(self, stretches: Sequence[Stretch]) -> list[Told]:
+        """What changed, by time, then in the order of results and of their nodes."""
+        told = [
+            each
+            for teller, stretch in zip(self._tellers, stretches, strict=True)
+            for each in teller.tell(stretch)
+        ]
+        return sorted(told, key=lambda each: each.time_ns)
+
+    def _events(self, told: Sequence[Told]) -> list[Messages]:
+        times_ns = np.array([each.time_ns for each in told], np.int64)
+        return [
+            self._messages(_EVENTS, times_ns, [each.event for each in told]),
+            self._messages(_EVENT_LOG, times_ns, [each.log for each in told]),
+        ]
+
+    def _automaton_states(self, stretches: Sequence[Stretch]) -> Messages:
+        """One message per sample and result that has an automaton."""
+        running = [
+            (run, stretch) for run, stretch in zip(self._runs, stretches, strict=True) if run is not None
+        ]
+        encoded = [run.encode(stretch) for run, stretch in running]
+        return self._in_order(_AUTOMATON, [stretch for _, stretch in running], encoded)
+
+    def _drawn(self, trace: Trace, stretches: Sequence[Stretch]) -> Messages:
+        """The scene."""
+        evaluated = [
+            Evaluated(concerns, stretch.times_ns, stretch.series)
+            for concerns, stretch in zip(self._concerns, stretches, strict=True)
+        ]
+        judged = [
+            Judged(each, stretch.leaves, pointing)
+            for each, stretch, pointing in zip(evaluated, stretches, self._pointing, strict=True)
+        ]
+        drawn = self._encoder.encode(trace, evaluated, self._scene, judged)
+        self._scene = drawn.state
+        return self._messages(_SCENE, drawn.times_ns, drawn.payloads)
+
+    def _in_order(
+        self, channel: Channel, stretches: Sequence[Stretch], encoded: Sequence[Sequence[bytes]]
+    ) -> Messages:
+        """Messages of stretches by time, numbered in the order of results however the samples are cut."""
+        times_ns = np.concatenate([np.empty(0, np.int64), *(stretch.times_ns for stretch in stretches)])
+        payloads = [payload for own in encoded for payload in own]
+        order = np.argsort(times_ns, kind="stable")
+        return self._messages(channel, times_ns[order], [payloads[index] for index in order.tolist()])
+
+    def _messages(self, channel: Channel, times_ns: Integers, payloads: Sequence[bytes]) -> Messages:
+        first = self._written[channel.topic]
+        self._written[channel.topic] += len(payloads)
+        return messages_of(channel, times_ns, payloads, first)
+
+
+def shown_regions(files: Sequence[Specification]) -> Mapping[str, Outline]:
+    """The regions of all files; where two files differ on a name, the later one carries its file's name."""
+    shown: dict[str, Outline] = {}
+    for file in files:
+        for name, outline in file.regions.items():
+            is_taken = name in shown and shown[name] != outline
+            shown[f"{file.filename}:{name}" if is_taken else name] = outline
+    return shown
+
+
+_SPECIFICATION = protobuf_channel(SPECIFICATION, SpecificationMessage)
+_ROBUSTNESS = protobuf_channel(ROBUSTNESS, Robustness)
+_AUTOMATON = protobuf_channel(AUTOMATON, AutomatonState)
+_SCENE = protobuf_channel(SCENE, SceneUpdate)
+_EVENTS = protobuf_channel(EVENTS, Event)
+_EVENT_LOG = protobuf_channel(EVENT_LOG, Log)
+
+
+class AnnotatedEvaluation:
+    """Specifications evaluated over samples as they come, with the messages that say so.
+
+    Into how many stretches the samples are cut changes neither numbers nor messages.
+
+    Attributes:
+        trees: every result, under the name it is reported by.
+        streams: their evaluation, in the same order.
+    """
+
+    def __init__(
+        self,
+        files: Sequence[Specification],
+        instances: Sequence[Sequence[Instance]],
+        semantics: Semantics = "ltlf",
+        compiled_before: Callable[[], Sequence[Attachment]] = list,
+        known: Sequence[KeptAutomaton] = (),
+    ) -> None:
+        """Start before the first sample.
+
+        Args:
+            instances: what to evaluate of each file.
+            compiled_before: gives the attachments of a log; automata among them need no MONA.
+            known: automata of specs of these files, which are not compiled again.
+        """
+        self._files = files
+        self._semantics = semantics
+        self._compiled_before = compiled_before
+        self._known = known
+        begin = partial(instance_evaluation, semantics=semantics)
+        self._evaluations = [
+            EvaluationStream(own, file.regions, begin) for own, file in zip(instances, files, strict=True)
+        ]
+        self.streams = [stream for evaluation in self._evaluations for stream in evaluation.streams]
+        self.trees = reported_trees(files, instances)
+
+    def extend(self, trace: Trace) -> list[Stretch]:
+        """Take in the next samples; one stretch for each of `trees`."""
+        return [stretch for evaluation in self._evaluations for stretch in evaluation.extend(trace)]
+
+    def messages(self, trace: Trace, stretches: Sequence[Stretch]) -> list[Messages]:
+        """What to write beside samples, from the stretches that `extend` gave for them."""
+        return self._annotator.messages(trace, stretches)
+
+    @property
+    def finals(self) -> list[Floats]:
+        """For each of `trees` (N, 2), lower and upper end of each node's value if the log ends here."""
+        return [stream.final for stream in self.streams]
+
+    def end(self, time_ns: int) -> Messages:
+        """What to write after everything else of a log.
+
+        Args:
+            time_ns: that of its last sample or message, whichever is later.
+        """
+        return merge(self._annotator.end(time_ns, self.finals))
+
+    def layout(self, beside: Collection[str] = ()) -> Attachment:
+        """How to open the log in a viewer, once everything else is written.
+
+        Args:
+            beside: topics of messages of others in it.
+        """
+        return layout_attachment(self._annotator.contents(beside))
+
+    def automata_metadata(self) -> Mapping[str, str]:
+        """For each spec, how large its automaton is, or why there is none."""
+        return automata_metadata(self.automata)
+
+    def automata_attachments(self, prefix: str) -> list[Attachment]:
+        """The automata, to be kept beside the specifications of `specification_attachments`."""
+        return automata_attachments(self.automata, prefix)
+
+    @cached_property
+    def automata(self) -> Sequence[KeptAutomaton]:
+        """Of each tree; compiled when first asked for, since not every evaluation is written down."""
+        return automata_of(self._files, self.trees, self._semantics, self._compiled_before(), self._known)
+
+    def annotator(self, scene: SceneState | None = None) -> Annotator:
+        """Who writes what is to be said of the samples, from the first on.
+
+        Args:
+            scene: what a viewer shows already, if it goes on with it.
+        """
+        instances = [stream.instance for stream in self.streams]
+        return Annotator(self._files, self.trees, instances, self.automata, self._semantics, scene)
+
+    @cached_property
+    def _annotator(self) -> Annotator:
+        return self.annotator()
+
+
+def kept_files(files: Sequence[Specification]) -> list[Specification]:
+    """The specifications as a log keeps them, so that who reads it back gets equal ones of equal names.
+
+    Each has a file name whose stem no other has. A text that would not be read back as the same specification
+    (it was parsed with a profile or constants of its own) gives way to the canonical one.
+    """
+    kept: list[Specification] = []
+    stems: set[str] = set()
+    for file in files:
+        path = PurePath(file.filename)
+        own, suffix = path.stem.strip("<>"), path.suffix or ".spatial"
+        stem, count = own, 1
+        while stem in stems:
+            count += 1
+            stem = f"{own}-{count}"
+        stems.add(stem)
+        kept.append(replace(_self_contained(file), filename=f"{stem}{suffix}"))
+    return kept
+
+
+def specification_attachments(files: Sequence[Specification], prefix: str) -> list[Attachment]:
+    """The texts of `kept_files`, to be kept in a log under names that begin with `prefix`."""
+    return [Attachment(f"{prefix}{file.filename}", "text/plain", file.source.encode()) for file in files]
+
+
+def _self_contained(file: Specification) -> Specification:
+    for text in (file.source, format_specification(file)):
+        try:
+            read_back = parse_specification(text, filename=file.filename)
+        except SpecificationError:
+            continue
+        if read_back == file:
+            return file if text == file.source else read_back
+    # relations given in Python cannot be written down
+    return file

@@ -1,0 +1,283 @@
+"""Where automata are after every sample → messages of /spatial/automaton.
+
+Which results have an automaton, and what a log keeps of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spatial_replay.annotate.specification import ReportedTree
+from spatial_replay.automata.automaton import FALSE, TRUE, UNKNOWN, Automaton, Table
+from spatial_replay.automata.compile import automaton, stored_text
+from spatial_replay.automata.dot_hoa import size_words
+from spatial_replay.errors import NoAutomatonError
+from spatial_replay.geometry.arrays import Flags, Integers
+from spatial_replay.logs.messages import Attachment
+from spatial_replay.logs.objects.wire import Template, payloads_of
+from spatial_replay.logs.schemas import AutomatonState_pb2
+from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
+from spatial_replay.logs.topics import AUTOMATA_PREFIX
+from spatial_replay.monitor.offline import finished
+from spatial_replay.monitor.semantics import Semantics
+from spatial_replay.monitor.stream import Stretch
+from spatial_replay.spec.formula import Atom, Formula, NamedSpec, Quantified, Specification, iter_nodes
+
+_NOW = 1
+"""Where `now` stands among the numbers of a node."""
+
+_MOST_TEMPLATES = 4096
+
+# what the values of propositions are in messages: false, true and, last so that -1 finds it, unknown
+_TRUTHS = np.array(
+    [AutomatonState_pb2.TRUTH_FALSE, AutomatonState_pb2.TRUTH_TRUE, AutomatonState_pb2.TRUTH_UNKNOWN],
+    np.uint8,
+)
+
+
+class AutomatonRun:
+    """One automaton on its way through the samples, and the messages that say where it is.
+
+    Into how many stretches the samples are cut changes no message.
+
+    Attributes:
+        propositions: the nodes that are the automaton's propositions.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        object: str | None,
+        automaton: Automaton,
+        formula: Formula,
+        order: Sequence[Atom | Quantified],
+    ) -> None:
+        """Start before the first sample.
+
+        Args:
+            name: the specification's name.
+            object: the object that a template's parameter stands for, or None.
+            formula: what the automaton is of.
+            order: which leaf of a stretch is which.
+        """
+        self._name, self._object = name, object
+        self._automaton = automaton
+        self._order = order
+        self._table = Table.of(automaton)
+        numbers = {id(node): number for number, _, node in iter_nodes(formula)}
+        self.propositions = tuple(numbers[id(each.formula)] for each in automaton.propositions)
+        self._possible = np.zeros(len(automaton.states), np.bool_)
+        self._possible[automaton.initial] = True
+        self._templates: dict[bytes, Template] = {}
+        about = (automaton.accepting, automaton.can_accept, automaton.can_reject)
+        self._about = np.array([[state in each for each in about] for state in automaton.states], np.bool_)
+
+    def encode(self, stretch: Stretch) -> list[bytes]:
+        """Take in the next samples; one message for each."""
+        if not len(stretch.times_ns):
+            return []
+        values = self._values(stretch)
+        before, after = self._steps(values)
+        keys, groups = _distinct(before, after)
+        payloads = [b""] * len(stretch.times_ns)
+        for number, key in enumerate(keys):
+            members = np.flatnonzero(groups == number)
+            template = self._template(key, before[members[0]], after[members[0]])
+            marks = np.empty((len(members), len(self.propositions) + 3), np.uint8)
+            marks[:, :-3] = _TRUTHS[values[:, members]].T
+            marks[:, -3:] = self._summary(after[members[0]])
+            words = stretch.times_ns[members].astype(np.uint64)[:, None]
+            for index, payload in zip(
+                members.tolist(), payloads_of(template.fill(words, marks)), strict=True
+            ):
+                payloads[index] = payload
+        return payloads
+
+    def pass_over(self, stretch: Stretch) -> None:
+        """Take in the next samples without a message."""
+        if len(stretch.times_ns):
+            self._steps(self._values(stretch))
+
+    def _values(self, stretch: Stretch) -> Flags:
+        """(P, T): whether each proposition is true in each sample, or unknown."""
+        now = stretch.series[list(self.propositions), _NOW]
+        values = np.where(now >= 0.0, TRUE, FALSE).astype(np.int8)
+        unclear = np.isnan(now)
+        for number in np.flatnonzero(unclear.any(axis=1)).tolist():
+            # a number that is not determined can still have a sign that is
+            formula = self._automaton.propositions[number].formula
+            done = finished(formula, self._order, stretch.leaves, stretch.times_ns)
+            low, high = done.ends(0, wide=False)
+            values[number, unclear[number]] = UNKNOWN
+            values[number, unclear[number] & (low >= 0.0)] = TRUE
+            values[number, unclear[number] & (high < 0.0)] = FALSE
+        return values
+
+    def _steps(self, values: Flags) -> tuple[NDArray[np.bool_] | Integers, NDArray[np.bool_] | Integers]:
+        """Where the run is before and after each sample: as states (T,), or as sets of them (T, S)."""
+        states = np.flatnonzero(self._possible)
+        if len(states) == 1 and not (values == UNKNOWN).any():
+            first = int(states[0])
+            after = self._table.states(first, values)
+            self._possible = np.zeros_like(self._possible)
+            self._possible[after[-1]] = True
+            return np.concatenate([[first], after[:-1]]), after
+        sets = self._table.state_sets(self._possible, values)
+        before = np.concatenate([self._possible[None], sets[:-1]])
+        self._possible = sets[-1].copy()
+        return before, sets
+
+    def _summary(self, after: NDArray[np.bool_] | Integers) -> NDArray[np.uint8]:
+        """(3,): whether accepting, able to accept and able to reject, of a state or of a set of them."""
+        about = self._about[_members(after)]
+        values = np.where(about.all(axis=0), TRUE, np.where(about.any(axis=0), UNKNOWN, FALSE))
+        return _TRUTHS[values]
+
+    def _template(
+        self, key: bytes, before: NDArray[np.bool_] | Integers, after: NDArray[np.bool_] | Integers
+    ) -> Template:
+        if key not in self._templates:
+            if len(self._templates) >= _MOST_TEMPLATES:
+                self._templates.clear()
+            message = self._message(_members(before).tolist(), _members(after).tolist())
+            self._templates[key] = Template.of(message)
+        return self._templates[key]
+
+    def _message(self, sources: list[int], targets: list[int]) -> AutomatonState:
+        """A message of one step, with something in every field that differs between samples."""
+        message = AutomatonState(
+            time_ns=1, specification=self._name, object=self._object or "", states=targets
+        )
+        message.propositions.extend([AutomatonState_pb2.TRUTH_TRUE] * len(self.propositions))
+        if len(sources) == 1:
+            message.source = sources[0]
+        if len(sources) == len(targets) == 1 and sources != targets:
+            taken = self._automaton.transition(sources[0], targets[0])
+            message.guard = "" if taken is None else _shortened(self._automaton.guard_words(taken))
+        message.accepting = message.can_accept = message.can_reject = AutomatonState_pb2.TRUTH_TRUE
+        return message
+
+
+_LONGEST_GUARD = 500
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _LONGEST_GUARD else f"{text[: _LONGEST_GUARD - 1].rstrip()}…"
+
+
+def _members(states: NDArray[np.bool_] | Integers) -> Integers:
+    """The numbers of the states in a set, or of one."""
+    return np.atleast_1d(np.flatnonzero(states) if states.ndim else states.astype(np.int64))
+
+
+def _distinct(
+    before: NDArray[np.bool_] | Integers, after: NDArray[np.bool_] | Integers
+) -> tuple[list[bytes], Integers]:
+    """What steps there are, each with a key, and which of them (T,) each sample takes."""
+    if before.ndim == 1:
+        both = np.stack([before, after], axis=1)
+        rows = np.ascontiguousarray(both).view(np.uint8).reshape(len(both), -1)
+    else:
+        rows = np.packbits(np.concatenate([before, after], axis=1), axis=1)
+    kinds, groups = np.unique(rows.view(f"V{rows.shape[1]}").ravel(), return_inverse=True)
+    return [kind.tobytes() for kind in kinds], groups.ravel()
+
+
+_STORED = ".json"
+_MOST_LITERALS = 50_000
+"""Of an automaton whose guards have more literals, only what a replay needs is kept."""
+
+
+@dataclass(frozen=True)
+class KeptAutomaton:
+    """The automaton of a spec or, for a template, of all its instances.
+
+    Attributes:
+        name: the name that the spec is reported under.
+        automaton: None if it has none.
+        reason: why not.
+        details: the same, with the place in the specification and the remedy where those are known.
+    """
+
+    name: str
+    specification: Specification
+    spec: NamedSpec
+    automaton: Automaton | None
+    reason: str = ""
+    details: str = ""
+
+    @property
+    def summary(self) -> str:
+        """What there is, in a few words."""
+        if self.automaton is None:
+            return f"none: {self.details or self.reason}"
+        return size_words(self.automaton)
+
+
+def automata_of(
+    files: Sequence[Specification],
+    trees: Sequence[ReportedTree],
+    semantics: Semantics,
+    compiled_before: Sequence[Attachment] = (),
+    known: Sequence[KeptAutomaton] = (),
+) -> list[KeptAutomaton]:
+    """The automaton of each tree's spec, one for each of `trees`; instances of a template share theirs.
+
+    Args:
+        compiled_before: attachments of a log; an automaton among them is taken where it would take MONA.
+        known: automata of specs of these files, which are not compiled again.
+    """
+    stored = [each.data for each in compiled_before if _is_stored(each)]
+    found = {id(each.spec.formula): each for each in known}
+    for tree in trees:
+        if id(tree.formula) not in found:
+            file = files[tree.file]
+            spec = next(each for each in file.results if each.formula is tree.formula)
+            found[id(tree.formula)] = _kept(tree.name, file, spec, semantics, stored)
+    return [found[id(tree.formula)] for tree in trees]
+
+
+def automata_metadata(automata: Sequence[KeptAutomaton]) -> Mapping[str, str]:
+    """For each spec, how large its automaton is, or why there is none."""
+    return {each.name: each.summary for each in automata}
+
+
+def automata_attachments(automata: Sequence[KeptAutomaton], prefix: str) -> list[Attachment]:
+    """The automata as files: for a replay, for Graphviz, for tools of automata theory.
+
+    Args:
+        prefix: what the names of the specification's own attachments begin with.
+    """
+    attachments = []
+    for each in {kept.name: kept for kept in automata}.values():
+        if each.automaton is None:
+            continue
+        texts = {_STORED: ("application/json", stored_text(each.automaton, each.specification, each.spec))}
+        literals = sum(len(cube) for move in each.automaton.transitions for cube in move.guard)
+        if literals <= _MOST_LITERALS:
+            texts[".dot"] = ("text/vnd.graphviz", each.automaton.to_dot())
+            texts[".hoa"] = ("text/plain", each.automaton.to_hoa())
+        for suffix, (kind, text) in texts.items():
+            attachments.append(
+                Attachment(f"{AUTOMATA_PREFIX}{prefix}{each.name}{suffix}", kind, text.encode())
+            )
+    return attachments
+
+
+def _is_stored(attachment: Attachment) -> bool:
+    return attachment.name.startswith(AUTOMATA_PREFIX) and attachment.name.endswith(_STORED)
+
+
+def _kept(
+    name: str, file: Specification, spec: NamedSpec, semantics: Semantics, stored: Sequence[bytes]
+) -> KeptAutomaton:
+    if semantics != "ltlf":
+        return KeptAutomaton(name, file, spec, None, "an automaton is of the semantics ltlf")
+    try:
+        return KeptAutomaton(name, file, spec, automaton(file, spec.name, stored=stored))
+    except NoAutomatonError as error:
+        return KeptAutomaton(name, file, spec, None, error.reason, str(error))

@@ -1,0 +1,208 @@
+"""Certificates: hashes that say what an evaluation was made of and what it found.
+
+Every hash is over content, not over how it happens to be cut into blocks, chunks or files: one recording in
+two containers has one sample hash.
+
+SHA-256 of much data beside other work.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import deque
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spatial_replay import __version__
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.logs.messages import Messages
+from spatial_replay.spec.format import format_specification
+from spatial_replay.spec.formula import Specification
+from spatial_replay.trace.trace import ABSENT, Trace
+
+_MOST_WAITING = 64
+"""How many buffers may wait to be hashed, so that memory stays bounded."""
+
+
+class Hashing:
+    """Takes buffers into hashes in their order, on a thread of its own.
+
+    Hashing a large buffer leaves the interpreter to others, so that on two cores it costs a replay next to
+    nothing.
+    """
+
+    def __init__(self) -> None:
+        self._thread = ThreadPoolExecutor(1, "hashing")
+        self._waiting: deque[Future[None]] = deque()
+
+    def update(self, hashed: hashlib._Hash, buffer: bytes | NDArray[np.generic]) -> None:
+        """Take a buffer, which must not change afterwards, into a hash."""
+        if len(self._waiting) >= _MOST_WAITING:
+            self._waiting.popleft().result()
+        # an array is a buffer, though its type does not say so
+        self._waiting.append(self._thread.submit(hashed.update, cast(bytes, buffer)))
+
+    def finish(self) -> None:
+        """Wait until everything was taken in."""
+        while self._waiting:
+            self._waiting.popleft().result()
+
+
+class SampleHash:
+    """SHA-256 of samples: of every column of every object and signal, and these by name."""
+
+    def __init__(self, hashing: Hashing | None = None) -> None:
+        self._hashing = hashing or Hashing()
+        self._times = hashlib.sha256()
+        self._objects: dict[str, list[hashlib._Hash]] = {}
+        self._signals: dict[str, hashlib._Hash] = {}
+
+    def add(self, trace: Trace) -> None:
+        """Take in the next samples."""
+        self._hashing.update(self._times, _integers(trace.times_ns))
+        classes = np.array([list(hashlib.sha256(_text(name)).digest()) for name in trace.classes], np.uint8)
+        for name, rows in zip(trace.names, trace.rows.T, strict=True):
+            seen = np.flatnonzero(rows != ABSENT)
+            if not len(seen):
+                continue
+            observations = np.where(rows < ABSENT, -2 - rows, rows)[seen]
+            shapes = trace.footprints.select(observations)
+            columns = (
+                _integers(trace.times_ns[seen]),
+                _integers(np.diff(shapes.part_start)),
+                _integers(np.diff(shapes.vertex_start)),
+                _floats(shapes.vertices),
+                _floats(shapes.radius),
+                _floats(shapes.bottom),
+                _floats(shapes.top),
+                _floats(trace.yaw[observations]),
+                _floats(trace.uncertainty[observations]),
+                classes[trace.class_code[observations]],
+            )
+            hashes = self._objects.setdefault(name, [hashlib.sha256() for _ in columns])
+            for hashed, column in zip(hashes, columns, strict=True):
+                self._hashing.update(hashed, column)
+        for name, values in trace.signals.items():
+            known = np.flatnonzero(~np.isnan(values))
+            if len(known):
+                hashed = self._signals.setdefault(name, hashlib.sha256())
+                pairs = np.rec.fromarrays([trace.times_ns[known], values[known]])
+                self._hashing.update(hashed, pairs.tobytes())
+
+    def hexdigest(self) -> str:
+        self._hashing.finish()
+        total = hashlib.sha256(self._times.digest())
+        for name in sorted(self._objects):
+            total.update(_text(name))
+            for hashed in self._objects[name]:
+                total.update(hashed.digest())
+        for name in sorted(self._signals):
+            total.update(_text(name) + self._signals[name].digest())
+        return total.hexdigest()
+
+
+class MessageHash:
+    """SHA-256 of messages in their order: topic, time and bytes of each."""
+
+    def __init__(self, hashing: Hashing | None = None) -> None:
+        self._hashing = hashing or Hashing()
+        # a hash for each column, so that many messages are taken in at once, however they are cut
+        self._topics, self._times = hashlib.sha256(), hashlib.sha256()
+        self._lengths, self._payloads = hashlib.sha256(), hashlib.sha256()
+
+    def add(self, messages: Messages) -> None:
+        """Take in the next messages."""
+        if not len(messages):
+            return
+        topics = np.zeros((max(messages.channels) + 1, 32), np.uint8)
+        for number, channel in messages.channels.items():
+            topics[number] = np.frombuffer(hashlib.sha256(_text(channel.topic)).digest(), np.uint8)
+        lengths = np.fromiter(map(len, messages.payloads), np.int64, len(messages))
+        update = self._hashing.update
+        update(self._topics, topics[messages.channel])
+        update(self._times, _integers(messages.log_time_ns))
+        update(self._lengths, _integers(lengths))
+        update(self._payloads, b"".join(messages.payloads))
+
+    def hexdigest(self) -> str:
+        self._hashing.finish()
+        total = hashlib.sha256()
+        for column in (self._topics, self._times, self._lengths, self._payloads):
+            total.update(column.digest())
+        return total.hexdigest()
+
+
+class ResultHash:
+    """SHA-256 of results: of each one's numbers as little-endian bytes, sample by sample, node by node."""
+
+    def __init__(self, names: Sequence[tuple[str, str | None]], hashing: Hashing | None = None) -> None:
+        self._hashing = hashing or Hashing()
+        self._names = names
+        self._hashes = [hashlib.sha256() for _ in names]
+
+    def add(self, index: int, series: Floats) -> None:
+        """Take in the next numbers, (N, 4, T), of result `index`."""
+        self._hashing.update(self._hashes[index], _floats(series.transpose(2, 0, 1)))
+
+    def hexdigest(self) -> str:
+        self._hashing.finish()
+        total = hashlib.sha256()
+        for (name, object), hashed in zip(self._names, self._hashes, strict=True):
+            total.update(_text(name) + _text(object) + hashed.digest())
+        return total.hexdigest()
+
+
+def specification_sha256(files: Sequence[Specification]) -> str:
+    """SHA-256 of the canonical texts."""
+    total = hashlib.sha256()
+    for file in files:
+        total.update(_text(format_specification(file)))
+    return total.hexdigest()
+
+
+def described(files: Sequence[Specification]) -> str:
+    """Specifications as a log's metadata lists them, in JSON: name and SHA-256 of the canonical text."""
+    texts = [format_specification(file).encode("utf-8", "surrogatepass") for file in files]
+    hashes = [hashlib.sha256(text).hexdigest() for text in texts]
+    listed = zip(files, hashes, strict=True)
+    return json.dumps([{"name": file.filename, "sha256": digest} for file, digest in listed])
+
+
+def certificate(
+    samples: SampleHash, messages: MessageHash, files: Sequence[Specification], results: ResultHash
+) -> Mapping[str, str]:
+    """The certificate of an evaluation that has taken in everything."""
+    return {
+        "samples_sha256": samples.hexdigest(),
+        "messages_sha256": messages.hexdigest(),
+        "specification_sha256": specification_sha256(files),
+        "results_sha256": results.hexdigest(),
+        "spatial_replay_version": __version__,
+    }
+
+
+def _integers(values: Integers) -> NDArray[np.generic]:
+    """A little-endian copy."""
+    return np.array(values, "<i8", order="C")
+
+
+def _floats(values: Floats) -> NDArray[np.generic]:
+    """A little-endian copy; every NaN is the same one."""
+    copy = np.array(values, "<f8", order="C")
+    unknown = np.isnan(copy)
+    if unknown.any():
+        copy[unknown] = np.nan
+    return copy
+
+
+def _text(text: str | None) -> bytes:
+    """A text that cannot be taken for another one, or for none."""
+    if text is None:
+        return b"\xff" * 8
+    encoded = text.encode("utf-8", "surrogatepass")
+    return len(encoded).to_bytes(8, "little") + encoded

@@ -1,0 +1,184 @@
+"""Which leaf a number of a formula is the number of.
+
+Robustness is made of minima and maxima, so each number is that of some leaf at some sample, perhaps with
+its sign turned. Where that sample is the newest, comparing numbers finds the leaf, without a walk through
+the log.
+
+The leaf that a number over the whole log is that of, found without a walk through the log.
+
+Boolean operators join parts to a formula, and its number is that of one of them. A part, being a leaf or
+temporal, has the number that it has from the sample at which its value changed for the last time: in most
+formulas that is the sample of the leaf that decides, and comparing numbers says which leaf, if any.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.online.codes import low_and_high
+from spatial_replay.monitor.stream import Stretch
+from spatial_replay.spec.formula import Atom, Boolean, Formula, Quantified, iter_nodes
+
+
+class LeavesBelow(NamedTuple):
+    """The leaves below one node, each once for each sign in which it counts.
+
+    Attributes:
+        indices: (L,) int64, index among the program's leaves.
+        signs: (L,), 1 or -1.
+    """
+
+    indices: Integers
+    signs: Floats
+
+
+class Attained(NamedTuple):
+    """A leaf at a sample.
+
+    Attributes:
+        leaf: index among the program's leaves.
+        number: its own number there, its sign not turned.
+    """
+
+    leaf: int
+    number: float
+
+
+def leaves_below(formula: Formula, leaves: Sequence[Formula]) -> list[LeavesBelow]:
+    """For each node of a formula, by id, what is below it.
+
+    Args:
+        leaves: the program's leaves, of which equal ones are one.
+    """
+    numbers = {_key(leaf): index for index, leaf in enumerate(leaves)}
+    nodes = list(iter_nodes(formula))
+    found: list[dict[tuple[int, int], None]] = [{} for _ in nodes]
+    operands: list[list[int]] = [[] for _ in nodes]
+    for identifier, parent, _ in nodes:
+        if parent is not None:
+            operands[parent].append(identifier)
+    for identifier, _, node in reversed(nodes):
+        if isinstance(node, Atom | Quantified):
+            found[identifier] = {(numbers[_key(node)], 1): None}
+        for place, operand in enumerate(operands[identifier]):
+            for sign in signs_of(node, place):
+                found[identifier].update(dict.fromkeys((leaf, own * sign) for leaf, own in found[operand]))
+    return [_columns(list(each)) for each in found]
+
+
+def attained(below: LeavesBelow, ends: tuple[Floats, Floats], number: float, *, low: bool) -> Attained | None:
+    """The first leaf below a node that is what the node is, in one sample.
+
+    Args:
+        ends: (A,) low and high end of each of the program's leaves in that sample.
+        number: of the node; an infinite one says nothing of a leaf.
+        low: whether the number is the low end of the node's interval, or the high one.
+    """
+    if not np.isfinite(number):
+        return None
+    lows, highs = (end[below.indices] for end in ends)
+    own = np.where((below.signs > 0.0) == low, lows, highs)
+    hits = np.flatnonzero(own * below.signs == number)
+    if not len(hits):
+        return None
+    return Attained(int(below.indices[hits[0]]), float(own[hits[0]]) + 0.0)
+
+
+def _columns(entries: Sequence[tuple[int, int]]) -> LeavesBelow:
+    pairs = np.array(entries, np.int64).reshape(-1, 2)
+    return LeavesBelow(pairs[:, 0], pairs[:, 1].astype(np.float64))
+
+
+def signs_of(node: Formula, operand: int) -> tuple[int, ...]:
+    """In which signs an operand's number can become that of the node."""
+    match node:
+        case Boolean(operator="not"):
+            return (-1,)
+        case Boolean(operator="->") if operand == 0:
+            return (-1,)
+        case Boolean(operator="xor" | "<->"):
+            return (1, -1)
+    return (1,)
+
+
+def _key(leaf: Formula) -> tuple[object, ...]:
+    """What makes two leaves one."""
+    if isinstance(leaf, Quantified):
+        return leaf.quantifier, leaf.variables, leaf.group, leaf.body
+    if isinstance(leaf, Atom):
+        return (leaf.expression,)
+    raise TypeError(f"{leaf!r} is no leaf")
+
+
+class Parts:
+    """The parts of some nodes of a formula, each with the sample that its value is from.
+
+    Into how many stretches the samples are cut changes nothing.
+    """
+
+    def __init__(self, formula: Formula, below: Sequence[LeavesBelow], nodes: Collection[int]) -> None:
+        """Before the first sample.
+
+        Args:
+            below: of each node of the formula, its leaves.
+            nodes: ids of those whose parts are followed.
+        """
+        self._below = below
+        self._nodes = [node for _, _, node in iter_nodes(formula)]
+        self._operands: list[list[int]] = [[] for _ in self._nodes]
+        joined = set(nodes)
+        for identifier, parent, _ in iter_nodes(formula):
+            if parent is not None:
+                self._operands[parent].append(identifier)
+                if parent in joined and isinstance(self._nodes[parent], Boolean):
+                    joined.add(identifier)
+        self._parts = np.array(
+            sorted(each for each in joined if not isinstance(self._nodes[each], Boolean)), np.int64
+        )
+        self._values = np.full(len(self._parts), np.nan)
+        self._leaves: dict[int, Floats] = {}
+
+    def extend(self, stretch: Stretch) -> None:
+        """Take in the next samples, at least one."""
+        values = stretch.series[self._parts, 0]
+        before = np.concatenate([self._values[:, None], values[:, :-1]], axis=1)
+        changes = (values != before) & ~(np.isnan(values) & np.isnan(before))
+        self._values = values[:, -1].copy()
+        last = values.shape[1] - 1 - changes[:, ::-1].argmax(axis=1)
+        changed = np.flatnonzero(changes.any(axis=1))
+        # parts that changed together share the numbers of that sample
+        samples = {t: stretch.leaves[:, :, t].copy() for t in set(last[changed].tolist())}
+        for part, t in zip(self._parts[changed].tolist(), last[changed].tolist(), strict=True):
+            self._leaves[part] = samples[t]
+
+    def attained(self, node: int, ends: Floats, *, low: bool, wide: bool) -> Attained | None:
+        """The leaf whose number is an end of a node's interval, if it is one's at the sample it is from.
+
+        Args:
+            ends: (N, 2), lower and upper end of each node.
+            low: whether it is the lower end, or the upper one.
+            wide: whether the ends count uncertainty.
+        """
+        formula, number = self._nodes[node], _end(ends, node, low)
+        if not isinstance(formula, Boolean):
+            if node not in self._leaves:
+                return None
+            leaves = self._leaves[node]
+            lows, highs = low_and_high(len(leaves), wide=wide)
+            return attained(self._below[node], (leaves[lows], leaves[highs]), number, low=low)
+        for place, operand in enumerate(self._operands[node]):
+            for sign in signs_of(formula, place):
+                is_low = low == (sign > 0)
+                if sign * _end(ends, operand, is_low) == number:
+                    found = self.attained(operand, ends, low=is_low, wide=wide)
+                    if found is not None:
+                        return found
+        return None
+
+
+def _end(ends: Floats, node: int, low: bool) -> float:
+    return float(ends[node, 0 if low else 1])

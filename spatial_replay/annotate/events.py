@@ -1,0 +1,317 @@
+"""Changes of verdicts and of signs, and the end of a log → messages of /spatial/events and /spatial/log.
+
+Changes of a node, and what it is in the end, as sentences.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from foxglove_schemas_protobuf.Event_pb2 import Event
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from google.protobuf.timestamp_pb2 import Timestamp
+
+from spatial_replay.annotate.deciding_leaf import Attained, LeavesBelow, Parts, attained, leaves_below
+from spatial_replay.annotate.sentences import number_text
+from spatial_replay.annotate.specification import ReportedTree
+from spatial_replay.annotate.verdict_changes import (
+    FAILING,
+    HOLDING,
+    OF_CANDIDATE,
+    OF_STANDING,
+    SATISFIED,
+    START,
+    VIOLATED,
+    Change,
+    Period,
+    Standings,
+    follow,
+)
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.monitor.instances import Instance
+from spatial_replay.monitor.online.codes import low_and_high
+from spatial_replay.monitor.online.operators import looks_ahead
+from spatial_replay.monitor.semantics import Semantics
+from spatial_replay.monitor.stream import Stretch
+from spatial_replay.monitor.verdict import Verdict, final_verdict
+from spatial_replay.spec.format import format_formula
+from spatial_replay.spec.formula import Formula, Specification, TrackedName, iter_nodes
+from spatial_replay.spec.relations import RELATION_NAMES
+from spatial_replay.spec.walks import substitute
+
+_NOW: Final[Mapping[int, str]] = {
+    HOLDING: "holds so far",
+    FAILING: "fails so far",
+    SATISFIED: "is satisfied, whatever comes",
+    VIOLATED: "is violated, whatever comes",
+}
+
+
+def leaf_words(text: str, number: float, *, past: bool = False) -> str:
+    """A leaf and its number, as in "`a closeto[1] b` fails by 3.2"."""
+    if number == 0.0:
+        return f"`{text}` just {'held' if past else 'holds'}"
+    holds, fails = ("held", "failed") if past else ("holds", "fails")
+    return f"`{text}` {holds if number > 0.0 else fails} by {number_text(abs(number))}"
+
+
+def change_sentence(title: str, after: Period, witness: str) -> str:
+    """What has begun.
+
+    Args:
+        title: what the node is called.
+        witness: the leaf that its number is that of, in words; "" for none.
+    """
+    because = f", by {number_text(abs(after.worst))}" if math.isfinite(after.worst) else ""
+    if witness:
+        because = f": {witness}"
+    return f"{title} {_NOW[after.code]}{because}."
+
+
+def end_sentence(title: str, verdict: Verdict, ends: tuple[float, float], witness: str) -> str:
+    """What it is over the finished log.
+
+    Args:
+        ends: of the interval of its value; NaN where that is not determined.
+    """
+    amount, because = "", f": {witness}" if witness else ""
+    number = ends[verdict is Verdict.VIOLATED]
+    if verdict is Verdict.UNKNOWN:
+        low, high = map(number_text, ends)
+        because = f": robustness {'not determined' if math.isnan(number) else f'between {low} and {high}'}"
+    elif not witness and math.isfinite(number):
+        amount = f" by {number_text(abs(number))}"
+    return f"{title} is {verdict}{amount}, for the log has ended{because}."
+
+
+def past_sentence(before: Period, until_ns: int, witness: str) -> str:
+    """What was before, until something else began."""
+    did = "held" if before.code == HOLDING else "failed"
+    seconds = f"{(until_ns - before.start_ns) / 1e9:.3f} s"
+    worst = ""
+    if witness:
+        worst = f"; its worst was that {witness}"
+    elif math.isfinite(before.worst):
+        number = number_text(abs(before.worst))
+        worst = f", by {number} or more" if before.code == HOLDING else f", by up to {number}"
+    return f"Before, it {did} for {seconds}{worst}."
+
+
+class Watched(NamedTuple):
+    """A node whose changes are told.
+
+    Attributes:
+        node: its id.
+        title: what it is called in a sentence.
+        name: the spec's name.
+        line: where the spec stands in its file, from 1; 0 if nowhere.
+        below: its leaves.
+    """
+
+    node: int
+    title: str
+    name: str
+    line: int
+    below: LeavesBelow
+
+
+class Stated(NamedTuple):
+    """What is said of a period: its number as that of a leaf, "" if it is none's, and a sentence."""
+
+    period: Period
+    witness: str
+    sentence: str
+
+
+class Told(NamedTuple):
+    """One change, encoded for both topics, and when it is told."""
+
+    time_ns: int
+    event: bytes
+    log: bytes
+
+
+class EventTeller:
+    """Tells what becomes of one result's root and of the specs that it is made of, up to the end of the log.
+
+    What it keeps from one stretch of samples to the next is a few numbers for each of these, and for each of
+    their parts those of the leaves at one sample.
+    """
+
+    def __init__(
+        self, tree: ReportedTree, instance: Instance, file: Specification, semantics: Semantics = "ltlf"
+    ) -> None:
+        """Before the first sample."""
+        self._settles = semantics == "ltlf"  # the paper's knows no continuation, and so no verdict that stays
+        self._tree, self._filename = tree, "" if file.filename == "<text>" else file.filename
+        self._leaves = instance.program.leaves
+        below = leaves_below(tree.formula, self._leaves)
+        self._watched = _watched(tree, below, file)
+        self._nodes = np.array([each.node for each in self._watched], np.int64)
+        self._parts = Parts(tree.formula, below, self._nodes.tolist())
+        self._bindings = {variable: TrackedName(name) for variable, name in instance.bindings.items()}
+        self._relations = RELATION_NAMES | file.relations
+        self._standings = Standings.begin(len(self._watched))
+        self._carried: dict[tuple[int, int], Attained | None] = {}
+        self._last_ns: int | None = None
+
+    def tell(self, stretch: Stretch) -> list[Told]:
+        """Take in the next samples; the changes that they confirm, by node, then in the order of time."""
+        if not len(stretch.times_ns) or self._standings.are_final:
+            return []
+        self._last_ns = int(stretch.times_ns[-1])
+        self._parts.extend(stretch)
+        followed = follow(
+            self._standings, stretch.times_ns, stretch.series, self._nodes, settles=self._settles
+        )
+        self._standings = followed.standings
+        told = [self._told(change, stretch) for change in followed.changes]
+        carried = {}
+        for node, places in enumerate(followed.places.tolist()):
+            codes = followed.standings.integers[node, [0, 3]].tolist()
+            for slot, (code, place) in enumerate(zip(codes, places, strict=True)):
+                period = Period(code, 0, 0, float(followed.standings.worst[node, slot]), place)
+                carried[node, (OF_STANDING, OF_CANDIDATE)[slot]] = self._attained(node, period, stretch)
+        self._carried = carried
+        return told
+
+    def end(self, time_ns: int, final: Floats) -> list[Told]:
+        """What the end of the log makes of the nodes that samples after it could still change.
+
+        Args:
+            time_ns: when that is told; not before the last sample.
+            final: (N, 2), lower and upper end of each node's value over the finished log.
+        """
+        if self._last_ns is None:
+            return []
+        return [self._told_at_end(node, time_ns, self._last_ns, final) for node in self._standings.pending]
+
+    def _attained(self, node: int, period: Period, stretch: Stretch) -> Attained | None:
+        """The leaf that a period's worst number is that of, if it is one's at the sample in which it came."""
+        if period.place < 0:
+            return self._carried.get((node, period.place))
+        leaves = stretch.leaves[:, :, period.place]
+        low, high = low_and_high(len(leaves), wide=period.code in (SATISFIED, VIOLATED))
+        ends = leaves[low], leaves[high]
+        return attained(self._watched[node].below, ends, period.worst, low=period.code != VIOLATED)
+
+    def _told(self, change: Change, stretch: Stretch) -> Told:
+        watched, after, before = self._watched[change.node], change.after, change.before
+        witness = self._words(self._attained(change.node, after, stretch))
+        now = Stated(after, witness, change_sentence(watched.title, after, witness))
+        past = None
+        if before is not None:
+            past = self._past(before, after.start_ns, self._attained(change.node, before, stretch))
+        return self._encoded(watched, int(stretch.times_ns[change.sample]), now, past)
+
+    def _told_at_end(self, node: int, time_ns: int, last_ns: int, final: Floats) -> Told:
+        watched, before = self._watched[node], self._standings.period(node)
+        lower, upper = final[watched.node].tolist()
+        verdict = final_verdict(lower, upper)
+        low, found = verdict is not Verdict.VIOLATED, None
+        if verdict is not Verdict.UNKNOWN:
+            found = self._parts.attained(watched.node, final, low=low, wide=self._settles)
+        after = Period(_ENDED[verdict], last_ns, last_ns, lower if low else upper, OF_STANDING)
+        witness = self._words(found)
+        now = Stated(after, witness, end_sentence(watched.title, verdict, (lower, upper), witness))
+        past = None
+        if before.code != START and before.start_ns < last_ns:
+            past = self._past(before, last_ns, self._carried[node, OF_STANDING])
+        return self._encoded(watched, time_ns, now, past)
+
+    def _past(self, period: Period, until_ns: int, worst: Attained | None) -> Stated:
+        """What was, before something else began."""
+        witness = self._words(worst, past=True)
+        return Stated(period, witness, past_sentence(period, until_ns, witness))
+
+    def _encoded(self, watched: Watched, time_ns: int, now: Stated, past: Stated | None) -> Told:
+        period, witness, sentence = now
+        facts = self._facts(watched) | self._facts_of(period, witness, "")
+        if past is not None:
+            before, sentence = past.period, f"{sentence} {past.sentence}"
+            facts |= self._facts_of(before, past.witness, "_before")
+            facts |= {"start_ns_before": str(before.start_ns), "end_ns_before": str(before.end_ns)}
+        event = Event(start_time=_stamp(period.start_ns), end_time=_stamp(period.end_ns))
+        for key, text in (facts | {"message": sentence}).items():
+            event.metadata.add(key=key, value=text)
+        log = Log(
+            timestamp=_stamp(time_ns),
+            level=_LEVELS[period.code],
+            message=sentence,
+            name=watched.name,
+            file=self._filename,
+            line=watched.line,
+        )
+        return Told(time_ns, *(each.SerializeToString(deterministic=True) for each in (event, log)))
+
+    def _words(self, found: Attained | None, *, past: bool = False) -> str:
+        """A leaf and its number in words; "" for none."""
+        if found is None:
+            return ""
+        leaf: Formula = substitute(self._leaves[found.leaf], self._bindings)
+        return leaf_words(format_formula(leaf, relations=self._relations), found.number, past=past)
+
+    def _facts(self, watched: Watched) -> dict[str, str]:
+        of = {} if self._tree.object is None else {"object": self._tree.object}
+        return {"specification": self._tree.name, **of, "node": str(watched.node), "name": watched.name}
+
+    def _facts_of(self, period: Period, witness: str, suffix: str) -> dict[str, str]:
+        if period.code == START:
+            return {"verdict": "unknown"}
+        sign = "positive" if period.code in (HOLDING, SATISFIED) else "negative"
+        verdict = "pending"
+        if not self._settles or period.code in (SATISFIED, VIOLATED):
+            verdict = "satisfied" if sign == "positive" else "violated"
+        facts = {"verdict": verdict, "sign": sign, "robustness": repr(period.worst)}
+        if witness:
+            facts["witness"] = witness
+        return {f"{key}{suffix}": text for key, text in facts.items()}
+
+
+def _watched(tree: ReportedTree, below: Sequence[LeavesBelow], file: Specification) -> list[Watched]:
+    """The root, and each named part that later samples can change, once.
+
+    Args:
+        below: of each node of the tree, its leaves.
+    """
+    lines = {spec.name: _line(file.source, spec.span.start, spec.span.end) for spec in file.specs}
+    found: list[Watched] = []
+    names: set[str] = set()
+    for identifier, parent, node in iter_nodes(tree.formula):
+        if parent is None:
+            title = f"`{tree.name}`" + (f" for {tree.object}" if tree.object is not None else "")
+        elif node.name and node.name not in names and looks_ahead(node):
+            title = f"`{node.name}` in {found[0].title}"
+        else:
+            continue
+        name = tree.name if parent is None else node.name or ""
+        names.add(node.name or name)
+        found.append(Watched(identifier, title, name, lines.get(node.name or name, 0), below[identifier]))
+    return found
+
+
+def _line(source: str, start: int, end: int) -> int:
+    return source.count("\n", 0, start) + 1 if end > start else 0
+
+
+def _stamp(time_ns: int) -> Timestamp:
+    return Timestamp(seconds=time_ns // 10**9, nanos=time_ns % 10**9)
+
+
+_ENDED: Final[Mapping[Verdict, int]] = {
+    Verdict.SATISFIED: SATISFIED,
+    Verdict.VIOLATED: VIOLATED,
+    Verdict.UNKNOWN: START,
+}
+"""How a node stands in a log that has ended: where its verdict is unknown, nothing is known of it."""
+
+_LEVELS: Final[Mapping[int, Log.Level.ValueType]] = {
+    START: Log.WARNING,
+    HOLDING: Log.INFO,
+    FAILING: Log.WARNING,
+    SATISFIED: Log.INFO,
+    VIOLATED: Log.ERROR,
+}

@@ -1,0 +1,190 @@
+"""Numbers of every node after every sample ↔ messages of /spatial/robustness."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+
+from spatial_replay.errors import LogError
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.logs.objects.wire import LayoutError, Template, payloads_of, rows_of
+from spatial_replay.logs.schemas import Robustness_pb2
+from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
+from spatial_replay.monitor.verdict import Verdict
+
+Codes = NDArray[np.uint8]
+
+VERDICTS = (Verdict.UNKNOWN, Verdict.PENDING, Verdict.SATISFIED, Verdict.VIOLATED, Verdict.UNKNOWN)
+"""What the codes of a message's verdicts mean; 0 is that of a message that says nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class RobustnessSeries:
+    """What a log says of one specification, or of one object's instance of a template.
+
+    Attributes:
+        specification: its name.
+        object: the object that a template's parameter stands for, or None.
+        ids: (N,) int64, the nodes' numbers.
+        names: N names; None for a node without one.
+        messages: (T,) int64, which of the messages decoded these samples are.
+        times_ns: (T,) int64.
+        series: (N, 4, T): value, now, lower, upper.
+        verdicts: (N, T) uint8, index into `VERDICTS`.
+    """
+
+    specification: str
+    object: str | None
+    ids: Integers
+    names: tuple[str | None, ...]
+    messages: Integers
+    times_ns: Integers
+    series: Floats
+    verdicts: Codes
+
+
+def encode_robustness(
+    name: str, object: str | None, names: Sequence[str | None], times_ns: Integers, series: Floats
+) -> list[bytes]:
+    """One message for each sample.
+
+    Args:
+        name: the specification's name.
+        object: the object that a template's parameter stands for, or None.
+        names: of the N nodes, by id; None for a node without one.
+        times_ns: (T,) int64.
+        series: (N, 4, T): value, now, lower, upper.
+    """
+    message = Robustness(time_ns=1, specification=name, object=object or "")
+    for identifier, node in enumerate(names):
+        message.nodes.add(
+            id=identifier,
+            name=node or "",
+            value=1.0,
+            now=1.0,
+            lower=1.0,
+            upper=1.0,
+            verdict=Robustness_pb2.VERDICT_PENDING,
+        )
+    words = np.empty((len(times_ns), 1 + 4 * len(names)), np.uint64)
+    words[:, 0] = times_ns
+    words[:, 1:] = series.reshape(4 * len(names), len(times_ns)).T.view(np.uint64)
+    verdicts = online_codes(series[:, 2], series[:, 3])
+    return payloads_of(Template.of(message).fill(words, np.ascontiguousarray(verdicts.T)))
+
+
+def online_codes(lower: Floats, upper: Floats) -> Codes:
+    """The codes of the verdicts while samples still come, as `online_verdict` gives them."""
+    codes = np.full(lower.shape, Robustness_pb2.VERDICT_PENDING, np.uint8)
+    codes[upper < 0.0] = Robustness_pb2.VERDICT_VIOLATED
+    codes[lower >= 0.0] = Robustness_pb2.VERDICT_SATISFIED
+    codes[np.isnan(lower)] = Robustness_pb2.VERDICT_UNKNOWN
+    return codes
+
+
+def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:
+    """What messages say, one entry for each specification and object, in order of first appearance.
+
+    Messages of one specification with other nodes than before, as of another run, make another entry.
+
+    Raises:
+        LogError: a message that is none of these.
+    """
+    found: dict[_Heading, list[_Rows]] = {}
+    waiting = _by_length(payloads)
+    while waiting:
+        indices = waiting.pop()
+        first = _parse(payloads[int(indices[0])], int(indices[0]))
+        template = _template(first)
+        if template is None:
+            taken = np.arange(len(indices)) == 0
+            rows = _parsed_row(first)
+        else:
+            encoded = rows_of([payloads[index] for index in indices.tolist()])
+            taken = template.matches(encoded)
+            rows = _template_rows(template, encoded[taken])
+        found.setdefault(_heading(first), []).append((indices[taken], *rows))
+        if not taken.all():
+            waiting.append(indices[~taken])
+    ordered = sorted(found.items(), key=lambda entry: min(int(rows[0][0]) for rows in entry[1]))
+    return [_joined(heading, rows) for heading, rows in ordered]
+
+
+_Heading = tuple[str, str, tuple[int, ...], tuple[str, ...]]
+_Rows = tuple[Integers, Integers, Floats, Codes]
+"""Of T messages: their indices (T,), times (T,), numbers (T, N, 4) and verdicts (T, N)."""
+
+
+def _by_length(payloads: Sequence[bytes]) -> list[Integers]:
+    lengths = np.array([len(payload) for payload in payloads], np.int64)
+    return [np.flatnonzero(lengths == length) for length in np.unique(lengths)]
+
+
+def _parse(payload: bytes, index: int) -> Robustness:
+    try:
+        return Robustness.FromString(payload)
+    except DecodeError as error:
+        raise LogError(
+            f"message {index} of {len(payload)} bytes is no spatial_replay.Robustness; "
+            "write the annotated log again from its source"
+        ) from error
+
+
+def _heading(message: Robustness) -> _Heading:
+    ids = tuple(node.id for node in message.nodes)
+    return message.specification, message.object, ids, tuple(node.name for node in message.nodes)
+
+
+def _template(message: Robustness) -> Template | None:
+    """The layout, if every number is in it; None where one takes its default by absence."""
+    try:
+        template = Template.of(message)
+    except LayoutError:
+        return None
+    nodes = len(message.nodes)
+    is_full = len(template.word_offsets) == 1 + 4 * nodes and len(template.mark_offsets) == nodes
+    return template if is_full else None
+
+
+def _template_rows(template: Template, encoded: Codes) -> tuple[Integers, Floats, Codes]:
+    words = template.words(encoded)
+    numbers = np.ascontiguousarray(words[:, 1:]).view(np.float64)
+    return (
+        words[:, 0].astype(np.int64),
+        numbers.reshape(len(words), -1, 4),
+        encoded[:, template.mark_offsets],
+    )
+
+
+def _parsed_row(message: Robustness) -> tuple[Integers, Floats, Codes]:
+    numbers = [(node.value, node.now, node.lower, node.upper) for node in message.nodes]
+    return (
+        np.array([message.time_ns], np.uint64).astype(np.int64),
+        np.array(numbers, np.float64).reshape(1, -1, 4),
+        np.array([[node.verdict for node in message.nodes]], np.uint8),
+    )
+
+
+def _joined(heading: _Heading, rows: list[_Rows]) -> RobustnessSeries:
+    name, object, ids, names = heading
+    messages, times, numbers, verdicts = (np.concatenate(column) for column in zip(*rows, strict=True))
+    order = np.argsort(messages, kind="stable")
+    if verdicts.size and verdicts.max() >= len(VERDICTS):
+        raise LogError(
+            f"a verdict of {name!r} has the code {verdicts.max()}, which this version does not know; "
+            "read the log with the version that wrote it"
+        )
+    return RobustnessSeries(
+        specification=name,
+        object=object or None,
+        ids=np.array(ids, np.int64),
+        names=tuple(node or None for node in names),
+        messages=messages[order],
+        times_ns=times[order],
+        series=np.ascontiguousarray(numbers[order].transpose(1, 2, 0)),
+        verdicts=np.ascontiguousarray(verdicts[order].T),
+    )

@@ -1,0 +1,491 @@
+"""Messages of /spatial/scene of one layout: the same entities with the same primitives, many at once.
+
+Entities of a scene: what a viewer draws of one object or region.
+
+Coordinates and colours that are NaN are left to be filled in; see `layout`.
+
+Footprints as polygons that a viewer draws: every part as one ring of points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.timestamp_pb2 import Timestamp
+
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import Footprint
+from spatial_replay.logs.objects.wire import Bytes, Template
+from spatial_replay.palette import LABEL, NEGATIVE
+from spatial_replay.spec.formula import Outline
+from spatial_replay.trace.observations import flat_index, starts_from_counts
+
+FRAME: Final = "world"
+
+ARROW_HEAD: Final = 0.15
+"""The length of an arrow's head by the size of the objects in a scene; of a short arrow it is half."""
+
+OBJECT_OPACITY: Final = 0.55
+REGION_OPACITY: Final = 0.3
+"""Of faces; objects stand out from the regions that they lie in."""
+
+_LINE_PIXELS: Final = 2.0
+_LABEL_PIXELS: Final = 14.0
+_NAN: Final = float("nan")
+
+
+class Elevation(NamedTuple):
+    """Where an entity lies along the vertical axis, in footprint units; NaN to be filled in.
+
+    Attributes:
+        fill: of its filled face, the upper one of a prism.
+        sides: from where to where a prism's sides reach: bottom and height; None for a flat entity.
+        label: of its name.
+    """
+
+    fill: float
+    sides: tuple[float, float] | None
+    label: float
+
+
+def draw(
+    entity: SceneEntity,
+    name: str,
+    outlines: list[Floats],
+    faces: list[Floats],
+    anchor: tuple[float, float],
+    elevation: Elevation,
+    opacity: float,
+) -> None:
+    """Add outlines, filled faces and the label to an entity; every colour but the label's is to be filled in.
+
+    The order in which numbers are to be filled in is that of `words_of_object` in `layout`.
+
+    Args:
+        outlines, faces: rings (n, 2); a face is convex.
+        anchor: where the label stands.
+        opacity: of the faces.
+    """
+    for ring in outlines:
+        _add_outline(entity, ring, elevation.fill)
+    for ring in faces:
+        if len(ring) > 2:
+            _add_face(entity, ring, elevation.fill, opacity)
+    if elevation.sides is not None:
+        for ring in outlines:
+            if len(ring) > 1:
+                _add_sides(entity, ring, *elevation.sides, opacity)
+    label = entity.texts.add(
+        billboard=True,
+        font_size=_LABEL_PIXELS,
+        scale_invariant=True,
+        text=name,
+        pose=_lying_at(elevation.label),
+    )
+    label.pose.position.x, label.pose.position.y = anchor
+    label.color.r, label.color.g, label.color.b, label.color.a = *LABEL, 1.0
+
+
+def point_at(entity: SceneEntity, label: str, lift: float) -> None:
+    """Add an arrow and its label to an entity; where they are and how long is to be filled in.
+
+    Args:
+        lift: what is drawn above the plane, and a fifth of an arrow's width.
+    """
+    arrow = entity.arrows.add(
+        shaft_length=_NAN, shaft_diameter=5.0 * lift, head_length=_NAN, head_diameter=12.0 * lift
+    )
+    arrow.pose.position.x = arrow.pose.position.y = arrow.pose.position.z = _NAN
+    arrow.pose.orientation.z = arrow.pose.orientation.w = _NAN
+    arrow.color.r, arrow.color.g, arrow.color.b, arrow.color.a = *NEGATIVE, 1.0
+    text = entity.texts.add(billboard=True, font_size=_LABEL_PIXELS, scale_invariant=True, text=label)
+    text.pose.position.x = text.pose.position.y = text.pose.position.z = _NAN
+    text.pose.orientation.w = 1.0
+    text.color.r, text.color.g, text.color.b, text.color.a = *LABEL, 1.0
+
+
+def _add_outline(entity: SceneEntity, ring: Floats, z: float) -> None:
+    line = entity.lines.add(
+        type=LinePrimitive.LINE_LOOP, thickness=_LINE_PIXELS, scale_invariant=True, pose=_lying_at(z)
+    )
+    for x, y in ring.tolist():
+        line.points.add(x=x, y=y)
+    line.color.r, line.color.g, line.color.b, line.color.a = _NAN, _NAN, _NAN, 1.0
+
+
+def _add_face(entity: SceneEntity, ring: Floats, z: float, opacity: float) -> None:
+    face = entity.triangles.add(pose=_lying_at(z))
+    for x, y in ring.tolist():
+        face.points.add(x=x, y=y)
+    for corner in range(1, len(ring) - 1):
+        face.indices.extend((0, corner, corner + 1))
+    face.color.r, face.color.g, face.color.b, face.color.a = _NAN, _NAN, _NAN, opacity
+
+
+def _add_sides(entity: SceneEntity, ring: Floats, bottom: float, height: float, opacity: float) -> None:
+    sides = entity.triangles.add(pose=_lying_at(bottom))
+    for x, y in ring.tolist():
+        sides.points.add(x=x, y=y)
+    for x, y in ring.tolist():
+        sides.points.add(x=x, y=y, z=height)
+    count = len(ring)
+    for low in range(count):
+        following = (low + 1) % count
+        sides.indices.extend((low, following, count + low, following, count + following, count + low))
+    sides.color.r, sides.color.g, sides.color.b, sides.color.a = _NAN, _NAN, _NAN, opacity
+
+
+def _lying_at(z: float) -> Pose:
+    pose = Pose()
+    pose.position.z = z
+    pose.orientation.w = 1.0
+    return pose
+
+
+ROUND: Final = 32
+"""Points on the ring of a rounded part."""
+
+
+class Rings(NamedTuple):
+    """The rings of R footprints, as ragged rows.
+
+    Attributes:
+        start: (R + 1,) int64, where each footprint's points begin.
+        points: (P, 2), counter-clockwise.
+        form: (R,) int64, index into `forms`.
+        forms: for each form, the lengths of its rings and whether it has a height.
+    """
+
+    start: Integers
+    points: Floats
+    form: Integers
+    forms: tuple[Form, ...]
+
+
+class Form(NamedTuple):
+    """What footprints have in common that are drawn with the same primitives."""
+
+    rings: tuple[int, ...]
+    has_height: bool
+
+
+def rings_of(footprints: FootprintBatch, point_radius: float) -> Rings:
+    """The rings of some footprints; a bare point is drawn as a disc of the given radius."""
+    counts = np.diff(footprints.vertex_start)
+    is_round = (counts == 1) | (footprints.radius > 0.0)
+    lengths = np.where(is_round, ROUND, counts)
+    part_start = starts_from_counts(lengths)
+    points = np.empty((part_start[-1], 2))
+    straight = ~is_round
+    points[flat_index(part_start[:-1][straight], counts[straight])] = footprints.vertices[
+        flat_index(footprints.vertex_start[:-1][straight], counts[straight])
+    ]
+    for count in np.unique(counts[is_round]).tolist():
+        parts = np.flatnonzero(is_round & (counts == count))
+        corners = footprints.vertices[footprints.vertex_start[parts][:, None] + np.arange(count)]
+        radius = np.where(footprints.radius[parts] > 0.0, footprints.radius[parts], point_radius)
+        points[part_start[parts][:, None] + np.arange(ROUND)] = _rounded(corners, radius)
+    form, forms = _forms(footprints, lengths)
+    return Rings(part_start[footprints.part_start], points, form, forms)
+
+
+def outlines_of(footprint: Footprint) -> list[Floats]:
+    """The ring (n, 2) of each part of one footprint."""
+    rings = rings_of(FootprintBatch.from_footprints([footprint]), 0.0)
+    ends = np.cumsum(rings.forms[0].rings)[:-1]
+    return np.split(rings.points, ends)
+
+
+def extents(footprints: FootprintBatch) -> Floats:
+    """(R,) the longer side of each footprint's bounding box."""
+    owner = np.repeat(np.arange(len(footprints)), np.diff(footprints.part_start))
+    vertex_part = np.repeat(np.arange(len(owner)), np.diff(footprints.vertex_start))
+    radius = footprints.radius[vertex_part][:, None]
+    low = np.full((len(footprints), 2), np.inf)
+    high = np.full((len(footprints), 2), -np.inf)
+    np.minimum.at(low, owner[vertex_part], footprints.vertices - radius)
+    np.maximum.at(high, owner[vertex_part], footprints.vertices + radius)
+    return np.asarray((high - low).max(axis=1))
+
+
+_ANGLES = np.arange(ROUND) * (2.0 * np.pi / ROUND)
+_DIRECTIONS: Final = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+
+
+def _rounded(corners: Floats, radius: Floats) -> Floats:
+    """Rings (M, ROUND, 2) of M parts: the outermost point in each direction.
+
+    Args:
+        corners: (M, n, 2).
+        radius: (M,).
+    """
+    x, y = _DIRECTIONS[:, :1], _DIRECTIONS[:, 1:]
+    reach = corners[:, None, :, 0] * x + corners[:, None, :, 1] * y
+    outermost = np.take_along_axis(corners, reach.argmax(axis=2)[:, :, None], axis=1)
+    return np.asarray(outermost + radius[:, None, None] * _DIRECTIONS)
+
+
+def _forms(footprints: FootprintBatch, lengths: Integers) -> tuple[Integers, tuple[Form, ...]]:
+    """(R,) the form of each footprint, and what the forms are."""
+    part_counts = np.diff(footprints.part_start)
+    has_height = ~np.isnan(footprints.bottom)
+    key = part_counts * 2 + has_height
+    for part in range(int(part_counts.max(initial=0))):
+        there = part_counts > part
+        length = np.zeros(len(footprints), np.int64)
+        length[there] = lengths[footprints.part_start[:-1][there] + part]
+        _, key = np.unique(key * (int(length.max()) + 1) + length, return_inverse=True)
+    _, examples, form = np.unique(key, return_index=True, return_inverse=True)
+    forms = tuple(
+        Form(
+            tuple(lengths[footprints.part_start[row] : footprints.part_start[row + 1]].tolist()),
+            bool(has_height[row]),
+        )
+        for row in examples.tolist()
+    )
+    return form.astype(np.int64), forms
+
+
+OBJECT: Final = "object/"
+REGION: Final = "region/"
+WITNESS: Final = "witness"
+
+LABEL_LENGTH: Final = 8
+"""Characters of a witness' number, spaces around it included."""
+
+_LABEL_LIFT: Final = 0.01
+"""How far above a region its name stands, by the region's size."""
+
+
+class Layout(NamedTuple):
+    """What decides where the numbers of a message stand.
+
+    Attributes:
+        deleted: objects that were in the message before and are not seen now.
+        objects: name and form of those seen.
+        witness: whether the worst violation is pointed at; or, with None, was so in the message before.
+    """
+
+    deleted: tuple[str, ...]
+    objects: tuple[tuple[str, Form], ...]
+    witness: bool | None = False
+
+
+class Region(NamedTuple):
+    """A region as it is drawn.
+
+    Attributes:
+        name: its name.
+        outline: its border, as the specification says it.
+        rings: its convex parts, each (n, 2).
+    """
+
+    name: str
+    outline: Outline
+    rings: tuple[Floats, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SceneTemplate:
+    """Messages of one layout, but for their times, coordinates and colours.
+
+    Attributes:
+        template: its words are what is to be filled in.
+        stamps: where a timestamp's content begins.
+    """
+
+    template: Template
+    stamps: tuple[int, ...]
+
+    def fill(self, times_ns: Integers, words: Floats) -> Bytes:
+        """(S,) times and (S, W) numbers → (S, L) encoded messages."""
+        rows = self.template.fill(words.view(np.uint64))
+        stamps = _encoded_stamps(times_ns)
+        for begin in self.stamps:
+            rows[:, begin : begin + _STAMP] = stamps
+        return rows
+
+
+def make_template(layout: Layout, regions: tuple[Region, ...], lift: float) -> SceneTemplate:
+    """The template of a layout.
+
+    Args:
+        lift: how far flat objects are drawn above the plane, so that they cover regions.
+    """
+    message = SceneUpdate()
+    for name in layout.deleted:
+        message.deletions.add(id=OBJECT + name, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
+    if layout.witness is None:
+        message.deletions.add(id=WITNESS, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
+    for region in regions:
+        _add_region(_add_entity(message, REGION + region.name), region)
+    for name, form in layout.objects:
+        _add_object(_add_entity(message, OBJECT + name), name, form, lift)
+    if layout.witness:
+        point_at(_add_entity(message, WITNESS), _A_LABEL, lift)
+    payload = np.frombuffer(message.SerializeToString(deterministic=True), np.uint8).copy()
+    words = Template.of(message).word_offsets
+    slots = words[np.isnan(payload[words[:, None] + np.arange(8)].view("<f8")[:, 0])]
+    if layout.witness:
+        # the last text of all: names come before it
+        slots = np.append(slots, payload.tobytes().rindex(_A_LABEL.encode()))
+    payload[slots[:, None] + np.arange(8)] = 0
+    return SceneTemplate(Template(payload, slots, np.empty(0, np.int64)), _stamp_offsets(payload.tobytes()))
+
+
+def words_of_region(region: Region, colour: Floats) -> list[Floats]:
+    """What a template leaves open in a region: the colours (S, 3) of its lines and faces."""
+    primitives = _region_entity(region)
+    return [colour] * (len(primitives.lines) + len(primitives.triangles))
+
+
+def words_of_object(
+    form: Form, points: Floats, bottom: Floats, top: Floats, colour: Floats, lift: float
+) -> list[Floats]:
+    """What a template leaves open in an object, in the order of its primitives' fields.
+
+    Args:
+        points: (S, P, 2), its rings, one after the other.
+        bottom, top: (S,) its height interval, if it has one.
+        colour: (S, 3).
+        lift: how far above the top the name stands.
+
+    Returns:
+        columns (S, n), each of one or more words.
+    """
+    rings = _split(points, form.rings)
+    upper = [top[:, None]] if form.has_height else []
+    words = []
+    for ring in rings:
+        words += [*upper, _flat(ring), colour]
+    for ring in rings:
+        if ring.shape[1] > 2:
+            words += [*upper, _flat(ring), colour]
+    if form.has_height:
+        for ring in rings:
+            if ring.shape[1] > 1:
+                words += [bottom[:, None], _flat(ring), _raised(ring, top - bottom), colour]
+    # half the sum of the ends does not depend on the order in which points are added up
+    words.append((points.min(axis=1) + points.max(axis=1)) / 2.0)
+    return words + [height + lift for height in upper]
+
+
+def words_of_witness(points: Floats, z: Floats, scale: float, labels: Sequence[str]) -> list[Floats]:
+    """What a template leaves open in the arrow at the worst violation.
+
+    Args:
+        points: (S, 2, 2), where it begins and where it ends.
+        z: (S,), how high.
+        scale: the size of objects in the scene.
+        labels: S texts, of at most `LABEL_LENGTH` ASCII characters.
+
+    Returns:
+        columns (S, n).
+    """
+    begin, end = points[:, 0], points[:, 1]
+    length = np.hypot(*(end - begin).T)
+    half = 0.5 * np.arctan2(*(end - begin).T[::-1])
+    head = np.minimum(0.5 * length, ARROW_HEAD * scale)
+    arrow = [begin, z, np.sin(half), np.cos(half), length - head, head]
+    middle = [(begin + end) / 2.0, z + ARROW_HEAD * scale]
+    text = "".join([label.center(LABEL_LENGTH) for label in labels]).encode()
+    label = np.frombuffer(text, "<f8")
+    return [column.reshape(len(points), -1) for column in (*arrow, *middle, label)]
+
+
+def _add_entity(message: SceneUpdate, identifier: str) -> SceneEntity:
+    return message.entities.add(id=identifier, frame_id=FRAME, timestamp=_A_STAMP)
+
+
+def _add_region(entity: SceneEntity, region: Region) -> None:
+    """A region's border as it was written, or for a disc its ring, and its convex parts as faces.
+
+    The name stands at its upper edge, where objects inside do not cover it.
+    """
+    corners = np.array(region.outline.vertices, np.float64)
+    outlines = list(region.rings) if region.outline.is_disc else [corners]
+    bottom, top = region.outline.height or (0.0, 0.0)
+    sides = None if region.outline.height is None else (bottom, top - bottom)
+    everything = np.concatenate(region.rings)
+    (left, low), (right, high) = everything.min(axis=0).tolist(), everything.max(axis=0).tolist()
+    label = top + _LABEL_LIFT * max(right - left, high - low)
+    draw(
+        entity,
+        region.name,
+        outlines,
+        list(region.rings),
+        ((left + right) / 2.0, high),
+        Elevation(top, sides, label),
+        REGION_OPACITY,
+    )
+
+
+def _region_entity(region: Region) -> SceneEntity:
+    entity = SceneEntity()
+    _add_region(entity, region)
+    return entity
+
+
+def _add_object(entity: SceneEntity, name: str, form: Form, lift: float) -> None:
+    rings = [np.full((length, 2), np.nan) for length in form.rings]
+    elevation = Elevation(lift, None, 2.0 * lift)
+    if form.has_height:
+        elevation = Elevation(np.nan, (np.nan, np.nan), np.nan)
+    draw(entity, name, rings, rings, (np.nan, np.nan), elevation, OBJECT_OPACITY)
+
+
+def _split(points: Floats, lengths: tuple[int, ...]) -> list[Floats]:
+    ends = np.cumsum(lengths).tolist()
+    return [points[:, end - length : end] for end, length in zip(ends, lengths, strict=True)]
+
+
+def _flat(ring: Floats) -> Floats:
+    return ring.reshape(len(ring), -1)
+
+
+def _raised(ring: Floats, height: Floats) -> Floats:
+    """(S, n, 2) points and (S,) heights → (S, 3 n): x, y, z, x, y, z …"""
+    z = np.broadcast_to(height[:, None, None], (*ring.shape[:2], 1))
+    return _flat(np.concatenate([ring, z], axis=2))
+
+
+_A_LABEL: Final = "#" * LABEL_LENGTH
+
+
+# ------------------------------------------------------------------------------------------- timestamps
+
+# Numbers of variable length may be padded: written with five bytes each, all stamps have one length.
+_SECONDS, _NANOS = (1 << 34) - 1, (1 << 30) - 1
+_A_STAMP: Final = Timestamp(seconds=_SECONDS, nanos=_NANOS)
+# its bytes of all ones are in no text, and every other number is a slot or an ordinary constant
+_STAMP_BYTES: Final = _A_STAMP.SerializeToString()
+_STAMP: Final = len(_STAMP_BYTES)
+_NS: Final = 1_000_000_000
+
+
+def _stamp_offsets(payload: bytes) -> tuple[int, ...]:
+    offsets = []
+    begin = payload.find(_STAMP_BYTES)
+    while begin >= 0:
+        offsets.append(begin)
+        begin = payload.find(_STAMP_BYTES, begin + _STAMP)
+    return tuple(offsets)
+
+
+def _encoded_stamps(times_ns: Integers) -> Bytes:
+    """(S,) nanoseconds → (S, 12) the contents of timestamps."""
+    rows = np.tile(np.frombuffer(_STAMP_BYTES, np.uint8), (len(times_ns), 1))
+    shifts = np.arange(0, 35, 7)
+    more = np.array([0x80, 0x80, 0x80, 0x80, 0x00])
+    for begin, number in ((1, times_ns // _NS), (7, times_ns % _NS)):
+        rows[:, begin : begin + 5] = number[:, None] >> shifts & 0x7F | more
+    return rows

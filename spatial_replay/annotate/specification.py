@@ -1,0 +1,154 @@
+"""Specifications and the trees of their results → the message of /spatial/specification."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import PurePath
+from typing import NamedTuple
+
+from spatial_replay.annotate.requirements import iter_subformulas
+from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
+from spatial_replay.logs.schemas.Specification_pb2 import SpecificationResult
+from spatial_replay.monitor.instances import Instance
+from spatial_replay.spec.format import format_formula, format_specification
+from spatial_replay.spec.formula import (
+    Atom,
+    Expression,
+    Formula,
+    Maximum,
+    Minimum,
+    Misalignment,
+    Negative,
+    Number,
+    Signal,
+    Specification,
+    Sum,
+    iter_nodes,
+    operator_of,
+)
+from spatial_replay.spec.relations import RELATION_NAMES
+
+DIMENSIONLESS = "1"
+MIXED = "mixed"
+FOOTPRINT_UNITS = ""
+
+
+class ReportedTree(NamedTuple):
+    """One result, as the tree that /spatial/robustness has numbers for.
+
+    Attributes:
+        name: the name it is reported under.
+        object: the object that a template's parameter stands for, or None.
+        file: index of its specification among the files.
+    """
+
+    name: str
+    object: str | None
+    file: int
+    formula: Formula
+
+
+def reported_trees(
+    files: Sequence[Specification], instances: Sequence[Sequence[Instance]]
+) -> list[ReportedTree]:
+    """Every result of every file; where two files have a spec of one name, after their files' stems.
+
+    Args:
+        instances: of each file, in the order in which they are evaluated.
+    """
+    names = [spec.name for file in files for spec in file.results]
+    trees = []
+    for index, (file, own) in enumerate(zip(files, instances, strict=True)):
+        for instance in own:
+            clashes = names.count(instance.name) > 1
+            name = f"{PurePath(file.filename).stem}.{instance.name}" if clashes else instance.name
+            trees.append(ReportedTree(name, instance.object, index, instance.formula))
+    return trees
+
+
+def encode_specification(
+    files: Sequence[Specification],
+    trees: Sequence[ReportedTree],
+    signal_units: Mapping[str, str] | None = None,
+    propositions: Sequence[Sequence[int]] | None = None,
+) -> bytes:
+    """The message that says what a log was evaluated against; equal arguments give equal bytes.
+
+    Args:
+        signal_units: units of the log's signals, where known.
+        propositions: of each tree, the nodes that are propositions of its automaton.
+    """
+    message = SpecificationMessage()
+    for file in files:
+        message.files.add(
+            name="" if file.filename == "<text>" else file.filename,
+            source=file.source,
+            canonical=format_specification(file),
+            profile=file.profile,
+        )
+    for index, tree in enumerate(trees):
+        result = message.results.add(name=tree.name, object=tree.object or "", file=tree.file)
+        result.propositions.extend(propositions[index] if propositions is not None else ())
+        _add_nodes(result, tree.formula, RELATION_NAMES | files[tree.file].relations, signal_units or {})
+    return message.SerializeToString(deterministic=True)
+
+
+def unit_of(formula: Formula, signal_units: Mapping[str, str]) -> str:
+    """The unit of a formula's robustness: that of its atoms, if they share one.
+
+    Footprint units are "", numbers without a unit "1"; a signal whose unit nobody stated has "units of
+    NAME". A formula over atoms of several units has "mixed".
+    """
+    units = {
+        _atom_unit(node.expression, signal_units)
+        for node in iter_subformulas(formula)
+        if isinstance(node, Atom)
+    }
+    if len(units) > 1:
+        return MIXED
+    return units.pop() if units else FOOTPRINT_UNITS
+
+
+def _add_nodes(
+    result: SpecificationResult, formula: Formula, relations: frozenset[str], signal_units: Mapping[str, str]
+) -> None:
+    for identifier, parent, formula_node in iter_nodes(formula):
+        node = result.nodes.add(
+            id=identifier,
+            operator=operator_of(formula_node),
+            name=formula_node.name or "",
+            text=format_formula(formula_node, relations=relations),
+            span_start=formula_node.span.start,
+            span_end=formula_node.span.end,
+            unit=unit_of(formula_node, signal_units),
+        )
+        if parent is not None:
+            node.parent = parent
+
+
+def _atom_unit(expression: Expression, signal_units: Mapping[str, str]) -> str:
+    units = set(_units(expression, signal_units))
+    if len(units) > 1:
+        return MIXED
+    return units.pop() if units else FOOTPRINT_UNITS
+
+
+def _units(expression: Expression, signal_units: Mapping[str, str]) -> Iterator[str]:
+    """The units of everything measured in an expression; its constants take those."""
+    stack = [expression]
+    while stack:
+        match stack.pop():
+            case Sum(first, second):
+                stack += [first, second]
+            case Negative(operand):
+                stack.append(operand)
+            case Minimum(operands) | Maximum(operands):
+                stack.extend(operands)
+            case Signal(name):
+                yield signal_units.get(name) or f"units of {name}"
+            case Misalignment():
+                yield DIMENSIONLESS
+            case Number():
+                pass
+            case _:
+                yield FOOTPRINT_UNITS

@@ -1,0 +1,223 @@
+"""From a specification to its automaton.
+
+Automata as files, so that one compiled before need not be compiled again.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from types import MappingProxyType
+from typing import Literal, TypeAlias, get_args
+
+from spatial_replay.automata.automaton import MAX_PROPOSITIONS, MAX_ROWS, Automaton, automaton_of
+from spatial_replay.automata.ltlf import Skeleton, no_automaton
+from spatial_replay.automata.minimise import least
+from spatial_replay.automata.mona import compiled_by_mona
+from spatial_replay.automata.progression import progressed
+from spatial_replay.automata.propositions import Propositions
+from spatial_replay.errors import NoAutomatonError, UsageError
+from spatial_replay.spec.diagnostics import Source, nearest_hint
+from spatial_replay.spec.format import format_formula
+from spatial_replay.spec.formula import NamedSpec, Specification
+from spatial_replay.spec.load import require_specification
+
+_VERSION = 1
+_LONGEST = 16 * 2**20
+"""Bytes of a file that is read."""
+
+
+def stored_text(automaton: Automaton, specification: Specification, spec: NamedSpec) -> str:
+    """An automaton as a file (JSON), with the formula that it is of."""
+    return json.dumps(
+        {
+            "version": _VERSION,
+            "specification": _canonical(specification, spec),
+            "propositions": [each.text for each in automaton.propositions],
+            "accepting": sorted(automaton.accepting),
+            "entries": automaton.entries,
+            "decisions": automaton.decisions,
+        },
+        ensure_ascii=False,
+        separators=(",", ":"),
+    )
+
+
+def automaton_from(data: bytes, specification: Specification, spec: NamedSpec) -> Automaton | None:
+    """The automaton of a spec out of a file; None if the file is of another formula, or is no such file."""
+    if len(data) > _LONGEST:
+        return None
+    try:
+        stored = json.loads(data)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(stored, dict) or stored.get("version") != _VERSION:
+        return None
+    propositions = Propositions(spec.formula).all
+    expected = (_canonical(specification, spec), [each.text for each in propositions])
+    if (stored.get("specification"), stored.get("propositions")) != expected:
+        return None
+    entries, accepting = _numbers(stored.get("entries")), _numbers(stored.get("accepting"))
+    decisions = _decisions(stored.get("decisions"))
+    if entries is None or accepting is None or decisions is None or len(propositions) > MAX_PROPOSITIONS:
+        return None
+    automaton = Automaton(spec.name, tuple(propositions), frozenset(accepting), tuple(entries), decisions)
+    return automaton if _is_sound(automaton) and _has_guards(automaton) else None
+
+
+def _canonical(specification: Specification, spec: NamedSpec) -> str:
+    return f"use {specification.profile}\n{format_formula(spec.formula)}"
+
+
+def _numbers(value: object) -> list[int] | None:
+    if not isinstance(value, list) or len(value) > MAX_ROWS or any(type(each) is not int for each in value):
+        return None
+    return value
+
+
+def _decisions(value: object) -> tuple[tuple[int, int, int], ...] | None:
+    if not isinstance(value, list) or len(value) > MAX_ROWS:
+        return None
+    rows = [_numbers(row) for row in value]
+    return tuple((row[0], row[1], row[2]) for row in rows if row is not None and len(row) == 3)
+
+
+def _is_sound(automaton: Automaton) -> bool:
+    """Whether every decision leads on to later ones and, in the end, to states that there are."""
+    states, propositions = len(automaton.entries), len(automaton.propositions)
+
+    def leads(place: int, rows: Sequence[tuple[int, int, int]], row: int, after: int) -> bool:
+        if place < 0:
+            return ~place < states
+        return place < row and rows[place][0] > after
+
+    rows = automaton.decisions
+    return (
+        states > 0
+        and all(0 <= state < states for state in automaton.accepting)
+        and all(leads(place, rows, len(rows), -1) for place in automaton.entries)
+        and all(
+            0 <= proposition < propositions
+            and leads(low, rows, row, proposition)
+            and leads(high, rows, row, proposition)
+            for row, (proposition, low, high) in enumerate(rows)
+        )
+    )
+
+
+def _has_guards(automaton: Automaton) -> bool:
+    try:
+        return bool(automaton.transitions)
+    except NoAutomatonError:
+        return False
+
+
+Compiler: TypeAlias = Literal["own", "mona"]
+"""Who compiles: this package, or MONA."""
+
+_NAMES: MappingProxyType[Compiler, str] = MappingProxyType({"own": "this package", "mona": "MONA"})
+
+
+def automaton(
+    specification: Specification,
+    name: str | None = None,
+    *,
+    compiler: Compiler | None = None,
+    stored: Iterable[bytes] = (),
+) -> Automaton:
+    """The automaton of a spec: which runs satisfy it, sample by sample.
+
+    It accepts a run that is fully observed and has a robustness above 0, and none with one below 0.
+
+    Args:
+        name: which spec of the file; without it, its only result.
+        compiler: "own" or "mona"; both give equal automata. Without it, that of this package, and where that
+            reaches its limits, MONA.
+        stored: automata as files; one of this spec is taken rather than asking MONA.
+
+    Raises:
+        NoAutomatonError: past operators, bounds in seconds, or too large.
+        UsageError: no specification, no such spec, several to choose from, no such compiler.
+    """
+    require_specification(specification)
+    if compiler is not None and compiler not in get_args(Compiler):
+        raise UsageError(f"no compiler {compiler!r}; there are 'own' and 'mona'")
+    spec = chosen_spec(specification, name)
+    source = Source.of(specification.source, specification.filename) if specification.source else None
+    propositions = Propositions(spec.formula)
+    skeleton = Skeleton(spec.formula, propositions, source)
+    compilers = get_args(Compiler) if compiler is None else (compiler,)
+    try:
+        return _compiled(spec, skeleton, propositions, compilers, _read(stored, specification, spec))
+    except NoAutomatonError as error:
+        raise no_automaton(spec, source, str(error)) from error
+
+
+def _compiled(
+    spec: NamedSpec,
+    skeleton: Skeleton,
+    propositions: Propositions,
+    compilers: Sequence[Compiler],
+    stored: Iterator[Automaton],
+) -> Automaton:
+    """The automaton of the first compiler that gives one; the first that is stored, rather than ask MONA.
+
+    Raises:
+        NoAutomatonError: why none does.
+    """
+    count = len(propositions.all)
+    if count > MAX_PROPOSITIONS:
+        raise NoAutomatonError(f"it has {count} propositions, an automaton at most {MAX_PROPOSITIONS}")
+    reasons = []
+    for each in compilers:
+        if each == "mona" and (before := next(stored, None)) is not None:
+            return before
+        try:
+            compiled = progressed if each == "own" else compiled_by_mona
+            machine = compiled(skeleton, count)
+        except NoAutomatonError as error:
+            reasons.append(f"{_NAMES[each]}: {error}")
+        else:
+            return _kept(automaton_of(least(machine), spec.name, propositions.all))
+    raise NoAutomatonError("; ".join(reasons))
+
+
+def _read(stored: Iterable[bytes], specification: Specification, spec: NamedSpec) -> Iterator[Automaton]:
+    """Those of files that are of a spec, read when they are asked for."""
+    for data in stored:
+        found = automaton_from(data, specification, spec)
+        if found is not None:
+            yield found
+
+
+def _kept(automaton: Automaton) -> Automaton:
+    """An automaton that is small enough, and knows its guards.
+
+    Raises:
+        NoAutomatonError: it is too large.
+    """
+    rows = max(len(automaton.entries), len(automaton.decisions))
+    if rows > MAX_ROWS:
+        raise NoAutomatonError(f"it takes {rows} states or decisions, at most {MAX_ROWS} are kept")
+    return automaton.with_transitions()
+
+
+def chosen_spec(specification: Specification, name: str | None) -> NamedSpec:
+    """The spec of a file that has a name; without one, its only result.
+
+    Raises:
+        UsageError: no such spec, several to choose from.
+    """
+    known = {spec.name: spec for spec in specification.specs}
+    if name is None:
+        if len(specification.results) != 1:
+            names = ", ".join(spec.name for spec in specification.results)
+            raise UsageError(f"{specification.filename} has several results; choose one with name=: {names}")
+        return specification.results[0]
+    if name not in known:
+        hint = nearest_hint(name, known)
+        names = ", ".join(known)
+        raise UsageError(
+            f"no spec {name!r} in {specification.filename}; {f'{hint} ' if hint else ''}there are {names}"
+        )
+    return known[name]

@@ -1,0 +1,222 @@
+"""Automata for people and for other tools: as text, for Graphviz, in the Hanoi format, drawn."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Sequence
+from dataclasses import replace
+from textwrap import wrap
+
+from spatial_replay.automata.automaton import Automaton
+from spatial_replay.automata.guards import Transition
+from spatial_replay.errors import OutputError, UsageError
+from spatial_replay.palette import NEGATIVE, POSITIVE, hexadecimal, light
+from spatial_replay.text import counted
+
+_DRAWING_S = 120.0
+"""How long Graphviz may take."""
+_LONGEST_LABEL = 12
+"""Characters of a proposition that stands on an arrow as it is."""
+_WIDTH = 20
+"""Characters after which a label of an arrow goes on in a new line."""
+_LEGEND_WIDTH = 100
+"""Characters of a line below a drawing."""
+
+
+def words_text(automaton: Automaton) -> str:
+    """States, what they mean, and their moves in words."""
+    lines = [f"automaton of {automaton.name}: {size_words(automaton)}"]
+    lines += [f"  {each.name} means {each.text}" for each in automaton.propositions if each.name is not None]
+    for state, transitions in enumerate(_by_source(automaton)):
+        lines.append(f"  state {state}: {state_words(automaton, state)}")
+        for each in transitions:
+            to = "stays" if each.target == state else f"to {each.target}"
+            lines.append(f"    {to} if {automaton.guard_words(each)}")
+    return "\n".join(lines)
+
+
+def size_words(automaton: Automaton) -> str:
+    """How large it is: "33 states, 6 propositions"."""
+    return f"{counted(len(automaton.states), 'state')}, {counted(len(automaton.propositions), 'proposition')}"
+
+
+def state_words(automaton: Automaton, state: int) -> str:
+    """What a run that ends in a state is, and what it can become."""
+    begins = "start, " if state == automaton.initial else ""
+    if state == automaton.initial and not automaton.has_returns:
+        return f"{begins}before the first sample"
+    now = "accepting" if state in automaton.accepting else "not accepting"
+    if state not in automaton.can_reject:
+        now = "accepting for good"
+    elif state not in automaton.can_accept:
+        now = "a trap: acceptance is lost"
+    return begins + now
+
+
+def state_colour(automaton: Automaton, state: int) -> str:
+    """What a state is filled with: light blue if it accepts for good, light vermillion if it is a trap."""
+    if state not in automaton.can_reject:
+        return hexadecimal(light(POSITIVE))
+    return "#ffffff" if state in automaton.can_accept else hexadecimal(light(NEGATIVE))
+
+
+def abbreviated(automaton: Automaton) -> Automaton:
+    """The automaton with short names for long propositions, as fit on arrows."""
+    taken = {each.label for each in automaton.propositions}
+    names = (name for number in range(2 * len(taken) + 1) if (name := f"p{number}") not in taken)
+    return replace(
+        automaton,
+        propositions=tuple(
+            each if len(each.label) <= _LONGEST_LABEL else replace(each, name=next(names))
+            for each in automaton.propositions
+        ),
+    )
+
+
+def meanings(automaton: Automaton) -> list[str]:
+    """What the names of propositions stand for: "p0: cup leftof plate"."""
+    return [f"{each.name}: {each.text}" for each in automaton.propositions if each.name is not None]
+
+
+def dot_text(automaton: Automaton) -> str:
+    """The automaton in the language of Graphviz, with guards in words and long propositions told below.
+
+    Accepting states have a double outline; those that accept for good are blue, traps are vermillion.
+    """
+    short = abbreviated(automaton)
+    return _digraph(short, meanings(short))
+
+
+def _digraph(automaton: Automaton, legend: Sequence[str] = ()) -> str:
+    lines = [
+        f"digraph {_quoted(automaton.name)} {{",
+        "  rankdir=LR;",
+        '  node [shape=circle, style=filled, fillcolor=white, fontname="Helvetica"];',
+        '  edge [fontname="Helvetica", fontsize=10];',
+        "  start [shape=point];",
+        f"  start -> {automaton.initial};",
+    ]
+    if legend:
+        told = "".join(f"{_escaped(line)}\\l" for each in legend for line in _legend_lines(each))
+        lines.append(f'  graph [fontname="Helvetica", fontsize=11, labelloc=b, labeljust=l, label="{told}"];')
+    for state in automaton.states:
+        shape = "doublecircle" if state in automaton.accepting else "circle"
+        colour = state_colour(automaton, state)
+        about = _quoted(state_words(automaton, state))
+        lines.append(f'  {state} [shape={shape}, fillcolor="{colour}", tooltip={about}];')
+    for each in automaton.transitions:
+        label = "\\n".join(map(_escaped, _broken(automaton.guard_words(each))))
+        lines.append(f'  {each.source} -> {each.target} [label="{label}"];')
+    return "\n".join([*lines, "}", ""])
+
+
+def hoa_text(automaton: Automaton) -> str:
+    """The automaton in the Hanoi omega-automata format, version 1.
+
+    That format is about infinite runs and has no acceptance for finite ones. So the accepting states are
+    written as the acceptance set 0 of a Büchi automaton: a finite run is accepted iff it ends in a state of
+    that set. The header `finite-runs`, which readers may ignore, says so.
+    """
+    numbers = range(len(automaton.propositions))
+    names = [_quoted(each.label) for each in automaton.propositions]
+    lines = [
+        "HOA: v1",
+        f"name: {_quoted(automaton.name)}",
+        f"States: {len(automaton.states)}",
+        f"Start: {automaton.initial}",
+        " ".join(["AP:", str(len(numbers)), *names]),
+        "acc-name: Buchi",
+        "Acceptance: 1 Inf(0)",
+        "properties: trans-labels explicit-labels state-acc complete deterministic",
+        'finite-runs: "accepted iff they end in a state of set 0"',
+        "--BODY--",
+    ]
+    for state, transitions in enumerate(_by_source(automaton)):
+        lines.append(f"State: {state} {{0}}" if state in automaton.accepting else f"State: {state}")
+        lines += [f"  [{_hoa_guard(each)}] {each.target}" for each in transitions]
+    return "\n".join([*lines, "--END--", ""])
+
+
+def svg_text(automaton: Automaton) -> str:
+    """The automaton drawn by Graphviz.
+
+    Raises:
+        UsageError: Graphviz is not installed.
+        OutputError: Graphviz fails, or takes too long.
+    """
+    return _graphviz(automaton, dot_text(automaton), "svg")
+
+
+def layout_text(automaton: Automaton) -> str:
+    """Where Graphviz puts states and arrows, without what is told below, as JSON.
+
+    Raises:
+        UsageError, OutputError: as `svg_text`.
+    """
+    return _graphviz(automaton, _digraph(automaton), "json0")
+
+
+def _graphviz(automaton: Automaton, text: str, form: str) -> str:
+    executable = shutil.which("dot")
+    if executable is None:
+        raise UsageError(
+            "drawing an automaton takes Graphviz, which is not installed: apt-get install graphviz; "
+            "or write it as text to a file that ends in .dot"
+        )
+    try:
+        done = subprocess.run(
+            [executable, f"-T{form}"],
+            input=text.encode(),
+            capture_output=True,
+            check=False,
+            timeout=_DRAWING_S,
+        )
+    except subprocess.TimeoutExpired:
+        raise OutputError(
+            f"Graphviz did not draw {len(automaton.states)} states and {len(automaton.transitions)} "
+            f"transitions within {_DRAWING_S:g} s; write them as text to a file that ends in .dot"
+        ) from None
+    if done.returncode != 0:
+        reason = done.stderr.decode(errors="replace").strip()[:200]
+        raise OutputError(f"Graphviz ended with code {done.returncode}: {reason}")
+    return done.stdout.decode()
+
+
+def _by_source(automaton: Automaton) -> list[list[Transition]]:
+    """For each state, the moves from it."""
+    moves: list[list[Transition]] = [[] for _ in automaton.states]
+    for each in automaton.transitions:
+        moves[each.source].append(each)
+    return moves
+
+
+def _hoa_guard(transition: Transition) -> str:
+    cubes = [
+        "&".join(str(number) if value else f"!{number}" for number, value in cube) or "t"
+        for cube in transition.guard
+    ]
+    return " | ".join(cubes)
+
+
+def _broken(text: str) -> list[str]:
+    """A sentence in lines, broken before `and` and `or`."""
+    lines = [""]
+    for word in text.split(" "):
+        if word in ("and", "or") and len(lines[-1]) > _WIDTH:
+            lines.append("")
+        lines[-1] += f" {word}" if lines[-1] else word
+    return lines
+
+
+def _legend_lines(text: str) -> list[str]:
+    return wrap(text, _LEGEND_WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
+
+
+def _escaped(text: str) -> str:
+    printable = "".join(character if character.isprintable() else " " for character in text)
+    return printable.replace("\\", "\\\\").replace('"', '\\"')
+
+
+def _quoted(text: str) -> str:
+    return f'"{_escaped(text)}"'

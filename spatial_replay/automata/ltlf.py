@@ -1,0 +1,252 @@
+"""The temporal skeleton of a formula: LTLf over propositions, in negation normal form, bounds unrolled.
+
+What keeps a formula from having an automaton, told with its place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+from spatial_replay.automata.propositions import Propositions, is_spatial
+from spatial_replay.errors import NoAutomatonError
+from spatial_replay.spec.diagnostics import Source
+from spatial_replay.spec.format import format_bound
+from spatial_replay.spec.formula import (
+    PAST_OPERATORS,
+    Boolean,
+    Bound,
+    Formula,
+    NamedSpec,
+    Temporal,
+    Truth,
+    iter_nodes,
+    operator_of,
+)
+
+
+def refuse_operators(formula: Formula, source: Source | None) -> None:
+    """That no operator looks back or counts seconds.
+
+    Raises:
+        NoAutomatonError: with every operator that does.
+    """
+    faults = []
+    for node in _temporal(formula):
+        if node.operator in PAST_OPERATORS:
+            message = f"`{node.operator}` looks back: there is no automaton for past operators"
+            faults.append(obstacle(source, node, message))
+        elif node.bound is not None and _counts_seconds(node.bound):
+            message = f"`{written(node)}` counts seconds, an automaton counts samples"
+            faults.append(obstacle(source, node, message, "for an automaton, bound it in samples"))
+    if faults:
+        told, reasons = dict.fromkeys(map(str, faults)), dict.fromkeys(fault.reason for fault in faults)
+        raise NoAutomatonError("\n".join(told), "; ".join(reasons))
+
+
+def no_automaton(spec: NamedSpec, source: Source | None, reason: str) -> NoAutomatonError:
+    """The error for a spec that no compiler is up to; its widest window is blamed, or else all of it."""
+    place = max(_temporal(spec.formula), key=_width, default=spec.formula)
+    if not _width(place):
+        place = _unnamed(spec.formula)
+    message = f"`{written(place)}` leaves {spec.name} without an automaton: {reason}"
+    hint = "for an automaton, write smaller bounds, or split it into several specs"
+    return obstacle(source, place, message, hint)
+
+
+def obstacle(source: Source | None, node: Formula | None, message: str, remedy: str = "") -> NoAutomatonError:
+    """The error for what stands at a node; where the source is known, with its place."""
+    hint = f"it is evaluated all the same{'; ' if remedy else ''}{remedy}"
+    if source is None or node is None:
+        return NoAutomatonError(f"{message}; {hint}", message)
+    return NoAutomatonError(str(source.diagnostic("error", node.span, message, hint)), message)
+
+
+def written(node: Formula) -> str:
+    """An operator with its bound, as in the canonical text."""
+    bound = node.bound if isinstance(node, Temporal) else None
+    return operator_of(node) + ("" if bound is None else format_bound(bound))
+
+
+def _temporal(formula: Formula) -> Iterator[Temporal]:
+    """Its temporal operators, in the order of the text."""
+    return (node for _, _, node in iter_nodes(formula) if isinstance(node, Temporal))
+
+
+def _counts_seconds(bound: Bound) -> bool:
+    """Whether the bound depends on times: not if it is only this sample, or all from this one on."""
+    return bound.unit == "ns" and (bound.lower > 0 or bound.upper not in (0, None))
+
+
+def _width(node: Formula) -> int:
+    """How many samples ahead a node's bound reaches."""
+    bound = node.bound if isinstance(node, Temporal) else None
+    return 0 if bound is None else bound.upper or bound.lower
+
+
+def _unnamed(formula: Formula) -> Formula:
+    """What a formula that only names another spec stands for."""
+    while isinstance(formula, Boolean) and formula.operator == "spec":
+        (formula,) = formula.operands
+    return formula
+
+
+MAX_NODES = 10_000
+"""How many subformulas a skeleton has at most, once its bounds are unrolled."""
+
+Kind = Literal["false", "true", "literal", "and", "or", "X", "WX", "U", "R"]
+
+
+class Node(NamedTuple):
+    """One subformula.
+
+    Attributes:
+        first, second: numbers of its operands; of a literal, its proposition and whether it is true (1).
+    """
+
+    kind: Kind
+    first: int = 0
+    second: int = 0
+
+
+FALSE, TRUE = 0, 1
+"""The numbers of the constants."""
+
+
+class Skeleton:
+    """The subformulas of a formula, equal ones once; operands come before what they are operands of.
+
+    Attributes:
+        nodes: by number.
+        root: the number of the whole formula.
+        chains: for a subformula over a bounded window, the same over a window longer by one sample; with it,
+            whether it is an until, from which the longer one follows, or a release, which follows from that.
+    """
+
+    def __init__(self, formula: Formula, propositions: Propositions, source: Source | None = None) -> None:
+        """Unroll a formula.
+
+        Args:
+            source: where it stands, for messages.
+
+        Raises:
+            NoAutomatonError: past operators, bounds in seconds, more than `MAX_NODES` subformulas.
+        """
+        refuse_operators(formula, source)
+        self.nodes: list[Node] = []
+        self._numbers: dict[Node, int] = {}
+        self._propositions = propositions
+        self._source = source
+        self.chains: dict[tuple[int, bool], int] = {}
+        self._known: dict[tuple[int, bool], int] = {}
+        self._unrolled: Temporal | None = None
+        self._node("false"), self._node("true")
+        self.root = self._of(formula, True)
+
+    def _of(self, formula: Formula, positive: bool) -> int:
+        """The number of a formula, or of its negation."""
+        key = (id(formula), positive)
+        if key not in self._known:
+            self._known[key] = self._built(formula, positive)
+        return self._known[key]
+
+    def _built(self, formula: Formula, positive: bool) -> int:
+        if isinstance(formula, Truth):
+            return TRUE if formula.value == positive else FALSE
+        if is_spatial(formula):
+            number, value = self._propositions.literal(formula)
+            return self._node("literal", number, int(value == positive))
+        if isinstance(formula, Boolean):
+            return self._boolean(formula, positive)
+        if isinstance(formula, Temporal):
+            return self._temporal(formula, [self._of(each, positive) for each in formula.operands], positive)
+        raise ValueError(f"{formula!r} is no formula")
+
+    def _boolean(self, formula: Boolean, positive: bool) -> int:
+        first, *rest = formula.operands
+        match formula.operator:
+            case "not":
+                return self._of(first, not positive)
+            case "spec":
+                return self._of(first, positive)
+            case "and" | "or":
+                join = self._both if (formula.operator == "and") == positive else self._either
+                result = self._of(first, positive)
+                for operand in rest:
+                    result = join(result, self._of(operand, positive))
+                return result
+            case "->":
+                join = self._either if positive else self._both
+                return join(self._of(first, not positive), self._of(rest[0], positive))
+        second = rest[0]
+        one, other = self._of(first, True), self._of(second, True)
+        not_one, not_other = self._of(first, False), self._of(second, False)
+        if (formula.operator == "xor") == positive:
+            return self._either(self._both(one, not_other), self._both(not_one, other))
+        return self._both(self._either(not_one, other), self._either(one, not_other))
+
+    def _temporal(self, formula: Temporal, operands: list[int], positive: bool) -> int:
+        self._unrolled = formula
+        if formula.operator in ("X", "WX"):
+            return self._next(operands[0], strong=(formula.operator == "X") == positive)
+        strong = (formula.operator in ("F", "U", "W")) == positive
+        # the left operand of what is in this polarity an until or a release; F and G have none
+        nothing = TRUE if strong else FALSE
+        left, right = (nothing, operands[0]) if formula.operator in ("F", "G") else operands
+        result = self._within(left, right, formula.bound, strong)
+        if formula.operator == "W":
+            # φ W ψ is (φ U ψ) or (G φ), both with the bound
+            always = self._within(FALSE if strong else TRUE, left, formula.bound, not strong)
+            result = self._either(result, always) if positive else self._both(result, always)
+        return result
+
+    def _within(self, left: int, right: int, bound: Bound | None, strong: bool) -> int:
+        """Until, or release where not `strong`, over a window."""
+        lower, upper = (0, None) if bound is None else (bound.lower, bound.upper)
+        if max(lower, upper or 0) > MAX_NODES:
+            raise self._too_large()
+        hold, free = (self._both, self._either) if strong else (self._either, self._both)
+        if upper is None:
+            result = self._node("U" if strong else "R", left, right)
+        else:
+            result = right
+            for _ in range(upper - lower):
+                shorter, result = result, free(right, hold(left, self._next(result, strong)))
+                if result != shorter:
+                    self.chains.setdefault((shorter, strong), result)
+        for _ in range(lower):
+            result = hold(left, self._next(result, strong))
+        return result
+
+    def _next(self, operand: int, strong: bool) -> int:
+        if operand == (FALSE if strong else TRUE):
+            return operand
+        return self._node("X" if strong else "WX", operand)
+
+    def _both(self, first: int, second: int) -> int:
+        return self._join("and", first, second, neutral=TRUE, final=FALSE)
+
+    def _either(self, first: int, second: int) -> int:
+        return self._join("or", first, second, neutral=FALSE, final=TRUE)
+
+    def _join(self, kind: Literal["and", "or"], first: int, second: int, *, neutral: int, final: int) -> int:
+        if first in (neutral, second) or second == final:
+            return second
+        if second == neutral or first == final:
+            return first
+        return self._node(kind, first, second)
+
+    def _node(self, kind: Kind, first: int = 0, second: int = 0) -> int:
+        node = Node(kind, first, second)
+        if node not in self._numbers:
+            if len(self.nodes) == MAX_NODES:
+                raise self._too_large()
+            self._numbers[node] = len(self.nodes)
+            self.nodes.append(node)
+        return self._numbers[node]
+
+    def _too_large(self) -> NoAutomatonError:
+        place = self._unrolled
+        what = "the formula" if place is None else f"`{written(place)}`"
+        message = f"with {what} unrolled into steps, there are more than {MAX_NODES} subformulas"
+        return obstacle(self._source, place, message, "for an automaton, write smaller bounds")

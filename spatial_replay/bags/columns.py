@@ -1,0 +1,299 @@
+"""Many messages as columns.
+
+A million small objects that live for a while make the interpreter's collector of cycles look through all
+there is, again and again, which costs more than reading them. Columns of texts, numbers and bytes do not.
+
+Messages in the order of time, out of stretches and files that overlap.
+
+Logs whose clock was set back while they were recorded, as when a simulation starts again.
+
+Read in the order of time, the two passes over the same time would look like one.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TypeAlias
+
+import numpy as np
+
+from spatial_replay.bags.reader import Message
+from spatial_replay.errors import LogError
+from spatial_replay.geometry.arrays import Integers
+from spatial_replay.logs.read_options import FaultList
+
+_TOGETHER = 512
+"""Messages made at once: fewer than the collector lets pass before it looks."""
+_NEW_MESSAGE = partial(tuple.__new__, Message)
+
+
+@dataclass(frozen=True, slots=True)
+class MessageColumns:
+    """M messages.
+
+    Attributes:
+        topics: (M,) names.
+        log_time_ns, publish_time_ns, sequence: (M,) int64.
+        payloads: M messages, each in its topic's encoding.
+        place: (M,) int64, numbers that increase in the order in which the messages were recorded.
+    """
+
+    topics: Sequence[str] = ()
+    log_time_ns: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
+    publish_time_ns: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
+    sequence: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
+    payloads: Sequence[bytes] = ()
+    place: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def __len__(self) -> int:
+        return len(self.topics)
+
+    def slice(self, begin: int, end: int) -> MessageColumns:
+        """The messages from `begin` up to, not including, `end`."""
+        return MessageColumns(
+            self.topics[begin:end],
+            self.log_time_ns[begin:end],
+            self.publish_time_ns[begin:end],
+            self.sequence[begin:end],
+            self.payloads[begin:end],
+            self.place[begin:end],
+        )
+
+    def take(self, places: Integers) -> MessageColumns:
+        """The messages in the given places, in that order."""
+        listed = places.tolist()
+        return MessageColumns(
+            [self.topics[place] for place in listed],
+            self.log_time_ns[places],
+            self.publish_time_ns[places],
+            self.sequence[places],
+            [self.payloads[place] for place in listed],
+            self.place[places],
+        )
+
+    def ordered(self) -> MessageColumns:
+        """The same messages by log time, topic and sequence; equal ones stay as they are."""
+        times = self.log_time_ns
+        if (times[1:] > times[:-1]).all():
+            return self
+        rank = {topic: number for number, topic in enumerate(sorted(set(self.topics)))}
+        topics = np.fromiter(map(rank.__getitem__, self.topics), np.int64, len(self))
+        return self.take(np.lexsort((self.sequence, topics, times)))
+
+    def count_before(self, time_ns: int) -> int:
+        """How many of the messages, which are in order, are earlier."""
+        return int(np.searchsorted(self.log_time_ns, time_ns, side="left"))
+
+    def messages(self) -> list[Message]:
+        """The messages one by one."""
+        columns = zip(
+            self.topics,
+            self.log_time_ns.tolist(),
+            self.publish_time_ns.tolist(),
+            self.sequence.tolist(),
+            self.payloads,
+            strict=True,
+        )
+        return list(map(_NEW_MESSAGE, columns))
+
+
+Columns: TypeAlias = Iterator[MessageColumns]
+
+
+def joined(several: Sequence[MessageColumns]) -> MessageColumns:
+    """The messages of several columns, one after the other."""
+    if len(several) == 1:
+        return several[0]
+    return MessageColumns(
+        [topic for each in several for topic in each.topics],
+        np.concatenate([np.zeros(0, np.int64), *(each.log_time_ns for each in several)]),
+        np.concatenate([np.zeros(0, np.int64), *(each.publish_time_ns for each in several)]),
+        np.concatenate([np.zeros(0, np.int64), *(each.sequence for each in several)]),
+        [payload for each in several for payload in each.payloads],
+        np.concatenate([np.zeros(0, np.int64), *(each.place for each in several)]),
+    )
+
+
+def in_pieces(columns: Columns, size: int = _TOGETHER) -> Columns:
+    """The same messages, no more than `size` at a time."""
+    for each in columns:
+        for begin in range(0, len(each), size):
+            yield each.slice(begin, begin + size)
+
+
+def one_by_one(columns: Columns) -> Iterator[Message]:
+    """The messages themselves."""
+    for piece in in_pieces(columns):
+        yield from piece.messages()
+
+
+def unnumbered(
+    topics: Sequence[str], times_ns: Integers, payloads: Sequence[bytes], place: Integers
+) -> MessageColumns:
+    """Messages of a container that knows one time and no sequence."""
+    return MessageColumns(topics, times_ns, times_ns, np.zeros(len(times_ns), np.int64), payloads, place)
+
+
+def places_in(part: int, within: Integers) -> Integers:
+    """Places in a log of several parts, such as chunks: in the order of the parts, then within each."""
+    return (np.int64(part) << 28) + within
+
+
+def in_order(starts_ns: Sequence[int], stretches: Iterable[MessageColumns]) -> Columns:
+    """The messages of several stretches by log time, topic and sequence.
+
+    No more is held than stretches overlap.
+
+    Args:
+        starts_ns: when each stretch begins, in order; a message before that comes late.
+    """
+    waiting = MessageColumns()
+    for number, stretch in enumerate(stretches, 1):
+        waiting = joined([waiting, stretch] if len(waiting) else [stretch]).ordered()
+        if number == len(starts_ns):
+            break
+        ready = waiting.count_before(starts_ns[number])
+        if ready:
+            yield waiting.slice(0, ready)
+            waiting = waiting.slice(ready, len(waiting))
+    if len(waiting):
+        yield waiting
+
+
+@dataclass(frozen=True)
+class Run:
+    """Messages in order that may be read from a time on."""
+
+    start_ns: int
+    read: Callable[[], Columns]
+
+
+_Active = list[tuple[int, int, MessageColumns, Columns]]
+"""A heap: time of the first message, number of the run, messages, and those that come after them."""
+
+
+def merged(runs: Iterable[Run]) -> Columns:
+    """The messages of several runs by log time; a run is opened when its time has come."""
+    waiting = sorted(runs, key=lambda run: run.start_ns, reverse=True)
+    active: _Active = []
+    opened = 0
+    while waiting or active:
+        while waiting and (not active or waiting[-1].start_ns <= active[0][0]):
+            _push_next(active, opened, waiting.pop().read())
+            opened += 1
+        if not active:
+            continue
+        _, number, columns, following = heapq.heappop(active)
+        limits = [run.start_ns for run in waiting[-1:]] + [each[0] for each in active[:1]]
+        # equal times come in the order of the runs
+        ready = columns.count_before(min(limits) + 1) if limits else len(columns)
+        yield columns.slice(0, ready)
+        if ready < len(columns):
+            rest = columns.slice(ready, len(columns))
+            heapq.heappush(active, (int(rest.log_time_ns[0]), number, rest, following))
+        else:
+            _push_next(active, number, following)
+
+
+def _push_next(active: _Active, number: int, following: Columns) -> None:
+    for columns in following:
+        if len(columns):
+            heapq.heappush(active, (int(columns.log_time_ns[0]), number, columns, following))
+            return
+
+
+class CountedTopics:
+    """Counts what is read of each topic, and compares it with what a log declares."""
+
+    def __init__(self, declared: Mapping[str, int | None]) -> None:
+        self._declared = declared
+        self._read: Counter[str] = Counter()
+
+    def counted(self, columns: Columns) -> Columns:
+        """The messages as they are."""
+        for each in columns:
+            self._read.update(each.topics)
+            yield each
+
+    def compare(self, name: str, faults: FaultList) -> None:
+        """Tell the faults where a topic has more or fewer messages than declared."""
+        for topic, declared in self._declared.items():
+            if declared is not None and declared != self._read[topic]:
+                faults.add(
+                    f"{name}: it declares {declared} messages on {topic!r}; {self._read[topic]} could be read"
+                )
+
+
+DISORDER_NS = 10**9
+"""How far messages may be out of order."""
+
+
+def without_jumps(columns: Columns, name: str) -> Columns:
+    """The messages as they are, in the order of time.
+
+    Raises:
+        LogError: those of a topic were not recorded in that order: some of them come more than a second
+            before others that were recorded earlier.
+    """
+    # logs put together topic by topic are in order all the same, so each topic counts by itself
+    topics = dict[str, _Recorded]()
+    for each in columns:
+        for topic, rows in _rows_by_topic(each.topics):
+            recorded = topics.setdefault(topic, _Recorded())
+            jump = recorded.first_jump(each.log_time_ns[rows], each.place[rows])
+            if jump is not None:
+                raise LogError(
+                    f"{name}: time jumps back: the message on {topic!r} logged at"
+                    f" {each.log_time_ns[rows][jump]} ns was recorded before others that were logged more"
+                    " than a second earlier; on_time_jump='split' (--on-time-jump split) ends the log"
+                    " where it jumps"
+                )
+        yield each
+
+
+def _rows_by_topic(topics: Sequence[str]) -> Iterator[tuple[str, Integers | slice]]:
+    names = sorted(set(topics))
+    if len(names) == 1:
+        yield names[0], slice(None)
+        return
+    number = {name: code for code, name in enumerate(names)}
+    codes = np.fromiter(map(number.__getitem__, topics), np.int64, len(topics))
+    rows = np.split(np.argsort(codes, kind="stable"), np.cumsum(np.bincount(codes))[:-1])
+    yield from zip(names, rows, strict=True)
+
+
+class _Recorded:
+    """How far the recording had come at each of the last messages, a second back and a little more."""
+
+    def __init__(self) -> None:
+        self._latest: deque[tuple[Integers, Integers]] = deque()
+        self._before = -1
+        self._furthest = -1
+
+    def first_jump(self, times_ns: Integers, places: Integers) -> int | None:
+        """The first message that was recorded before one of more than a second earlier, or None.
+
+        Args:
+            times_ns, places: (M,) of messages in the order of time, after those of the call before.
+        """
+        if not len(times_ns):
+            return None
+        is_ordered = places[0] >= self._furthest and (places[1:] >= places[:-1]).all()
+        furthest = places if is_ordered else np.maximum(np.maximum.accumulate(places), self._furthest)
+        self._latest.append((times_ns, furthest))
+        self._furthest = int(furthest[-1])
+        found = None if is_ordered else self._search(times_ns, places)
+        while self._latest[0][0][-1] < times_ns[-1] - DISORDER_NS:
+            self._before = int(self._latest.popleft()[1][-1])
+        return found
+
+    def _search(self, times_ns: Integers, places: Integers) -> int | None:
+        times = np.concatenate([times for times, _ in self._latest])
+        furthest = np.concatenate([[self._before], *(furthest for _, furthest in self._latest)])
+        earlier = np.searchsorted(times, times_ns - DISORDER_NS)
+        jumps = np.flatnonzero(places < furthest[earlier])
+        return int(jumps[0]) if len(jumps) else None

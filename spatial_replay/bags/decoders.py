@@ -1,0 +1,183 @@
+"""Payloads to objects, by the encoding of their topic.
+
+Topics by name, out of what each file or publisher says of them.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable
+from dataclasses import replace
+from functools import lru_cache
+
+from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message import DecodeError, Message
+from google.protobuf.message_factory import GetMessageClass
+
+from spatial_replay.bags.reader import Decoder, Topic
+from spatial_replay.bags.ros_types import ros_decoder, ros_definitions
+from spatial_replay.errors import LogError
+from spatial_replay.logs.messages import Schema
+
+_MOST_FILES = 1_000
+"""Files that one descriptor set may hold."""
+
+ENCODINGS = ("ros1", "cdr", "protobuf", "json")
+
+
+def decoder_of(topic: Topic, distribution: str | None = None) -> Decoder:
+    """How to decode the messages of a topic.
+
+    Args:
+        distribution: the release of ROS that the log names, for types that it does not define.
+
+    Raises:
+        LogError: the definition is missing or cannot be understood, or the encoding is not known.
+    """
+    try:
+        match topic.encoding:
+            case "ros1" | "cdr":
+                return ros_decoder(topic.type, topic.encoding, topic.schema, distribution)
+            case "protobuf":
+                return _protobuf_decoder(topic.type, _message_class(topic.type, topic.schema))
+            case "json":
+                return _decode_json
+        raise LogError(f"the encoding {topic.encoding!r:.100} is not known; known are {', '.join(ENCODINGS)}")
+    except LogError as error:
+        raise LogError(f"topic {topic.name!r}: {error}") from None
+
+
+def why_unreadable(topic: Topic, distribution: str | None = None) -> str | None:
+    """Why the messages of a topic cannot be decoded, or None."""
+    try:
+        if topic.encoding not in ("ros1", "cdr"):
+            decoder_of(topic)
+            return None
+    except LogError as error:
+        return str(error)
+    try:
+        # a decoder takes longer to make than its definition to check
+        ros_definitions(topic.type, topic.encoding, topic.schema, distribution)
+    except LogError as error:
+        return f"topic {topic.name!r}: {error}"
+    return None
+
+
+def same_definition(one: Topic, other: Topic) -> bool:
+    """Whether one decoder serves two topics of the same type; texts may differ in comments."""
+    if one.schema == other.schema or one.encoding == "json":
+        return True
+    if one.encoding not in ("ros1", "cdr"):
+        return False
+    try:
+        definitions = [ros_definitions(each.type, each.encoding, each.schema) for each in (one, other)]
+    except LogError:
+        return False
+    return definitions[0] == definitions[1]
+
+
+def _protobuf_decoder(type_name: str, message_class: type[Message]) -> Decoder:
+    from_string = message_class.FromString
+
+    def decode(payload: bytes) -> object:
+        try:
+            return from_string(payload)
+        except DecodeError as error:
+            raise LogError(f"a message is no {type_name}: {error}") from None
+
+    return decode
+
+
+@lru_cache(64)
+def _message_class(type_name: str, schema: Schema | None) -> type[Message]:
+    if schema is None or schema.encoding != "protobuf":
+        given = "missing" if schema is None else f"in {schema.encoding!r:.100}"
+        raise LogError(f"the definition of {type_name!r:.100} is {given}; protobuf needs a descriptor set")
+    pool = DescriptorPool()
+    try:
+        for file in _in_order(FileDescriptorSet.FromString(schema.data)):
+            pool.AddSerializedFile(file.SerializeToString())
+        return GetMessageClass(pool.FindMessageTypeByName(type_name))
+    # descriptors that contradict themselves or each other end in TypeError, and names without one in KeyError
+    except (DecodeError, TypeError, ValueError, KeyError, UnicodeError, RecursionError) as error:
+        reason = f"{error!s:.200}" or type(error).__name__
+        raise LogError(f"the definition of {type_name!r:.100} cannot be used: {reason}") from None
+
+
+def _in_order(described: FileDescriptorSet) -> list[FileDescriptorProto]:
+    """The files, each after those that it imports."""
+    if len(described.file) > _MOST_FILES:
+        raise ValueError(f"it has {len(described.file)} files; at most {_MOST_FILES} are read")
+    files = {file.name: file for file in described.file}
+    missing: dict[str, int] = {}
+    importers: dict[str, list[str]] = {name: [] for name in files}
+    for name, file in files.items():
+        imports = {each for each in file.dependency if each in files}
+        missing[name] = len(imports)
+        for each in imports:
+            importers[each].append(name)
+    ready = [name for name, count in missing.items() if not count]
+    # the list grows while it is walked: a file is ready when the last of its imports is
+    for name in ready:
+        for importer in importers[name]:
+            missing[importer] -= 1
+            if not missing[importer]:
+                ready.append(importer)
+    if len(ready) < len(files):
+        first = next(name for name, count in missing.items() if count)
+        raise ValueError(f"{first!r:.100} imports itself")
+    return [files[name] for name in ready]
+
+
+def _decode_json(payload: bytes) -> object:
+    try:
+        return json.loads(payload)
+    except (ValueError, RecursionError) as error:
+        raise LogError(f"a message is no JSON: {error!s:.200}") from None
+
+
+_LATCHED = re.compile(r"durability: *(1|transient_local)\b")
+
+
+def is_latched(qos: str) -> bool:
+    """Whether a ROS 2 publisher's quality of service keeps messages for whoever comes later."""
+    return _LATCHED.search(qos) is not None
+
+
+def topics_named(described: Iterable[Topic], distribution: str | None = None) -> tuple[Topic, ...]:
+    """One topic for each name, in order; those that cannot be decoded say why.
+
+    Args:
+        distribution: the release of ROS that the log names.
+    """
+    named: dict[str, Topic] = {}
+    for topic in described:
+        before = named.get(topic.name)
+        named[topic.name] = topic if before is None else _joined(before, topic)
+    return tuple(
+        topic if topic.unreadable else replace(topic, unreadable=why_unreadable(topic, distribution))
+        for _, topic in sorted(named.items())
+    )
+
+
+def _joined(one: Topic, other: Topic) -> Topic:
+    known = None not in (one.count, other.count)
+    joined = replace(
+        one,
+        count=(one.count or 0) + (other.count or 0) if known else None,
+        latched=one.latched or other.latched,
+        schema=one.schema or other.schema,
+    )
+    for what in ("type", "encoding"):
+        if getattr(one, what) != getattr(other, what):
+            said = f"{getattr(one, what)!r} and {getattr(other, what)!r}"
+            return replace(
+                joined, unreadable=f"topic {one.name!r} has messages of more than one {what}: {said}"
+            )
+    if None not in (one.schema, other.schema) and not same_definition(one, other):
+        return replace(
+            joined, unreadable=f"topic {one.name!r} has messages of {one.type!r} in two definitions"
+        )
+    return joined

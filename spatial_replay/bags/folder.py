@@ -1,0 +1,241 @@
+"""Folders of ROS 2 bags: one recording in several files, with metadata beside them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from spatial_replay.bags.columns import Columns, CountedTopics, MessageColumns, Run, merged, one_by_one
+from spatial_replay.bags.decoders import decoder_of, topics_named
+from spatial_replay.bags.mcap_log import McapLog
+from spatial_replay.bags.metadata import LARGEST_METADATA, BagMetadata, bag_metadata_from_text
+from spatial_replay.bags.reader import Decoder, Message, Topic
+from spatial_replay.bags.sqlite import SQLITE_MAGIC, SqliteBag
+from spatial_replay.bags.unpacking import ZSTD_MAGIC, temporary_folder, unpack_file, unpacked
+from spatial_replay.errors import LogError, MissingFileError
+from spatial_replay.logs.mcap.chunks import MAGIC
+from spatial_replay.logs.read_options import FaultList
+from spatial_replay.trace.sample import LATEST_NS
+
+METADATA_FILE = "metadata.yaml"
+_ENDINGS = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
+
+_File: TypeAlias = McapLog | SqliteBag
+
+
+class BagFolder:
+    """A folder with the files of one ROS 2 bag; see `MessageReader`."""
+
+    kind = "ROS 2 bag"
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._faults = FaultList()
+        self._remarks = FaultList()
+
+    @property
+    def name(self) -> str:
+        return self._path.name or self._path.absolute().name
+
+    @cached_property
+    def _metadata(self) -> BagMetadata | None:
+        path = self._path / METADATA_FILE
+        try:
+            with path.open("rb") as stream:
+                text = stream.read(LARGEST_METADATA + 1).decode()
+            return bag_metadata_from_text(text)
+        except FileNotFoundError:
+            what = "is missing: its recorder was interrupted"
+        except OSError as error:
+            raise MissingFileError.of(path, error) from None
+        except UnicodeDecodeError:
+            what = "is no text in UTF-8"
+        except LogError as error:
+            what = f"cannot be used: {error}"
+        self._faults.add(f"{self.name}: {METADATA_FILE} {what}; the files in the folder were read without it")
+        return None
+
+    @cached_property
+    def _files(self) -> tuple[_File, ...]:
+        present = sorted(
+            (each.name for each in self._path.iterdir() if each.name.endswith(_ENDINGS)), key=_rank
+        )
+        listed = self._metadata.files if self._metadata else tuple(present)
+        for name in listed:
+            if not (self._path / name).is_file():
+                self._faults.add(f"{self.name}: its file {name!r} is missing; what it holds is lost")
+        for name in sorted(set(present) - set(listed)):
+            self._remarks.add(
+                f"{self.name}: the file {name!r} is not listed in {METADATA_FILE}; it was not read"
+            )
+        opened = [self._opened(self._path / name) for name in listed if (self._path / name).is_file()]
+        files = tuple(each for each in opened if each is not None)
+        if not files:
+            reason = next(iter(self._faults.take()), "it has no .db3 and no .mcap")
+            raise LogError(f"{self.name} is no ROS 2 bag that can be read: {reason}")
+        return files
+
+    @cached_property
+    def _unpacked_files(self) -> Path:
+        """A folder for decompressed files."""
+        return temporary_folder(self)
+
+    @cached_property
+    def _topics(self) -> tuple[Topic, ...]:
+        found = [topic for file in self._files for topic in self._described(file)]
+        declared = self._metadata
+        named = topics_named(found, declared.distribution if declared else None)
+        if declared is None:
+            return named
+        absent = [
+            Topic(
+                name,
+                declared.types[name],
+                "cdr",
+                count,
+                unreadable=f"topic {name!r} is in none of the bag's files",
+            )
+            for name, count in declared.counts.items()
+            if name not in {topic.name for topic in found}
+        ]
+        known = [replace(topic, count=declared.counts.get(topic.name, 0)) for topic in named]
+        return tuple(sorted([*known, *absent], key=lambda topic: topic.name))
+
+    @property
+    def start_ns(self) -> int | None:
+        """Log time of the first message."""
+        return min((file.start_ns for file in self._files if file.start_ns is not None), default=None)
+
+    def topics(self) -> tuple[Topic, ...]:
+        """See `MessageReader.topics`."""
+        return self._topics
+
+    def decoder(self, topic: str) -> Decoder:
+        """See `MessageReader.decoder`."""
+        named = next(each for each in self._topics if each.name == topic)
+        return decoder_of(named, self._metadata.distribution if self._metadata else None)
+
+    def take_faults(self) -> tuple[str, ...]:
+        """See `MessageReader.take_faults`."""
+        return tuple(fault for each in self._told() for fault in each.take_faults()) + self._faults.take()
+
+    def move_faults(self, other: FaultList) -> None:
+        """See `MessageReader.move_faults`."""
+        for each in self._told():
+            each.move_faults(other)
+        self._faults.move_to(other)
+
+    def take_remarks(self) -> tuple[str, ...]:
+        """See `MessageReader.take_remarks`."""
+        return tuple(remark for each in self._told() for remark in each.take_remarks()) + self._remarks.take()
+
+    def iter_messages(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[Message]:
+        """See `MessageReader.iter_messages`."""
+        return one_by_one(self.iter_columns(topics, start_ns, end_ns))
+
+    def iter_columns(
+        self,
+        topics: Collection[str],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        *,
+        as_recorded: bool = False,
+    ) -> Columns:
+        """See `ColumnReader.iter_columns`."""
+        if end_ns is not None and end_ns > LATEST_NS:
+            end_ns = None
+        reads = [
+            partial(self._read, number, file, topics, start_ns, end_ns, as_recorded)
+            for number, file in enumerate(self._files)
+        ]
+        if as_recorded or len(reads) == 1:
+            columns: Columns = (each for read in reads for each in read())
+        else:
+            runs = zip(self._files, reads, strict=True)
+            columns = merged(Run(file.start_ns or 0, read) for file, read in runs)
+        if self._metadata and self._metadata.compression == "message":
+            columns = map(self._unpacked, columns)
+        if start_ns or end_ns is not None or self._metadata is None:
+            yield from columns
+            return
+        self._compare_types(topics)
+        counted = CountedTopics({each.name: each.count for each in self._topics if each.name in topics})
+        yield from counted.counted(columns)
+        counted.compare(f"{self.name}/{METADATA_FILE}", self._faults)
+
+    @staticmethod
+    def _read(
+        number: int,
+        file: _File,
+        topics: Collection[str],
+        start_ns: int | None,
+        end_ns: int | None,
+        as_recorded: bool,
+    ) -> Columns:
+        for each in file.iter_columns(topics, start_ns, end_ns, as_recorded=as_recorded):
+            yield replace(each, place=(np.int64(number) << 48) + each.place)
+
+    def _told(self) -> Iterable[_File]:
+        """The files that were opened so far."""
+        return self._files if "_files" in self.__dict__ else ()
+
+    def _opened(self, path: Path) -> _File | None:
+        """The file by what it holds; None, and a fault, where nothing in it can be read."""
+        try:
+            with path.open("rb") as stream:
+                head = stream.read(len(SQLITE_MAGIC))
+            if head.startswith(ZSTD_MAGIC):
+                return self._opened(unpack_file(path, self._unpacked_files))
+        except OSError as error:
+            raise MissingFileError.of(path, error) from None
+        except LogError as error:
+            self._faults.add(f"{self.name}: {error}; what it holds is lost")
+            return None
+        if head == SQLITE_MAGIC:
+            return SqliteBag(path)
+        if head.startswith(MAGIC):
+            return McapLog(path)
+        self._faults.add(f"{self.name}: {path.name!r} is neither SQLite nor MCAP; what it holds is lost")
+        return None
+
+    def _described(self, file: _File) -> tuple[Topic, ...]:
+        try:
+            return file.topics()
+        except LogError as error:
+            self._faults.add(f"{self.name}: {error}")
+            return ()
+
+    def _compare_types(self, topics: Collection[str]) -> None:
+        declared = self._metadata.types if self._metadata else {}
+        for topic in self._topics:
+            said = declared.get(topic.name, topic.type)
+            if topic.name in topics and said != topic.type:
+                self._faults.add(
+                    f"{self.name}/{METADATA_FILE}: it says that {topic.name!r} has messages of {said!r:.100};"
+                    f" they are of {topic.type!r}"
+                )
+
+    def _unpacked(self, packed: MessageColumns) -> MessageColumns:
+        payloads: list[bytes] = []
+        kept: list[int] = []
+        for place, payload in enumerate(packed.payloads):
+            try:
+                payloads.append(unpacked(payload))
+                kept.append(place)
+            except LogError as error:
+                where = f"on {packed.topics[place]!r} at {packed.log_time_ns[place]} ns"
+                self._faults.add(f"{self.name}: {where}: {error}")
+        return replace(packed.take(np.array(kept, np.int64)), payloads=payloads)
+
+
+def _rank(name: str) -> tuple[str | int, ...]:
+    """Sorts bag_10.db3 after bag_9.db3."""
+    return tuple(int(part) if part.isdecimal() else part for part in re.split(r"([0-9]+)", name)[:80])

@@ -1,0 +1,156 @@
+"""MCAP logs by others, whole or damaged."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from functools import cached_property
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from mcap.opcode import Opcode
+
+from spatial_replay.bags.columns import Columns, CountedTopics, MessageColumns, in_order, places_in
+from spatial_replay.bags.decoders import is_latched, topics_named
+from spatial_replay.bags.file_reader import OneFile
+from spatial_replay.bags.reader import Topic
+from spatial_replay.bags.ros_definitions import full_type_name
+from spatial_replay.logs.mcap.chunks import ChunkPlace, DamageError, read_records, walk_records
+from spatial_replay.logs.mcap.index import Directory, read_directory
+from spatial_replay.logs.mcap.reader import ChunkWalk
+from spatial_replay.logs.messages import Channel
+from spatial_replay.logs.read_options import FaultList
+from spatial_replay.trace.sample import LATEST_NS
+
+_MESSAGE_FIELDS = 22
+
+
+class McapLog(OneFile):
+    """An MCAP log of any encoding, read chunk by chunk; see `MessageReader`."""
+
+    kind = "MCAP"
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._walked = 0
+
+    @cached_property
+    def _contents(self) -> tuple[Directory, dict[int, Channel]]:
+        with self._path.open("rb") as stream:
+            directory = read_directory(stream, self._faults, self.name)
+            return directory, ChunkWalk(stream, directory, FaultList(), self.name).channels
+
+    @cached_property
+    def _topics(self) -> tuple[Topic, ...]:
+        directory, channels = self._contents
+        statistics = directory.statistics
+        counts = statistics.channel_message_counts if statistics else None
+        if statistics and not counts and statistics.message_count:
+            # counts of channels are optional
+            counts = None
+        if statistics and counts and sum(counts.values()) != statistics.message_count:
+            self._faults.add(
+                f"{self.name}: its statistics contradict themselves: {statistics.message_count} messages,"
+                f" and {sum(counts.values())} on its channels"
+            )
+        return topics_named(
+            _topic(channel, None if counts is None else counts.get(number, 0))
+            for number, channel in sorted(channels.items())
+        )
+
+    @property
+    def start_ns(self) -> int | None:
+        """Log time of the first message."""
+        return min((place.start_ns for place in self._contents[0].chunks), default=None)
+
+    def iter_columns(
+        self,
+        topics: Collection[str],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        *,
+        as_recorded: bool = False,
+    ) -> Columns:
+        """See `ColumnReader.iter_columns`."""
+        first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else min(end_ns, LATEST_NS + 1)
+        directory, channels = self._contents
+        wanted = {number: channel.topic for number, channel in channels.items() if channel.topic in topics}
+        places = [
+            (rank, place)
+            for rank, place in enumerate(directory.chunks)
+            if place.start_ns < last
+            and place.end_ns >= first
+            and (place.channels is None or not place.channels.isdisjoint(wanted))
+        ]
+        if not as_recorded:
+            places.sort(key=lambda ranked: ranked[1].start_ns)
+        with self._path.open("rb") as stream:
+            self._walked = 0
+            stretches = (self._messages(stream, *ranked, wanted, first, last) for ranked in places)
+            columns = (
+                stretches if as_recorded else in_order([place.start_ns for _, place in places], stretches)
+            )
+            if (first, last) != (0, LATEST_NS + 1):
+                yield from columns
+                return
+            counted = CountedTopics({each.name: each.count for each in self._topics if each.name in topics})
+            yield from counted.counted(columns)
+            counted.compare(self.name, self._faults)
+            statistics = directory.statistics
+            total = statistics.message_count if statistics else self._walked
+            is_total_only = statistics is not None and not statistics.channel_message_counts
+            if is_total_only and len(places) == len(directory.chunks) and total != self._walked:
+                self._faults.add(
+                    f"{self.name}: it declares {total} messages in all; {self._walked} could be read"
+                )
+
+    def _messages(
+        self, stream: BinaryIO, rank: int, place: ChunkPlace, wanted: dict[int, str], first: int, last: int
+    ) -> MessageColumns:
+        """The messages in a place; what is lost of them goes to the faults."""
+        span = f"messages between {place.start_ns} and {place.end_ns} ns"
+        try:
+            content = read_records(stream, place)
+        except DamageError as damage:
+            self._fault(place, f"{damage}; the {span} are lost")
+            return MessageColumns()
+        heads, breaks_off = walk_records(content)
+        is_message = (heads.opcode == Opcode.MESSAGE) & (heads.end - heads.begin >= _MESSAGE_FIELDS)
+        if breaks_off:
+            self._fault(place, f"a record breaks off; of the {span}, {is_message.sum()} could be read")
+        self._walked += int(is_message.sum())
+        beyond = is_message & (heads.log_time > LATEST_NS)
+        if beyond.any():
+            self._fault(place, f"{beyond.sum()} of the {span} have a time beyond 2**63 - 1 ns")
+        if len(unknown := set(np.unique(heads.channel[is_message]).tolist()) - self._contents[1].keys()):
+            self._fault(place, f"some of the {span} are of a channel {min(unknown)} that is not declared")
+        rows = is_message & np.isin(heads.channel, np.array(list(wanted), np.uint64))
+        rows &= (heads.log_time >= first) & (heads.log_time < last)
+        bounds = zip((heads.begin[rows] + _MESSAGE_FIELDS).tolist(), heads.end[rows].tolist(), strict=True)
+        return MessageColumns(
+            [wanted[number] for number in heads.channel[rows].tolist()],
+            heads.log_time[rows].view(np.int64),
+            heads.publish_time[rows].view(np.int64),
+            heads.sequence[rows].view(np.int64),
+            [content[begin:end] for begin, end in bounds],
+            places_in(rank, np.flatnonzero(rows)),
+        )
+
+    def _fault(self, place: ChunkPlace, what: str) -> None:
+        self._faults.add(f"{self.name}: at byte {place.offset}: {what}")
+
+
+def _topic(channel: Channel, count: int | None) -> Topic:
+    schema = channel.schema
+    is_ros = channel.encoding in ("ros1", "cdr")
+    name = schema.name if schema else ""
+    return Topic(
+        name=channel.topic,
+        type=full_type_name(name) if is_ros else name,
+        encoding=channel.encoding,
+        count=count,
+        schema=schema,
+        latched=is_latched(channel.metadata.get("offered_qos_profiles", ""))
+        or channel.metadata.get("latching") in ("1", "true"),
+        metadata=channel.metadata,
+    )

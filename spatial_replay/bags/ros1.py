@@ -1,0 +1,158 @@
+"""ROS 1 bags, whole or damaged."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection
+from functools import cached_property
+from types import MappingProxyType
+from typing import BinaryIO
+
+import numpy as np
+
+from spatial_replay.bags.columns import (
+    Columns,
+    CountedTopics,
+    MessageColumns,
+    in_order,
+    places_in,
+    unnumbered,
+)
+from spatial_replay.bags.decoders import topics_named
+from spatial_replay.bags.file_reader import OneFile
+from spatial_replay.bags.reader import Topic
+from spatial_replay.bags.ros1_index import (
+    MESSAGE,
+    BagChunk,
+    BagDirectory,
+    Connection,
+    connections_in,
+    read_bag_directory,
+    read_chunk,
+    record_table,
+)
+from spatial_replay.bags.ros_definitions import full_type_name
+from spatial_replay.logs.mcap.chunks import DamageError
+from spatial_replay.logs.messages import Schema
+from spatial_replay.trace.sample import LATEST_NS
+
+
+class Ros1Bag(OneFile):
+    """A ROS 1 bag, read chunk by chunk; see `MessageReader`."""
+
+    kind = "ROS 1 bag"
+
+    @cached_property
+    def _directory(self) -> BagDirectory:
+        with self._path.open("rb") as stream:
+            return read_bag_directory(stream, self._faults, self.name)
+
+    @cached_property
+    def _topics(self) -> tuple[Topic, ...]:
+        counts: Counter[int] = Counter()
+        for chunk in self._directory.chunks:
+            counts.update(chunk.counts or {})
+        return topics_named(
+            self._topic(each, counts[each.number]) for each in self._directory.connections.values()
+        )
+
+    @property
+    def start_ns(self) -> int | None:
+        """Log time of the first message."""
+        return min((chunk.start_ns for chunk in self._directory.chunks), default=None)
+
+    def iter_columns(
+        self,
+        topics: Collection[str],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        *,
+        as_recorded: bool = False,
+    ) -> Columns:
+        """See `ColumnReader.iter_columns`."""
+        first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else min(end_ns, LATEST_NS + 1)
+        wanted = {c.number: c for c in self._directory.connections.values() if c.topic in topics}
+        chunks = [
+            (rank, chunk)
+            for rank, chunk in enumerate(self._directory.chunks)
+            if chunk.start_ns < last
+            and chunk.end_ns >= first
+            and (chunk.counts is None or not wanted.keys().isdisjoint(chunk.counts))
+        ]
+        if not as_recorded:
+            chunks.sort(key=lambda ranked: ranked[1].start_ns)
+        with self._path.open("rb") as stream:
+            stretches = (self._messages(stream, *ranked, wanted, first, last) for ranked in chunks)
+            columns = (
+                stretches if as_recorded else in_order([chunk.start_ns for _, chunk in chunks], stretches)
+            )
+            if (first, last) != (0, LATEST_NS + 1) or not self._directory.is_indexed:
+                yield from columns
+                return
+            counted = CountedTopics({each.name: each.count for each in self._topics if each.name in topics})
+            yield from counted.counted(columns)
+            counted.compare(self.name, self._faults)
+
+    def _messages(
+        self,
+        stream: BinaryIO,
+        rank: int,
+        chunk: BagChunk,
+        wanted: dict[int, Connection],
+        first: int,
+        last: int,
+    ) -> MessageColumns:
+        """The messages of a chunk; what is lost of them goes to the faults."""
+        span = f"messages between {chunk.start_ns} and {chunk.end_ns} ns"
+        try:
+            content = read_chunk(stream, chunk.offset)
+        except DamageError as damage:
+            self._fault(chunk, f"{damage}; the {span} are lost")
+            return MessageColumns()
+        table, breaks_off = record_table(content)
+        if breaks_off:
+            self._fault(chunk, f"a record breaks off; some of the {span} are lost")
+        try:
+            for connection in connections_in(content, table):
+                if wanted.get(connection.number, connection) != connection:
+                    self._fault(chunk, f"connection {connection.number} is described in two ways")
+        except DamageError as damage:
+            self._fault(chunk, f"{damage}; a connection is described there")
+        is_message = table.opcode == MESSAGE
+        if (chunk.start_ns, chunk.end_ns) != _span(table.time_ns[is_message]):
+            self._fault(chunk, f"the {span} have other times than the index says")
+        rows = is_message & np.isin(table.connection, list(wanted))
+        rows &= (table.time_ns >= first) & (table.time_ns < last)
+        names = {number: connection.topic for number, connection in wanted.items()}
+        bounds = zip(table.begin[rows].tolist(), table.end[rows].tolist(), strict=True)
+        return unnumbered(
+            [names[number] for number in table.connection[rows].tolist()],
+            table.time_ns[rows],
+            [content[begin:end] for begin, end in bounds],
+            places_in(rank, np.flatnonzero(rows)),
+        )
+
+    def _topic(self, connection: Connection, count: int) -> Topic:
+        definition = connection.data.get("message_definition", b"")
+        return Topic(
+            name=connection.topic,
+            type=full_type_name(connection.type),
+            encoding="ros1",
+            count=count if self._directory.is_indexed else None,
+            schema=Schema(connection.type, "ros1msg", definition),
+            latched=connection.is_latched,
+            metadata=MappingProxyType(
+                {
+                    key: connection.data[key].decode("utf-8", "replace")
+                    for key in ("callerid", "latching", "md5sum")
+                    if key in connection.data
+                }
+            ),
+        )
+
+    def _fault(self, chunk: BagChunk, what: str) -> None:
+        self._faults.add(f"{self.name}: at byte {chunk.offset}: {what}")
+
+
+def _span(times_ns: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> tuple[int, int]:
+    return (int(times_ns.min()), int(times_ns.max())) if len(times_ns) else (0, 0)

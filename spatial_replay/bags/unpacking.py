@@ -1,0 +1,95 @@
+"""Files that cannot be read in place: decompressed, or without a broken end. Messages compressed each."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import weakref
+from pathlib import Path
+
+import zstandard
+
+from spatial_replay.errors import LogError, OutputError
+from spatial_replay.logs.mcap.chunks import LARGEST_CHUNK
+from spatial_replay.logs.output_file import open_output, output_error
+
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_PIECE = 2**20
+_MOST_TIMES_LARGER = 1_000
+_ALWAYS_ALLOWED = 2**26
+_LEFT_FREE = 2**26
+"""Bytes of a disk that are never filled; of a small one, a tenth."""
+
+
+def temporary_folder(owner: object) -> Path:
+    """A folder that goes away with its owner.
+
+    Raises:
+        OutputError: the machine cannot make it.
+    """
+    try:
+        folder = tempfile.mkdtemp(prefix="spatial-replay-")
+    except OSError as error:
+        raise output_error(Path("a temporary folder"), error) from error
+    weakref.finalize(owner, shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
+
+
+def copy_beginning(path: Path, size: int, folder: Path) -> Path:
+    """Copy the first `size` bytes of a file into a folder."""
+    target = folder / path.name
+    with path.open("rb") as source, open_output(target) as sink:
+        while size > 0 and (piece := source.read(min(size, _PIECE))):
+            sink.write(piece)
+            size -= len(piece)
+    return target
+
+
+def unpack_file(packed: Path, folder: Path) -> Path:
+    """Decompress a file into a folder; what its name is there, without the ending of the compression.
+
+    Raises:
+        LogError: it does not decompress, or to something absurdly large.
+        OutputError: the folder has no room for it.
+    """
+    target = folder / (packed.stem if packed.suffix in (".zstd", ".zst") else packed.name)
+    most = packed.stat().st_size * _MOST_TIMES_LARGER + _ALWAYS_ALLOWED
+    free = shutil.disk_usage(folder).free
+    room = free - min(_LEFT_FREE, free // 10)
+    written = 0
+    try:
+        with packed.open("rb") as source, open_output(target) as sink:
+            reader = zstandard.ZstdDecompressor().stream_reader(source, read_across_frames=True)
+            while piece := reader.read(_PIECE):
+                written += len(piece)
+                if written > most:
+                    raise LogError(
+                        f"{packed.name} decompresses to more than {most} bytes; no recorder's file does"
+                    )
+                if written > room:
+                    raise OutputError(
+                        f"{packed.name} decompresses to more than there is room for in {folder.parent};"
+                        " TMPDIR can name a folder with more"
+                    )
+                sink.write(piece)
+    except zstandard.ZstdError as error:
+        if not written:
+            raise LogError(f"{packed.name} does not decompress ({error})") from None
+        # what came before the damage is a log that breaks off, and is reported as one
+    return target
+
+
+def unpacked(payload: bytes) -> bytes:
+    """A message that was compressed by itself.
+
+    Raises:
+        LogError: it does not decompress.
+    """
+    try:
+        size = zstandard.frame_content_size(payload)
+        if size > LARGEST_CHUNK:
+            raise LogError(f"a message claims to hold {size} bytes")
+        most = size if size >= 0 else min(LARGEST_CHUNK, len(payload) * _MOST_TIMES_LARGER + _PIECE)
+        return zstandard.ZstdDecompressor().decompress(payload, max_output_size=most)
+    except zstandard.ZstdError as error:
+        raise LogError(f"a message does not decompress ({error})") from None

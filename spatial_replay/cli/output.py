@@ -1,0 +1,247 @@
+"""What a replay found, for people and for machines.
+
+The decisions of a planned run, in words.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from itertools import accumulate, pairwise
+from pathlib import Path
+from textwrap import wrap
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from spatial_replay.cli.options import text_from_duration_ns
+from spatial_replay.text import counted, json_number
+
+if TYPE_CHECKING:
+    from google.protobuf.message import Message
+
+    from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanCandidate, PlanDecision, PlanEdge, PlanTarget
+    from spatial_replay.replay import Replayed, ReplayedSpec
+
+_COLOURS = {"satisfied": "blue", "violated": "red", "unknown": "yellow"}
+
+
+def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | None = None) -> None:
+    """One line for each result, worst news easy to see, on standard output; another one for a window."""
+    seconds = (replayed.end_ns - replayed.start_ns) / 1e9
+    damaged = ", damaged: verdicts are over what could be read" if replayed.faults else ""
+    click.echo(f"{replayed.log}: {counted(replayed.samples, 'sample')} over {seconds:.3f} s{damaged}")
+    titles = [_title(result) for result in replayed.results]
+    width = max(map(len, titles), default=0)
+    for title, result in zip(titles, replayed.results, strict=True):
+        verdict = click.style(f"{result.verdict:<9}", fg=_COLOURS[result.verdict], bold=True)
+        click.echo(f"  {title:<{width}}  {verdict}  {_numbers(result, replayed.first_ns)}")
+        if result.verdict == "unknown" and result.inquiry is not None and replayed.semantics == "ltlf":
+            click.echo(f"  {'':<{width}}  {_why_unknown(result, replayed.first_ns)}")
+        if window_ns is not None:
+            click.echo(f"  {'':<{width}}  {_over_window(result, replayed.first_ns, window_ns)}")
+    if not replayed.results:
+        click.echo("  no object was there for a template to stand for")
+    if output is not None:
+        click.echo(f"wrote {output}")
+
+
+def write_document(
+    replayed: Replayed, file: str, inputs: Sequence[Path], *, signal: bool, window_ns: int | None
+) -> None:
+    """Write everything found as one JSON object to a file, or to standard output for "-"."""
+    from spatial_replay.logs.output_file import replacing
+    from spatial_replay.replay import document
+
+    text = json.dumps(
+        document(replayed, signal=signal, window_ns=window_ns), ensure_ascii=False, allow_nan=False
+    )
+    if file == "-":
+        click.echo(text)
+        return
+    with replacing(Path(file), inputs) as stream:
+        stream.write(text.encode() + b"\n")
+
+
+def _title(result: ReplayedSpec) -> str:
+    return result.name if result.object is None else f"{result.name}({result.object})"
+
+
+def _numbers(result: ReplayedSpec, first_ns: int) -> str:
+    robustness = float(result.robustness[0])
+    parts = [f"robustness {_shown(robustness)}"]
+    lower, upper = result.final[0].tolist()
+    if not (lower == upper == robustness or math.isnan(lower)):
+        parts.append(f"between {_shown(lower)} and {_shown(upper)}")
+    if robustness == 0.0:
+        parts.append("marginal")
+    if result.first_satisfied_ns is not None:
+        parts.append(f"first satisfied at {text_from_duration_ns(result.first_satisfied_ns - first_ns)}")
+    return ", ".join(parts)
+
+
+def _why_unknown(result: ReplayedSpec, first_ns: int) -> str:
+    """What was not known, or not surely enough."""
+    from spatial_replay.annotate.sentences import sentences_of
+
+    if result.inquiry is None:
+        return ""
+    _, reason = sentences_of(result.inquiry.witness(), first_ns=first_ns)
+    return reason
+
+
+def _over_window(result: ReplayedSpec, first_ns: int, window_ns: int) -> str:
+    """How often, and when first, a spec did not hold over the samples of the last so many seconds."""
+    if result.inquiry is None:
+        return ""
+    values, times_ns = result.inquiry.window_signal(window_ns)[0], result.inquiry.times_ns
+    over = f"over the last {text_from_duration_ns(window_ns)}"
+    failing = (values < 0.0).nonzero()[0]
+    if not len(failing):
+        return f"{over} never violated; robustness at the end {_shown(float(values[-1]))}"
+    first = text_from_duration_ns(int(times_ns[failing[0]]) - first_ns)
+    count = f"{len(failing):,} of {counted(len(values), 'sample')}"
+    return f"{over} violated at {count}, first at {first}; robustness at the end {_shown(float(values[-1]))}"
+
+
+def _shown(number: float) -> str:
+    return "not determined" if math.isnan(number) else f"{number:.6g}"
+
+
+_LEAST_WIDTH: Final = 60
+"""Of lines, however narrow a terminal is."""
+_LONGEST: Final = 400
+"""Characters of alternatives; JSON has all."""
+
+
+def decision_lines(log: Path, decisions: Sequence[PlanDecision], width: int) -> Iterator[str]:
+    """Step by step: what was aimed at, tried, rejected and chosen, and how it went.
+
+    Args:
+        width: characters after which lines are broken.
+    """
+    for line in _whole_lines(log, decisions):
+        indent = " " * (len(line) - len(line.lstrip(" ")) + 4)
+        yield from wrap(
+            line,
+            max(width, _LEAST_WIDTH),
+            subsequent_indent=indent,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+
+
+def decision_rows(decisions: Sequence[PlanDecision]) -> list[dict[str, Any]]:
+    """The same as values for JSON."""
+    from google.protobuf.json_format import MessageToDict
+
+    rows = [MessageToDict(decision, preserving_proto_field_name=True) for decision in decisions]
+    for row, decision in zip(rows, decisions, strict=True):
+        _write_numbers(row, decision)
+        row["kind"] = decision.Kind.Name(decision.kind).removeprefix("KIND_").lower().replace("_", " ")
+    return rows
+
+
+def _write_numbers(row: dict[str, Any], message: Message) -> None:
+    """Write the numbers of a message as elsewhere; the library has its own texts for some."""
+    for field, value in message.ListFields():
+        written = row[field.name]
+        if field.type == field.TYPE_FIXED64:
+            row[field.name] = value
+        elif field.type == field.TYPE_DOUBLE:
+            many = isinstance(written, list)
+            row[field.name] = [json_number(each) for each in value] if many else json_number(value)
+        elif field.type == field.TYPE_MESSAGE:
+            parts = zip(written, value, strict=True) if isinstance(written, list) else [(written, value)]
+            for part, of_part in parts:
+                _write_numbers(part, of_part)
+
+
+def _whole_lines(log: Path, decisions: Sequence[PlanDecision]) -> Iterator[str]:
+    *before, last = decisions
+    motions = sum(decision.HasField("target") and decision.HasField("outcome") for decision in decisions)
+    is_cut = last.HasField("target") and not last.HasField("outcome")
+    yield (
+        f"{log.name}: {counted(len(decisions), 'decision')} for {last.specification!r}, "
+        f"{counted(motions, 'motion')}{' and one cut short' if is_cut else ''}, "
+        f"{counted(len(last.pruned), 'edge')} given up"
+    )
+    for decision in before:
+        yield from _lines(decision)
+    yield from _lines(last)
+    if is_cut:
+        yield "  the log ends during this motion"
+
+
+def _lines(decision: PlanDecision) -> Iterator[str]:
+    states = ", ".join(map(str, decision.states))
+    yield f"step {decision.number} at {_seconds(decision.time_ns)}, state {states}"
+    for edge in decision.considered:
+        yield from _edge_lines(edge, is_aim=edge is decision.considered[-1] and not edge.pruned)
+    if not decision.HasField("target"):
+        yield f"  {decision.reason}"
+    else:
+        # what it is for is told by the edge that is aimed at
+        aim = _either([guard.text for edge in decision.considered[-1:] for guard in edge.progress])
+        yield f"  {decision.reason.removesuffix(f': {aim}')}"
+        yield f"  {_way(decision.target)}"
+    if decision.HasField("outcome"):
+        outcome = decision.outcome
+        how = "done" if outcome.succeeded else "failed"
+        after = ", ".join(map(str, outcome.states))
+        yield f"  {how} at {_seconds(outcome.end_ns)}: {outcome.reason}; state {after}"
+
+
+def _edge_lines(edge: PlanEdge, *, is_aim: bool) -> Iterator[str]:
+    path = " -> ".join(map(str, edge.path))
+    yield f"  {'aimed at' if is_aim else 'looked into'} {edge.source} -> {edge.target} on the path {path}"
+    yield f"    to reach  {_some([guard.text for guard in edge.progress])}"
+    if edge.constraints:
+        yield f"    never     {_some([guard.text for guard in edge.constraints])}"
+    for candidate in edge.candidates:
+        yield f"    {_candidate(candidate)}"
+    if edge.pruned:
+        yield "    given up: " + edge.pruned.split(" (", 1)[0]
+
+
+def _candidate(candidate: PlanCandidate) -> str:
+    name = f"{candidate.object}{_maps(candidate)}"
+    if candidate.rejected:
+        return f"{name}: rejected, {candidate.rejected}"
+    mark = "chosen" if candidate.chosen else "possible"
+    return f"{name}: {mark}, {candidate.best:.4g} at best; {_way(candidate.target)}"
+
+
+def _maps(candidate: PlanCandidate) -> str:
+    """Which messages on the topic of maps are its own."""
+    numbers = sorted(each.number for each in candidate.maps)
+    if len(numbers) < 2:
+        return "".join(f" (map {number})" for number in numbers)
+    return f" (maps {numbers[0]} to {numbers[-1]})"
+
+
+def _way(target: PlanTarget) -> str:
+    points = list(zip(target.waypoints[::2], target.waypoints[1::2], strict=True))
+    length = sum(math.dist(one, other) for one, other in pairwise(points))
+    turned = f", turned by {math.degrees(target.turn):.3g} deg" if target.turn else ""
+    return (
+        f"{target.object} to ({target.x:.4g}, {target.y:.4g}){turned}, a way of {length:.4g}, "
+        f"robustness {target.robustness:.4g}"
+    )
+
+
+def _either(texts: Sequence[str]) -> str:
+    return " or ".join(f"({text})" for text in texts) if len(texts) > 1 else "".join(texts)
+
+
+def _some(texts: Sequence[str]) -> str:
+    """Alternatives, or the first of them and how many more there are."""
+    ends = list(accumulate(map(len, texts)))
+    count = max(1, sum(end <= _LONGEST for end in ends))
+    more = f" or {len(texts) - count} more" if count < len(texts) else ""
+    return (f"({texts[0]})" if more and count == 1 else _either(texts[:count])) + more
+
+
+def _seconds(time_ns: int) -> str:
+    return f"{time_ns / 1e9:.3f} s"

@@ -1,0 +1,413 @@
+"""CommonRoad scenarios: traffic, as outlines that move from one time step to the next.
+
+Shapes and states of CommonRoad scenarios: where an obstacle is, or may be, at a time step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import partial
+from math import cos, fsum, hypot, isfinite, nan, pi, sin
+from pathlib import Path
+
+from spatial_replay.errors import GeometryError, LogError, UsageError
+from spatial_replay.geometry.footprint import Concave, Footprint
+from spatial_replay.logs.formats.tracks import Report, ReportColumns, finished_block
+from spatial_replay.logs.formats.xml_elements import Element, iter_elements
+from spatial_replay.logs.messages import BLOCK_SAMPLES
+from spatial_replay.logs.read_options import FaultList
+from spatial_replay.trace.sample import LATEST_NS
+from spatial_replay.trace.trace import Trace
+
+Points = list[tuple[float, float]]
+
+Tell = Callable[[int, str], None]
+
+_LONGEST_STEP = 15
+"""Digits of the number of a time step."""
+_LONGEST_INTERVAL = 100_000
+"""Time steps."""
+
+
+class ScenarioError(Exception):
+    """A part of a scenario that makes no sense; its text says why and what to give instead."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A polygon, or (one vertex and a radius) a disc, in metres."""
+
+    vertices: Points
+    radius: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """Where an obstacle is at a time step.
+
+    Attributes:
+        x, y: in metres.
+        angle: of its outline, in radians.
+        oriented: whether its orientation is that angle, rather than anything about it.
+        uncertainty: how far, in metres, its true outline may be from the one given.
+        region: an outline in the world that takes the place of the obstacle's own.
+        known: whether anything is known about it but that it is there.
+    """
+
+    x: float = 0.0
+    y: float = 0.0
+    angle: float = 0.0
+    oriented: bool = False
+    uncertainty: float = 0.0
+    region: tuple[Part, ...] | None = None
+    known: bool = True
+
+    def report(self, name: str, class_name: str | None, outline: Sequence[Part]) -> Report:
+        """The obstacle with its own outline, around its own centre, as it stands here."""
+        if not self.known:
+            return Report(name, class_name, [nan, nan], [1], [0.0], invalid=True)
+        parts = self.region if self.region is not None else outline
+        along_x, along_y = cos(self.angle), sin(self.angle)
+        vertices = [
+            coordinate
+            for part in parts
+            for x, y in part.vertices
+            for coordinate in (self.x + along_x * x - along_y * y, self.y + along_y * x + along_x * y)
+        ]
+        return Report(
+            name,
+            class_name,
+            vertices,
+            [len(part.vertices) for part in parts],
+            [part.radius for part in parts],
+            yaw=self.angle if self.oriented else nan,
+            uncertainty=self.uncertainty,
+        )
+
+
+UNKNOWN = State(known=False)
+
+
+def moving_states(obstacle: Element, outline: Sequence[Part], tell: Tell) -> dict[int, State]:
+    """The states of an obstacle that moves, by time step.
+
+    Args:
+        tell: takes what is wrong with one of them, with its line.
+    """
+    states: dict[int, State] = {}
+    initial, trajectory = obstacle.child("initialState"), obstacle.child("trajectory")
+    listed = [*([initial] if initial else []), *(trajectory.all("state") if trajectory else ())]
+    for each in listed:
+        try:
+            step = _step(_required(each, "time"))
+        except ScenarioError as error:
+            tell(each.line, f"{error}; the state is left out")
+            continue
+        if step in states:
+            tell(each.line, f"time step {step} is there twice; the first state counts")
+            continue
+        states[step] = state_of(each, outline, tell)
+    occupied = obstacle.child("occupancySet")
+    for occupancy in occupied.all("occupancy") if occupied else ():
+        for step, state in _occupied(occupancy, tell):
+            states.setdefault(step, state)
+    return states
+
+
+def state_of(element: Element, outline: Sequence[Part], tell: Tell) -> State:
+    """A state, or that it is unknown, after saying why."""
+    try:
+        return _state(element, outline)
+    except ScenarioError as error:
+        tell(element.line, f"{error}; the obstacle is unknown there")
+        return UNKNOWN
+
+
+def parts_of(shape: Element) -> list[Part]:
+    """The rectangles, circles and polygons in an element.
+
+    Raises:
+        ScenarioError: there is none, or something else.
+    """
+    parts = [_part(child) for child in shape.children]
+    if not parts:
+        raise ScenarioError(f"<{shape.name}> is empty; give <rectangle>, <circle> or <polygon>")
+    return parts
+
+
+def _part(element: Element) -> Part:
+    if element.name == "polygon":
+        vertices = [_point(point) for point in element.all("point")]
+        if not vertices:
+            raise ScenarioError("<polygon> has no <point>; give at least one")
+        return Part(vertices)
+    middle = element.child("center")
+    x, y = _point(middle) if middle is not None else (0.0, 0.0)
+    if element.name == "circle":
+        return Part([(x, y)], _size(element, "radius"))
+    if element.name == "rectangle":
+        length, width = _size(element, "length"), _size(element, "width")
+        angle = _number(element, "orientation") if element.child("orientation") is not None else 0.0
+        corners = ((-length, -width), (length, -width), (length, width), (-length, width))
+        c, s = cos(angle) / 2, sin(angle) / 2
+        return Part([(x + a * c - b * s, y + a * s + b * c) for a, b in corners])
+    raise ScenarioError(f"<{element.name}> is no shape; give <rectangle>, <circle> or <polygon>")
+
+
+def _state(element: Element, outline: Sequence[Part]) -> State:
+    """Position and orientation, each exact or somewhere in a region or interval."""
+    position = _required(element, "position")
+    point = position.child("point")
+    away = 0.0
+    if point is not None:
+        x, y = _point(point)
+    elif position.child("lanelet") is not None:
+        # somewhere on a lane: the road is not read
+        return UNKNOWN
+    else:
+        x, y, away = _around(parts_of(position))
+    low, high = _orientation(element)
+    # a point of the outline at a distance r of the centre moves by 2 r sin(h/2) when that turns by h
+    reach = max((hypot(*vertex) for part in outline for vertex in part.vertices), default=0.0)
+    turned = 2 * reach * sin(min(high - low, 2 * pi) / 4)
+    state = State(x, y, (low + high) / 2, oriented=low == high, uncertainty=away + turned)
+    return state if all(map(isfinite, (x, y, low, high, away))) else UNKNOWN
+
+
+def _orientation(element: Element) -> tuple[float, float]:
+    orientation = element.child("orientation")
+    if orientation is None:
+        return -pi, pi
+    if orientation.child("exact") is not None:
+        exact = _number(orientation, "exact")
+        return exact, exact
+    low, high = _number(orientation, "intervalStart"), _number(orientation, "intervalEnd")
+    if low > high:
+        raise ScenarioError(f"orientation is from {low:g} to {high:g}; give its start before its end")
+    return low, high
+
+
+def _occupied(occupancy: Element, tell: Tell) -> Iterator[tuple[int, State]]:
+    """The time steps of a region that the obstacle is somewhere in."""
+    try:
+        steps = _steps(_required(occupancy, "time"))
+        parts = parts_of(_required(occupancy, "shape"))
+        # its outline is within this one, which is nowhere farther from it than it is wide
+        region = _hull(parts)
+        _, _, reach = _around([region])
+        state = State(uncertainty=2 * reach, region=(region,)) if isfinite(reach) else UNKNOWN
+    except ScenarioError as error:
+        tell(occupancy.line, f"{error}; the occupancy is left out")
+        return
+    for step in steps:
+        yield step, state
+
+
+def _hull(parts: Sequence[Part]) -> Part:
+    """A convex outline around all of them."""
+    if len(parts) > 1 and any(part.radius for part in parts):
+        x, y, radius = _around(parts)
+        return Part([(x, y)], radius)
+    if len(parts) == 1 and parts[0].radius:
+        return parts[0]
+    try:
+        hull = Footprint.polygon([vertex for part in parts for vertex in part.vertices], concave="hull")
+    except GeometryError as error:
+        raise ScenarioError(str(error)) from None
+    return Part([(float(x), float(y)) for x, y in hull.parts[0].vertices])
+
+
+def _around(parts: Sequence[Part]) -> tuple[float, float, float]:
+    """A disc around all of them: x, y, radius."""
+    vertices = [vertex for part in parts for vertex in part.vertices]
+    x, y = (fsum(vertex[axis] for vertex in vertices) / len(vertices) for axis in (0, 1))
+    return x, y, max(hypot(a - x, b - y) + part.radius for part in parts for a, b in part.vertices)
+
+
+def _steps(time: Element) -> range:
+    """The time steps of an exact time or an interval."""
+    if time.child("intervalStart") is None:
+        step = _step(time)
+        return range(step, step + 1)
+    first, last = (_whole(_required(time, name)) for name in ("intervalStart", "intervalEnd"))
+    if not 0 <= last - first <= _LONGEST_INTERVAL:
+        raise ScenarioError(
+            f"time is from step {first} to {last}; give an interval of 0 to {_LONGEST_INTERVAL}"
+        )
+    return range(first, last + 1)
+
+
+def _step(time: Element) -> int:
+    if time.child("intervalStart") is not None:
+        raise ScenarioError("time is an interval; give <exact> for a state")
+    return _whole(_required(time, "exact"))
+
+
+def _whole(element: Element) -> int:
+    text = element.text
+    if not (len(text) <= _LONGEST_STEP and text.isascii() and text.isdecimal()):
+        raise ScenarioError(f"a time step is {text[:60]!r}; give an integer from 0 on")
+    return int(text)
+
+
+def _point(element: Element) -> tuple[float, float]:
+    return _number(element, "x"), _number(element, "y")
+
+
+def _size(element: Element, name: str) -> float:
+    size = _number(element, name)
+    if size < 0:
+        raise ScenarioError(f"{name} is {size:g}; give a size of at least 0")
+    return size
+
+
+def _number(element: Element, name: str) -> float:
+    text = _required(element, name).text
+    try:
+        return float(text)
+    except ValueError:
+        raise ScenarioError(f"{name} is {text[:60]!r}; give a number") from None
+
+
+def _required(element: Element, name: str) -> Element:
+    child = element.child(name)
+    if child is None:
+        raise ScenarioError(f"<{element.name}> has no <{name}>; give it one")
+    return child
+
+
+_OBSTACLES = frozenset(
+    # `obstacle`, with its role inside, is how versions before 2020a write the first two
+    ["staticObstacle", "dynamicObstacle", "obstacle", "environmentObstacle", "phantomObstacle"]
+)
+
+_BLOCK_REPORTS = 2**14
+"""A block is closed when it holds this many obstacles, however few its time steps are."""
+
+
+@dataclass(slots=True)
+class _Obstacle:
+    """One obstacle of a scenario.
+
+    Attributes:
+        parts: its outline, around its own centre.
+        moving: where it is, by time step.
+        standing: where it is at every time step, if it does not move.
+    """
+
+    name: str
+    class_name: str | None
+    parts: list[Part]
+    moving: dict[int, State] = field(default_factory=dict)
+    standing: State | None = None
+
+    def report(self, step: int) -> Report | None:
+        """The obstacle at a time step; None if it is not there."""
+        state = self.standing or self.moving.get(step)
+        return None if state is None else state.report(self.name, self.class_name, self.parts)
+
+
+def is_scenario(head: bytes) -> bool:
+    """Whether a file begins as an XML file does."""
+    return (
+        head.removeprefix(b"\xef\xbb\xbf")
+        .lstrip()
+        .startswith((b"<?xml", b"<!--", b"<!DOCTYPE", b"<commonRoad"))
+    )
+
+
+def iter_scenario(path: Path, faults: FaultList, *, concave: Concave = "decompose") -> Iterator[Trace]:
+    """The time steps of a CommonRoad scenario in blocks.
+
+    A sample is a time step that some moving obstacle has a state for; obstacles that do not move are in each
+    of them. The road, planning problems and their goals are no objects. What is wrong goes to `faults`.
+
+    Raises:
+        LogError: the file is no scenario.
+        UsageError: a scenario without obstacles.
+    """
+    elements = iter_elements(path, faults, _OBSTACLES)
+    step_s = _step_size(path, next(elements))
+    obstacles = list(_iter_obstacles(path, faults, elements))
+    steps = sorted({step for each in obstacles for step in each.moving}) or ([0] if obstacles else [])
+    if not obstacles and not len(faults):
+        raise UsageError(f"{path.name} is a scenario without obstacles; give one that has some")
+    columns = ReportColumns()
+    held = 0
+    for step in steps:
+        time_ns = round(step * step_s * 10**9)
+        if time_ns > LATEST_NS:
+            faults.add(f"{path.name}: time step {step} lies beyond what a time can be; it is left out")
+            continue
+        reports = [report for each in obstacles if (report := each.report(step)) is not None]
+        columns.add(time_ns, f"{path.name}: time step {step}", reports, {})
+        held += len(reports)
+        if len(columns) == BLOCK_SAMPLES or held >= _BLOCK_REPORTS:
+            yield finished_block(columns, faults, concave)
+            columns, held = ReportColumns(), 0
+    if len(columns):
+        yield finished_block(columns, faults, concave)
+
+
+def _step_size(path: Path, root: Element) -> Fraction:
+    if root.name != "commonRoad":
+        raise LogError(f"{path.name} is XML, but no scenario: its root is <{root.name}>, not <commonRoad>")
+    text = root.attributes.get("timeStepSize", "")
+    try:
+        size = float(text)
+    except ValueError:
+        size = 0.0
+    if not (isfinite(size) and 1e-9 <= size <= 1e9):
+        raise LogError(
+            f"{path.name}:{root.line}: timeStepSize is {text[:60]!r}; give seconds from 1e-9 to 1e9"
+        )
+    # as it is written: 0.1 s are 100 ms to the nanosecond
+    return Fraction(repr(size))
+
+
+def _iter_obstacles(path: Path, faults: FaultList, elements: Iterator[Element]) -> Iterator[_Obstacle]:
+    names = set[str]()
+    for element in elements:
+        name = element.attributes.get("id", "")
+        place = f"{path.name}:{element.line}: <{element.name}>"
+        try:
+            if not name or name in names:
+                raise ScenarioError(f"id is {name[:60]!r}; give each obstacle one of its own")
+            place = f"{path.name}:{element.line}: obstacle {name}"
+            obstacle = _obstacle(name, element, partial(_tell, faults, path.name, name))
+        except ScenarioError as error:
+            faults.add(f"{place}: {error}; it is left out")
+            continue
+        names.add(name)
+        yield obstacle
+
+
+def _tell(faults: FaultList, file: str, obstacle: str, line: int, what: str) -> None:
+    faults.add(f"{file}:{line}: obstacle {obstacle}: {what}")
+
+
+def _obstacle(name: str, element: Element, tell: Tell) -> _Obstacle:
+    kind = element.child("type")
+    class_name = (kind.text or None) if kind is not None else None
+    if element.name == "phantomObstacle":
+        # it may be there or not: a member of every open group that nothing is known about
+        return _Obstacle(name, class_name, [], dict.fromkeys(moving_states(element, [], tell), UNKNOWN))
+    shape = element.child("shape")
+    if shape is None:
+        raise ScenarioError("it has no <shape>; give it one")
+    outline = parts_of(shape)
+    if element.name == "environmentObstacle":
+        return _Obstacle(name, class_name, outline, standing=State())
+    if _stands(element):
+        initial = element.child("initialState")
+        if initial is None:
+            raise ScenarioError("it has no <initialState>; give it one")
+        return _Obstacle(name, class_name, outline, standing=state_of(initial, outline, tell))
+    return _Obstacle(name, class_name, outline, moving_states(element, outline, tell))
+
+
+def _stands(element: Element) -> bool:
+    role = element.child("role")
+    return element.name == "staticObstacle" or (role is not None and role.text == "static")

@@ -1,0 +1,131 @@
+"""Track CSV: one oriented box a line, lines of equal time make a sample."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from math import cos, isfinite, nan, sin
+from pathlib import Path
+
+from spatial_replay.errors import LogError
+from spatial_replay.geometry.footprint import Concave
+from spatial_replay.logs.formats.tracks import Report, ReportColumns, finished_block, iter_lines
+from spatial_replay.logs.messages import BLOCK_SAMPLES
+from spatial_replay.logs.read_options import FaultList
+from spatial_replay.trace.sample import LATEST_NS
+from spatial_replay.trace.trace import Trace
+
+COLUMNS = ("time_ns", "name", "class", "x", "y", "yaw", "length", "width")
+
+
+class _NoObjectError(Exception):
+    """A line that is no object; its text says why and what to give instead."""
+
+
+def iter_csv(path: Path, faults: FaultList, *, concave: Concave = "decompose") -> Iterator[Trace]:
+    """The samples of a track CSV in blocks.
+
+    A sample with a line that cannot be read is left out as a whole and goes to `faults`.
+
+    Raises:
+        LogError: the first line does not name the columns.
+    """
+    columns = ReportColumns()
+    for time_ns, place, reports in _samples(path, faults):
+        columns.add(time_ns, place, reports, {})
+        if len(columns) == BLOCK_SAMPLES:
+            yield finished_block(columns, faults, concave)
+            columns = ReportColumns()
+    if len(columns):
+        yield finished_block(columns, faults, concave)
+
+
+def _samples(path: Path, faults: FaultList) -> Iterator[tuple[int, str, list[Report]]]:
+    lines = iter_lines(path, faults)
+    order = _column_order(path, next(lines, (1, ""))[1])
+    time_ns, place, reports, broken = -1, "", dict[str, Report](), False
+    for number, line in lines:
+        here = f"{path.name}:{number}"
+        try:
+            row = _row(line, order)
+            at = _time(row["time_ns"])
+            if at < time_ns:
+                raise _NoObjectError(f"time_ns is {at}, before {time_ns}; give times that do not go back")
+        except _NoObjectError as error:
+            faults.add(f"{here}: {error}")
+            continue
+        if at > time_ns:
+            if reports and not broken:
+                yield time_ns, place, list(reports.values())
+            time_ns, place, reports, broken = at, here, {}, False
+        try:
+            report = _report(row)
+            if report.name in reports:
+                raise _NoObjectError(f"object {report.name!r} is there twice; name each object once a sample")
+            reports[report.name] = report
+        except _NoObjectError as error:
+            faults.add(f"{here}: {error}; the sample at {at} ns is left out")
+            broken = True
+    if reports and not broken:
+        yield time_ns, place, list(reports.values())
+
+
+def _column_order(path: Path, header: str) -> list[str]:
+    order = [name.strip() for name in header.strip().split(",")]
+    if sorted(order) != sorted(COLUMNS):
+        raise LogError(
+            f"{path.name}:1: the columns are {', '.join(order)[:200]!r}; a track CSV has {','.join(COLUMNS)}"
+        )
+    return order
+
+
+def _row(line: str, order: list[str]) -> dict[str, str]:
+    try:
+        cells = next(csv.reader([line], strict=True))
+    except (csv.Error, StopIteration) as error:
+        raise _NoObjectError(f"the line is no CSV ({error}); a quoted text ends on its own line") from None
+    if len(cells) != len(order):
+        raise _NoObjectError(f"the line has {len(cells)} cells; give {len(order)}")
+    return dict(zip(order, cells, strict=True))
+
+
+def _time(text: str) -> int:
+    try:
+        time_ns = int(text)
+    except ValueError:
+        time_ns = -1
+    if not 0 <= time_ns <= LATEST_NS:
+        raise _NoObjectError(f"time_ns is {text[:60]!r}; give integer nanoseconds from 0 to 2**63 - 1")
+    return time_ns
+
+
+def _report(row: dict[str, str]) -> Report:
+    if not row["name"]:
+        raise _NoObjectError("the name is empty; give each object a name")
+    x, y, length, width = (_number(row, column) for column in ("x", "y", "length", "width"))
+    yaw = _number(row, "yaw") if row["yaw"].strip() else nan
+    if length < 0 or width < 0:
+        raise _NoObjectError(f"length and width are {length:g} and {width:g}; give sizes of at least 0")
+    if isfinite(yaw) or not row["yaw"].strip():
+        angle = yaw if isfinite(yaw) else 0.0
+        along, across = (cos(angle), sin(angle)), (-sin(angle), cos(angle))
+    else:
+        along = across = (nan, nan)
+    corners = ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))
+    vertices = [
+        origin + a * length * along[axis] + b * width * across[axis]
+        for a, b in corners
+        for axis, origin in enumerate((x, y))
+    ]
+    return Report(row["name"], row["class"] or None, vertices, [4], [0.0], yaw=yaw)
+
+
+def _number(row: dict[str, str], column: str) -> float:
+    """The number in a cell; an empty one stands for a number that is not known."""
+    text = row[column].strip()
+    try:
+        return float(text) if text else nan
+    except ValueError:
+        raise _NoObjectError(
+            f"{column} is {text[:60]!r}; give a number, or nothing where it is not known"
+        ) from None

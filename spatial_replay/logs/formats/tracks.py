@@ -1,0 +1,323 @@
+"""Track files: one sample a line as JSON, or one object a line as CSV.
+
+Lines of a text file, plain or gzip, that may be damaged anywhere.
+
+Objects collected one by one into columns.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from math import nan
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+import numpy as np
+
+from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import Concave
+from spatial_replay.logs.messages import BLOCK_SAMPLES
+from spatial_replay.logs.read_options import FaultList
+from spatial_replay.trace.observations import Observations, starts_from_counts, trace_from_observations
+from spatial_replay.trace.sample import LATEST_NS
+from spatial_replay.trace.trace import Trace
+
+GZIP_MAGIC = b"\x1f\x8b"
+LONGEST_LINE = 16 * 2**20
+"""Bytes; a line beyond this is no sample but a file of another kind, or damage."""
+
+
+def open_text(path: Path) -> BinaryIO:
+    """The file's bytes, decompressed if it begins as a gzip file does, whatever its name."""
+    with path.open("rb") as stream:
+        magic = stream.read(len(GZIP_MAGIC))
+    return cast(BinaryIO, gzip.open(path, "rb")) if magic == GZIP_MAGIC else path.open("rb")
+
+
+def iter_lines(path: Path, faults: FaultList) -> Iterator[tuple[int, str]]:
+    """Each line that is not blank with its number, counted from 1; what cannot be read goes to `faults`."""
+    number = 0
+    with open_text(path) as stream:
+        while True:
+            number += 1
+            try:
+                line = stream.readline(LONGEST_LINE)
+                too_long = len(line) == LONGEST_LINE and not line.endswith(b"\n")
+                while too_long and (rest := stream.readline(LONGEST_LINE)) and not rest.endswith(b"\n"):
+                    pass
+            except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+                faults.add(f"{path.name}:{number}: the compressed data breaks off here ({error})")
+                return
+            if not line:
+                return
+            if too_long:
+                faults.add(f"{path.name}:{number}: the line is longer than {LONGEST_LINE} bytes")
+                continue
+            try:
+                text = line.decode("utf-8-sig" if number == 1 else "utf-8")
+            except UnicodeDecodeError as error:
+                faults.add(f"{path.name}:{number}: byte {error.start + 1} of the line is not UTF-8")
+                continue
+            if not text.isspace():
+                yield number, text
+
+
+@dataclass(slots=True)
+class Report:
+    """One object as a line of a log reports it, unchecked; the defaults stand for what it does not say.
+
+    Attributes:
+        vertices: x, y, x, y … of all parts.
+        vertex_counts: number of vertices of each part.
+        radii: rounding radius of each part.
+    """
+
+    name: str
+    class_name: str | None = None
+    vertices: list[float] = field(default_factory=list)
+    vertex_counts: list[int] = field(default_factory=list)
+    radii: list[float] = field(default_factory=list)
+    yaw: float = nan
+    uncertainty: float = 0.0
+    bottom: float = nan
+    top: float = nan
+    invalid: bool = False
+
+
+class ReportColumns:
+    """Samples as they come, and the trace of them when there are enough."""
+
+    def __init__(self) -> None:
+        self.times: list[int] = []
+        self.places: list[str] = []
+        self._reports: list[Report] = []
+        self._counts: list[int] = []
+        self._signals: list[dict[str, float]] = []
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def add(self, time_ns: int, place: str, reports: list[Report], signals: dict[str, float]) -> None:
+        """Take one sample; `place` says where it stands in its file."""
+        self.times.append(time_ns)
+        self.places.append(place)
+        self._reports += reports
+        self._counts.append(len(reports))
+        self._signals.append(signals)
+
+    def trace(self, *, concave: Concave) -> tuple[Trace, list[str]]:
+        """The samples that can be used, and what is wrong with the others, each with its place."""
+        trace, faults = trace_from_observations(self._observations(), concave=concave)
+        return trace, [f"{self.places[index]}: {what}" for index, what in sorted(faults.items())]
+
+    def _observations(self) -> Observations:
+        reports = self._reports
+        names = {name: index for index, name in enumerate(dict.fromkeys(r.name for r in reports))}
+        ordered = sorted({r.class_name for r in reports}, key=lambda c: (c is not None, c or ""))
+        classes = {name: index for index, name in enumerate(ordered)}
+        signals = sorted({name for values in self._signals for name in values})
+        return Observations(
+            times_ns=np.array(self.times, np.int64),
+            sample=np.repeat(np.arange(len(self.times)), self._counts),
+            name=np.array([names[r.name] for r in reports], np.int64),
+            names=list(names),
+            class_code=np.array([classes[r.class_name] for r in reports], np.int64),
+            classes=tuple(ordered),
+            yaw=np.array([r.yaw for r in reports], np.float64),
+            uncertainty=np.array([r.uncertainty for r in reports], np.float64),
+            shapes=_shapes(reports),
+            invalid=np.array([r.invalid for r in reports], np.bool_),
+            signals={
+                name: np.array([values.get(name, nan) for values in self._signals], np.float64)
+                for name in signals
+            },
+        )
+
+
+def _shapes(reports: list[Report]) -> FootprintBatch:
+    return FootprintBatch(
+        part_start=starts_from_counts(np.array([len(r.radii) for r in reports], np.int64)),
+        vertex_start=starts_from_counts(np.array([n for r in reports for n in r.vertex_counts], np.int64)),
+        vertices=np.array([x for r in reports for x in r.vertices], np.float64).reshape(-1, 2),
+        radius=np.array([x for r in reports for x in r.radii], np.float64),
+        bottom=np.array([r.bottom for r in reports], np.float64),
+        top=np.array([r.top for r in reports], np.float64),
+    )
+
+
+_SAMPLE_KEYS = {"time_ns", "objects", "signals"}
+_OBJECT_KEYS = {"name", "class", "polygon", "parts", "height", "yaw", "uncertainty"}
+_PART_KEYS = {"vertices", "radius"}
+
+
+class _NoSampleError(Exception):
+    """A line that is no sample; its text says why and what to give instead."""
+
+
+def iter_jsonl(path: Path, faults: FaultList, *, concave: Concave = "decompose") -> Iterator[Trace]:
+    """The samples of a `.jsonl` file in blocks; lines that are no sample go to `faults`."""
+    columns = ReportColumns()
+    latest = -1
+    for number, line in iter_lines(path, faults):
+        place = f"{path.name}:{number}"
+        try:
+            time_ns, reports, signals = _sample(line)
+            if time_ns <= latest:
+                raise _NoSampleError(f"time_ns is {time_ns}, not after {latest}; give times that increase")
+        except _NoSampleError as error:
+            faults.add(f"{place}: {error}")
+            continue
+        latest = time_ns
+        columns.add(time_ns, place, reports, signals)
+        if len(columns) == BLOCK_SAMPLES:
+            yield finished_block(columns, faults, concave)
+            columns = ReportColumns()
+    if len(columns):
+        yield finished_block(columns, faults, concave)
+
+
+def finished_block(columns: ReportColumns, faults: FaultList, concave: Concave) -> Trace:
+    """The trace of the collected samples; what had to be left out goes to `faults`."""
+    trace, left_out = columns.trace(concave=concave)
+    for fault in left_out:
+        faults.add(fault)
+    return trace
+
+
+def _sample(line: str) -> tuple[int, list[Report], dict[str, float]]:
+    try:
+        sample = json.loads(line)
+    except RecursionError:
+        raise _NoSampleError("the line is nested too deeply for a sample") from None
+    except ValueError as error:
+        raise _NoSampleError(f"the line is no JSON ({error})") from None
+    if not isinstance(sample, dict):
+        raise _NoSampleError(f'the line is {_kind(sample)}; give {{"time_ns": …, "objects": […]}}')
+    _check_keys(sample, _SAMPLE_KEYS, "the sample")
+    time_ns = sample.get("time_ns")
+    if type(time_ns) is not int or not 0 <= time_ns <= LATEST_NS:
+        raise _NoSampleError(f"time_ns is {_short(time_ns)}; give integer nanoseconds from 0 to 2**63 - 1")
+    objects = _list(sample.get("objects", []), "objects")
+    reports = [_report(entry) for entry in objects]
+    if len({report.name for report in reports}) < len(reports):
+        names = [report.name for report in reports]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise _NoSampleError(f"object {twice!r} is there twice; name each object once")
+    return time_ns, reports, _signals(sample.get("signals", {}))
+
+
+def _report(entry: Any) -> Report:
+    if not isinstance(entry, dict):
+        raise _NoSampleError(f'an object is {_kind(entry)}; give {{"name": …, "polygon": […]}}')
+    name = entry.get("name")
+    if not isinstance(name, str) or not _is_text(name):
+        raise _NoSampleError(f"an object's name is {_short(name)}; give a text that is not empty")
+    what = f"object {name!r}"
+    _check_keys(entry, _OBJECT_KEYS, what)
+    class_name = entry.get("class")
+    if class_name is not None and not (isinstance(class_name, str) and _is_text(class_name, empty=True)):
+        raise _NoSampleError(f"{what}: class is {_short(class_name)}; give a text or leave it out")
+    report = Report(name, class_name)
+    if ("polygon" in entry) == ("parts" in entry):
+        raise _NoSampleError(f"{what}: give one of polygon and parts")
+    if "polygon" in entry:
+        _add_part(report, entry["polygon"], 0.0, f"{what}: polygon")
+    else:
+        for part in _list(entry["parts"], f"{what}: parts"):
+            if not isinstance(part, dict):
+                raise _NoSampleError(
+                    f'{what}: a part is {_kind(part)}; give {{"vertices": […], "radius": r}}'
+                )
+            _check_keys(part, _PART_KEYS, f"a part of {what}")
+            radius = _number(part.get("radius", 0.0), f"{what}: radius")
+            _add_part(report, part.get("vertices"), radius, f"{what}: vertices")
+    report.uncertainty = _number(entry.get("uncertainty", 0.0), f"{what}: uncertainty")
+    if entry.get("height") is not None:
+        height = _list(entry["height"], f"{what}: height")
+        if len(height) != 2:
+            raise _NoSampleError(f"{what}: height has {len(height)} numbers; give [bottom, top]")
+        report.bottom, report.top = (_number(value, f"{what}: height") for value in height)
+        report.invalid = report.bottom != report.bottom and report.top != report.top
+    if entry.get("yaw") is not None:
+        report.yaw = _number(entry["yaw"], f"{what}: yaw")
+        report.invalid |= report.yaw != report.yaw
+    return report
+
+
+def _add_part(report: Report, vertices: Any, radius: float, what: str) -> None:
+    listed = _list(vertices, what)
+    flat = report.vertices
+    for point in listed:
+        if type(point) is not list or len(point) != 2:
+            raise _NoSampleError(f"{what} holds {_short(point)}; give [x, y] pairs")
+        x, y = point
+        flat.append(x if type(x) is float else _number(x, what))
+        flat.append(y if type(y) is float else _number(y, what))
+    report.vertex_counts.append(len(listed))
+    report.radii.append(radius)
+
+
+def _signals(entry: Any) -> dict[str, float]:
+    if not isinstance(entry, dict):
+        raise _NoSampleError(f'signals are {_kind(entry)}; give {{"name": number}}')
+    for name in entry:
+        if not _is_text(name):
+            raise _NoSampleError(f"a signal's name is {_short(name)}; give a text that is not empty")
+    return {name: _number(value, f"signal {name!r}") for name, value in entry.items()}
+
+
+def _number(value: Any, what: str) -> float:
+    """The number; null, like NaN, stands for one that is not known."""
+    if value is None:
+        return nan
+    if type(value) is not int and type(value) is not float:
+        raise _NoSampleError(f"{what} holds {_short(value)}; give a number, or null where it is not known")
+    try:
+        return float(value)
+    except OverflowError:
+        raise _NoSampleError(
+            f"{what} holds an integer beyond 1.8e308; give a number that fits a double"
+        ) from None
+
+
+def _list(value: Any, what: str) -> list[Any]:
+    if not isinstance(value, list):
+        raise _NoSampleError(f"{what}: {_short(value)} where a list belongs")
+    return value
+
+
+def _check_keys(entry: dict[str, Any], known: set[str], what: str) -> None:
+    if not entry.keys() <= known:
+        unknown = ", ".join(map(repr, sorted(entry.keys() - known)))
+        raise _NoSampleError(
+            f"{what} has the unknown key {_shorten(unknown)}; known are {', '.join(sorted(known))}"
+        )
+
+
+def _is_text(text: str, *, empty: bool = False) -> bool:
+    """Whether a text can be written as UTF-8: JSON can spell halves of surrogate pairs, which cannot."""
+    if not text:
+        return empty
+    return text.isascii() or not any("\ud800" <= character <= "\udfff" for character in text)
+
+
+def _kind(value: Any) -> str:
+    kinds = {dict: "an object", list: "a list", str: "a text", bool: "a truth value", type(None): "null"}
+    return kinds.get(type(value), "a number")
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, dict | list):
+        return _kind(value)
+    try:
+        return _shorten(json.dumps(value))
+    except ValueError:
+        return "a number of too many digits"
+
+
+def _shorten(text: str) -> str:
+    return text if len(text) <= 60 else text[:59] + "…"

@@ -1,0 +1,158 @@
+"""Elements of an XML file that nobody vouches for, piece by piece."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+from xml.parsers import expat
+
+from spatial_replay.errors import LogError
+from spatial_replay.logs.formats.tracks import open_text
+from spatial_replay.logs.read_options import FaultList
+
+LARGEST_FILE = 512 * 2**20
+"""Bytes, decompressed."""
+MOST_ELEMENTS = 500_000
+"""Elements inside one that is kept."""
+DEEPEST = 64
+LONGEST_TEXT = 4096
+_PIECE = 2**16
+
+
+@dataclass(slots=True)
+class Element:
+    """An element with what is in it.
+
+    Attributes:
+        line: where it begins, counted from 1.
+        text: its own text; texts beyond `LONGEST_TEXT` are cut.
+    """
+
+    name: str
+    attributes: dict[str, str]
+    line: int
+    children: list[Element] = field(default_factory=list)
+    text: str = ""
+
+    def child(self, name: str) -> Element | None:
+        """The first child of a name."""
+        return next(self.all(name), None)
+
+    def all(self, name: str) -> Iterator[Element]:
+        """Every child of a name."""
+        return (child for child in self.children if child.name == name)
+
+
+def iter_elements(path: Path, faults: FaultList, wanted: frozenset[str]) -> Iterator[Element]:
+    """The root, without its content, then each of its children that has a wanted name.
+
+    Of a file that is broken somewhere, the children before that place are given, and the rest goes to
+    `faults`. Documents that declare a type of their own are refused: with them entities, and whatever those
+    would fetch or blow up to.
+
+    Raises:
+        LogError: there is no root to give, the file declares a type, or it is beyond the limits above.
+    """
+    collector = _Collector(path.name, wanted)
+    with open_text(path) as stream:
+        given = False
+        for problem in _parse(stream, collector):
+            for element in collector.take():
+                given = True
+                yield element
+            if problem is not None:
+                what = f"{path.name}:{collector.line}: {problem}"
+                if not given:
+                    raise LogError(f"{what}; give a well-formed XML file")
+                faults.add(f"{what}; what follows is left out")
+
+
+def _parse(stream: BinaryIO, collector: _Collector) -> Iterator[str | None]:
+    """Parse a piece a step; the last step may yield what is wrong with the file."""
+    read = 0
+    while True:
+        try:
+            piece = stream.read(_PIECE)
+            read += len(piece)
+            if read > LARGEST_FILE:
+                raise LogError(f"{collector.name} is larger than {LARGEST_FILE >> 20} MiB; split it")
+            collector.parser.Parse(piece, not piece)
+        except expat.ExpatError as error:
+            yield f"the XML is broken ({expat.ErrorString(error.code)})"
+            return
+        except (EOFError, zlib.error, LookupError, ValueError) as error:
+            # broken compression, an encoding nobody knows
+            yield f"the file cannot be read ({error})"
+            return
+        yield None
+        if not piece:
+            return
+
+
+class _Collector:
+    """What a parser hands over, as elements."""
+
+    def __init__(self, name: str, wanted: frozenset[str]) -> None:
+        self.name = name
+        self._wanted = wanted
+        self._open: list[Element] = []
+        self._depth = self._kept = 0
+        self._done: list[Element] = []
+        self.parser = expat.ParserCreate()
+        self.parser.buffer_text = True
+        self.parser.StartDoctypeDeclHandler = self._doctype
+        self.parser.StartElementHandler = self._start
+        self.parser.EndElementHandler = self._end
+        self.parser.CharacterDataHandler = self._text
+
+    @property
+    def line(self) -> int:
+        return self.parser.CurrentLineNumber
+
+    def take(self) -> list[Element]:
+        """The elements that were finished since the last call."""
+        done, self._done = self._done, []
+        return done
+
+    def _doctype(self, *declared: object) -> None:
+        raise LogError(
+            f"{self.name}:{self.line}: the file declares a document type, whose entities are not trusted;"
+            " remove <!DOCTYPE …>"
+        )
+
+    def _start(self, name: str, attributes: dict[str, str]) -> None:
+        self._depth += 1
+        if self._depth > DEEPEST:
+            raise LogError(
+                f"{self.name}:{self.line}: elements are nested deeper than {DEEPEST}; flatten them"
+            )
+        if self._depth == 1:
+            self._done.append(Element(name, attributes, self.line))
+        elif self._open or (self._depth == 2 and name in self._wanted):
+            self._keep(Element(name, attributes, self.line))
+
+    def _keep(self, element: Element) -> None:
+        self._kept = self._kept + 1 if self._open else 0
+        if self._kept > MOST_ELEMENTS:
+            first = self._open[0]
+            raise LogError(
+                f"{self.name}:{first.line}: <{first.name}> has more than {MOST_ELEMENTS} elements; split it"
+            )
+        if self._open:
+            self._open[-1].children.append(element)
+        self._open.append(element)
+
+    def _end(self, name: str) -> None:
+        self._depth -= 1
+        if self._open:
+            element = self._open.pop()
+            element.text = element.text.strip()
+            if not self._open:
+                self._done.append(element)
+
+    def _text(self, text: str) -> None:
+        if self._open and len(self._open[-1].text) < LONGEST_TEXT:
+            self._open[-1].text += text[:LONGEST_TEXT]

@@ -1,0 +1,309 @@
+"""Chunks of an MCAP log: found, checked, decompressed, walked.
+
+The heads of the records in a chunk, found in one compiled pass.
+
+MCAP records to and from bytes.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from io import BytesIO
+from typing import BinaryIO, NamedTuple, TypeAlias, TypeVar
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap import records
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
+
+from spatial_replay.compiled import kernel, piece
+from spatial_replay.geometry.arrays import Integers
+
+MAGIC = b"\x89MCAP0\r\n"
+RECORD_HEAD = struct.Struct("<BQ")
+"""Opcode and length of the body that follows."""
+
+_Record = TypeVar("_Record")
+
+
+class DamageError(Exception):
+    """Bytes that are not what they should be; its text says what is wrong, the catcher knows where."""
+
+
+def encoded(*several: records.McapRecord) -> bytes:
+    """Records one after the other, each with its head."""
+    builder = RecordBuilder()
+    for record in several:
+        record.write(builder)
+    return bytes(builder.end())  # type: ignore[no-untyped-call]
+
+
+def decoded(read: Callable[[ReadDataStream], _Record], body: bytes) -> _Record:
+    """The record in a body.
+
+    Raises:
+        DamageError: the body is too short, or holds impossible lengths or texts that are not UTF-8.
+    """
+    try:
+        return read(ReadDataStream(BytesIO(body)))
+    except (EndOfFile, struct.error, UnicodeDecodeError, OverflowError) as error:
+        raise DamageError(f"a record cannot be read ({type(error).__name__}: {error})") from None
+
+
+Bytes = NDArray[np.uint8]
+Words = NDArray[np.uint64]
+
+_RECORD_HEAD = 9
+_MESSAGE_FIELDS = 22
+_SCHEMA, _CHANNEL, _MESSAGE = 3, 4, 5
+
+
+class RecordHeads(NamedTuple):
+    """N schemas, channels and messages.
+
+    Attributes:
+        opcode: (N,) int64.
+        begin, end: (N,) int64, where their bodies stand.
+        channel, sequence, log_time, publish_time: (N,) uint64, of messages; 0 for other records.
+    """
+
+    opcode: Integers
+    begin: Integers
+    end: Integers
+    channel: Words
+    sequence: Words
+    log_time: Words
+    publish_time: Words
+
+
+def walk_records(content: bytes) -> tuple[RecordHeads, bool]:
+    """The schemas, channels and messages in some bytes, and whether the last record breaks off."""
+    view = np.frombuffer(content, np.uint8)
+    # counted first: room for as many as there could be is many times the bytes
+    count, _ = _walk(view, np.empty((3, 0), np.int64), np.empty((4, 0), np.uint64))
+    places = np.empty((3, count), np.int64)
+    fields = np.empty((4, count), np.uint64)
+    _, end = _walk(view, places, fields)
+    return RecordHeads(*places, *fields), end < len(content)
+
+
+@piece
+def _word(content: Bytes, begin: int, size: int) -> int:
+    """A little-endian number of `size` bytes."""
+    word = np.uint64(0)
+    for k in range(size):
+        word |= np.uint64(content[begin + k]) << np.uint64(8 * k)
+    return word  # type: ignore[return-value]
+
+
+@kernel
+def _walk(content: Bytes, places: Integers, fields: Words) -> tuple[int, int]:
+    """Fill in as many as there is room for; how many there are, and where the last whole record ends."""
+    size = content.shape[0]
+    position = 0
+    count = 0
+    while position + _RECORD_HEAD <= size:
+        length = _word(content, position + 1, 8)
+        begin = position + _RECORD_HEAD
+        if length > np.uint64(size - begin):
+            break
+        end = begin + int(length)
+        opcode = content[position]
+        is_message = opcode == _MESSAGE and end - begin >= _MESSAGE_FIELDS
+        if is_message or _SCHEMA <= opcode <= _CHANNEL:
+            if count < places.shape[1]:
+                places[0, count], places[1, count], places[2, count] = opcode, begin, end
+                fields[0, count] = fields[1, count] = fields[2, count] = fields[3, count] = 0
+                if is_message:
+                    fields[0, count] = _word(content, begin, 2)
+                    fields[1, count] = _word(content, begin + 2, 4)
+                    fields[2, count] = _word(content, begin + 6, 8)
+                    fields[3, count] = _word(content, begin + 14, 8)
+            count += 1
+        position = end
+    return count, position
+
+
+LARGEST_CHUNK = 2**30
+"""Bytes, uncompressed; a chunk that claims more is taken for damage, not for data."""
+
+_ALWAYS_ALLOWED, _MOST_TIMES_LARGER = 2**26, 1_000
+"""Bytes, and times its own size, that a chunk may decompress to: no recorder's chunk needs more."""
+
+_CHUNK_HEAD = struct.Struct("<QQQII")
+_FIXED_HEAD = RECORD_HEAD.size + _CHUNK_HEAD.size
+_LONGEST_HEAD = 80
+_TOGETHER, _AHEAD = 8, 24
+
+
+RawMessage: TypeAlias = tuple[int, int, int, int, bytes]
+"""A message as it stands in a chunk: log time, channel, sequence, publish time, payload."""
+
+Declaration: TypeAlias = records.Schema | records.Channel
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkPlace:
+    """Where a stretch of records stands in the file.
+
+    Attributes:
+        offset, length: of the record with its head, in bytes.
+        start_ns, end_ns: log times of its first and last message.
+        compressed: whether it is a chunk; else records that stand in the file as they are.
+        channels: those with messages in it, as the index says; None where it does not.
+    """
+
+    offset: int
+    length: int
+    start_ns: int
+    end_ns: int
+    compressed: bool = True
+    channels: frozenset[int] | None = None
+
+
+def chunk_place(offset: int, record: bytes, length: int) -> ChunkPlace:
+    """The place of a chunk by the beginning of its record, if that is consistent in itself.
+
+    Args:
+        record: the first bytes of the record, at least 64 unless the file ends.
+        length: of the record with its head.
+
+    Raises:
+        DamageError: it is not.
+    """
+    if len(record) < _FIXED_HEAD:
+        raise DamageError("a chunk breaks off")
+    start, end, size, _, name_length = _CHUNK_HEAD.unpack_from(record, RECORD_HEAD.size)
+    data_length = _FIXED_HEAD + name_length
+    if name_length > 16 or len(record) < data_length + 8:
+        raise DamageError("a chunk's head makes no sense")
+    stored = int.from_bytes(record[data_length : data_length + 8], "little")
+    if data_length + 8 + stored != length or size > LARGEST_CHUNK or not start <= end < 2**63:
+        raise DamageError("a chunk's head makes no sense")
+    return ChunkPlace(offset, length, start, end)
+
+
+def read_records(stream: BinaryIO, place: ChunkPlace) -> bytes:
+    """The records in a place, decompressed.
+
+    Raises:
+        DamageError: the chunk is cut off, does not decompress, or has another checksum than it says.
+    """
+    stream.seek(place.offset)
+    record = stream.read(place.length)
+    if len(record) < place.length:
+        raise DamageError("the chunk breaks off")
+    if not place.compressed:
+        return record
+    chunk_place(place.offset, record[:_LONGEST_HEAD], len(record))
+    _, _, size, checksum, name_length = _CHUNK_HEAD.unpack_from(record, RECORD_HEAD.size)
+    begin = _FIXED_HEAD + name_length
+    content = _decompressed(record[_FIXED_HEAD:begin], record[begin + 8 :], size)
+    if len(content) != size:
+        raise DamageError(f"the chunk holds {len(content)} bytes instead of {size}")
+    if checksum and zlib.crc32(content) != checksum:
+        raise DamageError("the chunk's checksum does not fit its content")
+    return content
+
+
+def iter_contents(
+    stream: BinaryIO, places: Sequence[ChunkPlace]
+) -> Iterator[tuple[ChunkPlace, Callable[[], bytes]]]:
+    """Each place with its records, as `read_records` gives them when called.
+
+    The next places are read and decompressed by another thread while the caller works on one: the stream
+    belongs to it meanwhile.
+    """
+    groups = [places[begin : begin + _TOGETHER] for begin in range(0, len(places), _TOGETHER)]
+    waiting: deque[tuple[Sequence[ChunkPlace], Future[list[Callable[[], bytes]]]]] = deque()
+    with ThreadPoolExecutor(1, "chunk-reading") as reader:
+        for group in groups:
+            waiting.append((group, reader.submit(_read_all, stream, group)))
+            if len(waiting) > _AHEAD:
+                ready, contents = waiting.popleft()
+                yield from zip(ready, contents.result(), strict=True)
+        for ready, contents in waiting:
+            yield from zip(ready, contents.result(), strict=True)
+
+
+def _read_all(stream: BinaryIO, places: Sequence[ChunkPlace]) -> list[Callable[[], bytes]]:
+    """What each place gives when asked: its records, or its damage."""
+    return [_outcome(stream, place) for place in places]
+
+
+def _outcome(stream: BinaryIO, place: ChunkPlace) -> Callable[[], bytes]:
+    try:
+        content = read_records(stream, place)
+    except DamageError as damage:
+        lost = damage
+
+        def fail() -> bytes:
+            raise lost
+
+        return fail
+    return lambda: content
+
+
+def _decompressed(compression: bytes, data: bytes, size: int) -> bytes:
+    if compression and size > max(_ALWAYS_ALLOWED, _MOST_TIMES_LARGER * len(data)):
+        raise DamageError(f"the chunk claims to hold {size} bytes in {len(data)}")
+    try:
+        if compression == b"zstd":
+            if zstandard.frame_content_size(data) > size:
+                raise DamageError("the chunk holds more than it says")
+            return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+        if compression == b"lz4":
+            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
+    except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+        raise DamageError(f"the chunk does not decompress ({error})") from None
+    if compression:
+        raise DamageError(f"the chunk is compressed as {compression!r}; known are zstd and lz4")
+    return data
+
+
+@dataclass(frozen=True, slots=True)
+class Records:
+    """The records of a chunk that a reader needs, in the order in which they stand.
+
+    Attributes:
+        damage: why the chunk's end could not be read, or None.
+    """
+
+    messages: list[RawMessage]
+    declarations: list[Declaration]
+    damage: str | None = None
+
+
+def split_records(content: bytes, passed_over: frozenset[int] = frozenset()) -> Records:
+    """The messages and the declarations in decompressed records, up to where one breaks off.
+
+    Args:
+        passed_over: channels whose messages are not wanted.
+    """
+    heads, breaks_off = walk_records(content)
+    is_message = (heads.opcode == Opcode.MESSAGE) & (heads.end - heads.begin >= _MESSAGE_FIELDS)
+    for channel in passed_over:
+        is_message &= heads.channel != channel
+    wanted = np.flatnonzero(is_message)
+    begins, ends = (heads.begin[wanted] + _MESSAGE_FIELDS).tolist(), heads.end[wanted].tolist()
+    fields = (heads.log_time, heads.channel, heads.sequence, heads.publish_time)
+    payloads = [content[begin:end] for begin, end in zip(begins, ends, strict=True)]
+    messages = list(zip(*(field[wanted].tolist() for field in fields), payloads, strict=True))
+    declarations: list[Declaration] = []
+    for index in np.flatnonzero((heads.opcode == Opcode.SCHEMA) | (heads.opcode == Opcode.CHANNEL)).tolist():
+        read = records.Schema.read if heads.opcode[index] == Opcode.SCHEMA else records.Channel.read
+        try:
+            declarations.append(decoded(read, content[heads.begin[index] : heads.end[index]]))
+        except DamageError as damage:
+            whole = int(np.searchsorted(wanted, index))
+            return Records(messages[:whole], declarations, str(damage))
+    return Records(messages, declarations, "a record breaks off" if breaks_off else None)

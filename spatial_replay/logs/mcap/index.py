@@ -1,0 +1,339 @@
+"""What an MCAP file holds and where, by its summary or, failing that, by looking.
+
+What an MCAP log keeps beside its messages: attachments and metadata.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from heapq import merge
+from types import MappingProxyType
+from typing import BinaryIO
+
+from mcap import records
+from mcap.opcode import Opcode
+
+from spatial_replay.logs.mcap.chunks import MAGIC, RECORD_HEAD, ChunkPlace, DamageError, chunk_place, decoded
+from spatial_replay.logs.messages import Attachment
+from spatial_replay.logs.read_options import FaultList
+
+_FOOTER_BYTES = RECORD_HEAD.size + 20
+_CHUNK_HEAD_BYTES = 64
+_CHUNK_INDEX = struct.Struct("<QQQQI")
+_MESSAGE_INDEX = struct.Struct("<HQ")
+_LOOSE_BYTES = 2**22
+_LARGEST_RECORD = 2**30
+_STRIDE = 2**20
+_MOST_GAPS = 1_000
+"""Damaged stretches after which the rest of a file is not searched."""
+_COMPRESSIONS = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
+_BEFORE_COMPRESSION = RECORD_HEAD.size + 28
+
+
+@dataclass(slots=True)
+class Directory:
+    """Places in a file, and what the summary says of them.
+
+    Attributes:
+        header: None where it cannot be read.
+        schemas, channels: declared outside chunks, by number.
+        chunks: in the order of the file.
+        attachments, metadata: offset and length of each such record with its head.
+        statistics: None without a summary.
+    """
+
+    header: records.Header | None = None
+    schemas: dict[int, records.Schema] = field(default_factory=dict)
+    channels: dict[int, records.Channel] = field(default_factory=dict)
+    chunks: list[ChunkPlace] = field(default_factory=list)
+    attachments: list[tuple[int, int]] = field(default_factory=list)
+    metadata: list[tuple[int, int]] = field(default_factory=list)
+    statistics: records.Statistics | None = None
+
+
+def read_directory(stream: BinaryIO, faults: FaultList, name: str) -> Directory:
+    """The directory of a file that begins as an MCAP file; what is wrong with it goes to `faults`."""
+    size = stream.seek(0, os.SEEK_END)
+    try:
+        return _from_summary(stream, size)
+    except _NoSummaryError:
+        return _Scan(stream, size, faults, name).directory()
+    except DamageError as damage:
+        known = len(faults)
+        directory = _Scan(stream, size, faults, name).directory()
+        if len(faults) == known:
+            faults.add(f"{name}: {damage}; the log was read without its index")
+        return directory
+
+
+class _NoSummaryError(Exception):
+    """A file that has no summary, or not one that tells everything, as other writers may make it."""
+
+
+def _from_summary(stream: BinaryIO, size: int) -> Directory:
+    """The directory that a file's own summary gives.
+
+    Raises:
+        _NoSummaryError: there is no summary, or one that leaves something out.
+        DamageError: the end of the file is missing or damaged.
+    """
+    directory = Directory(header=_header(stream))
+    tail_bytes = _FOOTER_BYTES + len(MAGIC)
+    if size < tail_bytes + len(MAGIC):
+        raise DamageError("the file ends without a footer; its writer was interrupted")
+    stream.seek(size - tail_bytes)
+    tail = stream.read(tail_bytes)
+    if not tail.endswith(MAGIC) or RECORD_HEAD.unpack_from(tail) != (Opcode.FOOTER, 20):
+        raise DamageError("the file ends without a footer; its writer was interrupted")
+    footer = decoded(records.Footer.read, tail[RECORD_HEAD.size :])
+    if footer.summary_start == 0:
+        raise _NoSummaryError
+    if not len(MAGIC) <= footer.summary_start <= size - tail_bytes:
+        raise DamageError("the footer points outside the file")
+    stream.seek(footer.summary_start)
+    section = stream.read(size - tail_bytes - footer.summary_start)
+    if footer.summary_crc and zlib.crc32(section + tail[: _FOOTER_BYTES - 4]) != footer.summary_crc:
+        raise DamageError("the summary's checksum does not fit")
+    for opcode, body in _iter_bodies(section):
+        _take_in(directory, opcode, body)
+    _check_complete(directory, footer.summary_start)
+    directory.chunks.sort(key=lambda place: place.offset)
+    return directory
+
+
+def _header(stream: BinaryIO) -> records.Header | None:
+    stream.seek(len(MAGIC))
+    head = stream.read(RECORD_HEAD.size)
+    if len(head) < RECORD_HEAD.size:
+        return None
+    opcode, length = RECORD_HEAD.unpack(head)
+    if opcode != Opcode.HEADER or length > _STRIDE:
+        raise DamageError("the header is damaged")
+    header: records.Header = decoded(records.Header.read, stream.read(length))
+    return header
+
+
+def _iter_bodies(section: bytes) -> Iterator[tuple[int, bytes]]:
+    position = 0
+    while position < len(section):
+        if len(section) - position < RECORD_HEAD.size:
+            raise DamageError("the summary breaks off")
+        opcode, length = RECORD_HEAD.unpack_from(section, position)
+        position += RECORD_HEAD.size
+        if length > len(section) - position:
+            raise DamageError("the summary breaks off")
+        yield opcode, section[position : position + length]
+        position += length
+
+
+def _take_in(directory: Directory, opcode: int, body: bytes) -> None:
+    if opcode == Opcode.SCHEMA:
+        schema = decoded(records.Schema.read, body)
+        directory.schemas[schema.id] = schema
+    elif opcode == Opcode.CHANNEL:
+        channel = decoded(records.Channel.read, body)
+        directory.channels[channel.id] = channel
+    elif opcode == Opcode.STATISTICS:
+        directory.statistics = decoded(records.Statistics.read, body)
+    elif opcode == Opcode.CHUNK_INDEX:
+        if len(body) < _CHUNK_INDEX.size:
+            raise DamageError("the index breaks off")
+        start_ns, end_ns, offset, length, indexed = _CHUNK_INDEX.unpack_from(body)
+        directory.chunks.append(
+            ChunkPlace(offset, length, start_ns, end_ns, channels=_indexed_channels(body, indexed))
+        )
+    elif opcode == Opcode.ATTACHMENT_INDEX:
+        attachment = decoded(records.AttachmentIndex.read, body)
+        directory.attachments.append((attachment.offset, attachment.length))
+    elif opcode == Opcode.METADATA_INDEX:
+        metadata = decoded(records.MetadataIndex.read, body)
+        directory.metadata.append((metadata.offset, metadata.length))
+
+
+def _indexed_channels(body: bytes, length: int) -> frozenset[int] | None:
+    """The channels for which a chunk has an index of messages; None without any such index."""
+    entries = body[_CHUNK_INDEX.size : _CHUNK_INDEX.size + length]
+    if not entries or len(entries) != length or length % _MESSAGE_INDEX.size:
+        return None
+    return frozenset(channel for channel, _ in _MESSAGE_INDEX.iter_unpack(entries))
+
+
+def _check_complete(directory: Directory, end: int) -> None:
+    """That a summary tells everything; other writers may leave out parts of theirs."""
+    statistics = directory.statistics
+    if statistics is None or (
+        statistics.chunk_count != len(directory.chunks)
+        or statistics.channel_count != len(directory.channels)
+        or statistics.schema_count != len(directory.schemas)
+        or statistics.attachment_count != len(directory.attachments)
+        or statistics.metadata_count != len(directory.metadata)
+        or (statistics.message_count > 0 and not directory.chunks)
+    ):
+        raise _NoSummaryError
+    places = [(place.offset, place.length) for place in directory.chunks]
+    if any(offset + length > end for offset, length in places + directory.attachments + directory.metadata):
+        raise DamageError("the summary points outside the file")
+
+
+class _Scan:
+    """One pass over the records of a file, skipping their contents."""
+
+    def __init__(self, stream: BinaryIO, size: int, faults: FaultList, name: str) -> None:
+        self._stream = stream
+        self._size = size
+        self._faults = faults
+        self._name = name
+        self._found = Directory()
+        self._loose: ChunkPlace | None = None
+        self._ended = False
+
+    def directory(self) -> Directory:
+        position = sound = len(MAGIC)
+        gaps = 0
+        while position < self._size and not self._ended:
+            try:
+                position = self._record(position)
+            except DamageError as damage:
+                gaps += 1
+                following = self._next_chunk(sound) if gaps < _MOST_GAPS else None
+                lost = (following or self._size) - position
+                where = f"{self._name}: at byte {position}"
+                self._faults.add(f"{where}: {damage}; {max(lost, 0)} bytes cannot be read")
+                if following is None:
+                    break
+                position = following
+            if self._found.chunks and self._found.chunks[-1].compressed:
+                sound = max(sound, self._found.chunks[-1].offset + self._found.chunks[-1].length)
+        self._end_loose()
+        return self._found
+
+    def _record(self, position: int) -> int:
+        """Take in the record at a position; where the next one begins."""
+        self._stream.seek(position)
+        beginning = self._stream.read(_CHUNK_HEAD_BYTES)
+        if len(beginning) < RECORD_HEAD.size:
+            raise DamageError("the file breaks off")
+        opcode, length = RECORD_HEAD.unpack_from(beginning)
+        following = int(position + RECORD_HEAD.size + length)
+        if opcode == 0 or (opcode > max(Opcode) and opcode < 0x80):
+            raise DamageError(f"there is no record (opcode {opcode})")
+        if following > self._size:
+            raise DamageError("the file breaks off in a record")
+        if opcode == Opcode.CHUNK:
+            self._end_loose()
+            self._found.chunks.append(chunk_place(position, beginning, RECORD_HEAD.size + length))
+        elif opcode == Opcode.MESSAGE:
+            self._message(position, beginning, following)
+        elif opcode in (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL):
+            if length > _LARGEST_RECORD:
+                raise DamageError(f"a record claims to hold {length} bytes")
+            self._stream.seek(position + RECORD_HEAD.size)
+            body = self._stream.read(length)
+            if opcode == Opcode.HEADER:
+                self._found.header = decoded(records.Header.read, body)
+            else:
+                _take_in(self._found, opcode, body)
+        elif opcode == Opcode.ATTACHMENT:
+            self._found.attachments.append((position, following - position))
+        elif opcode == Opcode.METADATA:
+            self._found.metadata.append((position, following - position))
+        elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
+            if self._next_chunk(following) is not None:
+                raise DamageError("the data end before the last chunk")
+            # what follows repeats what was seen already
+            self._ended = True
+        return following
+
+    def _message(self, position: int, beginning: bytes, following: int) -> None:
+        """Put a message outside chunks into a place with its neighbours."""
+        if len(beginning) < RECORD_HEAD.size + 22 or following - position < RECORD_HEAD.size + 22:
+            raise DamageError("a message breaks off")
+        time_ns = int.from_bytes(beginning[RECORD_HEAD.size + 6 : RECORD_HEAD.size + 14], "little")
+        loose = self._loose
+        if loose and loose.offset + loose.length == position and loose.length < _LOOSE_BYTES:
+            self._loose = ChunkPlace(
+                loose.offset,
+                following - loose.offset,
+                min(loose.start_ns, time_ns),
+                max(loose.end_ns, time_ns),
+                compressed=False,
+            )
+        else:
+            self._end_loose()
+            self._loose = ChunkPlace(position, following - position, time_ns, time_ns, compressed=False)
+
+    def _end_loose(self) -> None:
+        if self._loose:
+            self._found.chunks.append(self._loose)
+            self._loose = None
+
+    def _next_chunk(self, position: int) -> int | None:
+        """Where the next chunk begins that is consistent in itself, from a position on."""
+        overlap = _BEFORE_COMPRESSION + _CHUNK_HEAD_BYTES
+        while position < self._size:
+            self._stream.seek(position)
+            window = self._stream.read(_STRIDE + overlap)
+            for place in merge(*(_iter_places(window, mark) for mark in _COMPRESSIONS)):
+                record = window[place : place + _CHUNK_HEAD_BYTES]
+                opcode, length = RECORD_HEAD.unpack_from(record)
+                if opcode != Opcode.CHUNK or position + place + RECORD_HEAD.size + length > self._size:
+                    continue
+                try:
+                    chunk_place(position + place, record, RECORD_HEAD.size + length)
+                except DamageError:
+                    continue
+                return position + place
+            position += _STRIDE
+        return None
+
+
+def _iter_places(window: bytes, mark: bytes) -> Iterator[int]:
+    """Where a chunk would begin, by the name of its compression, in order."""
+    found = window.find(mark)
+    while found >= 0:
+        if found >= _BEFORE_COMPRESSION:
+            yield found - _BEFORE_COMPRESSION
+        found = window.find(mark, found + 1)
+
+
+def iter_attachments(
+    stream: BinaryIO, directory: Directory, faults: FaultList, name: str
+) -> Iterator[Attachment]:
+    """The attachments of a file that can be read; the others go to `faults`."""
+    for offset, length in directory.attachments:
+        stream.seek(offset + RECORD_HEAD.size)
+        body = stream.read(length - RECORD_HEAD.size)
+        checksum = int.from_bytes(body[-4:], "little")
+        try:
+            if checksum and zlib.crc32(body[:-4]) != checksum:
+                raise DamageError("an attachment's checksum does not fit")
+            record = decoded(records.Attachment.read, body)
+        except DamageError as damage:
+            faults.add(f"{name}: at byte {offset}: {damage}; the attachment is lost")
+            continue
+        yield Attachment(record.name, record.media_type, record.data)
+
+
+def iter_metadata(
+    stream: BinaryIO, directory: Directory, faults: FaultList, name: str
+) -> Iterator[tuple[str, Mapping[str, str]]]:
+    """The metadata records of a file that can be read, with their names; the others go to `faults`."""
+    for offset, length in directory.metadata:
+        stream.seek(offset + RECORD_HEAD.size)
+        try:
+            record = decoded(records.Metadata.read, stream.read(length - RECORD_HEAD.size))
+        except DamageError as damage:
+            faults.add(f"{name}: at byte {offset}: {damage}; the metadata is lost")
+            continue
+        yield record.name, MappingProxyType(record.metadata)
+
+
+def check_kept(stream: BinaryIO, directory: Directory, faults: FaultList, name: str) -> None:
+    """Tell `faults` what cannot be read: whoever copies the log loses it."""
+    for kept in (iter_attachments, iter_metadata):
+        for _ in kept(stream, directory, faults, name):
+            pass

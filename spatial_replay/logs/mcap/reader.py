@@ -1,0 +1,304 @@
+"""MCAP logs of spatial-replay, whole or damaged, in blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from operator import itemgetter
+from pathlib import Path
+from types import MappingProxyType
+from typing import BinaryIO
+
+import numpy as np
+from mcap import records
+
+from spatial_replay.errors import LogError, UsageError
+from spatial_replay.geometry.footprint import Concave
+from spatial_replay.logs.mcap.chunks import (
+    ChunkPlace,
+    DamageError,
+    Declaration,
+    RawMessage,
+    iter_contents,
+    read_records,
+    split_records,
+)
+from spatial_replay.logs.mcap.index import (
+    Directory,
+    check_kept,
+    iter_attachments,
+    iter_metadata,
+    read_directory,
+)
+from spatial_replay.logs.messages import BLOCK_SAMPLES, Attachment, Block, Channel, Messages, Schema
+from spatial_replay.logs.objects.decode import decode_objects
+from spatial_replay.logs.read_options import FaultList
+from spatial_replay.logs.topics import DERIVED, OBJECTS
+from spatial_replay.trace.sample import LATEST_NS
+from spatial_replay.trace.trace import Trace
+
+BLOCK_BYTES = 64 * 2**20
+"""A block of messages is closed when it holds this much, however few its samples are."""
+AFTER_ALL_NS = 2**64
+_SAMPLES = "spatial_replay.ObjectStates"
+_CHANNEL, _PAYLOAD = itemgetter(1), itemgetter(4)
+
+
+@dataclass(frozen=True)
+class McapSource:
+    """An MCAP log with the topic /spatial/objects."""
+
+    path: Path
+    kind: str = "MCAP"
+    concave: Concave = "decompose"
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        """See `Source.iter_blocks`; messages of derived topics are left out.
+
+        Only chunks that reach into the window are read, if the log has an index.
+        """
+        faults = FaultList()
+        with self.path.open("rb") as stream:
+            walk = ChunkWalk(stream, read_directory(stream, faults, self.name), faults, self.name)
+            window = (0 if start_ns is None else start_ns, AFTER_ALL_NS if end_ns is None else end_ns)
+            decoder = _BlockDecoder(self, walk, faults)
+            for messages in _blocks(walk, window, _is_copied):
+                yield decoder.block(messages)
+            check_kept(stream, walk.directory, faults, self.name)
+            rest = faults.take(last=True)
+            if not decoder.any_sample and not walk.sees_objects:
+                raise self._without_objects(walk, decoder.first_fault or next(iter(rest), None))
+            if not decoder.any_sample and window == (0, AFTER_ALL_NS):
+                fault = decoder.first_fault or next(iter(rest), None)
+                if fault is not None:
+                    raise LogError(f"{self.name} holds no sample: {fault}")
+            if rest:
+                yield Block(replace(Trace.from_samples(()), faults=rest))
+
+    def iter_payloads(self, topic: str) -> Iterator[tuple[list[bytes], tuple[str, ...]]]:
+        """The messages of one topic as they are, in order, in lists of bounded size; and what was lost."""
+        faults = FaultList()
+        with self.path.open("rb") as stream:
+            walk = ChunkWalk(stream, read_directory(stream, faults, self.name), faults, self.name)
+            for messages in _blocks(walk, (0, AFTER_ALL_NS), topic.__eq__):
+                yield [payload for *_, payload in messages], faults.take()
+            yield [], faults.take(last=True)
+
+    def attachments(self) -> tuple[Attachment, ...]:
+        """The files kept in the log, those that can be read."""
+        with self.path.open("rb") as stream:
+            directory = read_directory(stream, FaultList(), self.name)
+            return tuple(iter_attachments(stream, directory, FaultList(), self.name))
+
+    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
+        """The metadata records, those that can be read, with their names."""
+        with self.path.open("rb") as stream:
+            directory = read_directory(stream, FaultList(), self.name)
+            return tuple(iter_metadata(stream, directory, FaultList(), self.name))
+
+    def _without_objects(self, walk: ChunkWalk, fault: str | None) -> LogError | UsageError:
+        topics = sorted({channel.topic for channel in walk.channels.values()})
+        if not topics:
+            return LogError(f"{self.name} holds no message" + (f": {fault}" if fault else ""))
+        listed = ", ".join(map(repr, topics[:8])) + (", …" if len(topics) > 8 else "")
+        what = f"no topic {OBJECTS!r} in {self.name}; it has {listed}"
+        if fault:
+            return LogError(f"{what}: {fault}")
+        return UsageError(f"{what}; a mapping file says which of them carry objects")
+
+
+def holds_samples(path: Path) -> bool:
+    """Whether a log has the topic of our samples."""
+    with path.open("rb") as stream:
+        faults = FaultList()
+        walk = ChunkWalk(stream, read_directory(stream, faults, path.name), faults, path.name)
+        return any(
+            channel.topic == OBJECTS and channel.schema is not None and channel.schema.name == _SAMPLES
+            for channel in walk.channels.values()
+        )
+
+
+class ChunkWalk:
+    """The messages of a log by chunk, with the channels that have been declared so far."""
+
+    def __init__(self, stream: BinaryIO, directory: Directory, faults: FaultList, name: str) -> None:
+        self._stream = stream
+        self._faults = faults
+        self._name = name
+        self.directory = directory
+        self._schemas = dict(directory.schemas)
+        self.channels: dict[int, Channel] = {}
+        self.places = sorted(directory.chunks, key=lambda place: (place.start_ns, place.offset))
+        for channel in directory.channels.values():
+            self._declare(channel)
+        if directory.statistics is None:
+            self._find_channels()
+
+    @property
+    def sees_objects(self) -> bool:
+        """Whether a channel with samples has been declared."""
+        return any(channel.topic == OBJECTS for channel in self.channels.values())
+
+    def iter_messages(
+        self, places: Sequence[ChunkPlace], is_wanted: Callable[[str], bool] = lambda topic: True
+    ) -> Iterator[tuple[ChunkPlace, list[RawMessage]]]:
+        """The messages in each place; what is lost of them goes to the faults.
+
+        Args:
+            is_wanted: which topics matter; messages of others may be left out.
+        """
+        for place, content in iter_contents(self._stream, places):
+            passed_over = {number for number, each in self.channels.items() if not is_wanted(each.topic)}
+            yield place, self._messages(place, content, frozenset(passed_over))
+
+    def _messages(
+        self, place: ChunkPlace, read: Callable[[], bytes], passed_over: frozenset[int]
+    ) -> list[RawMessage]:
+        span = f"messages between {place.start_ns} and {place.end_ns} ns"
+        try:
+            content = split_records(read(), passed_over)
+        except DamageError as damage:
+            self._fault(place, f"{damage}; the {span} are lost")
+            return []
+        if content.damage:
+            self._fault(place, f"{content.damage}; of the {span}, {len(content.messages)} could be read")
+        self._take_in(content.declarations)
+        channels = self.channels
+        found = [m for m in content.messages if m[1] in channels and m[0] <= LATEST_NS]
+        if lost := len(content.messages) - len(found):
+            self._fault(place, f"{lost} of the {span} have no channel, or a time beyond 2**63 - 1 ns")
+        return found
+
+    def _find_channels(self) -> None:
+        """Declare all channels of a log without a summary: chunks need not come in the order of time."""
+        for place in sorted(self.places, key=lambda each: each.offset):
+            # the chunk is read again for its messages, and its damage told then
+            with suppress(DamageError):
+                self._take_in(split_records(read_records(self._stream, place)).declarations)
+
+    def _take_in(self, declarations: Iterable[Declaration]) -> None:
+        for record in declarations:
+            if isinstance(record, records.Schema):
+                self._schemas.setdefault(record.id, record)
+            else:
+                self._declare(record)
+
+    def _declare(self, channel: records.Channel) -> None:
+        if channel.id in self.channels:
+            return
+        schema = self._schemas.get(channel.schema_id)
+        self.channels[channel.id] = Channel(
+            channel.topic,
+            channel.message_encoding,
+            Schema(schema.name, schema.encoding, schema.data) if schema else None,
+            MappingProxyType(channel.metadata),
+        )
+
+    def _fault(self, place: ChunkPlace, what: str) -> None:
+        self._faults.add(f"{self._name}: at byte {place.offset}: {what}")
+
+
+def _is_copied(topic: str) -> bool:
+    return topic not in DERIVED
+
+
+def _blocks(
+    walk: ChunkWalk, window: tuple[int, int], is_wanted: Callable[[str], bool]
+) -> Iterator[list[RawMessage]]:
+    """The messages of the topics wanted, in order, in lists of bounded size."""
+    start_ns, end_ns = window
+    places = [place for place in walk.places if place.start_ns < end_ns and place.end_ns >= start_ns]
+    waiting: list[RawMessage] = []
+    size = samples = 0
+    for number, (place, messages) in enumerate(walk.iter_messages(places, is_wanted), 1):
+        wanted = {number for number, channel in walk.channels.items() if is_wanted(channel.topic)}
+        objects = {number for number, channel in walk.channels.items() if channel.topic == OBJECTS}
+        if not wanted.issuperset(walk.channels) or place.start_ns < start_ns or place.end_ns >= end_ns:
+            messages = [m for m in messages if m[1] in wanted and start_ns <= m[0] < end_ns]
+        waiting += messages
+        size += sum(map(len, map(_PAYLOAD, messages)))
+        samples += sum(map(objects.__contains__, map(_CHANNEL, messages)))
+        if number < len(places) and (size >= BLOCK_BYTES or samples >= BLOCK_SAMPLES):
+            waiting.sort()
+            ready = _count_before(waiting, places[number].start_ns)
+            if ready:
+                yield waiting[:ready]
+                waiting = waiting[ready:]
+                size = sum(map(len, map(_PAYLOAD, waiting)))
+                samples = sum(map(objects.__contains__, map(_CHANNEL, waiting)))
+    if waiting:
+        waiting.sort()
+        yield waiting
+
+
+def _count_before(messages: list[RawMessage], time_ns: int) -> int:
+    """How many of the messages, which are in order, are earlier."""
+    count = len(messages)
+    while count and messages[count - 1][0] >= time_ns:
+        count -= 1
+    return count
+
+
+class _BlockDecoder:
+    """Messages to blocks; remembers the latest sample, after which the next one has to come."""
+
+    def __init__(self, source: McapSource, walk: ChunkWalk, faults: FaultList) -> None:
+        self._source = source
+        self._walk = walk
+        self._faults = faults
+        self._latest_ns = -1
+        self.any_sample = False
+        self.first_fault: str | None = None
+
+    def block(self, messages: list[RawMessage]) -> Block:
+        columns = self._columns(messages)
+        samples = [number for number, channel in columns.channels.items() if self._is_objects(channel)]
+        own = np.flatnonzero(np.isin(columns.channel, samples))
+        times = columns.log_time_ns[own]
+        before = np.maximum.accumulate(np.concatenate([[self._latest_ns], times]))
+        for time_ns in times[times <= before[:-1]].tolist():
+            self._fault(f"sample at {time_ns} ns: there is one at this time already")
+        own, self._latest_ns = own[times > before[:-1]], int(before[-1])
+        payloads = [columns.payloads[index] for index in own.tolist()]
+        trace, faults = decode_objects(payloads, columns.log_time_ns[own], concave=self._source.concave)
+        for fault in faults:
+            self._fault(fault)
+        self.any_sample = self.any_sample or len(trace) > 0
+        lost = self._faults.take()
+        self.first_fault = self.first_fault or next(iter(lost), None)
+        return Block(replace(trace, faults=lost), columns)
+
+    def _is_objects(self, channel: Channel) -> bool:
+        if channel.topic != OBJECTS:
+            return False
+        schema = channel.schema.name if channel.schema else "none"
+        if (channel.encoding, schema) != ("protobuf", _SAMPLES):
+            raise LogError(
+                f"{self._source.name}: {OBJECTS!r} has messages of the schema {schema!r}, encoded as"
+                f" {channel.encoding!r}; {_SAMPLES} in protobuf belong there"
+            )
+        return True
+
+    def _columns(self, messages: list[RawMessage]) -> Messages:
+        copied = {
+            number: channel for number, channel in self._walk.channels.items() if channel.topic not in DERIVED
+        }
+        if not messages:
+            return Messages(MappingProxyType(copied))
+        log_time_ns, channel, sequence, publish_time_ns, payloads = zip(*messages, strict=True)
+        return Messages(
+            channels=MappingProxyType(copied),
+            channel=np.array(channel, np.int64),
+            sequence=np.array(sequence, np.int64),
+            log_time_ns=np.array(log_time_ns, np.int64),
+            publish_time_ns=np.array(publish_time_ns, np.uint64).view(np.int64),
+            payloads=payloads,
+        )
+
+    def _fault(self, what: str) -> None:
+        self._faults.add(f"{self._source.name}: {what}")

@@ -1,0 +1,212 @@
+"""What a source yields: a stretch of a log, as samples and as the messages it was made of.
+
+Messages of several channels in the one order that a log has.
+
+Sinks: where messages go.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Protocol
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Integers
+from spatial_replay.trace.trace import Trace
+
+BLOCK_SAMPLES = 8_192
+"""A block holds at most this many samples, so that memory stays bounded whatever the log's length."""
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """How a channel's messages are described: an MCAP schema without its number."""
+
+    name: str
+    encoding: str
+    data: bytes = field(repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A topic with the form of its messages: an MCAP channel without its number.
+
+    Attributes:
+        topic: where messages go, such as /spatial/objects.
+        encoding: of the messages: protobuf, json, cdr, ros1.
+        schema: None where the log has none.
+        metadata: as in the log.
+    """
+
+    topic: str
+    encoding: str
+    schema: Schema | None
+    metadata: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}), hash=False)
+
+
+def _none() -> Integers:
+    return np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Messages:
+    """M messages in the order (time, channel, sequence), byte for byte as in the log.
+
+    Attributes:
+        channels: by the number that `channel` uses.
+        channel: (M,) int64.
+        sequence: (M,) int64.
+        log_time_ns, publish_time_ns: (M,) int64.
+        payloads: M encoded messages.
+    """
+
+    channels: Mapping[int, Channel] = field(default_factory=lambda: MappingProxyType({}))
+    channel: Integers = field(default_factory=_none)
+    sequence: Integers = field(default_factory=_none)
+    log_time_ns: Integers = field(default_factory=_none)
+    publish_time_ns: Integers = field(default_factory=_none)
+    payloads: Sequence[bytes] = ()
+
+    def __len__(self) -> int:
+        return len(self.payloads)
+
+
+def messages_of(channel: Channel, times_ns: Integers, payloads: Sequence[bytes], first: int) -> Messages:
+    """Messages of one channel, published when they are logged, numbered from `first`."""
+    return Messages(
+        channels={0: channel},
+        channel=np.zeros(len(payloads), np.int64),
+        sequence=np.arange(first, first + len(payloads), dtype=np.int64),
+        log_time_ns=times_ns,
+        publish_time_ns=times_ns,
+        payloads=payloads,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """A stretch of a log.
+
+    Attributes:
+        trace: its samples; `trace.faults` tells what was lost since the block before.
+        messages: what a copy of the log has to contain beside what is derived from the samples; empty for
+            sources that are no log of messages. A copy gets a topic for the samples where they have none.
+        remarks: what whoever evaluates it should know, without anything being lost: how many observations are
+            out of date, which transforms are missing.
+    """
+
+    trace: Trace
+    messages: Messages = field(default_factory=Messages)
+    remarks: tuple[str, ...] = ()
+
+
+def merge(streams: Sequence[Messages]) -> Messages:
+    """All messages, in the order of time, topic and sequence.
+
+    Numbers of channels mean nothing outside their log, so channels are ordered by what they are: the same
+    messages come out in the same order from whichever log they were read.
+    """
+    joined = join(streams)
+    return select(joined, np.lexsort((joined.sequence, joined.channel, joined.log_time_ns)))
+
+
+def join(streams: Sequence[Messages]) -> Messages:
+    """All messages, one stream after the other."""
+    channels = sorted(
+        {
+            (_rank(channel), id(channel)): channel
+            for stream in streams
+            for channel in stream.channels.values()
+        }.items()
+    )
+    number: dict[int, int] = {}
+    merged: dict[int, Channel] = {}
+    for (rank, identity), channel in channels:
+        if not merged or _rank(merged[len(merged) - 1]) != rank:
+            merged[len(merged)] = channel
+        number[identity] = len(merged) - 1
+    return Messages(
+        channels=merged,
+        channel=_joined([_renumbered(stream, number) for stream in streams]),
+        sequence=_joined([stream.sequence for stream in streams]),
+        log_time_ns=_joined([stream.log_time_ns for stream in streams]),
+        publish_time_ns=_joined([stream.publish_time_ns for stream in streams]),
+        payloads=[payload for stream in streams for payload in stream.payloads],
+    )
+
+
+def select(messages: Messages, chosen: Integers) -> Messages:
+    """The messages with the given indices, in that order."""
+    return Messages(
+        channels=messages.channels,
+        channel=messages.channel[chosen],
+        sequence=messages.sequence[chosen],
+        log_time_ns=messages.log_time_ns[chosen],
+        publish_time_ns=messages.publish_time_ns[chosen],
+        payloads=[messages.payloads[index] for index in chosen.tolist()],
+    )
+
+
+def _rank(channel: Channel) -> tuple[str, str, str, str, bytes, tuple[tuple[str, str], ...]]:
+    schema = channel.schema
+    name, encoding, data = ("", "", b"") if schema is None else (schema.name, schema.encoding, schema.data)
+    return channel.topic, channel.encoding, name, encoding, data, tuple(sorted(channel.metadata.items()))
+
+
+def _renumbered(stream: Messages, number: dict[int, int]) -> Integers:
+    if not len(stream):
+        return np.zeros(0, np.int64)
+    new = np.zeros(max(stream.channels) + 1, np.int64)
+    for old, channel in stream.channels.items():
+        new[old] = number[id(channel)]
+    return new[stream.channel]
+
+
+def _joined(arrays: Sequence[Integers]) -> Integers:
+    return np.concatenate([np.zeros(0, np.int64), *arrays])
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """A file kept in a log."""
+
+    name: str
+    media_type: str
+    data: bytes = field(repr=False)
+
+
+class Sink(Protocol):
+    """A log being written."""
+
+    def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
+        """Add a metadata record."""
+
+    def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
+        """Add a file to be kept in the log."""
+
+    def write_messages(self, messages: Messages) -> None:
+        """Add messages, in the order given."""
+
+
+class MemorySink:
+    """A log in memory, for tests and for whoever wants messages rather than a file."""
+
+    def __init__(self) -> None:
+        self.metadata: list[tuple[str, Mapping[str, str]]] = []
+        self.attachments: list[Attachment] = []
+        self.messages: list[Messages] = []
+
+    def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
+        """See `Sink`."""
+        self.metadata.append((name, dict(data)))
+
+    def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
+        """See `Sink`."""
+        self.attachments.append(Attachment(name, media_type, data))
+
+    def write_messages(self, messages: Messages) -> None:
+        """See `Sink`."""
+        self.messages.append(messages)

@@ -1,0 +1,386 @@
+"""Messages of /spatial/objects to traces, many samples at a time.
+
+Where the numbers stand in ObjectStates messages of one layout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import Concave
+from spatial_replay.logs.objects.wire import Bytes, LayoutError, Template, Words, rows_of
+from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectState, ObjectStates
+from spatial_replay.trace.observations import Observations, starts_from_counts, trace_from_observations
+from spatial_replay.trace.trace import Trace
+
+UNKNOWN, ZERO = -2, -1
+"""Places of numbers that a message does not hold, after the last slot: they are NaN and 0."""
+
+
+class WrongMessageError(Exception):
+    """Bytes that are no ObjectStates message; its text says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Which slot of a message holds what; `UNKNOWN` or `ZERO` where none does.
+
+    Attributes:
+        time: slot of the sample's time.
+        names, classes: of the J objects.
+        part_counts: (J,) parts of each object.
+        vertex_counts: (P,) vertices of each part.
+        coordinates: (2 V,) slots of x, y, x, y …
+        radius: (P,) slots.
+        yaw, bottom, top, uncertainty: (J,) slots.
+        stated: slots of yaw and height that the message holds, and (of the same length) whose they are.
+        signals: slot of each signal's value.
+    """
+
+    time: int
+    names: tuple[str, ...]
+    classes: tuple[str | None, ...]
+    part_counts: Integers
+    vertex_counts: Integers
+    coordinates: Integers
+    radius: Integers
+    yaw: Integers
+    bottom: Integers
+    top: Integers
+    uncertainty: Integers
+    stated: Integers
+    stated_by: Integers
+    signals: dict[str, int]
+
+
+def parsed(payload: bytes) -> ObjectStates:
+    """The message, or a piece of one, in an encoding.
+
+    Raises:
+        WrongMessageError: it is none, an object has no name or a vertex no y.
+    """
+    message = ObjectStates()
+    try:
+        message.ParseFromString(payload)
+    except DecodeError:
+        raise WrongMessageError("the message is no ObjectStates") from None
+    for state in message.objects:
+        if not state.name:
+            raise WrongMessageError("an object has no name")
+        if any(len(part.coordinates) % 2 for part in state.parts):
+            raise WrongMessageError(f"object {state.name!r} has a part with an odd number of coordinates")
+    return message
+
+
+def layout_of(message: ObjectStates) -> Layout:
+    """Where `Template.of(message)` has its slots.
+
+    Raises:
+        WrongMessageError: a signal without a name, or with one that another has.
+    """
+    slots = _Slots()
+    time = slots.next_if(message.HasField("time_ns"), UNKNOWN)
+    objects = [_object_slots(state, slots) for state in message.objects]
+    signals = {signal.name: slots.next_if(signal.HasField("value"), ZERO) for signal in message.signals}
+    if "" in signals or len(signals) < len(message.signals):
+        raise WrongMessageError("a signal has no name, or one that another signal has")
+    stated = [
+        (slot, index)
+        for index, state in enumerate(objects)
+        for slot in (state.yaw, state.bottom, state.top)
+        if slot != UNKNOWN
+    ]
+    return Layout(
+        time=time,
+        names=tuple(state.name for state in message.objects),
+        classes=tuple(s.class_name if s.HasField("class_name") else None for s in message.objects),
+        part_counts=_integers(len(state.radius) for state in objects),
+        vertex_counts=_integers(len(part.coordinates) // 2 for s in message.objects for part in s.parts),
+        coordinates=_integers(slot for state in objects for slot in state.coordinates),
+        radius=_integers(slot for state in objects for slot in state.radius),
+        yaw=_integers(state.yaw for state in objects),
+        bottom=_integers(state.bottom for state in objects),
+        top=_integers(state.top for state in objects),
+        uncertainty=_integers(state.uncertainty for state in objects),
+        stated=_integers(slot for slot, _ in stated),
+        stated_by=_integers(index for _, index in stated),
+        signals=signals,
+    )
+
+
+class _ObjectSlots(NamedTuple):
+    coordinates: list[int]
+    radius: list[int]
+    yaw: int
+    bottom: int
+    top: int
+    uncertainty: int
+
+
+def _object_slots(state: ObjectState, slots: _Slots) -> _ObjectSlots:
+    """The slots of one object, taken in the order of the fields."""
+    coordinates, radius = list[int](), list[int]()
+    for part in state.parts:
+        coordinates += [slots.next_if(True, UNKNOWN) for _ in part.coordinates]
+        radius.append(slots.next_if(part.HasField("radius"), ZERO))
+    absent = ZERO if state.HasField("height") else UNKNOWN
+    return _ObjectSlots(
+        coordinates,
+        radius,
+        yaw=slots.next_if(state.HasField("yaw"), UNKNOWN),
+        bottom=slots.next_if(state.height.HasField("bottom"), absent),
+        top=slots.next_if(state.height.HasField("top"), absent),
+        uncertainty=slots.next_if(state.HasField("uncertainty"), ZERO),
+    )
+
+
+class _Slots:
+    """Hands out slots one after the other."""
+
+    def __init__(self) -> None:
+        self._next = 0
+
+    def next_if(self, present: bool, otherwise: int) -> int:
+        """The next slot for a number that is present, the given place for one that is not."""
+        if not present:
+            return otherwise
+        self._next += 1
+        return self._next - 1
+
+
+def _integers(values: Iterable[int]) -> Integers:
+    return np.fromiter(values, np.int64)
+
+
+SAMPLES_PER_LAYOUT = 32
+"""Setting up a layout costs about as much as reading this many messages piece by piece."""
+FIRST_LAYOUTS = 16
+
+_TIME_TAG, _OBJECT_TAG, _SIGNAL_TAG = 0x09, 0x12, 0x1A
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Samples (K,) of one layout with their numbers (K, W + 2)."""
+
+    samples: Integers
+    layout: Layout
+    numbers: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class _Pieces:
+    """Encodings, each of a message or of fields of one, with the samples that they belong to."""
+
+    samples: Integers
+    payloads: Sequence[bytes]
+
+    def take(self, places: Integers) -> _Pieces:
+        return _Pieces(self.samples[places], [self.payloads[place] for place in places.tolist()])
+
+
+def decode_objects(
+    payloads: Sequence[bytes], times_ns: Integers, *, concave: Concave = "decompose"
+) -> tuple[Trace, list[str]]:
+    """The trace in encoded ObjectStates messages.
+
+    Args:
+        payloads: T messages.
+        times_ns: (T,) int64, their log times, which increase.
+        concave: what becomes of polygons that are not convex; our own logs hold none.
+
+    Returns:
+        the trace of the messages that can be used, and what is wrong with the others, each with its time.
+    """
+    faults: dict[int, str] = {}
+    groups = _groups(payloads, faults)
+    faults = _wrong_times(groups, times_ns) | _signals_given_twice(groups) | faults
+    trace, wrong = trace_from_observations(_observations(groups, times_ns), concave=concave)
+    faults = wrong | faults
+    if faults.keys() - wrong.keys():
+        kept = np.ones(len(times_ns), np.bool_)
+        kept[list(faults)] = False
+        trace = trace.take(np.searchsorted(trace.times_ns, times_ns[kept]))
+    told = [f"sample at {times_ns[index]} ns: {what}" for index, what in sorted(faults.items())]
+    return trace, told
+
+
+def _groups(payloads: Sequence[bytes], faults: dict[int, str]) -> list[_Group]:
+    """All numbers of all messages, by layout; messages that are none go to `faults`.
+
+    Where most messages have a layout of their own, their objects do not: those are read piece by piece.
+    """
+    whole = _Pieces(np.arange(len(payloads), dtype=np.int64), payloads)
+    groups, left = _grouped(whole, faults, SAMPLES_PER_LAYOUT)
+    if len(left.samples):
+        split = [_fields(payload) or [payload] for payload in left.payloads]
+        samples = np.repeat(left.samples, [len(fields) for fields in split])
+        pieces = _Pieces(samples, [piece for fields in split for piece in fields])
+        groups += _grouped(pieces, faults, 0)[0]
+    return groups
+
+
+def _grouped(pieces: _Pieces, faults: dict[int, str], worth: int) -> tuple[list[_Group], _Pieces]:
+    """Pieces by layout, and what is left over once layouts serve fewer pieces each than they should.
+
+    Args:
+        worth: how many pieces a layout should serve on average, the first few layouts aside.
+    """
+    groups: list[_Group] = []
+    left: list[Integers] = []
+    tried = served = 0
+    lengths = np.fromiter(map(len, pieces.payloads), np.int64, len(pieces.payloads))
+    values, counts = np.unique(lengths, return_counts=True)
+    for length in values[np.argsort(-counts, kind="stable")].tolist():
+        places = np.flatnonzero(lengths == length)
+        if (tried - FIRST_LAYOUTS) * worth > served:
+            left.append(places)
+            continue
+        rows = rows_of([pieces.payloads[place] for place in places.tolist()])
+        while len(places) and (tried - FIRST_LAYOUTS) * worth <= served:
+            tried += 1
+            group, same = _first_group(pieces.take(places[:1]), rows, faults)
+            if group is not None:
+                groups.append(replace(group, samples=pieces.samples[places[same]]))
+            served += int(np.count_nonzero(same))
+            places, rows = places[~same], rows[~same]
+        left.append(places)
+    rest = np.concatenate([np.empty(0, np.int64), *left])
+    return groups, pieces.take(np.sort(rest))
+
+
+def _first_group(
+    first: _Pieces, rows: Bytes, faults: dict[int, str]
+) -> tuple[_Group | None, NDArray[np.bool_]]:
+    """The group of the first of some rows (n, L), if it can be read, and (n,) which rows that settles."""
+    alone = np.zeros(len(rows), np.bool_)
+    alone[0] = True
+    try:
+        message = parsed(first.payloads[0])
+        template, layout = Template.of(message), layout_of(message)
+    except (WrongMessageError, LayoutError) as error:
+        faults[int(first.samples[0])] = str(error)
+        return None, alone
+    same = template.matches(rows) if len(template) == rows.shape[1] else ~alone
+    if same[0]:
+        return _Group(first.samples, layout, _padded(template.words(rows[same]))), same
+    # another encoder's order of fields: the library's own bytes say the same
+    row = rows_of([message.SerializeToString(deterministic=True)])
+    return _Group(first.samples, layout, _padded(template.words(row))), alone
+
+
+def _fields(payload: bytes) -> list[bytes] | None:
+    """The fields of a message, each as a message of its own; None if it is not made of known fields once."""
+    pieces: list[bytes] = []
+    begin, end, times = 0, len(payload), 0
+    while begin < end:
+        tag, position = payload[begin], begin + 1
+        if tag == _TIME_TAG:
+            position += 8
+            times += 1
+        elif tag in (_OBJECT_TAG, _SIGNAL_TAG):
+            length = shift = 0
+            while position < end:
+                length |= (payload[position] & 0x7F) << shift
+                shift += 7
+                position += 1
+                if payload[position - 1] < 0x80:
+                    break
+            position += length
+        else:
+            return None
+        if position > end or times > 1:
+            return None
+        pieces.append(payload[begin:position])
+        begin = position
+    return pieces
+
+
+def _wrong_times(groups: Sequence[_Group], times_ns: Integers) -> dict[int, str]:
+    stated = np.zeros(len(times_ns), np.int64)
+    has_time = np.zeros(len(times_ns), np.bool_)
+    for group in groups:
+        if group.layout.time != UNKNOWN:
+            stated[group.samples] = np.ascontiguousarray(group.numbers[:, group.layout.time]).view(np.int64)
+            has_time[group.samples] = True
+    wrong = np.flatnonzero(has_time & (stated != times_ns)).tolist()
+    faults = {index: f"time_ns is {stated[index]}, not the log time of the message" for index in wrong}
+    return faults | dict.fromkeys(np.flatnonzero(~has_time).tolist(), "the message has no time_ns")
+
+
+def _signals_given_twice(groups: Sequence[_Group]) -> dict[int, str]:
+    faults: dict[int, str] = {}
+    for name in {name for group in groups for name in group.layout.signals}:
+        given = np.concatenate([group.samples for group in groups if name in group.layout.signals])
+        samples, counts = np.unique(given, return_counts=True)
+        faults |= {int(index): f"signal {name!r} is there twice" for index in samples[counts > 1]}
+    return faults
+
+
+def _padded(words: Words) -> Floats:
+    # the last two places, UNKNOWN and ZERO
+    padding = np.broadcast_to([np.nan, 0.0], (len(words), 2))
+    return np.concatenate([words.view(np.float64), padding], axis=1)
+
+
+def _observations(groups: Sequence[_Group], times_ns: Integers) -> Observations:
+    names = {name: code for code, name in enumerate(dict.fromkeys(n for g in groups for n in g.layout.names))}
+    ordered = sorted({c for g in groups for c in g.layout.classes}, key=lambda c: (c is not None, c or ""))
+    classes = {name: code for code, name in enumerate(ordered)}
+
+    def column(field: str) -> Floats:
+        picked = (g.numbers[:, getattr(g.layout, field)].ravel() for g in groups)
+        return np.concatenate([np.empty(0), *picked])
+
+    def repeated(values: Iterable[tuple[_Group, Sequence[int] | Integers]]) -> Integers:
+        tiled = (np.tile(np.asarray(v, np.int64), len(g.samples)) for g, v in values)
+        return np.concatenate([np.empty(0, np.int64), *tiled])
+
+    signals = sorted({name for g in groups for name in g.layout.signals})
+    return Observations(
+        times_ns=times_ns,
+        sample=np.concatenate(
+            [np.empty(0, np.int64), *(np.repeat(g.samples, len(g.layout.names)) for g in groups)]
+        ),
+        name=repeated((g, [names[n] for n in g.layout.names]) for g in groups),
+        names=list(names),
+        class_code=repeated((g, [classes[c] for c in g.layout.classes]) for g in groups),
+        classes=tuple(ordered),
+        yaw=column("yaw"),
+        uncertainty=column("uncertainty"),
+        shapes=FootprintBatch(
+            part_start=starts_from_counts(repeated((g, g.layout.part_counts) for g in groups)),
+            vertex_start=starts_from_counts(repeated((g, g.layout.vertex_counts) for g in groups)),
+            vertices=column("coordinates").reshape(-1, 2),
+            radius=column("radius"),
+            bottom=column("bottom"),
+            top=column("top"),
+        ),
+        invalid=np.concatenate([np.empty(0, np.bool_), *map(_invalid, groups)]),
+        signals={name: _signal(name, groups, len(times_ns)) for name in signals},
+    )
+
+
+def _invalid(group: _Group) -> NDArray[np.bool_]:
+    """(K * J,) where an orientation or a height is stated, but is no number."""
+    layout = group.layout
+    invalid = np.zeros((len(group.samples), len(layout.names)), np.bool_)
+    for slot, owner in zip(layout.stated.tolist(), layout.stated_by.tolist(), strict=True):
+        invalid[:, owner] |= ~np.isfinite(group.numbers[:, slot])
+    return invalid.ravel()
+
+
+def _signal(name: str, groups: Sequence[_Group], count: int) -> Floats:
+    values = np.full(count, np.nan)
+    for group in groups:
+        if name in group.layout.signals:
+            values[group.samples] = group.numbers[:, group.layout.signals[name]]
+    return values

@@ -1,0 +1,145 @@
+"""How a log is to be read, where the log itself does not say.
+
+What was lost while reading, in words: the first ones in full, the others counted.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from fractions import Fraction
+from os import PathLike, fspath
+from reprlib import repr as shortened
+from typing import Literal, cast, get_args
+
+from spatial_replay.errors import UsageError
+from spatial_replay.geometry.footprint import Concave
+
+Lost = Literal["drop", "keep"]
+"""What becomes of rows that say that an object is out of the picture."""
+
+OnTimeJump = Literal["error", "split"]
+"""What becomes of a log whose clock jumps back, as that of a simulation that was started again."""
+
+FASTEST_RATE = 10**9
+"""Frames a second; more of them would share a nanosecond."""
+
+_CHOICES = {"lost": get_args(Lost), "on_time_jump": get_args(OnTimeJump), "concave": get_args(Concave)}
+
+
+@dataclass(frozen=True, slots=True)
+class ReadOptions:
+    """How a log is to be read; the defaults fit every log.
+
+    Attributes:
+        concave: what becomes of polygons that are not convex.
+        mapping: the mapping file that says which topics carry which objects.
+        on_time_jump: what becomes of a log of messages whose clock jumps back.
+        rate: frames a second, for formats that count frames.
+        lost: what becomes of rows that say that their object is out of the picture.
+
+    Raises:
+        UsageError: a value that an option does not have.
+    """
+
+    concave: Concave = "decompose"
+    mapping: str | PathLike[str] | None = None
+    on_time_jump: OnTimeJump = "error"
+    rate: float | None = None
+    lost: Lost = "drop"
+
+    def __post_init__(self) -> None:
+        for name, choices in _CHOICES.items():
+            value = getattr(self, name)
+            if value not in choices:
+                raise UsageError(f"{name} is {shortened(value)}; give one of {', '.join(choices)}")
+        if self.mapping is not None and not isinstance(self.mapping, (str, PathLike)):
+            raise UsageError(f"mapping is {shortened(self.mapping)}; give the path of a mapping file")
+        if self.rate is not None:
+            _check_rate(self.rate)
+
+    def given(self) -> dict[str, object]:
+        """The options that differ from their defaults, but for `concave`, which every format takes."""
+        return {
+            field.name: getattr(self, field.name)
+            for field in fields(self)
+            if field.name != "concave" and getattr(self, field.name) != field.default
+        }
+
+    def refuse_except(self, taken: frozenset[str], kind: str, log: str) -> None:
+        """Refuse options that say nothing to a format.
+
+        Raises:
+            UsageError: an option was given that is not among those that are taken.
+        """
+        for name, value in self.given().items():
+            if name not in taken:
+                shown = fspath(cast("PathLike[str]", value)) if name == "mapping" else value
+                reason = f"{kind}, {_REASONS[name]}"
+                raise UsageError(f"{name} {shown!r} is not needed: {log} is {reason}; leave it out")
+
+
+_REASONS = {
+    "mapping": "which names its objects itself",
+    "on_time_jump": "whose times never go back",
+    "rate": "which has times, not numbers of frames",
+    "lost": "which has no rows marked as lost",
+}
+
+
+def _check_rate(rate: object) -> None:
+    if isinstance(rate, bool) or not isinstance(rate, (int, float)) or not 0 < rate <= FASTEST_RATE:
+        raise UsageError(
+            f"rate is {shortened(rate)}; give frames a second, above 0 and at most {FASTEST_RATE}"
+        )
+
+
+def frame_times(rate: float) -> Fraction:
+    """Nanoseconds from one frame to the next, exactly; a rate of 29.97 is taken as it is written."""
+    return Fraction(10**9) / Fraction(repr(float(rate)))
+
+
+KEPT_IN_FULL = 100
+"""How many faults of one log are told one by one."""
+
+_MORE = re.compile(r"… and (\d+) more faults? of")
+
+
+def count_of(faults: Sequence[str]) -> int:
+    """How many faults are told, those among them that a last line only counts."""
+    uncounted = _MORE.match(faults[-1]) if faults else None
+    return len(faults) + (int(uncounted[1]) - 1 if uncounted else 0)
+
+
+class FaultList:
+    """Faults as they are found; `take` hands over those that nobody has taken yet."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._moved = 0
+        self._waiting: list[str] = []
+
+    def __len__(self) -> int:
+        return self._count
+
+    def add(self, fault: str) -> None:
+        self._count += 1
+        if self._count <= KEPT_IN_FULL:
+            self._waiting.append(fault)
+
+    def move_to(self, other: FaultList) -> None:
+        """Hand over to another list what nobody has taken yet, counted as here."""
+        for fault in self.take():
+            other.add(fault)
+        beyond = max(0, self._count - KEPT_IN_FULL)
+        other._count += beyond - self._moved
+        self._moved = beyond
+
+    def take(self, *, last: bool = False) -> tuple[str, ...]:
+        """The faults since the last call; with `last`, a line that counts those beyond the limit."""
+        taken, self._waiting = self._waiting, []
+        if last and self._count > KEPT_IN_FULL:
+            more = self._count - KEPT_IN_FULL
+            taken.append(f"… and {more} more fault{'s' if more > 1 else ''} of this kind or another")
+        return tuple(taken)

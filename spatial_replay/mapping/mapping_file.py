@@ -1,0 +1,335 @@
+"""Mapping files: from text to values, with all faults at once.
+
+The entry of one topic in a mapping file, as a value.
+
+The published JSON Schema of mapping files, and its faults in words.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Iterator
+from collections.abc import Mapping as Table
+from decimal import Decimal
+from functools import cache
+from importlib.resources import files
+from math import pi
+from os import PathLike
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from spatial_replay.errors import MissingFileError, UsageError
+from spatial_replay.mapping.field_paths import FieldPath, Template
+from spatial_replay.mapping.model import (
+    LogMapping,
+    Measure,
+    Sampling,
+    Shape,
+    Signal,
+    Stamp,
+    TopicMapping,
+    Translation,
+    Uncertainty,
+    age_ns,
+    duration_ns,
+    unit_ns,
+)
+from spatial_replay.mapping.yaml_document import LARGEST_TEXT, Document, Place, Value, document_from_text
+from spatial_replay.text import nearest_hint
+
+if TYPE_CHECKING:
+    from jsonschema.protocols import Validator
+
+_SIGNAL_KEYS = frozenset({"signals", "max_age", "clock", "stamp"})
+"""Keys that say nothing about objects: a topic with signals and these alone has no objects."""
+
+
+def topic_mapping_from_values(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) -> TopicMapping:
+    """An entry that follows the schema.
+
+    Args:
+        shapes: the shapes by name.
+
+    Raises:
+        UsageError: a path or a template that the schema let pass.
+    """
+    if "objects" in entry:
+        FieldPath.of(entry["objects"])
+    if "name" in entry:
+        Template.of(entry["name"])
+    frame = entry.get("frame")
+    yaw = entry.get("yaw")
+    position = entry.get("position")
+    return TopicMapping(
+        topic=topic,
+        reads_objects="signals" not in entry or not entry.keys() <= _SIGNAL_KEYS,
+        type=entry.get("type"),
+        objects=entry.get("objects"),
+        complete=entry.get("complete"),
+        name=entry.get("name"),
+        class_name=_class(entry.get("class")),
+        position=tuple(position) if isinstance(position, list) else position,
+        orientation=entry.get("orientation"),
+        yaw=yaw["field"] if isinstance(yaw, dict) else yaw,
+        yaw_scale=pi / 180 if isinstance(yaw, dict) and yaw.get("unit") == "deg" else 1.0,
+        polygon=entry.get("polygon"),
+        shape=_shape(entry.get("shape"), shapes),
+        height=_height(entry.get("height")),
+        uncertainty=_uncertainty(entry.get("uncertainty")),
+        frame=frame.removeprefix("/") if isinstance(frame, str) else None,
+        frame_field=frame["field"] if isinstance(frame, dict) else None,
+        stamp=_stamp(entry.get("stamp")),
+        signals=tuple(_signal(name, value) for name, value in entry.get("signals", {}).items()),
+        only=tuple(entry.get("only", ())),
+        without=tuple(entry.get("except", ())),
+        max_age_ns=age_ns(entry["max_age"]) if "max_age" in entry else None,
+        clock=entry.get("clock"),
+    )
+
+
+def _class(value: Any) -> str | Translation | None:
+    if not isinstance(value, dict):
+        return None if value is None else str(value)
+    return Translation(
+        value["field"], MappingProxyType(dict(value.get("names", {}))), value.get("else"), "else" in value
+    )
+
+
+def _shape(value: Any, shapes: Table[str, Any]) -> Shape | None:
+    if value is None:
+        return None
+    if isinstance(value, str):
+        value = shapes[value]
+    x, y = value.get("offset", (0.0, 0.0))
+    offset = (float(x), float(y))
+    if "box" in value:
+        return Shape("box", tuple(_measure(size) for size in value["box"]), offset=offset)
+    if "disc" in value:
+        return Shape("disc", (_measure(value["disc"]),), offset=offset)
+    corners = tuple((float(x), float(y)) for x, y in value["polygon"])
+    return Shape("polygon", points=corners, offset=offset)
+
+
+def _height(value: Any) -> tuple[Measure, Measure] | None:
+    return None if value is None else (_measure(value[0]), _measure(value[1]))
+
+
+def _uncertainty(value: Any) -> Uncertainty | None:
+    if value is None:
+        return None
+    if isinstance(value, dict):
+        return Uncertainty(value["covariance"], True, float(value.get("sigmas", 2.0)))
+    if value == "covariance":
+        return Uncertainty("", True)
+    return Uncertainty(_measure(value))
+
+
+def _measure(value: Any) -> Measure:
+    return value if isinstance(value, str) else float(value)
+
+
+def _stamp(value: Any) -> Stamp | None:
+    if value is None:
+        return None
+    return (
+        Stamp(value["field"], unit_ns(value.get("unit", "ns"))) if isinstance(value, dict) else Stamp(value)
+    )
+
+
+def _signal(name: str, value: Any) -> Signal:
+    return (
+        Signal(name, value["field"], value.get("unit", ""))
+        if isinstance(value, dict)
+        else Signal(name, value)
+    )
+
+
+SCHEMA_FILE = "mapping.schema.json"
+
+
+def schema_faults(value: Value) -> Iterator[tuple[Place, str]]:
+    """Where a value does not follow the schema, and what belongs there, in the order of the schema."""
+    for error in _validator().iter_errors(value):
+        yield from _told(error)
+
+
+@cache
+def _validator() -> Validator:
+    from jsonschema import Draft202012Validator
+
+    text = files(__package__).joinpath(SCHEMA_FILE).read_text(encoding="utf-8")
+    return Draft202012Validator(json.loads(text))
+
+
+def _told(error: Any) -> Iterator[tuple[Place, str]]:
+    place: Place = tuple(error.absolute_path)
+    keyword = error.validator
+    if keyword == "anyOf" and isinstance(error.instance, dict | list):
+        for branch in _branches(error):
+            if not any(_is_of_another_kind(each, len(place)) for each in branch):
+                for each in branch:
+                    yield from _told(each)
+                return
+    if keyword == "additionalProperties" and isinstance(error.instance, dict):
+        known = list(error.schema.get("properties", {}))
+        for key in error.instance:
+            if key not in known:
+                hint = nearest_hint(key, known) or f"known are {', '.join(known)}"
+                yield (*place, key), f"unknown key; {hint}"
+    elif keyword == "required":
+        missing = [key for key in error.validator_value if key not in error.instance]
+        yield place, f"the key {missing[0]!r} is missing"
+    elif "propertyNames" in error.absolute_schema_path:
+        yield place, "a name is empty; give it a name"
+    else:
+        wanted = error.schema.get("description", _around(error))
+        yield place, f"{shown(error.instance)} where this belongs: {wanted}"
+
+
+def _around(error: Any) -> str:
+    """What belongs where a rule without a description of its own was broken: that of the rule around it."""
+    parent = error.parent
+    while parent is not None and "description" not in parent.schema:
+        parent = parent.parent
+    fallback = f"something that fits {error.validator} {error.validator_value}"
+    return fallback if parent is None else str(parent.schema["description"])
+
+
+def _branches(error: Any) -> Iterable[list[Any]]:
+    branches: dict[int, list[Any]] = {}
+    for each in error.context:
+        branches.setdefault(each.schema_path[0], []).append(each)
+    return branches.values()
+
+
+def _is_of_another_kind(error: Any, depth: int) -> bool:
+    """Whether an alternative failed because the value as a whole is of another kind."""
+    return error.validator == "type" and len(error.absolute_path) == depth
+
+
+def shown(value: object) -> str:
+    """A value in a few words."""
+    if isinstance(value, dict):
+        return f"keys {', '.join(map(str, value))[:60]}" if value else "{}"
+    text = json.dumps(value, ensure_ascii=False, default=str)
+    return text if len(text) <= 60 else text[:59] + "…"
+
+
+_MOST_FAULTS = 100
+
+
+def load_mapping(path: str | PathLike[str]) -> LogMapping:
+    """The mapping in a file.
+
+    Raises:
+        MissingFileError: there is no such file.
+        UsageError: the file is no mapping; all its faults are listed.
+    """
+    try:
+        with Path(path).open("rb") as stream:
+            data = stream.read(LARGEST_TEXT + 1)
+    except (OSError, ValueError) as error:
+        raise MissingFileError.of(path, error) from None
+    name = Path(path).name
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise UsageError(f"{name}:{line}: a byte is not UTF-8; give a text file") from None
+    return parse_mapping(text, name)
+
+
+def parse_mapping(text: str, name: str = "mapping") -> LogMapping:
+    """The mapping that a text holds.
+
+    Raises:
+        UsageError: it is no mapping; all its faults are listed.
+    """
+    document = document_from_text(text)
+    faults = list(document.faults)
+    if not faults:
+        told = dict([*schema_faults(document.value), *_contradictions(document)])
+        faults = [
+            (document.line_of(place), f"{_text_from_place(place)}{what}") for place, what in told.items()
+        ]
+    if faults:
+        raise UsageError(_listed(name, faults))
+    try:
+        return _mapping(document, name)
+    except UsageError as error:
+        raise UsageError(f"{name}: {error}") from None
+
+
+def _mapping(document: Document, name: str) -> LogMapping:
+    value: Any = document.value
+    shapes = value.get("shapes") or {}
+    sample = value.get("sample", {})
+    canonical = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=True)
+    fixed_frame = value.get("fixed_frame")
+    return LogMapping(
+        name=name,
+        sha256=hashlib.sha256(canonical.encode("utf-8", "surrogatepass")).hexdigest(),
+        topics=tuple(
+            topic_mapping_from_values(topic, entry or {}, shapes) for topic, entry in value["topics"].items()
+        ),
+        fixed_frame=None if fixed_frame is None else fixed_frame.removeprefix("/"),
+        clock=value.get("clock", "log"),
+        sampling=Sampling(sample.get("topic"), duration_ns(sample["every"]) if "every" in sample else None),
+        max_age_ns=age_ns(value["max_age"]) if "max_age" in value else None,
+    )
+
+
+def _contradictions(document: Document) -> list[tuple[Place, str]]:
+    """What the schema cannot say: names of shapes that are not there, keys that exclude each other."""
+    value = document.value
+    if not isinstance(value, dict) or not isinstance(value.get("topics"), dict):
+        return []
+    listed = value.get("shapes")
+    shapes = list(listed) if isinstance(listed, dict) else []
+    faults: list[tuple[Place, str]] = []
+    topics: Any = value["topics"]
+    for topic, entry in topics.items():
+        if not isinstance(entry, dict):
+            continue
+        shape = entry.get("shape")
+        if isinstance(shape, str) and shape not in shapes:
+            hint = nearest_hint(shape, shapes) or f"shapes are {', '.join(shapes) or 'none'}"
+            faults.append((("topics", topic, "shape"), f"there is no shape {shape[:60]!r}; {hint}"))
+        for one, other in (("polygon", "shape"), ("orientation", "yaw")):
+            if one in entry and other in entry:
+                faults.append((("topics", topic, other), f"there is {one!r} already; give one of the two"))
+    for place, text in _durations(value):
+        if isinstance(text, str) and text[:1].isdigit() and Decimal(0) == _leading_number(text):
+            faults.append((place, f"{text!r} is no time; give a duration above 0"))
+    return faults
+
+
+def _durations(value: Any) -> list[tuple[Place, Any]]:
+    sample = value.get("sample")
+    found: list[tuple[Place, Any]] = [(("max_age",), value.get("max_age"))]
+    if isinstance(sample, dict):
+        found.append((("sample", "every"), sample.get("every")))
+    for topic, entry in value["topics"].items():
+        if isinstance(entry, dict):
+            found.append((("topics", topic, "max_age"), entry.get("max_age")))
+    return found
+
+
+def _leading_number(text: str) -> Decimal | None:
+    digits = text.rstrip("nums")
+    return Decimal(digits) if digits.replace(".", "", 1).isdigit() else None
+
+
+def _text_from_place(place: Place) -> str:
+    text = ""
+    for step in place:
+        text += f"[{step}]" if isinstance(step, int) else f"{'.' if text else ''}{step[:80]}"
+    return f"{text}: " if text else ""
+
+
+def _listed(name: str, faults: list[tuple[int, str]]) -> str:
+    lines = [f"{name}:{line}: {what}" for line, what in sorted(faults)]
+    more = len(lines) - _MOST_FAULTS
+    return "\n".join(lines[:_MOST_FAULTS] + ([f"… and {more} more"] if more > 0 else []))

@@ -1,0 +1,300 @@
+"""How objects are read from messages: the built-in types, and any other by its fields."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping as Table
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Literal, TypeAlias
+
+from spatial_replay.mapping.model import Measure, Shape, Stamp, TopicMapping, Translation, Uncertainty
+
+Alternatives: TypeAlias = tuple[str, ...]
+"""Field paths of which the first that leads somewhere is taken."""
+
+_NO_CLASSES: Table[str, str | None] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """Where in the messages of a topic objects stand, as far as it is known before the first one is seen.
+
+    Attributes:
+        objects: path of the list of objects; "" for a message that is one object.
+        complete: whether a message lists every object there is.
+        stays: whether an object stays until it is deleted, however long nothing is said of it.
+        name: template.
+        position: each the path of a point, or the paths of its coordinates.
+        sizes: each the paths of length, width and maybe height of a box.
+        solids: whether the parts of an object come from a message of a kind of its own.
+        frame, stamp: from the object, or with `$.` from the message.
+        angle_scale: radians in one unit of `yaw`.
+    """
+
+    objects: str = ""
+    complete: bool = False
+    stays: bool = False
+    name: str = "{topic}"
+    position: tuple[Alternatives, ...] = ()
+    orientation: Alternatives = ()
+    yaw: Alternatives = ()
+    angle_scale: float = 1.0
+    polygon: Alternatives = ()
+    sizes: tuple[Alternatives, ...] = ()
+    class_name: str | None = None
+    class_field: Alternatives = ()
+    class_table: Table[str, str | None] = field(default_factory=lambda: _NO_CLASSES, hash=False)
+    class_other: str | None = None
+    class_has_other: bool = False
+    covariance: str = ""
+    frame: Alternatives = ("$.header.frame_id",)
+    frame_name: str | None = None
+    stamp: tuple[Stamp, ...] = (Stamp("$.header.stamp"),)
+    solids: Literal["", "marker", "scene", "primitive"] = ""
+    shape: Shape | None = None
+    height: tuple[Measure, Measure] | None = None
+    uncertainty: Uncertainty | None = None
+    is_generic: bool = False
+
+
+_OBJECT_CLASSES = MappingProxyType(
+    {
+        str(value): name
+        for value, name in enumerate(
+            (
+                "unknown",
+                "unknown_small",
+                "unknown_medium",
+                "unknown_big",
+                "pedestrian",
+                "bike",
+                "car",
+                "truck",
+                "motorcycle",
+                "other_vehicle",
+                "barrier",
+                "sign",
+            )
+        )
+    }
+)
+
+_IN_OBJECT = {"frame": ("header.frame_id",), "stamp": (Stamp("header.stamp"),)}
+_TIMESTAMPED = {"frame": ("frame_id",), "stamp": (Stamp("timestamp"),)}
+_RESULT_CLASS = ("results[0].hypothesis.class_id", "results[0].id", "results[0].hypothesis.id")
+
+_POSE = Reading(position=(("pose.position",),), orientation=("pose.orientation",))
+_TRANSFORM = Reading(
+    name="{child_frame_id}",
+    position=(("transform.translation",),),
+    orientation=("transform.rotation",),
+    frame=("header.frame_id",),
+    stamp=(Stamp("header.stamp"),),
+)
+_FRAME_TRANSFORM = Reading(
+    name="{child_frame_id}",
+    position=(("translation",),),
+    orientation=("rotation",),
+    frame=("parent_frame_id",),
+    stamp=(Stamp("timestamp"),),
+)
+_MARKER = Reading(
+    name="{ns|topic}_{id}",
+    stays=True,
+    solids="marker",
+    frame=("header.frame_id",),
+    stamp=(Stamp("header.stamp"),),
+)
+
+BUILT_IN: Table[str, Reading] = MappingProxyType(
+    {
+        "geometry_msgs/PoseStamped": _POSE,
+        "geometry_msgs/PoseWithCovarianceStamped": Reading(
+            position=(("pose.pose.position",),),
+            orientation=("pose.pose.orientation",),
+            covariance="pose.covariance",
+        ),
+        "nav_msgs/Odometry": Reading(
+            position=(("pose.pose.position",),),
+            orientation=("pose.pose.orientation",),
+            covariance="pose.covariance",
+        ),
+        "geometry_msgs/PoseArray": Reading(
+            objects="poses[*]",
+            complete=True,
+            name="{topic}_{index}",
+            position=(("position",),),
+            orientation=("orientation",),
+        ),
+        "geometry_msgs/PolygonStamped": Reading(polygon=("polygon.points",)),
+        "geometry_msgs/TransformStamped": _TRANSFORM,
+        "tf2_msgs/TFMessage": replace(_TRANSFORM, objects="transforms[*]"),
+        "tf/tfMessage": replace(_TRANSFORM, objects="transforms[*]"),
+        "visualization_msgs/Marker": _MARKER,
+        "visualization_msgs/MarkerArray": replace(_MARKER, objects="markers[*]"),
+        "vision_msgs/Detection2DArray": Reading(
+            objects="detections[*]",
+            complete=True,
+            name="{topic}_{id|tracking_id|index}",
+            position=(
+                ("bbox.center.position.x", "bbox.center.position.y"),
+                ("bbox.center.x", "bbox.center.y"),
+            ),
+            yaw=("bbox.center.theta",),
+            sizes=(("bbox.size_x", "bbox.size_y"),),
+            class_field=_RESULT_CLASS,
+        ),
+        "vision_msgs/Detection3DArray": Reading(
+            objects="detections[*]",
+            complete=True,
+            name="{topic}_{id|tracking_id|index}",
+            position=(("bbox.center.position",),),
+            orientation=("bbox.center.orientation",),
+            sizes=(("bbox.size.x", "bbox.size.y", "bbox.size.z"),),
+            class_field=_RESULT_CLASS,
+        ),
+        "apriltag_msgs/AprilTagDetectionArray": Reading(
+            objects="detections[*]",
+            complete=True,
+            name="tag{id}",
+            polygon=("corners",),
+            class_field=("family",),
+        ),
+        "derived_object_msgs/ObjectArray": Reading(
+            objects="objects[*]",
+            complete=True,
+            name="object_{id}",
+            position=(("pose.position",),),
+            orientation=("pose.orientation",),
+            solids="primitive",
+            class_field=("classification",),
+            class_table=_OBJECT_CLASSES,
+        ),
+        "foxglove/SceneUpdate": Reading(
+            objects="entities[*]",
+            stays=True,
+            name="{id|index}",
+            solids="scene",
+            **_TIMESTAMPED,  # type: ignore[arg-type]
+        ),
+        "foxglove/PosesInFrame": Reading(
+            objects="poses[*]",
+            complete=True,
+            name="{topic}_{index}",
+            position=(("position",),),
+            orientation=("orientation",),
+            frame=("$.frame_id",),
+            stamp=(Stamp("$.timestamp"),),
+        ),
+        "foxglove/PoseInFrame": replace(_POSE, frame=("$.frame_id",), stamp=(Stamp("$.timestamp"),)),
+        "foxglove/FrameTransform": _FRAME_TRANSFORM,
+        "foxglove/FrameTransforms": replace(_FRAME_TRANSFORM, objects="transforms[*]"),
+    }
+)
+
+TRANSFORM_TYPES = frozenset(
+    {
+        "geometry_msgs/TransformStamped",
+        "tf2_msgs/TFMessage",
+        "tf/tfMessage",
+        "foxglove/FrameTransform",
+        "foxglove/FrameTransforms",
+    }
+)
+
+GENERIC = Reading(
+    position=(
+        ("pose.pose.position",),
+        ("pose.position",),
+        ("position",),
+        ("base.position",),
+        ("pose",),
+        ("center",),
+        ("centre",),
+        ("x", "y", "z"),
+        ("x", "y"),
+    ),
+    orientation=("pose.pose.orientation", "pose.orientation", "orientation"),
+    yaw=("theta", "yaw", "heading", "pose.theta", "pose.yaw", "base.orientation.yaw"),
+    frame=("header.frame_id", "$.header.frame_id", "frame_id", "$.frame_id"),
+    stamp=tuple(
+        Stamp(path)
+        for path in ("header.stamp", "$.header.stamp", "stamp", "$.stamp", "timestamp", "$.timestamp")
+    ),
+    is_generic=True,
+)
+"""How an unknown type is read: by the names that fields of poses usually have."""
+
+
+def short_type(name: str) -> str:
+    """`pkg/Name` of a type as ROS 1, ROS 2, protobuf or Foxglove's JSON schemas write it."""
+    words = re.split(r"[/.]|::", name)
+    short = f"{words[0]}/{words[-1]}" if len(words) > 1 else name
+    return re.sub(r"^(ros_)?foxglove_msgs/", "foxglove/", short)
+
+
+def reading_of(topic_type: str, mapping: TopicMapping) -> Reading:
+    """How a topic is read: as its type is, but for what its mapping says."""
+    kept = BUILT_IN.get(short_type(mapping.type or topic_type), GENERIC)
+    is_list = mapping.objects is not None
+    if is_list and mapping.objects != kept.objects:
+        # the type's own list is not what is wanted, so neither are its fields
+        kept = GENERIC
+    changes: dict[str, object] = {}
+    if is_list:
+        changes["objects"] = mapping.objects
+        changes["complete"] = kept.complete or kept.is_generic
+    if mapping.complete is not None:
+        changes["complete"] = mapping.complete
+    if mapping.name is not None:
+        changes["name"] = mapping.name
+    elif is_list and kept.is_generic:
+        changes["name"] = "{topic}_{id|index}"
+    changes |= _pose_changes(mapping) | _shape_changes(mapping) | _class_changes(mapping.class_name)
+    if mapping.frame is not None or mapping.frame_field is not None:
+        changes |= {
+            "frame_name": mapping.frame,
+            "frame": (mapping.frame_field,) if mapping.frame_field else (),
+        }
+    if mapping.stamp is not None:
+        changes["stamp"] = (mapping.stamp,)
+    if mapping.uncertainty is not None:
+        changes["uncertainty"] = mapping.uncertainty
+    return replace(kept, **changes)  # type: ignore[arg-type]
+
+
+def _pose_changes(mapping: TopicMapping) -> dict[str, object]:
+    changes: dict[str, object] = {}
+    if mapping.position is not None:
+        paths = (mapping.position,) if isinstance(mapping.position, str) else mapping.position
+        changes |= {"position": (paths,), "polygon": (), "solids": ""}
+    if mapping.orientation is not None:
+        changes |= {"orientation": (mapping.orientation,), "yaw": ()}
+    if mapping.yaw is not None:
+        changes |= {"yaw": (mapping.yaw,), "orientation": (), "angle_scale": mapping.yaw_scale}
+    return changes
+
+
+def _shape_changes(mapping: TopicMapping) -> dict[str, object]:
+    changes: dict[str, object] = {}
+    if mapping.polygon is not None:
+        changes |= {"polygon": (mapping.polygon,), "sizes": (), "solids": ""}
+    if mapping.shape is not None:
+        changes |= {"shape": mapping.shape, "polygon": (), "sizes": (), "solids": ""}
+    if mapping.height is not None:
+        changes["height"] = mapping.height
+    return changes
+
+
+def _class_changes(class_name: str | Translation | None) -> dict[str, object]:
+    if class_name is None:
+        return {}
+    if isinstance(class_name, str):
+        return {"class_name": class_name, "class_field": ()}
+    return {
+        "class_field": (class_name.field,),
+        "class_table": class_name.table,
+        "class_other": class_name.other,
+        "class_has_other": class_name.has_other,
+    }

@@ -1,0 +1,161 @@
+"""A mapping compared with the topics of a log: what has to be read, and how."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from spatial_replay.bags.reader import Topic
+from spatial_replay.errors import UsageError
+from spatial_replay.mapping.message_types import BUILT_IN, TRANSFORM_TYPES, Reading, reading_of, short_type
+from spatial_replay.mapping.model import DEFAULT_MAX_AGE_NS, FOREVER_NS, Clock, LogMapping, TopicMapping
+from spatial_replay.mapping.transforms import HISTORY_NS
+from spatial_replay.text import nearest_hint
+
+DISORDER_NS = 10**9
+"""How far messages may be out of order."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedTopic:
+    """How one topic is read.
+
+    Attributes:
+        mapping: of the topic; None where it is read for transforms or times only.
+        reading: how its objects are read; None for none.
+        max_age_ns: how long what it says stays valid.
+        is_transforms: whether its transforms place frames; `is_static`: at all times.
+        is_lasting: whether a message counts however long ago it came.
+        is_latched: whether it may have been sent long before it was recorded.
+    """
+
+    name: str
+    clock: Clock
+    mapping: TopicMapping | None
+    reading: Reading | None
+    max_age_ns: int
+    is_transforms: bool
+    is_static: bool
+    is_lasting: bool
+    is_latched: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A mapping that fits a log.
+
+    Attributes:
+        topics: every topic to read: those mapped, and those with transforms where frames are needed.
+        by_log_time: whether times of samples are log times; if not, which messages make the samples of a
+            window is only known when they have been decoded.
+        margin_ns: how far beyond the end of a window messages still count.
+        planned: how each topic is read, as in `topics`.
+        lost: topics with transforms that cannot be decoded, with the reason.
+        sampled_topic: the topic whose messages are sampled; None for samples at each multiple of a step.
+    """
+
+    mapping: LogMapping
+    topics: tuple[str, ...]
+    by_log_time: bool
+    margin_ns: int
+    planned: tuple[PlannedTopic, ...] = ()
+    sampled_topic: str | None = None
+    lost: tuple[tuple[str, str], ...] = ()
+
+    @classmethod
+    def of(cls, mapping: LogMapping, topics: Sequence[Topic]) -> Plan:
+        """
+        Raises:
+            UsageError: the mapping does not fit the topics; all faults are listed.
+        """
+        known = {topic.name: topic for topic in topics}
+        faults = _faults(mapping, known)
+        if faults:
+            raise UsageError("\n".join(f"{mapping.name}: {fault}" for fault in faults))
+        mapped = {entry.topic: entry for entry in mapping.topics}
+        needs_frames = mapping.fixed_frame is not None
+        names = [topic for topic in mapped if topic in known]
+        transforms = [
+            topic
+            for topic in topics
+            if needs_frames and short_type(topic.type) in TRANSFORM_TYPES and topic.name not in mapped
+        ]
+        names += [topic.name for topic in transforms if topic.unreadable is None]
+        lost = [
+            (topic.name, topic.unreadable) for topic in transforms if topic.unreadable and topic.count != 0
+        ]
+        sampled = None if mapping.sampling.step_ns is not None else mapping.sampling.topic or _first(mapping)
+        if sampled is not None and sampled not in names:
+            names.append(sampled)
+        planned = tuple(_planned(mapping, mapped.get(name), known[name], needs_frames) for name in names)
+        waits_for_frames = any(topic.is_transforms and not topic.is_static for topic in planned)
+        return cls(
+            mapping=mapping,
+            topics=tuple(names),
+            by_log_time=all(topic.clock == "log" for topic in planned),
+            margin_ns=DISORDER_NS + (HISTORY_NS if waits_for_frames else 0),
+            planned=planned,
+            sampled_topic=sampled,
+            lost=tuple(lost),
+        )
+
+    def lookback_ns(self, topic: str) -> int | None:
+        """How long before a window messages of a topic count; None for all of them, such as static ones."""
+        found = next(each for each in self.planned if each.name == topic)
+        ages = [
+            each.max_age_ns
+            for each in self.planned
+            if each.reading is not None and not each.is_lasting and not each.is_transforms
+        ]
+        own = found.max_age_ns if found.mapping is not None else 0
+        if found.is_transforms and not found.is_static:
+            own = max(own, HISTORY_NS + max(ages, default=0))
+            if any(each.is_lasting and each.reading is not None for each in self.planned):
+                return None
+        return None if found.is_lasting or own >= FOREVER_NS else own + DISORDER_NS
+
+
+def _faults(mapping: LogMapping, known: dict[str, Topic]) -> list[str]:
+    faults: list[str] = []
+    asked = [entry.topic for entry in mapping.topics]
+    sampled = mapping.sampling.topic
+    for name in [*asked, *([sampled] if sampled is not None and sampled not in asked else [])]:
+        where = f"topics.{name}" if name in asked else "sample.topic"
+        if name not in known:
+            listed = ", ".join(sorted(known)[:20]) or "none"
+            hint = nearest_hint(name, known) or f"its topics are {listed}"
+            faults.append(f"{where}: the log has no topic {name!r}; {hint}")
+        elif (reason := known[name].unreadable) is not None:
+            faults.append(f"{where}: its messages cannot be decoded: {reason}")
+    for entry in mapping.topics:
+        if entry.type is not None and short_type(entry.type) not in BUILT_IN:
+            hint = nearest_hint(short_type(entry.type), BUILT_IN) or f"known are {', '.join(BUILT_IN)}"
+            faults.append(f"topics.{entry.topic}.type: {entry.type!r} is no type that is known; {hint}")
+    return faults
+
+
+def _first(mapping: LogMapping) -> str:
+    """The topic that is sampled if nothing is said: the first with objects, else the first."""
+    return next((entry.topic for entry in mapping.topics if entry.reads_objects), mapping.topics[0].topic)
+
+
+def _planned(
+    mapping: LogMapping, entry: TopicMapping | None, topic: Topic, needs_frames: bool
+) -> PlannedTopic:
+    is_transforms = needs_frames and short_type(topic.type) in TRANSFORM_TYPES
+    is_static = is_transforms and (topic.latched or topic.name.rsplit("/", 1)[-1] == "tf_static")
+    reading = reading_of(topic.type, entry) if entry is not None and entry.reads_objects else None
+    stays = topic.latched or (reading is not None and reading.stays)
+    default = FOREVER_NS if stays else mapping.max_age_ns or DEFAULT_MAX_AGE_NS
+    max_age_ns = (entry.max_age_ns if entry is not None else None) or default
+    return PlannedTopic(
+        name=topic.name,
+        clock=(entry.clock if entry is not None else None) or mapping.clock,
+        mapping=entry,
+        reading=reading,
+        max_age_ns=max_age_ns,
+        is_transforms=is_transforms,
+        is_static=is_static,
+        is_latched=topic.latched,
+        is_lasting=is_static or (reading is not None and max_age_ns >= FOREVER_NS),
+    )

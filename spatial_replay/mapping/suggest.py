@@ -1,0 +1,446 @@
+"""A mapping file to start from, out of what a log holds.
+
+What in a message looks like an object: where it is, what it is called, how large it is.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from operator import itemgetter
+from types import MappingProxyType
+
+from spatial_replay.bags.reader import Topic
+from spatial_replay.logs.topics import DERIVED
+from spatial_replay.mapping.field_paths import field_names, get_field, is_list, name_from_topic
+from spatial_replay.mapping.message_types import BUILT_IN, TRANSFORM_TYPES, short_type
+from spatial_replay.trace.sample import FOREVER
+
+_DEEPEST = 4
+_POSITIONS = ("position", "center", "centre", "translation", "location", "point")
+_TURNS = ("orientation", "rotation", "quaternion")
+_YAWS = ("yaw", "theta", "heading", "angle")
+_SIZES = ("dimension", "dimensions", "size", "scale", "extent", "shape", "bbox")
+_OUTLINES = ("corners", "polygon", "points", "vertices", "outline", "footprint", "contour")
+_NAMES = ("name", "id", "track_id", "object_id", "tracking_id", "child_frame_id", "uuid", "label")
+_CLASSES = ("class", "class_name", "classification", "category", "label", "object_type", "type")
+_LISTS = (
+    "object",
+    "detection",
+    "track",
+    "tag",
+    "agent",
+    "obstacle",
+    "pose",
+    "vehicle",
+    "pedestrian",
+    "marker",
+)
+_NOT_PLACES = frozenset(
+    {"velocity", "acceleration", "twist", "linear", "angular", "header", "stamp", "covariance"}
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Guess:
+    """How an object may be read; texts are field paths.
+
+    Attributes:
+        objects: the path of the list that it is in, or None.
+        position: of a point, or paths of x and y.
+        size: paths of length, width and maybe height; or of a radius.
+        others: further lists whose elements look like objects.
+    """
+
+    objects: str | None = None
+    position: str | tuple[str, ...] | None = None
+    orientation: str | None = None
+    yaw: str | None = None
+    polygon: str | None = None
+    size: tuple[str, ...] = ()
+    name: str | None = None
+    class_name: str | None = None
+    others: tuple[str, ...] = ()
+
+    @property
+    def score(self) -> int:
+        """How much of an object it is."""
+        parts = (self.polygon, self.size, self.name, self.orientation or self.yaw, self.class_name)
+        return 10 * (self.polygon is not None or self.position is not None) + sum(map(bool, parts))
+
+
+def guess_from(message: object) -> Guess | None:
+    """What in a message looks like an object, or a list of them; None if nothing does."""
+    itself = _object_in(message)
+    lists = sorted(
+        ((guess, path) for path, guess in _iter_lists(message)),
+        key=lambda found: (-_kinship(found[1]), -found[0].score),
+    )
+    if lists and (itself is None or itself.polygon is None):
+        best, path = lists[0]
+        return replace(best, objects=path, others=tuple(other for _, other in lists[1:]))
+    return itself
+
+
+def numbers_in(message: object) -> tuple[str, ...]:
+    """The paths of the numbers of a message that stand outside of lists and of its header."""
+    return tuple(
+        path
+        for path, value in _iter_fields(message, passed_over=frozenset({"header", "stamp"}))
+        if _is_number(value)
+    )
+
+
+def frame_of(message: object) -> str | None:
+    """The frame that a message says its coordinates are in."""
+    for path, value in _iter_fields(message, passed_over=frozenset()):
+        if path.split(".")[-1] == "frame_id" and isinstance(value, str) and value:
+            return value.removeprefix("/")
+    return None
+
+
+def _iter_lists(message: object) -> Iterator[tuple[str, Guess]]:
+    for path, value in _iter_fields(message):
+        if is_list(value) and len(value) and field_names(value[0]):
+            guess = _object_in(value[0])
+            # corners of one outline are points, not objects
+            if guess is not None and not (path.split(".")[-1] in _OUTLINES and guess.score <= 10):
+                yield f"{path}[*]", guess
+
+
+def _object_in(value: object) -> Guess | None:
+    """The object that a message or an element of a list is."""
+    fields = dict(_iter_fields(value))
+    polygon = next((path for path in _named(fields, _OUTLINES) if _is_outline(fields[path])), None)
+    position = _position_in(fields)
+    if polygon is None and position is None:
+        return None
+    yaw = _first(fields, _YAWS, _is_number) if polygon is None else None
+    turn = next((path for path in _named(fields, _TURNS) if _has(fields[path], "xyzw")), None)
+    return Guess(
+        position=position if polygon is None else None,
+        orientation=turn if polygon is None else None,
+        yaw=None if turn else yaw,
+        polygon=polygon,
+        size=_size_in(fields) if polygon is None else (),
+        name=_name_in(fields),
+        class_name=_first(fields, _CLASSES, lambda each: isinstance(each, str)),
+    )
+
+
+def _position_in(fields: dict[str, object]) -> str | tuple[str, ...] | None:
+    for path in _named(fields, _POSITIONS):
+        if _has(fields[path], "xy"):
+            return path
+    if _is_number(fields.get("x")) and _is_number(fields.get("y")) and not _is_number(fields.get("w")):
+        return ("x", "y")
+    return None
+
+
+def _size_in(fields: dict[str, object]) -> tuple[str, ...]:
+    for path in _named(fields, _SIZES):
+        for names in (("length", "width", "height"), ("x", "y", "z"), ("size_x", "size_y", "size_z")):
+            known = field_names(fields[path])
+            if all(name in known and _is_number(get_field(fields[path], name)) for name in names[:2]):
+                return tuple(f"{path}.{name}" for name in names if name in known)
+    for names in (("length", "width", "height"), ("size_x", "size_y", "size_z")):
+        if all(_is_number(fields.get(name)) for name in names[:2]):
+            return tuple(name for name in names if name in fields)
+    return ("radius",) if _is_number(fields.get("radius")) else ()
+
+
+def _name_in(fields: dict[str, object]) -> str | None:
+    for path in _named(fields, _NAMES):
+        value = fields[path]
+        if isinstance(value, str | int) and not isinstance(value, bool):
+            return path
+        if "value" in field_names(value):
+            return f"{path}.value"
+    return None
+
+
+def _named(fields: dict[str, object], names: tuple[str, ...]) -> list[str]:
+    """The paths that end in one of some names: the shallowest first, then in the order of the names."""
+    found = [path for path in fields if path.split(".")[-1].lower() in names]
+    return sorted(found, key=lambda path: (path.count("."), names.index(path.split(".")[-1].lower())))
+
+
+def _first(fields: dict[str, object], names: tuple[str, ...], fits: Callable[[object], bool]) -> str | None:
+    return next((path for path in _named(fields, names) if fits(fields[path])), None)
+
+
+def _iter_fields(
+    value: object, path: str = "", depth: int = 0, *, passed_over: frozenset[str] = _NOT_PLACES
+) -> Iterator[tuple[str, object]]:
+    """Every field of a message, and of those in it, with its path; lists are not entered."""
+    for name in field_names(value) if depth < _DEEPEST else ():
+        inner = get_field(value, name)
+        full = f"{path}.{name}" if path else name
+        if name not in passed_over:
+            yield full, inner
+            yield from _iter_fields(inner, full, depth + 1, passed_over=passed_over)
+
+
+def _kinship(path: str) -> int:
+    """How much a list's name sounds like objects that move."""
+    last = path.removesuffix("[*]").split(".")[-1].lower()
+    return 2 * ("moving" in last or "dynamic" in last) + any(word in last for word in _LISTS)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _has(value: object, names: str) -> bool:
+    """Whether a message has fields of one letter each, all numbers."""
+    known = field_names(value)
+    return all(name in known and _is_number(get_field(value, name)) for name in names)
+
+
+def _is_outline(value: object) -> bool:
+    if not is_list(value):
+        return "points" in field_names(value) and _is_outline(get_field(value, "points"))
+    return len(value) >= 3 and _has(value[0], "xy")
+
+
+EXAMPLES = 20
+"""Decoded messages of each topic that are worth a look."""
+
+_RADIUS = "0.5"
+_TOGETHER_NS = 10**9
+_NOT_KNOWN: Mapping[str, int] = MappingProxyType({})
+_MOST_SIGNALS = 8
+_PLAIN = re.compile(r"/?[A-Za-z_][\w/.-]*", re.ASCII)
+_WORDS = frozenset({"true", "false", "null", "yes", "no", "on", "off", "y", "n"})
+"""Words that some readers of YAML take for something else than text."""
+_MIDDLEWARE = frozenset({"rosout", "rosout_agg", "parameter_events", "clock", "diagnostics"})
+"""Topics about programs rather than things, by the last part of their names."""
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A topic that may be mapped.
+
+    Attributes:
+        entry: what a mapping says of it, in YAML's flow style; empty where nothing looks like an object.
+        remarks: what a reader should know or change.
+        is_transforms: whether its objects are frames, which other topics may need rather than name.
+        frame: the frame that its coordinates are in.
+        numbers: paths of what may be signals.
+    """
+
+    topic: Topic
+    entry: str = ""
+    remarks: tuple[str, ...] = ()
+    is_transforms: bool = False
+    frame: str | None = None
+    numbers: tuple[str, ...] = ()
+
+
+def candidates(topics: Sequence[Topic], examples: Mapping[str, Sequence[object]]) -> tuple[Candidate, ...]:
+    """What each topic could be read as.
+
+    Args:
+        examples: some decoded messages of each topic, by its name.
+    """
+    return tuple(_candidate(topic, examples.get(topic.name, ())) for topic in topics)
+
+
+def suggest_mapping(
+    log: str,
+    topics: Sequence[Topic],
+    examples: Mapping[str, Sequence[object]],
+    first_ns: Mapping[str, int] = _NOT_KNOWN,
+) -> str:
+    """A mapping file with comments, as text; it can be used at once where some topic holds objects.
+
+    Args:
+        log: the log's name.
+        examples: some decoded messages of each topic, by its name.
+        first_ns: log time of the first message of each topic, by its name.
+    """
+    found = candidates(topics, examples)
+    mapped = [each for each in found if each.entry and not each.is_transforms]
+    transforms = [each for each in found if each.is_transforms]
+    active = mapped or [each for each in transforms if each.entry]
+    lines = [f"# How messages of {_comment(log)} become objects: a start, made from the first of them."]
+    lines += [*_frame_lines(active, transforms, examples), *_time_lines(active, first_ns), "topics:"]
+    if not active:
+        lines.append("  # nothing looks like an object; name the fields of a topic that is one, such as")
+        lines.append("  # /robot/state: {name: robot, position: [x, y], yaw: theta, shape: {disc: 0.5}}")
+    for each in active:
+        lines += [f"  # {_described(each.topic)}", *(f"  # {remark}" for remark in each.remarks)]
+        lines.append(f"  {_text(each.topic.name)}: {each.entry}")
+    rest = [each for each in found if each not in active]
+    if rest:
+        lines += ["", "  # not used:", *(line for each in rest for line in _unused(each))]
+    return "\n".join(lines) + "\n"
+
+
+def _candidate(topic: Topic, examples: Sequence[object]) -> Candidate:
+    if topic.name in DERIVED or topic.name.rstrip("/").split("/")[-1] in _MIDDLEWARE:
+        return Candidate(topic)
+    kind = short_type(topic.type)
+    frame = next((name for each in examples if (name := frame_of(each)) is not None), None)
+    if topic.unreadable is not None:
+        return Candidate(topic, remarks=(f"cannot be read: {_comment(topic.unreadable)}",))
+    if kind in TRANSFORM_TYPES:
+        return Candidate(topic, f"{{shape: {{disc: {_RADIUS}}}}}", _SIZELESS, is_transforms=True)
+    if kind in BUILT_IN:
+        reading = BUILT_IN[kind]
+        has_outline = bool(reading.polygon or reading.sizes or reading.solids)
+        entry = "{}" if has_outline else f"{{shape: {{disc: {_RADIUS}}}}}"
+        return Candidate(topic, entry, () if has_outline else _SIZELESS, frame=frame)
+    guesses = [guess for each in examples if (guess := guess_from(each)) is not None]
+    if not guesses:
+        return Candidate(topic, numbers=numbers_in(examples[0]) if examples else ())
+    best = max(guesses, key=lambda guess: guess.score)
+    return Candidate(topic, _entry(topic, best), _remarks(best), frame=frame)
+
+
+_SIZELESS = (f"messages have no size: {_RADIUS} is a guess, {{box: [length, width]}} is another shape",)
+
+
+def _entry(topic: Topic, guess: Guess) -> str:
+    parts: list[tuple[str, str | tuple[str, ...] | None]] = [
+        ("objects", guess.objects),
+        ("name", _name(topic, guess)),
+        ("class", guess.class_name),
+        ("position", guess.position),
+        ("orientation", guess.orientation),
+        ("yaw", guess.yaw),
+        ("polygon", guess.polygon),
+    ]
+    texts = [f"{key}: {_value(key, value)}" for key, value in parts if value is not None]
+    if guess.polygon is None:
+        texts.append(f"shape: {_shape(guess)}")
+    return "{" + ", ".join(texts) + "}"
+
+
+def _value(key: str, value: str | tuple[str, ...]) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_text, value))}]"
+    return f"{{field: {_text(value)}}}" if key == "class" else _text(value)
+
+
+def _shape(guess: Guess) -> str:
+    if not guess.size:
+        return f"{{disc: {_RADIUS}}}"
+    return f"{{disc: {guess.size[0]}}}" if len(guess.size) == 1 else f"{{box: [{', '.join(guess.size)}]}}"
+
+
+def _name(topic: Topic, guess: Guess) -> str:
+    if guess.objects is None:
+        return name_from_topic(topic.name)
+    word = guess.objects.removesuffix("[*]").split(".")[-1].removesuffix("s") or "object"
+    return f"{word}{{{guess.name or 'index'}}}"
+
+
+def _remarks(guess: Guess) -> tuple[str, ...]:
+    sizeless = () if guess.polygon is not None or guess.size else _SIZELESS
+    others = (f"other lists that look like objects: {', '.join(guess.others[:6])}",) if guess.others else ()
+    return sizeless + others
+
+
+def _frame_lines(
+    active: Sequence[Candidate], transforms: Sequence[Candidate], examples: Mapping[str, Sequence[object]]
+) -> Iterator[str]:
+    """The fixed frame: needed as soon as coordinates are in more than one."""
+    frames = sorted({each.frame for each in active if each.frame is not None})
+    edges = {
+        edge
+        for each in transforms
+        for message in examples.get(each.topic.name, ())
+        for edge in _edges(message)
+    }
+    roots = sorted({parent for parent, _ in edges} - {child for _, child in edges})
+    if len(frames) > 1:
+        yield f"# coordinates are in the frames {_comment(', '.join(frames))}: bring them into one"
+        known = {name for edge in edges for name in edge}
+        fixed = next((root for root in roots if known.issuperset(frames)), None)
+        yield f"{'' if fixed else '# '}fixed_frame: {_text(fixed or frames[0])}"
+    elif edges:
+        yield "# without a fixed frame, coordinates are taken as they are"
+        yield f"# fixed_frame: {_text((roots or frames or ['map'])[0])}"
+
+
+def _edges(message: object) -> Iterator[tuple[str, str]]:
+    """The frames that a message with transforms joins, parent first."""
+    listed = getattr(message, "transforms", None)
+    if isinstance(message, dict):
+        listed = message.get("transforms")
+    for each in [message] if listed is None else listed:
+        fields = each if isinstance(each, dict) else _Attributes(each)
+        parent = frame_of(each) or fields.get("parent_frame_id")
+        child = fields.get("child_frame_id")
+        if isinstance(parent, str) and isinstance(child, str) and parent and child:
+            yield parent.removeprefix("/"), child.removeprefix("/")
+
+
+class _Attributes:
+    """The attributes of a message, got as the keys of a JSON object are."""
+
+    def __init__(self, message: object) -> None:
+        self._message = message
+
+    def get(self, name: str) -> object:
+        return getattr(self._message, name, None)
+
+
+def _time_lines(active: Sequence[Candidate], first_ns: Mapping[str, int]) -> Iterator[str]:
+    yield "clock: log    # when a message was recorded; publish: when it was sent; header: its own stamp"
+    if active:
+        topic = _text(_sampled(active, first_ns).name)
+        yield f"sample: {{topic: {topic}}}    # a sample at each of its messages; or {{every: 100ms}}"
+        yield "max_age: 1s    # after which an object that nothing is heard of is unknown"
+
+
+def _sampled(active: Sequence[Candidate], first_ns: Mapping[str, int]) -> Topic:
+    """Where to take samples: at the last of the topics that begin together, so that none is missing."""
+    topics = [each.topic for each in active]
+    begins = [first_ns.get(topic.name, FOREVER) for topic in topics]
+    often = max(topic.count or 0 for topic in topics)
+    together = [
+        (begin, topic)
+        for begin, topic in zip(begins, topics, strict=True)
+        if begin <= min(begins) + _TOGETHER_NS and 2 * (topic.count or 0) >= often
+    ]
+    return max(together, key=itemgetter(0))[1] if together else topics[0]
+
+
+def _unused(each: Candidate) -> Iterator[str]:
+    topic = _text(each.topic.name)
+    if each.entry:
+        yield f"  # {topic}: {each.entry}    # {_described(each.topic)}"
+    elif each.numbers:
+        path = {number: _text(number.replace(".", "_")) for number in each.numbers[:_MOST_SIGNALS]}
+        signals = ", ".join(f"{_signal_name(each.topic, name)}: {number}" for number, name in path.items())
+        yield f"  # {topic}: {{signals: {{{signals}}}}}    # {_described(each.topic)}"
+    else:
+        remark = "".join(f"; {remark}" for remark in each.remarks)
+        yield f"  # {topic}: {_described(each.topic)}{remark}"
+
+
+def _signal_name(topic: Topic, name: str) -> str:
+    return f"{name_from_topic(topic.name)}_{name}"
+
+
+def _described(topic: Topic) -> str:
+    kind = _comment(topic.type) or "type unknown"
+    return (
+        kind if topic.count is None else f"{kind}, {topic.count:,} message{'' if topic.count == 1 else 's'}"
+    )
+
+
+def _comment(text: str) -> str:
+    """A text that stays on its line."""
+    return " ".join("".join(each if each.isprintable() else " " for each in text).split())[:200]
+
+
+def _text(text: str) -> str:
+    """A text as a YAML scalar."""
+    return (
+        text if _PLAIN.fullmatch(text) and not text.endswith("[*]") else json.dumps(text, ensure_ascii=True)
+    )

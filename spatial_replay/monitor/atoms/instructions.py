@@ -1,0 +1,281 @@
+"""Atoms and open quantifiers, compiled for the objects that some samples have.
+
+The instructions that leaves are made of, run over columns of samples.
+
+Each instruction writes one column in every channel (see `run`): what it computes from earlier columns, or
+reads from measurements, signals and constants.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import permutations
+from math import inf, perm
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from spatial_replay.compiled import long_kernel
+from spatial_replay.errors import UsageError
+from spatial_replay.geometry.arrays import Flags, Floats, Integers
+from spatial_replay.monitor.atoms.terms import Bindings, bind, bind_group
+from spatial_replay.spec.formula import (
+    Atom,
+    Boolean,
+    CentroidProjection,
+    Earlier,
+    Expression,
+    Formula,
+    Group,
+    Maximum,
+    Measurement,
+    Minimum,
+    Misalignment,
+    Negative,
+    Number,
+    Projection,
+    Protrusion,
+    Quantified,
+    Signal,
+    SignedDistance,
+    Sum,
+    Temporal,
+    Truth,
+)
+
+# instructions: operation, a, b, c
+CONSTANT, MEASURED, SIGNAL = 0, 1, 2  # number a of its kind
+ADD, NEGATE, LEAST, GREATEST = 3, 4, 5, 6  # numbers; not a number where an operand is not
+HOLDS = 7  # a number as an interval: all of the reals where it is not a number
+AND, OR, XOR, IFF = 8, 9, 10, 11  # intervals
+AND_MEMBER, OR_MEMBER = 12, 13  # a, and b where members c is 1, anything where it is -1
+
+TILE = 128
+"""How many samples are taken at a time, so that their columns stay in the processor's cache."""
+
+
+@long_kernel
+def run_instructions(
+    code: Integers,
+    constants: Floats,
+    values: Floats,
+    spreads: Floats,
+    signals: Floats,
+    members: Flags,
+    outputs: Integers,
+    leaves: Floats,
+) -> None:
+    """Run the instructions over all samples; leaf j is what instruction outputs[j] gives."""
+    channels, _, samples = leaves.shape
+    columns = np.empty((code.shape[0], channels, min(TILE, samples)))
+    for t in range(0, samples, TILE):
+        count = min(TILE, samples - t)
+        for i in range(code.shape[0]):
+            op, a, b, c = code[i, 0], code[i, 1], code[i, 2], code[i, 3]
+            for channel in range(channels):
+                mirror = channel ^ 1 if channels > 1 else channel
+                target = columns[i, channel]
+                first, second = columns[a, channel], columns[b, channel]
+                for k in range(count):
+                    if op == CONSTANT:
+                        target[k] = constants[a]
+                    elif op == MEASURED:
+                        target[k] = values[a, t + k]
+                        if channel == 2:
+                            target[k] -= spreads[a, t + k]
+                        elif channel == 3:
+                            target[k] += spreads[a, t + k]
+                    elif op == SIGNAL:
+                        target[k] = signals[a, t + k]
+                    elif op == ADD:
+                        target[k] = first[k] + second[k]
+                    elif op == NEGATE:
+                        target[k] = -columns[a, mirror, k]
+                    elif op in (LEAST, GREATEST):
+                        if np.isnan(first[k]) or np.isnan(second[k]):
+                            target[k] = np.nan
+                        elif op == LEAST:
+                            target[k] = min(first[k], second[k])
+                        else:
+                            target[k] = max(first[k], second[k])
+                    elif op == HOLDS:
+                        target[k] = first[k]
+                        if np.isnan(first[k]) or np.isnan(columns[a, mirror, k]):
+                            target[k] = np.inf if channel % 2 else -np.inf
+                    elif op == AND:
+                        target[k] = min(first[k], second[k])
+                    elif op == OR:
+                        target[k] = max(first[k], second[k])
+                    elif op == XOR:
+                        target[k] = max(
+                            min(first[k], -columns[b, mirror, k]), min(-columns[a, mirror, k], second[k])
+                        )
+                    elif op == IFF:
+                        target[k] = min(
+                            max(-columns[a, mirror, k], second[k]), max(-columns[b, mirror, k], first[k])
+                        )
+                    else:
+                        value = second[k]
+                        if members[c, t + k] < 0:
+                            value = np.inf if channel % 2 else -np.inf
+                        if members[c, t + k] == 0:
+                            target[k] = first[k]
+                        elif op == AND_MEMBER:
+                            target[k] = min(first[k], value)
+                        else:
+                            target[k] = max(first[k], value)
+        for j in range(len(outputs)):
+            for channel in range(channels):
+                for k in range(count):
+                    leaves[channel, j, t + k] = columns[outputs[j], channel, k]
+
+
+MAX_BINDINGS = 20_000
+"""How many ways of binding their variables the open quantifiers of one formula may have in all."""
+
+
+class OpenGroups(Protocol):
+    """Who can be in the open groups of some samples."""
+
+    def candidates(self, group: Group | Earlier) -> tuple[str, ...]:
+        """Names of the objects that are members in any of the samples."""
+
+    def may_be_unknown(self, group: Group | Earlier) -> bool:
+        """Whether the group is that of a time before the first sample in any of them."""
+
+
+class Membership(NamedTuple):
+    """A binding of an open quantifier: 1 in samples where all of `chosen` are members, 0 elsewhere.
+
+    Attributes:
+        chosen: which of the group's candidates. With none it stands for the group itself: -1 in samples
+            where that is unknown, 0 elsewhere.
+    """
+
+    group: Group | Earlier
+    chosen: tuple[int, ...]
+
+
+class LeafCode:
+    """Instructions for some leaves, operands first; equal ones share a column.
+
+    Attributes:
+        rows: operation, a, b, c of each instruction, with its number.
+        constants, measurements, signals, members: what instructions read, with the number they know it by.
+    """
+
+    def __init__(self, groups: OpenGroups) -> None:
+        self._groups = groups
+        self._bindings = 0
+        self.rows: dict[tuple[int, int, int, int], int] = {}
+        self.constants: dict[float, int] = {}
+        self.measurements: dict[Measurement, int] = {}
+        self.signals: dict[str, int] = {}
+        self.members: dict[Membership, int] = {}
+
+    def add_leaves(self, leaves: Sequence[Formula], bindings: Bindings) -> list[int]:
+        """The number of the instruction that gives each leaf of a formula, as an interval.
+
+        Raises:
+            UsageError: more than `MAX_BINDINGS`.
+        """
+        self._bindings = 0
+        return [self._add(leaf, bindings) for leaf in leaves]
+
+    def _add(self, formula: Formula, bindings: Bindings) -> int:
+        """The number of the instruction that gives a formula without temporal operators."""
+        match formula:
+            case Truth():
+                return self._constant(inf if formula.value else -inf)
+            case Atom():
+                return self._row(HOLDS, self._expression(formula.expression, bindings))
+            case Quantified():
+                return self._quantified(formula, bindings)
+            case Boolean():
+                first, *rest = [self._add(each, bindings) for each in formula.operands]
+                return self._boolean(formula.operator, first, rest)
+            case Temporal():
+                raise TypeError("a temporal operator in the body of an open quantifier")
+
+    def _row(self, op: int, a: int = 0, b: int = 0, c: int = 0) -> int:
+        return self.rows.setdefault((op, a, b, c), len(self.rows))
+
+    def _constant(self, value: float) -> int:
+        return self._row(CONSTANT, self.constants.setdefault(value, len(self.constants)))
+
+    def _expression(self, expression: Expression, bindings: Bindings) -> int:
+        match expression:
+            case Number():
+                return self._constant(expression.value)
+            case Signal():
+                return self._row(SIGNAL, self.signals.setdefault(expression.name, len(self.signals)))
+            case Sum():
+                first = self._expression(expression.first, bindings)
+                return self._row(ADD, first, self._expression(expression.second, bindings))
+            case Negative():
+                return self._row(NEGATE, self._expression(expression.operand, bindings))
+            case Minimum() | Maximum():
+                op = LEAST if isinstance(expression, Minimum) else GREATEST
+                row, *others = [self._expression(each, bindings) for each in expression.operands]
+                for other in others:
+                    row = self._row(op, row, other)
+                return row
+        measurement = _bound(expression, bindings)
+        return self._row(MEASURED, self.measurements.setdefault(measurement, len(self.measurements)))
+
+    def _boolean(self, operator: str, first: int, rest: Sequence[int]) -> int:
+        match operator:
+            case "not":
+                return self._row(NEGATE, first)
+            case "xor":
+                return self._row(XOR, first, rest[0])
+            case "<->":
+                return self._row(IFF, first, rest[0])
+            case "->":
+                return self._row(OR, self._row(NEGATE, first), rest[0])
+        for other in rest:
+            first = self._row(AND if operator == "and" else OR, first, other)
+        return first
+
+    def _quantified(self, formula: Quantified, bindings: Bindings) -> int:
+        is_forall = formula.quantifier == "forall"
+        group = bind_group(formula.group, bindings)
+        names = self._groups.candidates(group)
+        self._check_bindings(formula, len(names))
+        op = AND_MEMBER if is_forall else OR_MEMBER
+        result = self._constant(inf if is_forall else -inf)
+        if self._groups.may_be_unknown(group):
+            result = self._row(op, result, result, self._member(group, ()))
+        for chosen in permutations(range(len(names)), len(formula.variables)):
+            inner = {**bindings, **{v: names[n] for v, n in zip(formula.variables, chosen, strict=True)}}
+            body = self._add(formula.body, inner)
+            result = self._row(op, result, body, self._member(group, chosen))
+        return result
+
+    def _member(self, group: Group | Earlier, chosen: tuple[int, ...]) -> int:
+        return self.members.setdefault(Membership(group, chosen), len(self.members))
+
+    def _check_bindings(self, formula: Quantified, member_count: int) -> None:
+        self._bindings += perm(member_count, len(formula.variables))
+        if self._bindings > MAX_BINDINGS:
+            raise UsageError(
+                f"{formula.quantifier} {', '.join(formula.variables)} over {member_count} objects brings a "
+                f"formula to {self._bindings} bindings; {MAX_BINDINGS} is the limit: use a smaller group or "
+                "fewer variables"
+            )
+
+
+def _bound(measurement: Measurement, bindings: Bindings) -> Measurement:
+    if not bindings:
+        return measurement
+    match measurement:
+        case SignedDistance():
+            return SignedDistance(bind(measurement.first, bindings), bind(measurement.second, bindings))
+        case Misalignment():
+            return Misalignment(bind(measurement.first, bindings), bind(measurement.second, bindings))
+        case Protrusion():
+            return Protrusion(bind(measurement.inner, bindings), bind(measurement.outer, bindings))
+        case Projection():
+            return Projection(bind(measurement.term, bindings), measurement.axis, measurement.side)
+        case CentroidProjection():
+            return CentroidProjection(bind(measurement.term, bindings), measurement.axis, measurement.side)

@@ -1,0 +1,343 @@
+"""What the leaves of a monitor are computed from, found once for samples with the same objects.
+
+To a monitor most samples look alike: other numbers, the same names. A plan holds what follows from the names,
+as index arrays, so that a sample costs little more than its numbers. It serves every sample whose members of
+open groups are among its own, under whatever names; an object that is not in a sample is only a flag to it.
+
+Which plan serves a sample: one for all where no group is open, else by how many are in the open groups.
+
+To a specification, objects that it does not name are all alike but for their classes. So a plan has stand-ins
+for them, and in each sample it is said whom they stand for: tracks that come and go under ever new names need
+no plan of their own.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain, zip_longest
+from math import nan
+from typing import TypeAlias, cast
+
+import numpy as np
+
+from spatial_replay.errors import UsageError
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.geometry.measure import QUANTITY_CODES
+from spatial_replay.monitor.atoms.instructions import LeafCode
+from spatial_replay.monitor.atoms.live_kernel import ABSENT, PlanArrays, leaves_of_sample, packed
+from spatial_replay.monitor.atoms.live_rows import (
+    NO_DELAY,
+    Frame,
+    Leaves,
+    Member,
+    RecentSamples,
+    Rows,
+    iter_delays,
+)
+from spatial_replay.monitor.atoms.measurements import measured_terms, quantity_of
+from spatial_replay.monitor.atoms.terms import footprint_from_outline
+from spatial_replay.spec.formula import (
+    ANY_CLASS,
+    Atom,
+    Enlarged,
+    Formula,
+    Group,
+    Misalignment,
+    Outline,
+    Quantified,
+    RegionName,
+    Term,
+    TrackedName,
+)
+from spatial_replay.spec.walks import base_of, iter_formulas, terms_of
+from spatial_replay.trace.sample import Sample
+
+
+class LeafPlan:
+    """How the leaves of formulas follow from a sample and the earlier ones that it looks back at."""
+
+    def __init__(self, frame: Frame, members: frozenset[Member]) -> None:
+        """Plan for samples that hold no other members of open groups.
+
+        Raises:
+            UsageError: more bindings than `MAX_BINDINGS`.
+        """
+        self._classes = frame.classes
+        rows = Rows(frame, members)
+        code = LeafCode(rows)
+        outputs = [number for leaves in frame.leaves for number in code.add_leaves(leaves, {})]
+        self._arrays = packed(_arrays(frame, rows, code, outputs))
+        self._places = tuple(rows.places)
+        self._signals = tuple(code.signals)
+
+    @property
+    def nbytes(self) -> int:
+        """How much memory its arrays take."""
+        return sum(array.nbytes for array in self._arrays)
+
+    def leaf_values(self, samples: Sequence[Sample | None], stands_for: Mapping[str, str]) -> Floats:
+        """Each leaf of each formula, one after the other.
+
+        Args:
+            samples: the one at each of the frame's delays; None before the first.
+            stands_for: the objects that go by another name among the plan's members.
+
+        Returns:
+            (C, A, 1), in as many channels as `leaves.leaf_values` would give.
+        """
+        seen = [
+            None if (sample := samples[number]) is None else sample.objects.get(stands_for.get(name, name))
+            for number, name in self._places
+        ]
+        newest = cast(Sample, samples[0]).signals
+        whole, numbers, vertices = self._flattened(cast(list[TrackedObject | None], seen))
+        return leaves_of_sample(
+            self._arrays,
+            np.array([ABSENT if sample is None else 0 for sample in samples] + whole, np.int64),
+            np.array(numbers + [newest.get(name, nan) for name in self._signals], np.float64),
+            np.concatenate(vertices).ravel(),
+        )
+
+    def _flattened(self, seen: list[TrackedObject | None]) -> tuple[list[int], list[float], list[Floats]]:
+        """What the objects at the plan's places are made of (see `leaves_of_sample`)."""
+        classes: list[int] = []
+        counts: list[int] = []
+        sizes: list[int] = []
+        numbers: list[float] = []
+        radii: list[float] = []
+        vertices: list[Floats] = [_NO_VERTICES]
+        for tracked in seen:
+            if tracked is None:
+                classes.append(ABSENT)
+                counts.append(0)
+                numbers += _NO_NUMBERS
+                continue
+            classes.append(class_code(tracked, self._classes))
+            bottom, top = tracked.height or _NO_HEIGHT
+            numbers += (bottom, top, nan if tracked.yaw is None else tracked.yaw, tracked.uncertainty)
+            parts = tracked.footprint.parts
+            counts.append(len(parts))
+            for part in parts:
+                sizes.append(len(part.vertices))
+                radii.append(part.radius)
+                vertices.append(part.vertices)
+        return classes + counts + sizes, numbers + radii, vertices
+
+
+_NO_HEIGHT = (nan, nan)
+_NO_NUMBERS = (nan, nan, nan, 0.0)
+_NO_VERTICES = np.empty((0, 2))
+
+
+def class_code(tracked: TrackedObject, classes: Mapping[str, int]) -> int:
+    """The code of an object's class."""
+    return classes.get((tracked.class_name or "").casefold(), 0) if classes else 0
+
+
+def _arrays(frame: Frame, rows: Rows, code: LeafCode, outputs: Sequence[int]) -> PlanArrays:
+    measurements = list(code.measurements)
+    operands: dict[Term, int] = {}
+    geometric = [k for k, each in enumerate(measurements) if not isinstance(each, Misalignment)]
+    pairs = [
+        [operands.setdefault(term, len(operands)) for term in measured_terms(measurements[k])]
+        for k in geometric
+    ]
+    yaws = [
+        [k, *(rows.of_term(term)[0].row for term in measured_terms(each))]
+        for k, each in enumerate(measurements)
+        if isinstance(each, Misalignment)
+    ]
+    operand_rows = [rows.of_term(term) for term in operands]
+    required = [
+        [row for term in measured_terms(each) for row in rows.required(term)] for each in measurements
+    ]
+    members = [rows.of_membership(each) for each in code.members]
+    regions = FootprintBatch.from_footprints(
+        [footprint_from_outline(outline) for outline in frame.regions.values()],
+        [outline.height for outline in frame.regions.values()],
+    )
+    return PlanArrays(
+        extent=_whole([len(frame.delays), len(frame.regions), len(rows.places), len(code.signals)]),
+        region_parts=np.diff(regions.part_start),
+        region_sizes=np.diff(regions.vertex_start),
+        region_radius=regions.radius.copy(),
+        region_vertices=regions.vertices.ravel(),
+        region_heights=np.stack((regions.bottom, regions.top), axis=1),
+        operand_start=_starts(operand_rows),
+        operand_rows=_whole(each.row for among in operand_rows for each in among),
+        operand_classes=_whole(each.class_code for among in operand_rows for each in among),
+        enlargement=np.array([_enlargement(term) for term in operands], np.float64),
+        geometric=_whole(geometric),
+        quantity=_whole(QUANTITY_CODES[quantity_of(measurements[k])] for k in geometric),
+        first=_whole(pair[0] for pair in pairs),
+        second=_whole(pair[1] if len(pair) > 1 else ABSENT for pair in pairs),
+        yaws=np.array(yaws, np.int64).reshape(len(yaws), 3),
+        required_start=_starts(required),
+        required=_whole(row for among in required for row in among),
+        member_start=_starts(members),
+        member_rows=_whole(each.row for among in members for each in among),
+        member_classes=_whole(each.class_code for among in members for each in among),
+        is_group=_whole(not each.chosen for each in code.members),
+        code=np.array(list(code.rows), np.int64).reshape(len(code.rows), 4),
+        constants=np.array(list(code.constants), np.float64),
+        outputs=_whole(outputs),
+    )
+
+
+def _whole(numbers: Iterable[int]) -> Integers:
+    return np.array(list(numbers), np.int64)
+
+
+def _starts(among: Sequence[Sequence[object]]) -> Integers:
+    return np.concatenate(([0], np.cumsum([len(each) for each in among], dtype=np.int64)))
+
+
+def _enlargement(term: Term) -> float:
+    """How much a term is enlarged in all, added in the order in which a scene does."""
+    return _enlargement(term.term) + term.radius if isinstance(term, Enlarged) else 0.0
+
+
+MOST_PLANS = 256
+MOST_BYTES = 1 << 22
+"""How many plans are kept, and how much memory they take but for the newest; first goes the one used longest
+ago."""
+
+_NOBODY = ""
+"""A name that no object has."""
+
+_Classes: TypeAlias = tuple[int, ...]
+"""Codes of the classes that one object has in the samples looked at: nearly always one."""
+
+_Counts: TypeAlias = tuple[tuple[_Classes, int], ...]
+"""How many stand-ins there are for the unnamed objects of each kind."""
+
+
+class SampleLeaves:
+    """The leaves of some formulas, sample after sample, with what they look back at."""
+
+    def __init__(self, leaves: Sequence[Leaves], regions: Mapping[str, Outline]) -> None:
+        formulas = list(chain.from_iterable(leaves))
+        bases = [base_of(term) for term in _terms(formulas)]
+        open_classes = {base.class_name or "" for base in bases if isinstance(base, Group) and base.is_open}
+        regions_named = {base.name for base in bases if isinstance(base, RegionName)}
+        classes = sorted({name.casefold() for name in open_classes if name != ANY_CLASS})
+        self._frame = Frame(
+            leaves,
+            tuple(dict.fromkeys((NO_DELAY, *iter_delays(formulas)))),
+            {name: code for code, name in enumerate(classes, start=1)},
+            {name: outline for name, outline in regions.items() if name in regions_named},
+        )
+        self._recent = RecentSamples(self._frame.delays)
+        self._takes_any = ANY_CLASS in open_classes
+        self._own_names = _names(bases)
+        self._prefix = "?"
+        while any(name.startswith(self._prefix) for name in self._own_names):
+            self._prefix += "?"
+        self._own_members: frozenset[Member] = frozenset()  # grows, but no further than the specification
+        self._only_plan = None if open_classes else LeafPlan(self._frame, frozenset())
+        self._plans: OrderedDict[tuple[frozenset[Member], _Counts], LeafPlan] = OrderedDict()
+        self._bytes = 0
+
+    def look_at(self, sample: Sample) -> list[Sample | None]:
+        """Take in the next sample; it and those that it looks back at."""
+        return self._recent.take(sample)
+
+    def values(self, samples: Sequence[Sample | None]) -> Floats:
+        """(C, A, 1), each leaf of each formula.
+
+        Args:
+            samples: what `look_at` gave.
+
+        Raises:
+            UsageError: more bindings than `MAX_BINDINGS`.
+        """
+        if self._only_plan is not None:
+            return self._only_plan.leaf_values(samples, {})
+        unnamed = self._unnamed_members(samples)
+        counts = {classes: _room(len(names)) for classes, names in unnamed.items()}
+        try:
+            plan = self._plan_for(counts)
+        except UsageError:
+            counts = {classes: len(names) for classes, names in unnamed.items()}
+            plan = self._plan_for(counts)
+        stands_for: dict[str, str] = {}
+        for classes, names in unnamed.items():
+            stands_for.update(
+                zip_longest(self._stand_ins(classes, counts[classes]), names, fillvalue=_NOBODY)
+            )
+        return plan.leaf_values(samples, stands_for)
+
+    def _unnamed_members(self, samples: Sequence[Sample | None]) -> dict[_Classes, list[str]]:
+        """Who is in any open group in any of the samples and not named in the specification, by kind."""
+        found: dict[str, _Classes] = {}
+        own: list[Member] = []
+        for sample in samples:
+            for name, tracked in () if sample is None else sample.objects.items():
+                code = class_code(cast(TrackedObject, tracked), self._frame.classes)
+                if not (code or self._takes_any):
+                    continue
+                if name in self._own_names:
+                    own.append(Member(name, code))
+                elif code not in found.setdefault(name, (code,)):
+                    found[name] = tuple(sorted((*found[name], code)))
+        if not self._own_members.issuperset(own):
+            self._own_members |= frozenset(own)
+        kinds: dict[_Classes, list[str]] = {}
+        for name, classes in found.items():
+            kinds.setdefault(classes, []).append(name)
+        return kinds
+
+    def _stand_ins(self, classes: _Classes, count: int) -> list[str]:
+        """Names for so many unnamed objects: none that the specification names."""
+        return [f"{self._prefix}{classes} {number}" for number in range(count)]
+
+    def _plan_for(self, counts: Mapping[_Classes, int]) -> LeafPlan:
+        """The plan for so many unnamed members of each kind."""
+        key = self._own_members, tuple(sorted(counts.items()))
+        if key in self._plans:
+            self._plans.move_to_end(key)
+            return self._plans[key]
+        unnamed = {
+            Member(name, code)
+            for classes, count in counts.items()
+            for name in self._stand_ins(classes, count)
+            for code in classes
+        }
+        plan = LeafPlan(self._frame, self._own_members | unnamed)
+        self._plans[key] = plan
+        self._bytes += plan.nbytes
+        while len(self._plans) > 1 and (len(self._plans) > MOST_PLANS or self._bytes > MOST_BYTES):
+            _, dropped = self._plans.popitem(last=False)
+            self._bytes -= dropped.nbytes
+        return plan
+
+
+def _room(count: int) -> int:
+    """For how many a plan for so many is made: 1, 2, 3, 4, 6, 8, 12, 16, …, so that there are few plans."""
+    power = 1 << (count - 1).bit_length()
+    return count if count < 4 else power * 3 // 4 if count <= power * 3 // 4 else power
+
+
+def _terms(formulas: Sequence[Formula]) -> list[Term]:
+    terms: list[Term] = []
+    for formula in chain.from_iterable(map(iter_formulas, formulas)):
+        if isinstance(formula, Atom):
+            terms += terms_of(formula.expression)
+        elif isinstance(formula, Quantified):
+            terms.append(formula.group)
+    return terms
+
+
+def _names(bases: Sequence[Term]) -> frozenset[str]:
+    """The objects that terms name."""
+    names: set[str] = set()
+    for base in bases:
+        if isinstance(base, TrackedName):
+            names.add(base.name)
+        elif isinstance(base, Group):
+            names.update(base.members or ())
+            names.update(each.name for each in base.excluded if isinstance(each, TrackedName))
+    return frozenset(names)

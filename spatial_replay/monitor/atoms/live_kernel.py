@@ -1,0 +1,289 @@
+"""The leaves of one sample: measured and computed in one call.
+
+What does not change from sample to sample, which rows are measured with which and what becomes of the
+numbers, is in a plan's arrays. Rows stand for, in this order: each sample looked at, the regions, then the
+places, each an object in one of those samples. The class code of a row is `ABSENT` for what is not there.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from spatial_replay.compiled import inlined, kernel, piece
+from spatial_replay.geometry.arrays import Flags, Floats, Integers
+from spatial_replay.geometry.kernels import measure_rows
+from spatial_replay.geometry.measure import misalignment_of
+from spatial_replay.monitor.atoms.instructions import run_instructions
+
+ABSENT = -1
+ANY = -1
+"""The class wanted where any will do."""
+
+NUMBERS_OF_PLACE = 4
+"""Bottom, top, yaw (NaN where there is none) and uncertainty."""
+
+
+class PlanArrays(NamedTuple):
+    """What a plan does with every sample; ragged lists come with where each begins and the last ends.
+
+    Attributes:
+        extent: (4,), how many samples, regions, places and signals there are.
+        region_parts, region_sizes, region_radius, region_vertices, region_heights: the regions' footprints:
+            parts of each, vertices of each part, radius of each part, x and y of all vertices,
+            (bottom, top) of each.
+        operand_start, operand_rows, operand_classes: rows of each operand, and the class that each must have.
+        enlargement: of each operand.
+        geometric: numbers of the measurements between footprints, with their `quantity` and operands
+            `first` and `second` (-1: none).
+        yaws: (Y, 3), the number of each measurement between orientations, and its two rows.
+        required_start, required: the rows without which each measurement is unknown.
+        member_start, member_rows, member_classes: the rows that must be there for each binding, and classes.
+        is_group: for each binding, 1 where it stands for a group itself: not known without its row.
+        code, constants, outputs: what `run_instructions` takes.
+    """
+
+    extent: Integers
+    region_parts: Integers
+    region_sizes: Integers
+    region_radius: Floats
+    region_vertices: Floats
+    region_heights: Floats
+    operand_start: Integers
+    operand_rows: Integers
+    operand_classes: Integers
+    enlargement: Floats
+    geometric: Integers
+    quantity: Integers
+    first: Integers
+    second: Integers
+    yaws: Integers
+    required_start: Integers
+    required: Integers
+    member_start: Integers
+    member_rows: Integers
+    member_classes: Integers
+    is_group: Integers
+    code: Integers
+    constants: Floats
+    outputs: Integers
+
+
+class PackedPlan(NamedTuple):
+    """A plan's arrays in two, since each array costs a call something.
+
+    Attributes:
+        whole, numbers: the arrays of integers and of floats, flat, one after the other.
+        starts: where each array begins and ends in one of these, in the order of `PlanArrays`.
+    """
+
+    whole: Integers
+    numbers: Floats
+    starts: Integers
+
+
+def packed(plan: PlanArrays) -> PackedPlan:
+    """Pack arrays, for `_unpacked` to find."""
+    ends = {"i": 0, "f": 0}
+    starts = []
+    for array in plan:
+        starts += [ends[array.dtype.kind], ends[array.dtype.kind] + array.size]
+        ends[array.dtype.kind] += array.size
+    whole, numbers = (
+        np.concatenate([np.ravel(array) for array in plan if array.dtype.kind == kind]) for kind in ends
+    )
+    return PackedPlan(whole, numbers, np.array(starts, np.int64))
+
+
+@piece
+def _unpacked(plan: PackedPlan) -> PlanArrays:
+    at, whole, numbers = plan.starts, plan.whole, plan.numbers
+    return PlanArrays(
+        whole[at[0] : at[1]],
+        whole[at[2] : at[3]],
+        whole[at[4] : at[5]],
+        numbers[at[6] : at[7]],
+        numbers[at[8] : at[9]],
+        numbers[at[10] : at[11]].reshape((-1, 2)),
+        whole[at[12] : at[13]],
+        whole[at[14] : at[15]],
+        whole[at[16] : at[17]],
+        numbers[at[18] : at[19]],
+        whole[at[20] : at[21]],
+        whole[at[22] : at[23]],
+        whole[at[24] : at[25]],
+        whole[at[26] : at[27]],
+        whole[at[28] : at[29]].reshape((-1, 3)),
+        whole[at[30] : at[31]],
+        whole[at[32] : at[33]],
+        whole[at[34] : at[35]],
+        whole[at[36] : at[37]],
+        whole[at[38] : at[39]],
+        whole[at[40] : at[41]],
+        whole[at[42] : at[43]].reshape((-1, 4)),
+        numbers[at[44] : at[45]],
+        whole[at[46] : at[47]],
+    )
+
+
+@inlined
+def _is_there(classes: Integers, row: int, wanted: int) -> bool:
+    return classes[row] != ABSENT and wanted in (ANY, classes[row])
+
+
+@piece
+def _starts(before: int, first: Integers, second: Integers) -> Integers:
+    """Where rows of lengths 0 (so many), `first` and `second` begin, and the last ends."""
+    starts = np.zeros(before + len(first) + len(second) + 1, np.int64)
+    at = before
+    for lengths in (first, second):
+        for k in range(len(lengths)):
+            starts[at + 1] = starts[at] + lengths[k]
+            at += 1
+    return starts
+
+
+@piece
+def _joined(first: Floats, second: Floats) -> Floats:
+    joined = np.empty(len(first) + len(second))
+    for k in range(len(first)):
+        joined[k] = first[k]
+    for k in range(len(second)):
+        joined[len(first) + k] = second[k]
+    return joined
+
+
+@piece
+def _lengths(starts: Integers) -> Integers:
+    lengths = np.empty(len(starts) - 1, np.int64)
+    for k in range(len(lengths)):
+        lengths[k] = starts[k + 1] - starts[k]
+    return lengths
+
+
+@piece
+def _spreads(starts: Integers, members: Integers, places: Floats, here: int) -> Floats:
+    """Each operand's uncertainty, the largest of its members'; last that of no operand, 0."""
+    spreads = np.zeros(len(starts))
+    for operand in range(len(starts) - 1):
+        for k in range(starts[operand], starts[operand + 1]):
+            if members[k] >= here:
+                spreads[operand] = max(spreads[operand], places[members[k] - here, 3])
+    return spreads
+
+
+@inlined
+def _yaw(row: int, classes: Integers, places: Floats, here: int) -> float:
+    return places[row - here, 2] if row >= here and classes[row] != ABSENT else np.nan
+
+
+@piece
+def _measure(
+    plan: PlanArrays, classes: Integers, counts: Integers, sizes: Integers, radius: Floats, places: Floats,
+    vertices: Floats, values: Floats, spreads: Floats,
+) -> None:  # fmt: skip
+    """Fill `values` and `spreads` (K, 1), as `measurements.measured` gives them."""
+    here, regions = len(classes) - len(places), plan.extent[1]
+    bottom, top = np.empty(len(classes)), np.empty(len(classes))
+    for row in range(len(classes)):
+        bottom[row] = top[row] = np.nan
+        if row >= here:
+            bottom[row], top[row] = places[row - here, 0], places[row - here, 1]
+        elif row >= here - regions:
+            heights = plan.region_heights[row - here + regions]
+            bottom[row], top[row] = heights[0], heights[1]
+    members = np.empty(len(plan.operand_rows), np.int64)
+    for k in range(len(members)):
+        is_there = _is_there(classes, plan.operand_rows[k], plan.operand_classes[k])
+        members[k] = plan.operand_rows[k] if is_there else ABSENT
+    measured = np.empty((len(plan.geometric), 1))
+    measure_rows(
+        _starts(plan.extent[0], plan.region_parts, counts),
+        _starts(0, plan.region_sizes, sizes),
+        _joined(plan.region_vertices, vertices).reshape((-1, 2)),
+        _joined(plan.region_radius, radius),
+        bottom,
+        top,
+        members,
+        plan.operand_start,
+        _lengths(plan.operand_start),
+        plan.enlargement,
+        plan.quantity,
+        plan.first,
+        plan.second,
+        measured,
+    )
+    of_operands = _spreads(plan.operand_start, members, places, here)
+    for g in range(len(plan.geometric)):
+        k = plan.geometric[g]
+        values[k, 0] = measured[g, 0]
+        spreads[k, 0] = of_operands[plan.first[g]] + of_operands[plan.second[g]]  # the last for -1
+    for y in range(len(plan.yaws)):
+        k, a, b = plan.yaws[y]
+        yaws = _yaw(a, classes, places, here), _yaw(b, classes, places, here)
+        values[k, 0], spreads[k, 0] = misalignment_of(yaws[0], yaws[1]), 0.0
+    for k in range(len(values)):
+        for at in range(plan.required_start[k], plan.required_start[k + 1]):
+            if classes[plan.required[at]] == ABSENT:
+                values[k, 0] = np.nan
+
+
+@inlined
+def _members(plan: PlanArrays, classes: Integers, members: Flags) -> None:
+    """Fill `members` (M, 1): whether each binding is one (1, 0), or that is not known (-1)."""
+    for m in range(len(members)):
+        members[m, 0] = 0 if plan.is_group[m] else 1
+        for k in range(plan.member_start[m], plan.member_start[m + 1]):
+            if not _is_there(classes, plan.member_rows[k], plan.member_classes[k]):
+                members[m, 0] = -1 if plan.is_group[m] else 0
+
+
+@inlined
+def _channels_of(values: Floats, spreads: Floats, signals: Floats, members: Flags) -> int:
+    """How many channels hold what is known: 4 with uncertainty, 2 with anything unknown, else 1."""
+    channels = 1
+    for k in range(len(values)):
+        if spreads[k, 0] != 0.0:
+            return 4
+        if not np.isfinite(values[k, 0]):
+            channels = 2
+    for k in range(len(signals)):
+        if not np.isfinite(signals[k, 0]):
+            channels = 2
+    for k in range(len(members)):
+        if members[k, 0] < 0:
+            channels = 2
+    return channels
+
+
+@kernel
+def leaves_of_sample(packed_plan: PackedPlan, whole: Integers, numbers: Floats, vertices: Floats) -> Floats:
+    """(C, A, 1), as `leaf_values` gives them.
+
+    Args:
+        whole: class codes of the samples and of the places, parts of each place, vertices of each part.
+        numbers: `NUMBERS_OF_PLACE` of each place, radius of each part, value of each signal.
+        vertices: x and y of each vertex of all parts.
+    """
+    plan = _unpacked(packed_plan)
+    samples, regions, places, signals = plan.extent
+    counts = whole[samples + places : samples + 2 * places]
+    sizes = whole[samples + 2 * places :]
+    classes = np.zeros(samples + regions + places, np.int64)
+    for k in range(samples):
+        classes[k] = whole[k]
+    for k in range(places):
+        classes[samples + regions + k] = whole[samples + k]
+    of_places = numbers[: NUMBERS_OF_PLACE * places].reshape((places, NUMBERS_OF_PLACE))
+    radius = numbers[NUMBERS_OF_PLACE * places : len(numbers) - signals]
+    of_signals = numbers[len(numbers) - signals :].reshape((signals, 1))
+    values = np.empty((len(plan.required_start) - 1, 1))
+    spreads = np.empty((len(plan.required_start) - 1, 1))
+    _measure(plan, classes, counts, sizes, radius, of_places, vertices, values, spreads)
+    members = np.empty((len(plan.is_group), 1), np.int8)
+    _members(plan, classes, members)
+    channels = _channels_of(values, spreads, of_signals, members)
+    leaves = np.empty((channels, len(plan.outputs), 1))
+    run_instructions(plan.code, plan.constants, values, spreads, of_signals, members, plan.outputs, leaves)
+    return leaves

@@ -1,0 +1,179 @@
+"""Where a plan finds what terms are about: rows for objects in the samples looked at, numbered as needed.
+
+The few earlier samples that a monitor still looks back at.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from typing import NamedTuple, TypeAlias
+
+from spatial_replay.monitor.atoms.instructions import Membership
+from spatial_replay.monitor.atoms.live_kernel import ANY
+from spatial_replay.monitor.atoms.terms import left_out_of, open_group
+from spatial_replay.spec.formula import (
+    ANY_CLASS,
+    Atom,
+    Earlier,
+    Enlarged,
+    Formula,
+    Group,
+    Outline,
+    Quantified,
+    RegionName,
+    Term,
+)
+from spatial_replay.spec.walks import iter_formulas, terms_of
+from spatial_replay.trace.sample import Sample
+
+
+class Delay(NamedTuple):
+    """How far a term looks back: so many samples, or to the last sample at least so many ns earlier."""
+
+    samples: int | None
+    duration_ns: int | None
+
+    @classmethod
+    def of(cls, term: Earlier) -> Delay:
+        return cls(term.samples, term.duration_ns)
+
+
+NO_DELAY = Delay(0, None)
+
+
+def iter_delays(formulas: Iterable[Formula]) -> Iterator[Delay]:
+    """How far each term in some formulas looks back, for those that do."""
+    for formula in chain.from_iterable(map(iter_formulas, formulas)):
+        terms = terms_of(formula.expression) if isinstance(formula, Atom) else ()
+        for term in chain(terms, (formula.group,) if isinstance(formula, Quantified) else ()):
+            while isinstance(term, Enlarged):
+                term = term.term
+            if isinstance(term, Earlier):
+                yield Delay.of(term)
+
+
+class RecentSamples:
+    """What is at some delays, sample after sample. It keeps the samples within the delays, no others."""
+
+    def __init__(self, delays: Iterable[Delay]) -> None:
+        self._queues: list[tuple[Delay, deque[Sample]]] = [(delay, deque()) for delay in delays]
+
+    def take(self, sample: Sample) -> list[Sample | None]:
+        """Take in the next sample; the sample at each delay from it, None where that is before the first."""
+        return [_at_delay(delay, queue, sample) for delay, queue in self._queues]
+
+
+def _at_delay(delay: Delay, queue: deque[Sample], sample: Sample) -> Sample | None:
+    if delay == NO_DELAY:
+        return sample
+    queue.append(sample)
+    if delay.duration_ns is None:
+        while len(queue) > (delay.samples or 0) + 1:
+            queue.popleft()
+        return queue[0] if len(queue) > (delay.samples or 0) else None
+    latest_ns = sample.time_ns - delay.duration_ns
+    while len(queue) > 1 and queue[1].time_ns <= latest_ns:
+        queue.popleft()
+    return queue[0] if queue[0].time_ns <= latest_ns else None
+
+
+Leaves: TypeAlias = Sequence[Atom | Quantified]
+
+
+class Member(NamedTuple):
+    """An object that an open group may hold: its name, and the code of its class."""
+
+    name: str
+    class_code: int
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What plans for a specification share.
+
+    Attributes:
+        leaves: those of each formula.
+        delays: the samples looked at, the newest first.
+        classes: the code of each class that open groups ask for, by its name in lower case; others have 0.
+        regions: the shapes that formulas may name.
+    """
+
+    leaves: Sequence[Leaves]
+    delays: tuple[Delay, ...]
+    classes: Mapping[str, int]
+    regions: Mapping[str, Outline]
+
+
+class Row(NamedTuple):
+    """A row of a plan, and the class that it must have (or `ANY`) to count."""
+
+    row: int
+    class_code: int = ANY
+
+
+class Rows:
+    """Rows for what terms are about, numbered as they are asked for (see `plan_kernel`)."""
+
+    def __init__(self, frame: Frame, members: frozenset[Member]) -> None:
+        self._frame = frame
+        self._members = members
+        self._sample = {delay: number for number, delay in enumerate(frame.delays)}
+        self._region = {name: len(self._sample) + number for number, name in enumerate(frame.regions)}
+        self.places: dict[tuple[int, str], int] = {}
+
+    def candidates(self, group: Group | Earlier) -> tuple[str, ...]:
+        base = open_group(group)
+        wanted = self._class_wanted(base)
+        fitting = {name for name, code in self._members if wanted in (ANY, code)}
+        return tuple(sorted(fitting - left_out_of(base)))
+
+    def may_be_unknown(self, group: Group | Earlier) -> bool:
+        return isinstance(group, Earlier)
+
+    def of_membership(self, membership: Membership) -> list[Row]:
+        sample = self._sample_of(membership.group)
+        if not membership.chosen:
+            return [Row(sample)]
+        names, wanted = self.candidates(membership.group), self._class_wanted(open_group(membership.group))
+        return [Row(self._place(sample, names[each]), wanted) for each in membership.chosen]
+
+    def of_term(self, term: Term) -> list[Row]:
+        """The rows that a term is the union of."""
+        while isinstance(term, Enlarged):
+            term = term.term
+        sample = self._sample_of(term)
+        base = term.term if isinstance(term, Earlier) else term
+        if isinstance(base, RegionName):
+            return [Row(self._region[base.name])]
+        if not isinstance(base, Group):
+            return [Row(self._place(sample, base.name))]
+        if base.members is None:
+            wanted = self._class_wanted(base)
+            return [Row(self._place(sample, name), wanted) for name in self.candidates(base)]
+        left_out = left_out_of(base)
+        return [Row(self._place(sample, name)) for name in base.members if name not in left_out]
+
+    def required(self, term: Term) -> list[int]:
+        """The rows without which a term is unknown as a whole: that of its sample among them."""
+        while isinstance(term, Enlarged):
+            term = term.term
+        base = term.term if isinstance(term, Earlier) else term
+        sample = [self._sample_of(term)] if isinstance(term, Earlier) else []
+        if isinstance(base, RegionName) or (isinstance(base, Group) and base.members is None):
+            return sample
+        return sample + [each.row for each in self.of_term(term)]
+
+    def _sample_of(self, term: Term) -> int:
+        return self._sample[Delay.of(term) if isinstance(term, Earlier) else NO_DELAY]
+
+    def _class_wanted(self, group: Group) -> int:
+        if group.class_name == ANY_CLASS:
+            return ANY
+        return self._frame.classes[(group.class_name or "").casefold()]
+
+    def _place(self, sample: int, name: str) -> int:
+        first = len(self._sample) + len(self._region)
+        return self.places.setdefault((sample, name), first + len(self.places))

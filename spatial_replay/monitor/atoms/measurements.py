@@ -1,0 +1,189 @@
+"""Atoms and open quantifiers: their values in every sample, from measurements and signals.
+
+Numbers that leaves are computed from: measured once per trace, kept for the next edit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Flags, Floats
+from spatial_replay.geometry.measure import Operand, Quantity, Request, measure, misalignment
+from spatial_replay.monitor.atoms.instructions import LeafCode, Membership, run_instructions
+from spatial_replay.monitor.atoms.terms import Bindings, Scene
+from spatial_replay.spec.formula import (
+    CentroidProjection,
+    Earlier,
+    Enlarged,
+    Formula,
+    Measurement,
+    Misalignment,
+    Projection,
+    Protrusion,
+    RegionName,
+    SignedDistance,
+    Term,
+)
+
+
+def measured(scene: Scene, measurements: Sequence[Measurement]) -> tuple[Floats, Floats]:
+    """Each measurement in each sample of a scene.
+
+    Returns:
+        Values (K, T), NaN where unknown, and how far each may be off for uncertainty (K, T).
+    """
+    keys = [_key(scene, measurement) for measurement in measurements]
+    memo = scene.trace.memo
+    found = {key: array for key in keys if (array := memo.get(key)) is not None}
+    missing = {
+        key: measurement for key, measurement in zip(keys, measurements, strict=True) if key not in found
+    }
+    if missing:
+        for key, array in zip(missing, _measure(scene, list(missing.values())), strict=True):
+            memo.keep(key, array)
+            found[key] = array
+    if not keys:
+        return np.empty((0, len(scene))), np.empty((0, len(scene)))
+    values, spreads = (np.array([found[key][row] for key in keys]) for row in (0, 1))
+    return values, spreads
+
+
+def _measure(scene: Scene, measurements: Sequence[Measurement]) -> list[Floats]:
+    """(2, T) for each: value, NaN where unknown, and uncertainty; all in one kernel call."""
+    numbers: dict[Term, int] = {}
+    operands: list[Operand] = []
+
+    def operand(term: Term) -> int:
+        if term not in numbers:
+            numbers[term] = len(operands)
+            operands.append(scene.find(term).operand)
+        return numbers[term]
+
+    requests = [
+        Request(quantity_of(each), *(operand(term) for term in measured_terms(each)))
+        for each in measurements
+        if not isinstance(each, Misalignment)
+    ]
+    values = iter(measure(scene.batch, operands, requests) if requests else ())
+    result = []
+    for each in measurements:
+        found = [scene.find(term) for term in measured_terms(each)]
+        if isinstance(each, Misalignment):
+            value, spread = misalignment(found[0].yaw, found[1].yaw), np.zeros(len(scene))
+        else:
+            value, spread = next(values), np.sum([one.spread for one in found], axis=0)
+        unknown = np.logical_or.reduce([one.unknown for one in found])
+        if unknown.any():
+            value = np.where(unknown, np.nan, value)
+        array = np.array((value, spread))
+        array.flags.writeable = False
+        result.append(array)
+    return result
+
+
+def measured_terms(measurement: Measurement) -> tuple[Term, ...]:
+    """The one or two terms that a measurement is of."""
+    match measurement:
+        case SignedDistance() | Misalignment():
+            return measurement.first, measurement.second
+        case Protrusion():
+            return measurement.inner, measurement.outer
+        case Projection() | CentroidProjection():
+            return (measurement.term,)
+
+
+def quantity_of(measurement: Measurement) -> Quantity:
+    match measurement:
+        case SignedDistance():
+            return "signed_distance"
+        case Protrusion():
+            return "protrusion"
+        case Projection():
+            return f"{measurement.side}_{measurement.axis}"  # type: ignore[return-value]
+        case CentroidProjection():
+            return f"centroid_{measurement.side}_{measurement.axis}"  # type: ignore[return-value]
+        case Misalignment():
+            raise TypeError("an orientation is no quantity of footprints")
+
+
+def _key(scene: Scene, measurement: Measurement) -> Hashable:
+    """What a measurement is apart from the specification it stands in: regions by shape, not by name."""
+    shapes = tuple(
+        scene.regions[name] for name in map(_region, measured_terms(measurement)) if name is not None
+    )
+    if not shapes:
+        return scene.skip, measurement
+    nameless: Measurement
+    match measurement:
+        case SignedDistance():
+            nameless = replace(
+                measurement, first=_unnamed(measurement.first), second=_unnamed(measurement.second)
+            )
+        case Protrusion():
+            nameless = replace(
+                measurement, inner=_unnamed(measurement.inner), outer=_unnamed(measurement.outer)
+            )
+        case _:
+            return scene.skip, measurement, shapes
+    return scene.skip, nameless, shapes
+
+
+def _region(term: Term) -> str | None:
+    while isinstance(term, (Enlarged, Earlier)):
+        term = term.term
+    return term.name if isinstance(term, RegionName) else None
+
+
+def _unnamed(term: Term) -> Term:
+    if isinstance(term, Enlarged):
+        return Enlarged(_unnamed(term.term), term.radius)
+    return RegionName("") if _region(term) is not None else term
+
+
+def leaf_values(scene: Scene, leaves: Sequence[Formula], bindings: Bindings) -> Floats:
+    """Each leaf in each sample of a scene.
+
+    Returns:
+        (C, A, T) with C = 1 where everything is known, C = 2 (low and high end) where something may not be,
+        C = 4 (the same with uncertainty behind them) where there is uncertainty.
+
+    Raises:
+        UsageError: more than `MAX_BINDINGS`.
+    """
+    code = LeafCode(scene)
+    outputs = code.add_leaves(leaves, bindings)
+    values, spreads = measured(scene, list(code.measurements))
+    missing = np.full(len(scene), np.nan)
+    signals = np.array(
+        [
+            scene.trace.signals[name][scene.skip :] if name in scene.trace.signals else missing
+            for name in code.signals
+        ]
+    ).reshape(len(code.signals), len(scene))
+    members = np.array([_flags(scene, each) for each in code.members], np.int8)
+    members = members.reshape(len(code.members), len(scene))
+    is_known = np.isfinite(values).all() and np.isfinite(signals).all() and not (members < 0).any()
+    channels = 4 if spreads.any() else 1 if is_known else 2
+    result = np.empty((channels, len(outputs), len(scene)))
+    run_instructions(
+        np.array(list(code.rows), np.int64).reshape(len(code.rows), 4),
+        np.array(list(code.constants), np.float64),
+        values,
+        spreads,
+        signals,
+        members,
+        np.array(outputs, np.int64),
+        result,
+    )
+    return result
+
+
+def _flags(scene: Scene, membership: Membership) -> Flags:
+    """(T,): what a binding is in each sample (see `Membership`)."""
+    _, members, unknown = scene.members(membership.group)
+    if not membership.chosen:
+        return np.where(unknown, -1, 0).astype(np.int8)
+    return np.asarray(members[:, membership.chosen].min(axis=1))

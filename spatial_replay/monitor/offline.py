@@ -1,0 +1,166 @@
+"""A formula over a finished stretch of samples: every node at every sample.
+
+This is the usual offline robustness, rho(t, node) from each sample to the end, beside the monitor's numbers,
+which are about the first and the newest sample. A window that slides over a run is a stretch of its own.
+
+Every subformula of a formula, compiled for `finished_kernel.run_finished`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import count
+from types import MappingProxyType
+
+import numpy as np
+
+from spatial_replay.errors import UsageError
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.offline_kernel import run_finished, run_windows
+from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.codes import FINISHED_TARGET, low_and_high
+from spatial_replay.monitor.online.operators import SignalTable, array_of_rows
+from spatial_replay.spec.formula import FUTURE_OPERATORS, Atom, Formula, Quantified, Temporal, iter_nodes
+from spatial_replay.trace.sample import LATEST_NS
+
+_MIRRORED = MappingProxyType({"X": "Y", "F": "O", "G": "H", "U": "S"})
+"""Future operators and the past ones that they are in reversed time."""
+
+
+class FinishedTable(SignalTable):
+    """Rows of past operators, and of future operators as past ones in reversed time.
+
+    That needs the samples' end, so it is for a stretch that is finished; there, unlike for a stretch that
+    grows, every operator is a single pass.
+    """
+
+    def add(self, formula: Formula) -> int:
+        """The row of a formula."""
+        if isinstance(formula, Temporal) and formula.operator in FUTURE_OPERATORS:
+            return self._future(formula, [self.add(each) for each in formula.operands])
+        return super().add(formula)
+
+    def instructions(self, nodes: Sequence[int]) -> Integers:
+        """Rows with the columns that they read and write: that of node n is n, others come after.
+
+        Args:
+            nodes: (N,), the row of each node.
+
+        Returns:
+            (R, FINISHED_WIDTH), operands first.
+        """
+        column = {row: node for node, row in reversed(list(enumerate(nodes)))}
+        others = (row for row in range(len(self._rows)) if row not in column)
+        column |= dict(zip(others, count(len(nodes)), strict=False))
+        result = []
+        for number, (code, a, b, *rest) in enumerate(self._rows):
+            operands = (a, b) if code == codes.LEAF else (column[a], column[b])
+            result.append((code, *operands, *rest, column[number]))
+        # equal nodes share a row, but each has a column of its own
+        copies = [(codes.AND, column[row], column[row], 0, 0, 0, n) for n, row in enumerate(nodes)]
+        result += [copy for copy in copies if copy[1] != copy[-1]]
+        return array_of_rows(result, codes.FINISHED_WIDTH)
+
+    def _future(self, formula: Temporal, operands: list[int]) -> int:
+        match formula.operator:
+            case "WX":
+                return self._delay(operands[0], codes.SAMPLES, 1, codes.AHEAD, is_weak=True)
+            case "R":
+                negated = [self._row(codes.NOT, each) for each in operands]
+                until = self._temporal("S", negated, formula.bound, codes.AHEAD)
+                return self._row(codes.NOT, until)
+            case "W":
+                until = self._temporal("S", operands, formula.bound, codes.AHEAD)
+                always = self._temporal("H", operands[:1], formula.bound, codes.AHEAD)
+                return self._row(codes.OR, until, always)
+        return self._temporal(_MIRRORED[formula.operator], operands, formula.bound, codes.AHEAD)
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """Every node at every sample.
+
+    Attributes:
+        columns: (C, N, T), the ends of each node's interval (see `channels`).
+    """
+
+    columns: Floats
+
+    def ends(self, node: int, *, wide: bool = True) -> tuple[Floats, Floats]:
+        """Low and high end (T,) of a node's robustness at each sample, with uncertainty unless not `wide`."""
+        low, high = low_and_high(len(self.columns), wide=wide)
+        return self.columns[low, node], self.columns[high, node]
+
+
+def finished(
+    formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
+) -> Finished:
+    """Evaluate every node over all samples.
+
+    Args:
+        order: which leaf is which.
+        leaves: (C, A, T), their intervals (see `leaf_values`).
+        times_ns: (T,), increasing.
+    """
+    table, nodes, width = _compiled(formula, order)
+    columns = np.empty((len(leaves), width, len(times_ns)))
+    extrema = np.empty(len(times_ns))
+    run_finished(table, np.ascontiguousarray(leaves), times_ns, 0, len(times_ns), columns, extrema)
+    return Finished(columns[:, :nodes])
+
+
+def full_signal(
+    formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
+) -> Floats:
+    """(N, T): each node's robustness at each sample, to the end of the stretch; NaN where not determined."""
+    return _determined(finished(formula, order, leaves[:2], times_ns).columns)
+
+
+def window_signal(
+    formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers, width_ns: int
+) -> Floats:
+    """(N, T): each node's robustness over the samples in (t - width, t], for the sample at each t.
+
+    It is that at the first of these samples, on these samples alone: past operators start there. NaN where it
+    is not determined. Takes time in proportion to the samples in a window.
+
+    Raises:
+        UsageError: a width that is no positive number of ns.
+    """
+    if isinstance(width_ns, bool) or not isinstance(width_ns, int) or not 0 < width_ns <= LATEST_NS:
+        raise UsageError(f"a window of {width_ns!r} ns; give its width as an integer, 1 to 2**63 - 1 ns")
+    table, nodes, width = _compiled(formula, order)
+    leaves = np.ascontiguousarray(leaves[:2])
+    starts = np.searchsorted(times_ns, times_ns - width_ns, side="right").astype(np.int64)
+    columns = np.empty((len(leaves), width, len(times_ns)))
+    result = np.empty((len(leaves), nodes, len(times_ns)))
+    run_windows(table, leaves, times_ns, starts, columns, np.empty(len(times_ns)), result)
+    return _determined(result)
+
+
+def new_leaves(formula: Formula, order: Sequence[Atom | Quantified]) -> list[Atom | Quantified]:
+    """The leaves of a formula that are not among others."""
+    table = FinishedTable(order)
+    table.add(formula)
+    return table.leaves[len(order) :]
+
+
+def _compiled(formula: Formula, order: Sequence[Atom | Quantified]) -> tuple[Integers, int, int]:
+    """The table of a formula, how many nodes it has, and how many columns it needs."""
+    table = FinishedTable(order)
+    nodes = [table.add(node) for _, _, node in iter_nodes(formula)]
+    instructions = table.instructions(nodes)
+    return instructions, len(nodes), int(instructions[:, FINISHED_TARGET].max()) + 1
+
+
+def _determined(ends: Floats) -> Floats:
+    """(C, N, T) ends, which are written to, as numbers (N, T).
+
+    Adding zero turns -0.0 into 0.0, so that equal numbers are equal bits.
+    """
+    determined: Floats = ends[0]
+    determined += 0.0
+    if len(ends) > 1:
+        determined[determined != ends[1]] = np.nan
+    return determined

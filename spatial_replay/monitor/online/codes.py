@@ -1,0 +1,95 @@
+"""Numbers by which `program` tells `step` what to do; the columns of its tables, in their order.
+
+Channels: what a number can be when something is unknown or uncertain.
+
+All numbers exist in up to four channels: the ends of the interval with every uncertainty at 0 (nominal low
+and high), and the ends with uncertainty (wide low and high). They are equal, and only the first is kept, for
+as long as everything is known; the second appears with the first unknown, the rest with uncertainty. A
+negation swaps low and high: channel ^ 1.
+"""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+from spatial_replay.geometry.arrays import Floats
+
+SAMPLES, NANOSECONDS = 0, 1
+
+# columns of signals
+SIGNAL_CODE, SIGNAL_A, SIGNAL_B, SIGNAL_UNIT, SIGNAL_LOW, SIGNAL_HIGH, SIGNAL_WINDOW = range(7)
+SIGNAL_WIDTH = 7
+FINISHED_TARGET = 6  # of finished stretches: the column that a row writes, in place of the window
+FINISHED_WIDTH = 7
+# codes of signals
+LEAF = 0  # leaf a
+CONSTANT = 1  # low times infinity
+NOT, AND, OR, XOR, IFF = 2, 3, 4, 5, 6
+ONCE, HISTORICALLY, SINCE = 7, 8, 9
+WINDOW_MAX, WINDOW_MIN = 10, 11  # of a, over [low, high] back
+DELAY = 12  # a, low back; high times infinity where there is none
+AHEAD = 16  # added to a code from ONCE on: its mirror image in time (see `finished`)
+
+# columns of parts' nodes
+# a = -1 for the left operand of an until that is `true`, of a release that is `false`
+NODE_CODE, NODE_A, NODE_B, NODE_WEAK, NODE_UNIT, NODE_LOW, NODE_HIGH = range(7)
+NODE_VARIABLE, NODE_TABLE, NODE_DEPENDS = 7, 8, 9  # the first two -1 for none
+NODE_WIDTH = 10
+# codes of parts' nodes
+LITERAL = 0  # signal a, negated if b
+PART_AND, PART_OR = 2, 3
+UNTIL, RELEASE = 4, 5  # max(b, min(a, next)); min(b, max(a, next))
+PART_WINDOW_MAX, PART_WINDOW_MIN = 6, 7  # of a, over [low, high] ahead
+SHIFT = 8  # a, low ahead; a is wanted up to high ahead
+PAST_SINCE, PAST_TRIGGER = 9, 10  # max(b, min(a, previous)); min(b, max(a, previous))
+PAST_WINDOW_MAX, PAST_WINDOW_MIN = 11, 12
+PAST_DELAY = 13
+ANCHORED_UNTIL, ANCHORED_RELEASE = 14, 15  # window [low, high] counted from the first sample
+BINARY_NODES = (
+    PART_AND, PART_OR, UNTIL, RELEASE, PAST_SINCE, PAST_TRIGGER, ANCHORED_UNTIL, ANCHORED_RELEASE,
+)  # fmt: skip
+
+# columns of parts: nodes, numbers of variables and tables, where its tables and its cells start
+PART_FIRST, PART_END, PART_VARIABLES, PART_TABLES, PART_TABLE_START, PART_CELL_START = range(6)
+PART_IS_FLAT, PART_IS_REMEMBERING, PART_END_CORNER = 6, 7, 8  # the corner that ends a run
+PART_WIDTH = 9
+
+# columns of reports: the index is of the signal or part, the rule is for now
+REPORT_CODE, REPORT_INDEX, REPORT_RULE, REPORT_FIRST, REPORT_END = range(5)
+REPORT_WIDTH = 5
+# codes of reports
+REPORT_SIGNAL, REPORT_PART = 0, 1
+REPORT_NOT, REPORT_AND, REPORT_OR, REPORT_XOR, REPORT_IMPLIES, REPORT_IFF, REPORT_SPEC = 2, 3, 4, 5, 6, 7, 8
+REPORT_OF_BOOLEAN = MappingProxyType(
+    {
+        "not": REPORT_NOT,
+        "and": REPORT_AND,
+        "or": REPORT_OR,
+        "xor": REPORT_XOR,
+        "->": REPORT_IMPLIES,
+        "<->": REPORT_IFF,
+        "spec": REPORT_SPEC,
+    }
+)
+NOW_LAST_OPERAND, NOW_EITHER, NOW_TRUE, NOW_FALSE, NOW_OF_PART = 0, 1, 2, 3, 4
+
+# how a run over the recent samples treats what lies beyond the last one
+OPEN_END, OPEN_LOW, OPEN_HIGH, OPEN_CORNER = 0, 1, 2, 3
+
+
+CHANNELS = 4
+"""Nominal low and high, wide low and high."""
+
+_STANDS_FOR = MappingProxyType({1: (0, 0, 0, 0), 2: (0, 1, 0, 1), 4: (0, 1, 2, 3)})
+"""Which channel of so many each of all stands for."""
+
+
+def in_channels(numbers: Floats, channels: int) -> Floats:
+    """Numbers (C, …) in the given number of channels, at least C: 1, 2 or 4."""
+    return numbers if len(numbers) == channels else numbers[list(_STANDS_FOR[len(numbers)][:channels])]
+
+
+def low_and_high(channels: int, *, wide: bool) -> tuple[int, int]:
+    """Which of so many channels hold the low and the high ends, nominal or with uncertainty."""
+    stands_for = _STANDS_FOR[channels]
+    return (stands_for[2], stands_for[3]) if wide else (stands_for[0], stands_for[1])

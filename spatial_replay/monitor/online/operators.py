@@ -1,0 +1,416 @@
+"""Parts: temporal operators that look ahead, compiled for `tables.step_tables` and `windows.step_windows`.
+
+A part is in negation normal form over signals, so that its value is monotone in everything it is made of.
+
+The signal table: subformulas without a future operator, compiled for `signals.step_signals`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from spatial_replay.errors import UsageError
+from spatial_replay.geometry.arrays import Integers
+from spatial_replay.monitor.online import codes
+from spatial_replay.spec.formula import (
+    FUTURE_OPERATORS,
+    Atom,
+    Boolean,
+    Bound,
+    Formula,
+    Quantified,
+    Temporal,
+    Truth,
+    operands_of,
+)
+
+Row = tuple[int, ...]
+"""A row of a table, its columns as `codes` lists them."""
+
+NOTHING = -1
+"""Stands where a row has no operand, no upper end, no variable, no table or no window."""
+
+_WINDOWS = (codes.WINDOW_MAX, codes.WINDOW_MIN)
+
+
+def looks_ahead(formula: Formula) -> bool:
+    """Whether a formula holds a future operator."""
+    if isinstance(formula, Temporal) and formula.operator in FUTURE_OPERATORS:
+        return True
+    return any(looks_ahead(operand) for operand in operands_of(formula))
+
+
+def window_of(bound: Bound | None) -> tuple[int, int, int | None]:
+    """The unit, the lower and the upper end (None: unbounded) of an operator's window."""
+    if bound is None:
+        return codes.SAMPLES, 0, None
+    return (codes.SAMPLES if bound.unit == "samples" else codes.NANOSECONDS), bound.lower, bound.upper
+
+
+def array_of_rows(rows: Sequence[Row], width: int) -> Integers:
+    """(R, width), also for no rows."""
+    return np.array(rows, np.int64).reshape(len(rows), width)
+
+
+class SignalTable:
+    """Collects rows; equal subformulas share one, and operands come before what they are operands of.
+
+    Attributes:
+        leaves: atoms and open quantifiers, by the number that their rows refer to.
+    """
+
+    def __init__(self, leaves: Sequence[Atom | Quantified] = ()) -> None:
+        """Begin with leaves that are numbered already."""
+        self.leaves: list[Atom | Quantified] = []
+        self._leaf_numbers: dict[tuple[object, ...], int] = {}
+        self._rows: dict[Row, int] = {}
+        for leaf in leaves:
+            self._leaf_number(leaf)
+
+    @property
+    def windows(self) -> int:
+        """How many rows keep a sliding window."""
+        return sum(row[0] in _WINDOWS for row in self._rows)
+
+    @property
+    def keeps_history(self) -> bool:
+        """Whether any row looks at more than the newest sample."""
+        return any(row[0] in _WINDOWS or row[0] == codes.DELAY for row in self._rows)
+
+    def array(self) -> Integers:
+        """(S, SIGNAL_WIDTH), with the numbers of the sliding windows."""
+        window = 0
+        rows = []
+        for row in self._rows:
+            is_window = row[0] in _WINDOWS
+            rows.append((*row, window if is_window else NOTHING))
+            window += is_window
+        return array_of_rows(rows, codes.SIGNAL_WIDTH)
+
+    def add(self, formula: Formula) -> int:
+        """The row of a formula without future operators."""
+        match formula:
+            case Truth():
+                return self._row(codes.CONSTANT, low=1 if formula.value else -1)
+            case Atom() | Quantified():
+                return self._row(codes.LEAF, self._leaf_number(formula))
+            case Boolean():
+                return self._boolean(formula.operator, [self.add(each) for each in formula.operands])
+            case Temporal():
+                operands = [self.add(each) for each in formula.operands]
+                return self._temporal(formula.operator, operands, formula.bound)
+
+    def _row(self, code: int, a: int = 0, b: int = 0, unit: int = 0, low: int = 0, high: int = 0) -> int:
+        return self._rows.setdefault((code, a, b, unit, low, high), len(self._rows))
+
+    def _leaf_number(self, formula: Atom | Quantified) -> int:
+        key: tuple[object, ...]
+        if isinstance(formula, Atom):
+            key = (formula.expression,)
+        else:
+            key = (formula.quantifier, formula.variables, formula.group, formula.body)
+        if key not in self._leaf_numbers:
+            self._leaf_numbers[key] = len(self.leaves)
+            self.leaves.append(formula)
+        return self._leaf_numbers[key]
+
+    def _boolean(self, operator: str, operands: list[int]) -> int:
+        first, *rest = operands
+        match operator:
+            case "not":
+                return self._row(codes.NOT, first)
+            case "spec":
+                return first
+            case "and" | "or":
+                for operand in rest:
+                    first = self._row(codes.AND if operator == "and" else codes.OR, first, operand)
+                return first
+            case "xor":
+                return self._row(codes.XOR, first, rest[0])
+            case "->":
+                return self._row(codes.OR, self._row(codes.NOT, first), rest[0])
+            case _:
+                return self._row(codes.IFF, first, rest[0])
+
+    def _temporal(self, operator: str, operands: list[int], bound: Bound | None, ahead: int = 0) -> int:
+        """A past operator; with `codes.AHEAD`, the future operator that is its mirror image in time."""
+        unit, low, high = window_of(bound)
+        match operator:
+            case "Y":
+                return self._delay(operands[0], codes.SAMPLES, 1, ahead)
+            case "S":
+                left, right = operands
+                return self._since(left, right, unit, low, high, ahead)
+        is_weak = operator == "H"
+        if high is not None:
+            code = codes.WINDOW_MIN if is_weak else codes.WINDOW_MAX
+            return self._row(code + ahead, operands[0], 0, unit, low, high)
+        running = self._row((codes.HISTORICALLY if is_weak else codes.ONCE) + ahead, operands[0])
+        return running if low == 0 else self._delay(running, unit, low, ahead, is_weak=is_weak)
+
+    def _since(self, left: int, right: int, unit: int, low: int, high: int | None, ahead: int) -> int:
+        """phi S[a,b] psi as O[a,b] psi and phi S[a,inf] psi, the latter as phi on the last a and
+        phi S psi before: since min distributes over max, both are exact for robustness too."""
+        result = self._row(codes.SINCE + ahead, left, right)
+        if low > 0:
+            before = self._delay(result, unit, low, ahead)
+            since = self._row(codes.WINDOW_MIN + ahead, left, 0, unit, 0, low - 1)
+            result = self._row(codes.AND, since, before)
+        if high is not None:
+            within = self._row(codes.WINDOW_MAX + ahead, right, 0, unit, low, high)
+            result = self._row(codes.AND, within, result)
+        return result
+
+    def _delay(self, operand: int, unit: int, distance: int, ahead: int, *, is_weak: bool = False) -> int:
+        """An operand so far back: +inf where there is none for a weak operator, -inf for a strong one."""
+        return self._row(codes.DELAY + ahead, operand, 0, unit, distance, 1 if is_weak else -1)
+
+
+MAX_VARIABLES = 12
+"""How many unbounded future operators one part may nest: its table has 2**variables entries."""
+
+_ANCHORED = (codes.ANCHORED_UNTIL, codes.ANCHORED_RELEASE)
+_RUNNING = (codes.UNTIL, codes.RELEASE)
+_RECURRENT_PAST = (codes.PAST_SINCE, codes.PAST_TRIGGER)
+_PAST = (*_RECURRENT_PAST, codes.PAST_WINDOW_MAX, codes.PAST_WINDOW_MIN, codes.PAST_DELAY)
+
+
+def part_of(signals: SignalTable, node: Temporal) -> Part:
+    """The part of a node: anchored where that does, since it is the cheaper to run.
+
+    Raises:
+        UsageError: more than `MAX_VARIABLES` unbounded future operators.
+    """
+    bounded = node.operator in FUTURE_OPERATORS and (node.bound is not None or node.operator in ("X", "WX"))
+    part = Part(signals, node, anchored=bounded)
+    if bounded and not part.is_flat:
+        part = Part(signals, node, anchored=False)
+    if part.variables > MAX_VARIABLES:
+        raise UsageError(
+            f"a formula nests {part.variables} unbounded temporal operators under one {node.operator}; "
+            f"{MAX_VARIABLES} is the limit: split it into specs joined by `and`"
+        )
+    return part
+
+
+class Part:
+    """The rows of one part, operands first; equal subformulas share one.
+
+    Attributes:
+        variables: how many operators take a value from the next sample on.
+        tables: 1, and one for each past operator that carries a table of its own.
+    """
+
+    def __init__(self, signals: SignalTable, root: Temporal, *, anchored: bool) -> None:
+        """Build the part of a node that looks ahead.
+
+        Args:
+            signals: receives the subformulas that do not look ahead.
+            anchored: whether the root is a bounded operator that is only ever asked for at the first
+                sample, so that its window is a fixed stretch of the run and needs no history.
+        """
+        self.variables = 0
+        self.tables = 1
+        self._signals = signals
+        self._rows: dict[Row, int] = {}
+        self._added: dict[tuple[int, bool], int] = {}
+        if anchored:
+            self._anchored(root.operator, [self._add(each, True) for each in root.operands], root.bound)
+        else:
+            self._add(root, True)
+
+    def rows(self) -> tuple[Row, ...]:
+        """Rows with the number of their variable, of their table, and whether they depend on either."""
+        variable = 0
+        table = 1  # the part's own is 0
+        result: list[Row] = []
+        for *fields, is_variable in self._rows:
+            has_table = fields[0] in _RECURRENT_PAST
+            below = any(result[each][-1] for each in _operand_rows(*fields[:3]))
+            result.append(
+                (
+                    *fields,
+                    variable if is_variable else NOTHING,
+                    table if has_table else NOTHING,
+                    int(is_variable or has_table or below),
+                )
+            )
+            variable += is_variable
+            table += has_table
+        return tuple(result)
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether one sample settles everything but the variables: no window, shift or past operator."""
+        flat = (codes.LITERAL, codes.PART_AND, codes.PART_OR, *_ANCHORED)
+        return all(row[0] in flat or (row[0] in _RUNNING and row[-1]) for row in self._rows)
+
+    @property
+    def is_remembering(self) -> bool:
+        """Whether a past operator stands over a future one."""
+        return any(row[0] in _PAST for row in self._rows)
+
+    @property
+    def end_corner(self) -> int:
+        """The corner of the table that ends a run: +inf for weak operators, -inf for strong ones."""
+        weak = [row[3] for row in self._rows if row[-1]]
+        return sum(1 << variable for variable, is_weak in enumerate(weak) if is_weak)
+
+    def _row(
+        self,
+        code: int,
+        a: int = 0,
+        b: int = 0,
+        weak: int = 0,
+        unit: int = 0,
+        low: int = 0,
+        high: int = 0,
+        variable: bool = False,
+    ) -> int:
+        key = (code, a, b, weak, unit, low, high, int(variable))
+        if key not in self._rows:
+            self._rows[key] = len(self._rows)
+            self.variables += variable
+            self.tables += code in _RECURRENT_PAST
+        return self._rows[key]
+
+    def _add(self, formula: Formula, positive: bool) -> int:
+        """The row of a formula, or of its negation, in negation normal form.
+
+        Each is built once in either polarity: `xor` and `<->` ask for their operands in both.
+        """
+        key = (id(formula), positive)
+        if key not in self._added:
+            self._added[key] = self._built(formula, positive)
+        return self._added[key]
+
+    def _built(self, formula: Formula, positive: bool) -> int:
+        if isinstance(formula, Boolean) and looks_ahead(formula):
+            return self._boolean(formula, positive)
+        if isinstance(formula, Temporal) and looks_ahead(formula):
+            operands = [self._add(each, positive) for each in formula.operands]
+            if formula.operator in FUTURE_OPERATORS:
+                return self._future(formula.operator, operands, formula.bound, positive)
+            return self._past(formula.operator, operands, formula.bound, positive)
+        return self._row(codes.LITERAL, self._signals.add(formula), 0 if positive else 1)
+
+    def _boolean(self, formula: Boolean, positive: bool) -> int:
+        first, *rest = formula.operands
+        match formula.operator:
+            case "not":
+                return self._add(first, not positive)
+            case "spec":
+                return self._add(first, positive)
+            case "and" | "or":
+                is_both = (formula.operator == "and") == positive
+                row = self._add(first, positive)
+                for operand in rest:
+                    row = self._join(row, self._add(operand, positive), is_both=is_both)
+                return row
+            case "->":
+                operands = self._add(first, not positive), self._add(rest[0], positive)
+                return self._join(*operands, is_both=not positive)
+        return self._either_way(first, rest[0], positive, is_xor=formula.operator == "xor")
+
+    def _either_way(self, first: Formula, second: Formula, positive: bool, *, is_xor: bool) -> int:
+        """`xor` or `<->`, from its operands as they stand and negated, in the polarity of this node."""
+        a, b = self._add(first, positive), self._add(second, positive)
+        not_a, not_b = self._add(first, not positive), self._add(second, not positive)
+        pairs = ((a, not_b), (not_a, b)) if is_xor else ((not_a, b), (not_b, a))
+        inner = is_xor == positive
+        return self._join(*(self._join(*pair, is_both=inner) for pair in pairs), is_both=not inner)
+
+    def _join(self, first: int, second: int, *, is_both: bool) -> int:
+        return self._row(codes.PART_AND if is_both else codes.PART_OR, first, second)
+
+    def _future(self, operator: str, operands: list[int], bound: Bound | None, positive: bool) -> int:
+        operator, left, right, bound = _as_until_or_release(operator, operands, bound)
+        unit, low, high = window_of(bound)
+        # In its polarity the node is one of: until (U; weak: W) or release (R; strong: M)
+        is_until = (operator in ("F", "U", "W")) == positive
+        if operator == "W" and bound is not None:
+            until = self._bounded(left, right, unit, low, high, is_until=is_until)
+            always = self._bounded(NOTHING, left, unit, low, high, is_until=not is_until)
+            return self._join(until, always, is_both=not positive)
+        if operator == "W":
+            return self._unbounded(left, right, is_until=is_until, weak=positive)
+        return self._bounded(left, right, unit, low, high, is_until=is_until)
+
+    def _unbounded(self, left: int, right: int, *, is_until: bool, weak: bool, variable: bool = True) -> int:
+        code = codes.UNTIL if is_until else codes.RELEASE
+        return self._row(code, left, right, int(weak), variable=variable)
+
+    def _bounded(
+        self, left: int, right: int, unit: int, low: int, high: int | None, *, is_until: bool
+    ) -> int:
+        """Until or release over a window, by the identity that `SignalTable` uses for since."""
+        weak = int(not is_until)
+        own, other = _by_kind(codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN, is_until)
+        within = None if high is None else self._row(own, right, 0, weak, unit, low, high)
+        if within is not None and left == NOTHING:
+            return within
+        running = self._unbounded(left, right, is_until=is_until, weak=bool(weak), variable=high is None)
+        if low > 0 or high is not None:
+            running = self._row(codes.SHIFT, running, 0, weak, unit, low, NOTHING if high is None else high)
+        if low > 0 and left != NOTHING:
+            before = self._row(other, left, 0, 1 - weak, unit, 0, low - 1)
+            running = self._join(before, running, is_both=is_until)
+        return running if within is None else self._join(within, running, is_both=is_until)
+
+    def _past(self, operator: str, operands: list[int], bound: Bound | None, positive: bool) -> int:
+        unit, low, high = window_of(bound)
+        if operator == "Y":
+            return self._row(codes.PAST_DELAY, operands[0], 0, int(not positive), codes.SAMPLES, 1)
+        left, right = (NOTHING, operands[0]) if operator in ("O", "H") else operands
+        is_since = (operator in ("O", "S")) == positive
+        weak = int(not is_since)
+        own, other = _by_kind(codes.PAST_WINDOW_MAX, codes.PAST_WINDOW_MIN, is_since)
+        within = None if high is None else self._row(own, right, 0, weak, unit, low, high)
+        if within is not None and left == NOTHING:
+            return within
+        result = self._row(codes.PAST_SINCE if is_since else codes.PAST_TRIGGER, left, right, weak)
+        if low > 0:
+            result = self._row(codes.PAST_DELAY, result, 0, weak, unit, low)
+            if left != NOTHING:
+                before = self._row(other, left, 0, 1 - weak, unit, 0, low - 1)
+                result = self._join(before, result, is_both=is_since)
+        return result if within is None else self._join(within, result, is_both=is_since)
+
+    def _anchored(self, operator: str, operands: list[int], bound: Bound | None) -> int:
+        operator, left, right, bound = _as_until_or_release(operator, operands, bound)
+        unit, low, high = window_of(bound)
+
+        def window(code: int, left: int, right: int) -> int:
+            weak = int(code == codes.ANCHORED_RELEASE)
+            end = NOTHING if high is None else high
+            return self._row(code, left, right, weak, unit, low, end, variable=True)
+
+        if operator == "W":
+            until = window(codes.ANCHORED_UNTIL, left, right)
+            return self._join(until, window(codes.ANCHORED_RELEASE, NOTHING, left), is_both=False)
+        return window(codes.ANCHORED_UNTIL if operator in ("F", "U") else codes.ANCHORED_RELEASE, left, right)
+
+
+def _as_until_or_release(
+    operator: str, operands: list[int], bound: Bound | None
+) -> tuple[str, int, int, Bound | None]:
+    """A future operator with a left operand, `NOTHING` for F and G; X is F[1,1], and WX is G[1,1]."""
+    if operator in ("X", "WX"):
+        operator, bound = ("F" if operator == "X" else "G"), Bound(1, 1, "samples")
+    left, right = (NOTHING, operands[0]) if operator in ("F", "G") else operands
+    return operator, left, right, bound
+
+
+def _by_kind(greatest: int, least: int, is_strong: bool) -> tuple[int, int]:
+    """Which extremum an until or since takes of its right operand, and which of its left one."""
+    return (greatest, least) if is_strong else (least, greatest)
+
+
+def _operand_rows(code: int, a: int, b: int) -> tuple[int, ...]:
+    if code == codes.LITERAL:
+        return ()
+    if code in codes.BINARY_NODES:
+        return (a, b) if a != NOTHING else (b,)
+    return (a,)

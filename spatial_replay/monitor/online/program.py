@@ -1,0 +1,150 @@
+"""Formulas compiled for the step kernels: flat tables of what to do with each sample.
+
+A formula becomes three tables, each in an order in which operands come first:
+
+- *signals*: every subformula without a future operator. Its robustness at a sample is final once the
+  sample is there, so it is computed forwards, with a little state for past operators.
+- *parts*: one for each node of the tree that is a temporal operator and looks ahead, in negation normal
+  form over signals, so that its robustness is monotone in everything it is made of.
+- *reports*: the tree as the user sees it; Boolean nodes combine the numbers of their operands.
+
+`Run` takes samples through them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Integers
+from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.operators import (
+    Part,
+    Row,
+    SignalTable,
+    array_of_rows,
+    looks_ahead,
+    part_of,
+)
+from spatial_replay.spec.formula import Atom, Boolean, Formula, Quantified, Temporal, iter_nodes
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """A formula as tables (see `codes` for what the columns mean).
+
+    Attributes:
+        leaves: atoms and open quantifiers, whose values in each sample are given to the kernel.
+        signals: (S, SIGNAL_WIDTH).
+        nodes: (D, NODE_WIDTH), the nodes of all parts, part after part.
+        parts: (P, PART_WIDTH).
+        reports: (N, REPORT_WIDTH), in the order of node ids.
+        operands: ids of the nodes below each node of the tree, node after node.
+        windows: how many signals keep a sliding window.
+        table_size: how many numbers the parts' tables hold for one channel.
+        cells: how many rows of bookkeeping the parts need.
+        keeps_history: whether any window, delay or part looks at more than the newest sample.
+    """
+
+    leaves: tuple[Atom | Quantified, ...]
+    signals: Integers
+    nodes: Integers
+    parts: Integers
+    reports: Integers
+    operands: Integers
+    windows: int
+    table_size: int
+    cells: int
+    keeps_history: bool
+
+
+def compile_formula(formula: Formula) -> Program:
+    """The tables of a formula.
+
+    Raises:
+        UsageError: more than `MAX_VARIABLES` unbounded future operators under one node.
+    """
+    signals, parts = SignalTable(), _Parts()
+    reports: list[Row] = []
+    operand_ids: list[int] = []
+    for node, operands in _nodes_with_operands(formula):
+        ends = (len(operand_ids), len(operand_ids) + len(operands))
+        operand_ids.extend(operands)
+        if not looks_ahead(node):
+            reports.append((codes.REPORT_SIGNAL, signals.add(node), 0, *ends))
+        elif isinstance(node, Boolean):
+            reports.append((codes.REPORT_OF_BOOLEAN[node.operator], 0, 0, *ends))
+        elif isinstance(node, Temporal):
+            part = part_of(signals, node)
+            reports.append((codes.REPORT_PART, parts.add(part), _now_rule(node, part), *ends))
+    return Program(
+        leaves=tuple(signals.leaves),
+        signals=signals.array(),
+        nodes=array_of_rows(parts.node_rows, codes.NODE_WIDTH),
+        parts=array_of_rows(parts.part_rows, codes.PART_WIDTH),
+        reports=array_of_rows(reports, codes.REPORT_WIDTH),
+        operands=np.array(operand_ids, np.int64),
+        windows=signals.windows,
+        table_size=parts.table_size,
+        cells=parts.cells,
+        keeps_history=signals.keeps_history or parts.keeps_history,
+    )
+
+
+class _Parts:
+    """The parts of a formula, one after the other; equal ones share a place."""
+
+    def __init__(self) -> None:
+        self.part_rows: list[Row] = []
+        self.node_rows: list[Row] = []
+        self.table_size = 0
+        self.cells = 0
+        self.keeps_history = False
+        self._built: dict[tuple[Row, ...], int] = {}
+
+    def add(self, part: Part) -> int:
+        """The number of a part."""
+        rows = part.rows()
+        if rows in self._built:
+            return self._built[rows]
+        self._built[rows] = len(self.part_rows)
+        first = len(self.node_rows)
+        self.part_rows.append(
+            (
+                first,
+                first + len(rows),
+                part.variables,
+                part.tables,
+                self.table_size,
+                self.cells,
+                int(part.is_flat),
+                int(part.is_remembering),
+                part.end_corner,
+            )
+        )
+        self.node_rows.extend(rows)
+        self.table_size += part.tables << part.variables
+        self.cells += 1 + part.variables + part.tables
+        self.keeps_history |= not part.is_flat
+        return self._built[rows]
+
+
+def _nodes_with_operands(formula: Formula) -> list[tuple[Formula, list[int]]]:
+    """Every node of a tree, by id, with the ids of its operands."""
+    nodes: list[tuple[Formula, list[int]]] = []
+    for identifier, parent, node in iter_nodes(formula):
+        nodes.append((node, []))
+        if parent is not None:
+            nodes[parent][1].append(identifier)
+    return nodes
+
+
+def _now_rule(node: Temporal, part: Part) -> int:
+    """What a future operator is on the newest sample alone (`now`)."""
+    if part.is_remembering:
+        return codes.NOW_OF_PART
+    weak = node.operator in ("G", "R", "W", "WX")
+    if node.operator in ("X", "WX") or (node.bound is not None and node.bound.lower > 0):
+        return codes.NOW_TRUE if weak else codes.NOW_FALSE
+    return codes.NOW_EITHER if node.operator == "W" else codes.NOW_LAST_OPERAND

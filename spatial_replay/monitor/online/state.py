@@ -1,0 +1,227 @@
+"""The arrays that kernels share: what a run remembers, and room to work in.
+
+Positions of samples in a run, and how far windows in samples or in time reach from them.
+
+`stamps` holds the times of the samples offset, offset + 1, … of the run; `last` is the newest of them that
+counts.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from spatial_replay.compiled import piece
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.online.codes import CHANNELS, SAMPLES
+from spatial_replay.monitor.online.program import Program
+
+TILE = 256
+"""How many samples are taken in together: enough to amortise the walk over a program's tables, few enough to
+stay in the processor's cache."""
+
+NUMBERS = 8
+"""Numbers of a node at a sample: low and high end of its value, of what it is now, of its value over every
+continuation, and of its value if the run ends there."""
+
+
+class Memory(NamedTuple):
+    """What is carried from sample to sample.
+
+    Attributes:
+        history: (CHANNELS, S, room), every signal at the recent samples.
+        stamps: (room,), their times in ns.
+        running: (CHANNELS, S), every signal at the last sample.
+        firsts: (CHANNELS, S), every signal at the first sample.
+        wedges: (W, CHANNELS, room), for each sliding window a ring of positions.
+        wedge_ends: (W, CHANNELS, 2), how many positions ever left and entered it.
+        wedge_next: (W,), the next position to enter.
+        tables: (CHANNELS, ...), the parts' tables (see `tables`).
+        cells: the parts' bookkeeping (see `windows`).
+    """
+
+    history: Floats
+    stamps: Integers
+    running: Floats
+    firsts: Floats
+    wedges: Integers
+    wedge_ends: Integers
+    wedge_next: Integers
+    tables: Floats
+    cells: Integers
+
+
+class Scratch(NamedTuple):
+    """Room to work in, of no meaning between two calls.
+
+    Attributes:
+        columns: (D, room), a column per node of a part.
+        low, high, plain: (D,), ranges of positions per node.
+        values: (D,), a number per node.
+        point, order: (16,), a point at which a table is read.
+        starts: values that past operators start from, one per table.
+        fresh: a part's next tables.
+        wedge: (room,), positions.
+        series: (3, tile), what one part says in one channel.
+        parts: (P, NUMBERS, tile), what each part says.
+        nodes: (N, NUMBERS, tile), what each node of the tree says.
+    """
+
+    columns: Floats
+    low: Integers
+    high: Integers
+    plain: Integers
+    values: Floats
+    point: Floats
+    order: Integers
+    starts: Floats
+    fresh: Floats
+    wedge: Integers
+    series: Floats
+    parts: Floats
+    nodes: Floats
+
+
+def first_memory(program: Program, room: int) -> Memory:
+    """Memory before the first sample, with room for so many recent ones."""
+    signals = len(program.signals)
+    cells = np.zeros(program.cells, np.int64)
+    for _, _, variables, tables, _, cell, *_ in program.parts:
+        cells[cell + 1 + variables : cell + 1 + variables + tables] = -1
+    return Memory(
+        history=np.zeros((CHANNELS, signals, room)),
+        stamps=np.zeros(room, np.int64),
+        running=np.zeros((CHANNELS, signals)),
+        firsts=np.zeros((CHANNELS, signals)),
+        wedges=np.zeros((program.windows, CHANNELS, room), np.int64),
+        wedge_ends=np.zeros((program.windows, CHANNELS, 2), np.int64),
+        wedge_next=np.zeros(program.windows, np.int64),
+        tables=np.zeros((CHANNELS, program.table_size)),
+        cells=cells,
+    )
+
+
+def scratch_for(program: Program, room: int, tile: int) -> Scratch:
+    """Room to work in with so many recent samples, so many of them taken in together."""
+    widest = max((int(end - first) for first, end, *_ in program.parts), default=0)
+    largest = max(((1 << int(part[2])) * int(part[3]) for part in program.parts), default=1)
+    most_tables = max((int(part[3]) for part in program.parts), default=1)
+    low, high, plain = np.zeros((3, widest), np.int64)
+    return Scratch(
+        columns=np.zeros((widest, max(room, tile))),
+        low=low,
+        high=high,
+        plain=plain,
+        values=np.zeros(max(widest, 1)),
+        point=np.zeros(16),
+        order=np.zeros(16, np.int64),
+        starts=np.zeros(most_tables),
+        fresh=np.zeros(largest),
+        wedge=np.zeros(room, np.int64),
+        series=np.zeros((3, tile)),
+        parts=np.zeros((len(program.parts), NUMBERS, tile)),
+        nodes=np.zeros((len(program.reports), NUMBERS, tile)),
+    )
+
+
+def widen(memory: Memory, before: int) -> None:
+    """Give each channel that appears now the state of the one of the `before` that it was equal to."""
+    by_channel = (memory.running, memory.firsts, memory.tables, memory.history)
+    by_window = (memory.wedges.swapaxes(0, 1), memory.wedge_ends.swapaxes(0, 1))
+    for state in (*by_channel, *by_window):
+        if before == 1:
+            state[1] = state[0]
+        state[2:] = state[:2]
+
+
+def forget(memory: Memory, moved: int, used: int) -> None:
+    """Drop the oldest `moved` of `used` recent samples."""
+    memory.stamps[: used - moved] = memory.stamps[moved:used].copy()
+    memory.history[:, :, : used - moved] = memory.history[:, :, moved:used].copy()
+
+
+def doubled(memory: Memory) -> Memory:
+    """The same with twice the room for recent samples."""
+    old = len(memory.stamps)
+    wedges = np.zeros((*memory.wedges.shape[:2], 2 * old), np.int64)
+    for window, channel in np.ndindex(memory.wedges.shape[:2]):
+        entries = np.arange(*memory.wedge_ends[window, channel])
+        wedges[window, channel, entries % (2 * old)] = memory.wedges[window, channel, entries % old]
+    return memory._replace(
+        stamps=np.concatenate((memory.stamps, np.zeros(old, np.int64))),
+        history=np.concatenate((memory.history, np.zeros_like(memory.history)), axis=2),
+        wedges=wedges,
+    )
+
+
+@piece
+def first_after(stamps: Integers, offset: int, last: int, position: int, distance: int) -> int:
+    """The first position, offset … last, at least so many ns after another; last + 1 if there is none.
+
+    Times are compared by their differences, which fit where a time plus the distance might not.
+    """
+    low, high = 0, last - offset + 1
+    origin = stamps[position - offset]
+    while low < high:
+        middle = (low + high) >> 1
+        if stamps[middle] - origin < distance:
+            low = middle + 1
+        else:
+            high = middle
+    return offset + low
+
+
+@piece
+def first_onward(stamps: Integers, offset: int, last: int, position: int, distance: int, before: int) -> int:
+    """`first_after`, sought step by step from what it was for a position before."""
+    origin = stamps[position - offset]
+    while before <= last and stamps[before - offset] - origin < distance:
+        before += 1
+    return before
+
+
+@piece
+def ahead(stamps: Integers, offset: int, last: int, position: int, unit: int, distance: int) -> int:
+    """The first position at least so far ahead (it may lie after `last`)."""
+    if unit == SAMPLES:
+        return position + distance
+    if position > last:
+        return last + 1
+    return first_after(stamps, offset, last, position, distance)
+
+
+@piece
+def last_ahead(stamps: Integers, offset: int, last: int, position: int, unit: int, distance: int) -> int:
+    """The last position at most so far ahead, and known: `last` at most."""
+    if unit == SAMPLES:
+        return min(position + distance, last)
+    if position > last:
+        return last
+    return first_after(stamps, offset, last, position, distance + 1) - 1
+
+
+@piece
+def is_closed(stamps: Integers, offset: int, last: int, position: int, unit: int, distance: int) -> bool:
+    """Whether no later sample can fall into the window that ends so far ahead of a position."""
+    if position > last:
+        return False
+    if unit == SAMPLES:
+        return position + distance <= last
+    return bool(stamps[last - offset] - stamps[position - offset] >= distance)
+
+
+@piece
+def behind(stamps: Integers, offset: int, position: int, unit: int, distance: int) -> int:
+    """The last position at least so far behind; before `offset` if there is none."""
+    if unit == SAMPLES:
+        return position - distance
+    return first_after(stamps, offset, position, position, 1 - distance) - 1
+
+
+@piece
+def first_behind(stamps: Integers, offset: int, position: int, unit: int, distance: int) -> int:
+    """The first position at most so far behind, `offset` at least."""
+    if unit == SAMPLES:
+        return max(position - distance, offset)
+    return first_after(stamps, offset, position, position, -distance)

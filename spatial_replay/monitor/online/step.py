@@ -1,0 +1,457 @@
+"""A stretch of samples taken through a program in one call: signals, then parts, then the tree.
+
+Subformulas without future operators: settled at each sample, computed forwards.
+
+The tree that the user sees: every node's numbers, from signals, parts and operands.
+
+`memory.NUMBERS` says which numbers a node has at a sample.
+
+One program on one stream of samples: the compiled step that a monitor and a replay share.
+
+Samples are taken in by tiles: first the signals of a tile, then each part, then the tree. A tile of one
+sample and a tile of many give the same bits, because the only arithmetic is minima, maxima and negation.
+
+Numbers are kept in as many channels as are needed so far (see `channels`).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from spatial_replay.compiled import kernel, piece
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.online.codes import (
+    AND,
+    CONSTANT,
+    DELAY,
+    HISTORICALLY,
+    IFF,
+    LEAF,
+    NOT,
+    NOW_EITHER,
+    NOW_FALSE,
+    NOW_LAST_OPERAND,
+    NOW_TRUE,
+    ONCE,
+    OR,
+    PART_IS_FLAT,
+    REPORT_AND,
+    REPORT_CODE,
+    REPORT_END,
+    REPORT_FIRST,
+    REPORT_IMPLIES,
+    REPORT_INDEX,
+    REPORT_NOT,
+    REPORT_OR,
+    REPORT_PART,
+    REPORT_RULE,
+    REPORT_SIGNAL,
+    REPORT_XOR,
+    SINCE,
+    WINDOW_MAX,
+    WINDOW_MIN,
+    XOR,
+    in_channels,
+)
+from spatial_replay.monitor.online.program import Program
+from spatial_replay.monitor.online.state import (
+    NUMBERS,
+    TILE,
+    Memory,
+    Scratch,
+    behind,
+    doubled,
+    first_behind,
+    first_memory,
+    forget,
+    scratch_for,
+    widen,
+)
+from spatial_replay.monitor.online.tables import step_tables
+from spatial_replay.monitor.online.windows import kept_from, step_windows
+
+
+@piece
+def _combine_low(code: int, low: float, high: float, other_low: float, other_high: float) -> float:
+    """Lower end of a Boolean operator over two intervals; the upper end is its mirror image."""
+    if code == REPORT_AND:
+        return min(low, other_low)
+    if code == REPORT_OR:
+        return max(low, other_low)
+    if code == REPORT_XOR:
+        return max(min(low, -other_high), min(-high, other_low))
+    if code == REPORT_IMPLIES:
+        return max(-high, other_low)
+    return min(max(-high, other_low), max(-other_high, low))
+
+
+@piece
+def _combine(code: int, into: Floats, other: Floats, count: int) -> None:
+    for pair in range(0, NUMBERS, 2):
+        low, high, other_low, other_high = into[pair], into[pair + 1], other[pair], other[pair + 1]
+        if code == REPORT_AND:
+            for k in range(count):
+                low[k], high[k] = min(low[k], other_low[k]), min(high[k], other_high[k])
+        elif code == REPORT_OR:
+            for k in range(count):
+                low[k], high[k] = max(low[k], other_low[k]), max(high[k], other_high[k])
+        else:
+            for k in range(count):
+                low[k], high[k] = (
+                    _combine_low(code, low[k], high[k], other_low[k], other_high[k]),
+                    _combine_low(code, high[k], low[k], other_high[k], other_low[k]),
+                )
+
+
+@piece
+def _set_now(rule: int, into: Floats, first: Floats, last: Floats, count: int) -> None:
+    """What a part is now, from what its first and its last operand are."""
+    for number in (2, 3):
+        for k in range(count):
+            if rule == NOW_LAST_OPERAND:
+                into[number, k] = last[number, k]
+            elif rule == NOW_EITHER:
+                into[number, k] = max(first[number, k], last[number, k])
+            elif rule == NOW_TRUE:
+                into[number, k] = np.inf
+            elif rule == NOW_FALSE:
+                into[number, k] = -np.inf
+
+
+@piece
+def _write_series(numbers: Floats, t: int, count: int, series: Floats) -> None:
+    """value, now, lower and upper of every node; NaN where the ends of value or now differ.
+
+    Adding zero turns -0.0 into 0.0, so that equal numbers are equal bits.
+    """
+    for n in range(numbers.shape[0]):
+        for which in range(2):
+            low, high = numbers[n, 2 * which], numbers[n, 2 * which + 1]
+            for k in range(count):
+                series[n, which, t + k] = low[k] + 0.0 if low[k] == high[k] else np.nan
+        for which in range(2):
+            end = numbers[n, 4 + which]
+            for k in range(count):
+                series[n, 2 + which, t + k] = end[k] + 0.0
+
+
+@piece
+def report(
+    reports: Integers, operands: Integers, memory: Memory, scratch: Scratch, channels: int, begin: int,
+    count: int, t: int, series: Floats, final: Floats,
+) -> None:  # fmt: skip
+    """The numbers of every node over `count` samples, operands first.
+
+    Args:
+        begin: where these samples stand in the history.
+        t: where they go in `series`, (N, 4, T): value, now, lower, upper.
+        final: (N, 2), receives the ends of each node's value if the run ends with the last of them.
+    """
+    nominal_high = 1 if channels > 1 else 0
+    wide_low = 2 if channels > 2 else 0
+    wide_high = wide_low + nominal_high
+    numbers = scratch.nodes
+    for n in range(reports.shape[0] - 1, -1, -1):
+        code, index, rule = reports[n, REPORT_CODE], reports[n, REPORT_INDEX], reports[n, REPORT_RULE]
+        start, stop = reports[n, REPORT_FIRST], reports[n, REPORT_END]
+        rows = numbers[n]
+        if code == REPORT_SIGNAL:  # settled by the first sample
+            for k in range(count):
+                rows[0, k], rows[1, k] = memory.firsts[0, index], memory.firsts[nominal_high, index]
+                rows[2, k], rows[3, k] = (
+                    memory.history[0, index, begin + k],
+                    memory.history[nominal_high, index, begin + k],
+                )
+                rows[4, k], rows[5, k] = memory.firsts[wide_low, index], memory.firsts[wide_high, index]
+                rows[6, k], rows[7, k] = memory.firsts[wide_low, index], memory.firsts[wide_high, index]
+        elif code == REPORT_PART:
+            for number in range(NUMBERS):
+                for k in range(count):
+                    rows[number, k] = scratch.parts[index, number, k]
+            _set_now(rule, rows, numbers[operands[start]], numbers[operands[stop - 1]], count)
+        elif code == REPORT_NOT:
+            child = numbers[operands[start]]
+            for pair in range(0, NUMBERS, 2):
+                for k in range(count):
+                    rows[pair, k], rows[pair + 1, k] = -child[pair + 1, k], -child[pair, k]
+        else:
+            child = numbers[operands[start]]
+            for number in range(NUMBERS):
+                for k in range(count):
+                    rows[number, k] = child[number, k]
+            for each in range(start + 1, stop):
+                _combine(code, rows, numbers[operands[each]], count)
+    _write_series(numbers, t, count, series)
+    for n in range(reports.shape[0]):
+        final[n, 0], final[n, 1] = numbers[n, 6, count - 1] + 0.0, numbers[n, 7, count - 1] + 0.0
+
+
+@piece
+def step_signals(
+    signals: Integers, leaves: Floats, t: int, count: int, position: int, offset: int, memory: Memory
+) -> None:
+    """All signals over the samples t … t + count - 1 of `leaves`, in every channel, into the history.
+
+    Args:
+        position: of the first of these samples in the run; it stands at position - offset in the history.
+    """  # fmt: skip
+    begin = position - offset
+    history, stamps, running, wedge_next = memory.history, memory.stamps, memory.running, memory.wedge_next
+    channels = leaves.shape[0]
+    for s in range(signals.shape[0]):
+        code, a, b = signals[s, 0], signals[s, 1], signals[s, 2]
+        for channel in range(channels):
+            mirror = channel ^ 1 if channels > 1 else channel
+            target = history[channel, s, begin : begin + count]
+            first = history[channel, a, begin : begin + count]
+            second = history[channel, b, begin : begin + count]
+            if code == LEAF:
+                for k in range(count):
+                    target[k] = leaves[channel, a, t + k]
+            elif code == CONSTANT:
+                for k in range(count):
+                    target[k] = signals[s, 4] * np.inf
+            elif code == NOT:
+                for k in range(count):
+                    target[k] = -history[mirror, a, begin + k]
+            elif code == AND:
+                for k in range(count):
+                    target[k] = min(first[k], second[k])
+            elif code == OR:
+                for k in range(count):
+                    target[k] = max(first[k], second[k])
+            elif code == XOR:
+                for k in range(count):
+                    target[k] = max(
+                        min(first[k], -history[mirror, b, begin + k]),
+                        min(-history[mirror, a, begin + k], second[k]),
+                    )
+            elif code == IFF:
+                for k in range(count):
+                    target[k] = min(
+                        max(-history[mirror, a, begin + k], second[k]),
+                        max(-history[mirror, b, begin + k], first[k]),
+                    )
+            elif code in (ONCE, HISTORICALLY, SINCE):
+                _run_past(code, first, second, target, running[channel, s], position == 0)
+            elif code == DELAY:
+                for k in range(count):
+                    source = behind(stamps, offset, position + k, signals[s, 3], signals[s, 4])
+                    if source >= offset:
+                        target[k] = history[channel, a, source - offset]
+                    else:
+                        target[k] = signals[s, 5] * np.inf
+            else:
+                _slide(
+                    signals[s], history[channel, a], target, position, offset, count, stamps,
+                    memory.wedges[signals[s, 6], channel], memory.wedge_ends[signals[s, 6], channel],
+                    wedge_next[signals[s, 6]],
+                )  # fmt: skip
+            running[channel, s] = target[count - 1]
+            if position == 0:
+                memory.firsts[channel, s] = target[0]
+        if code in (WINDOW_MAX, WINDOW_MIN):
+            newest = behind(stamps, offset, position + count - 1, signals[s, 3], signals[s, 4])
+            wedge_next[signals[s, 6]] = max(wedge_next[signals[s, 6]], newest + 1)
+
+
+@piece
+def _run_past(code: int, first: Floats, second: Floats, target: Floats, before: float, starts: bool) -> None:
+    """Unbounded once, historically and since, from their value at the sample before."""
+    value = before
+    if starts:
+        value = np.inf if code == HISTORICALLY else -np.inf
+    for k in range(len(target)):
+        if code == ONCE:
+            value = max(first[k], value)
+        elif code == HISTORICALLY:
+            value = min(first[k], value)
+        else:
+            value = max(second[k], min(first[k], value))
+        target[k] = value
+
+
+@piece
+def _slide(
+    signal: Integers,
+    source: Floats,
+    target: Floats,
+    position: int,
+    offset: int,
+    count: int,
+    stamps: Integers,
+    wedge: Integers,
+    ends: Integers,
+    entering: int,
+) -> None:
+    """Extremum over a sliding window: a wedge of the positions whose values can still become it.
+
+    The wedge is a ring; `ends` counts the positions that ever left and entered it.
+    """  # fmt: skip
+    sign = 1.0 if signal[0] == WINDOW_MAX else -1.0
+    size = wedge.shape[0]
+    head, tail = ends[0], ends[1]
+    for k in range(count):
+        newest = behind(stamps, offset, position + k, signal[3], signal[4])
+        while entering <= newest:
+            value = sign * source[entering - offset]
+            while tail > head and sign * source[wedge[(tail - 1) % size] - offset] <= value:
+                tail -= 1
+            wedge[tail % size] = entering
+            tail += 1
+            entering += 1
+        oldest = first_behind(stamps, offset, position + k, signal[3], signal[5])
+        while tail > head and wedge[head % size] < oldest:
+            head += 1
+        target[k] = source[wedge[head % size] - offset] if tail > head else -sign * np.inf
+    ends[0], ends[1] = head, tail
+
+
+class Tables(NamedTuple):
+    """A program's tables (see `Program`)."""
+
+    signals: Integers
+    nodes: Integers
+    parts: Integers
+    reports: Integers
+    operands: Integers
+
+    @classmethod
+    def of(cls, program: Program) -> Tables:
+        return cls(program.signals, program.nodes, program.parts, program.reports, program.operands)
+
+
+@kernel
+def step(
+    tables: Tables, memory: Memory, scratch: Scratch, leaves: Floats, times_ns: Integers, start_ns: int,
+    position: int, offset: int, t: int, count: int, series: Floats, final: Floats,
+) -> None:  # fmt: skip
+    """Take in the samples t … t + count - 1 of `leaves`, by a program without windows under its parts.
+
+    Args:
+        leaves: (C, A, T), for as many channels as the run has.
+        start_ns: time of the first sample of the run.
+        position: of the first of these samples in the run; it stands at position - offset in the history.
+        series: (N, 4, T), receives value, now, lower and upper.
+        final: (N, 2), receives the ends of each node's value if the run ends with the last of them.
+    """  # fmt: skip
+    channels, begin = leaves.shape[0], position - offset
+    for k in range(count):
+        memory.stamps[begin + k] = times_ns[t + k]
+    step_signals(tables.signals, leaves, t, count, position, offset, memory)
+    step_tables(tables.nodes, tables.parts, memory, scratch, channels, position, start_ns, begin, count)
+    report(tables.reports, tables.operands, memory, scratch, channels, begin, count, t, series, final)
+
+
+@kernel
+def step_with_windows(
+    tables: Tables, memory: Memory, scratch: Scratch, leaves: Floats, times_ns: Integers, start_ns: int,
+    position: int, offset: int, t: int, count: int, series: Floats, final: Floats,
+) -> None:  # fmt: skip
+    """`step` for any program; apart from it because it is much more to compile and to load."""
+    channels, begin = leaves.shape[0], position - offset
+    for k in range(count):
+        memory.stamps[begin + k] = times_ns[t + k]
+    step_signals(tables.signals, leaves, t, count, position, offset, memory)
+    step_tables(tables.nodes, tables.parts, memory, scratch, channels, position, start_ns, begin, count)
+    for p in range(len(tables.parts)):
+        part = tables.parts[p]
+        if not part[PART_IS_FLAT]:
+            step_windows(
+                tables.nodes, part, memory, scratch, channels, position, offset, count, scratch.parts[p]
+            )
+    report(tables.reports, tables.operands, memory, scratch, channels, begin, count, t, series, final)
+
+
+class Run:
+    """The state that a compiled formula carries from sample to sample.
+
+    Its size depends on the formula and on how many samples its windows span, never on how long the stream
+    is. It is the one place that changes while a monitor or a replay goes on.
+    """
+
+    def __init__(self, program: Program, *, room: int = 2 * TILE, tile: int = TILE) -> None:
+        """Start before the first sample.
+
+        Args:
+            room: for how many recent samples there is room at first (it doubles when needed).
+            tile: how many samples are taken in together, at most. What comes one by one is faster with 1,
+                since the numbers worked with then lie closer together.
+        """
+        self._program = program
+        self._tile = tile
+        if not program.keeps_history:
+            room = tile
+        self._memory = first_memory(program, room)
+        self._scratch = scratch_for(program, room, tile)
+        self._final = np.zeros((len(program.reports), 2))
+        self._tables = Tables.of(program)
+        self._take_in = step if program.parts[:, PART_IS_FLAT].all() else step_with_windows
+        self._channels = 1
+        self._position = 0
+        self._offset = 0
+        self._start_ns = 0
+
+    def __len__(self) -> int:
+        """How many samples were taken in."""
+        return self._position
+
+    @property
+    def final(self) -> Floats:
+        """(N, 2): lower and upper end of each node's value if the run ends here."""
+        return self._final.copy()
+
+    def extend(self, leaves: Floats, times_ns: Integers) -> Floats:
+        """Take in more samples.
+
+        Args:
+            leaves: (C, A, T), the program's leaves: with C = 1 exact values, with C = 2 the ends of the
+                interval that what is unknown leaves open, with C = 4 those and the same ends with
+                uncertainty.
+            times_ns: (T,), increasing, also beyond the samples before.
+
+        Returns:
+            (N, 4, T): value, now, lower and upper of each node.
+        """
+        if len(leaves) > self._channels:
+            widen(self._memory, self._channels)
+            self._channels = len(leaves)
+        leaves = np.ascontiguousarray(in_channels(leaves, self._channels))
+        times_ns = np.array(times_ns, np.int64)  # writable, since kernels are compiled for that
+        series = np.empty((len(self._program.reports), 4, len(times_ns)))
+        done = 0
+        while done < len(times_ns):
+            count = self._make_room(min(self._tile, len(times_ns) - done))
+            self._step(leaves, times_ns, done, count, series)
+            done += count
+        return series
+
+    def _step(self, leaves: Floats, times_ns: Integers, t: int, count: int, series: Floats) -> None:
+        """Take in the samples t up to t + count, for which there is room."""
+        if self._position == 0:
+            self._start_ns = int(times_ns[t])
+        self._take_in(
+            self._tables, self._memory, self._scratch, leaves, times_ns, self._start_ns,
+            self._position, self._offset, t, count, series, self._final,
+        )  # fmt: skip
+        self._position += count
+
+    def _make_room(self, wanted: int) -> int:
+        """How many of the wanted samples there is room for, at least one."""
+        room = len(self._memory.stamps)
+        if not self._program.keeps_history:
+            self._offset = self._position
+        used = self._position - self._offset
+        if used + wanted > room:
+            signals, nodes, parts = self._program.signals, self._program.nodes, self._program.parts
+            last = self._position - 1
+            keep = kept_from(signals, nodes, parts, self._memory, self._scratch, self._offset, last)
+            if 2 * (keep - self._offset) >= room:
+                forget(self._memory, keep - self._offset, used)
+                self._offset = keep
+            elif used == room:
+                self._memory = doubled(self._memory)
+                self._scratch = scratch_for(self._program, 2 * room, self._tile)
+        return min(wanted, len(self._memory.stamps) - (self._position - self._offset))

@@ -1,0 +1,258 @@
+"""Tables: the value of a formula at the first sample as a function of what is still to come.
+
+Let x_1 … x_m be the values that the unbounded temporal subformulas of a part will have at the next sample.
+In negation normal form the part's value is a monotone lattice polynomial of them (minima and maxima only),
+so it is known from its values at the corners x in {-inf, +inf}^m: those are its table, of 2^m numbers. A new
+sample substitutes for each x_j the formula that it expands to (max(psi, min(phi, x)) for an until) and reads
+the old table at that point. The first and the last entry bound the value over every continuation; the corner
+where strong operators are -inf and weak ones +inf is the value if the run ends here.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spatial_replay.compiled import inlined, piece
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.online.codes import (
+    ANCHORED_RELEASE,
+    ANCHORED_UNTIL,
+    LITERAL,
+    NODE_A,
+    NODE_B,
+    NODE_CODE,
+    NODE_DEPENDS,
+    NODE_HIGH,
+    NODE_LOW,
+    NODE_UNIT,
+    NODE_VARIABLE,
+    NODE_WEAK,
+    PART_AND,
+    PART_END,
+    PART_END_CORNER,
+    PART_FIRST,
+    PART_IS_FLAT,
+    PART_OR,
+    PART_TABLE_START,
+    PART_VARIABLES,
+    SAMPLES,
+    UNTIL,
+)
+from spatial_replay.monitor.online.state import Memory, Scratch
+
+
+@piece
+def read_table(table: Floats, variables: int, point: Floats, order: Integers) -> float:
+    """A table at a point: walk its corners in descending order of the coordinates."""
+    if variables == 1:
+        return float(max(table[0], min(point[0], table[1])))
+    for j in range(variables):
+        k = j
+        while k > 0 and point[order[k - 1]] < point[j]:
+            order[k] = order[k - 1]
+            k -= 1
+        order[k] = j
+    result = table[0]
+    corner = 0
+    for k in range(variables):
+        corner |= 1 << order[k]
+        result = max(result, min(point[order[k]], table[corner]))
+    return float(result)
+
+
+@piece
+def corner_value(corner: int, variable: int) -> float:
+    return np.inf if (corner >> variable) & 1 else -np.inf
+
+
+@piece
+def _start(nodes: Integers, part: Integers, table: Floats, values: Floats) -> None:
+    """The table before the first sample: each operator is what it will be there."""
+    first, end = part[PART_FIRST], part[PART_END]
+    for corner in range(1 << part[PART_VARIABLES]):
+        for d in range(first, end):
+            if nodes[d, NODE_VARIABLE] >= 0:
+                values[d - first] = corner_value(corner, nodes[d, NODE_VARIABLE])
+            elif nodes[d, NODE_CODE] == PART_OR:
+                values[d - first] = max(values[nodes[d, NODE_A]], values[nodes[d, NODE_B]])
+        table[corner] = values[end - 1 - first]
+
+
+@piece
+def _fill_columns(
+    nodes: Integers,
+    part: Integers,
+    channel: int,
+    mirror: int,
+    history: Floats,
+    begin: int,
+    count: int,
+    columns: Floats,
+) -> None:
+    """The nodes that depend on no variable, over a stretch of samples."""
+    for d in range(part[PART_FIRST], part[PART_END]):
+        code, a, b = nodes[d, NODE_CODE], nodes[d, NODE_A], nodes[d, NODE_B]
+        column = columns[d - part[PART_FIRST]]
+        if code == LITERAL and b:
+            for k in range(count):
+                column[k] = -history[mirror, a, begin + k]
+        elif code == LITERAL:
+            for k in range(count):
+                column[k] = history[channel, a, begin + k]
+        elif nodes[d, NODE_DEPENDS]:
+            continue
+        elif code == PART_AND:
+            for k in range(count):
+                column[k] = min(columns[a, k], columns[b, k])
+        elif code == PART_OR:
+            for k in range(count):
+                column[k] = max(columns[a, k], columns[b, k])
+
+
+@piece
+def _is_anchored(code: int) -> bool:
+    return code in (ANCHORED_UNTIL, ANCHORED_RELEASE)
+
+
+@piece
+def _expand(node: Integers, left: float, right: float, later: float, position: int, elapsed_ns: int) -> float:
+    """An until or release at a sample, from its operands there and its value at the next sample.
+
+    Of an anchored one the right operand counts inside its window only.
+    """
+    value = later
+    counts = True
+    if _is_anchored(node[NODE_CODE]):
+        now = position if node[NODE_UNIT] == SAMPLES else elapsed_ns
+        counts = node[NODE_LOW] <= now and (node[NODE_HIGH] < 0 or now <= node[NODE_HIGH])
+    if node[NODE_CODE] == UNTIL or node[NODE_CODE] == ANCHORED_UNTIL:
+        value = min(left, value)
+        return max(right, value) if counts else value
+    value = max(left, value)
+    return min(right, value) if counts else value
+
+
+@piece
+def _close_windows(nodes: Integers, part: Integers, table: Floats, position: int, elapsed_ns: int) -> None:
+    """Settle the anchored operators whose window no later sample can fall into."""
+    for d in range(part[PART_FIRST], part[PART_END]):
+        now = position if nodes[d, NODE_UNIT] == SAMPLES else elapsed_ns
+        if _is_anchored(nodes[d, NODE_CODE]) and nodes[d, NODE_HIGH] >= 0 and now >= nodes[d, NODE_HIGH]:
+            bit = 1 << nodes[d, NODE_VARIABLE]
+            for corner in range(1 << part[PART_VARIABLES]):
+                table[corner] = table[corner | bit] if nodes[d, NODE_WEAK] else table[corner & ~bit]
+
+
+@inlined
+def _step_channel(
+    nodes: Integers, part: Integers, table: Floats, channel: int, mirror: int, memory: Memory,
+    scratch: Scratch, position: int, start_ns: int, begin: int, count: int,
+) -> None:  # fmt: skip
+    """`step_tables` in one channel; into `scratch.series` what if the run ended there, and the bounds."""
+    first, end, variables, end_corner = (
+        part[PART_FIRST],
+        part[PART_END],
+        part[PART_VARIABLES],
+        part[PART_END_CORNER],
+    )
+    corners = 1 << variables
+    columns, values, fresh, point = scratch.columns, scratch.values, scratch.fresh, scratch.point
+    ends, lows, highs = scratch.series[0], scratch.series[1], scratch.series[2]
+    if position == 0:
+        _start(nodes, part, table, values)
+    _fill_columns(nodes, part, channel, mirror, memory.history, begin, count, columns)
+    anchored = _is_anchored(nodes[end - 1, NODE_CODE]) or nodes[end - 1, NODE_CODE] == PART_OR
+    if variables == 1 and not anchored:
+        _step_simple(nodes[end - 1], table, columns, count, end_corner, ends, lows, highs)
+        return
+    for k in range(count):
+        elapsed_ns = memory.stamps[begin + k] - start_ns
+        for corner in range(corners):
+            for d in range(first, end):
+                if not nodes[d, NODE_DEPENDS]:
+                    values[d - first] = columns[d - first, k]
+                    continue
+                code, a, b = nodes[d, NODE_CODE], nodes[d, NODE_A], nodes[d, NODE_B]
+                if code == PART_AND:
+                    value = min(values[a], values[b])
+                elif code == PART_OR:
+                    value = max(values[a], values[b])
+                else:
+                    later = corner_value(corner, nodes[d, NODE_VARIABLE])
+                    neutral = np.inf if code in (UNTIL, ANCHORED_UNTIL) else -np.inf
+                    left = values[a] if a >= 0 else neutral
+                    value = _expand(nodes[d], left, values[b], later, position + k, elapsed_ns)
+                    point[nodes[d, NODE_VARIABLE]] = value
+                values[d - first] = value
+            fresh[corner] = read_table(table, variables, point, scratch.order)
+        for corner in range(corners):
+            table[corner] = fresh[corner]
+        if anchored:
+            _close_windows(nodes, part, table, position + k, elapsed_ns)
+        ends[k], lows[k], highs[k] = table[end_corner], table[0], table[corners - 1]
+
+
+@piece
+def _step_simple(
+    node: Integers,
+    table: Floats,
+    columns: Floats,
+    count: int,
+    end_corner: int,
+    ends: Floats,
+    lows: Floats,
+    highs: Floats,
+) -> None:
+    """`step_tables` for a single until or release: a table of two numbers."""
+    low, high = table[0], table[1]
+    a, b = node[NODE_A], node[NODE_B]
+    until = node[NODE_CODE] == UNTIL
+    for k in range(count):
+        right = columns[b, k]
+        if until:
+            later_low = right
+            later_high = max(right, columns[a, k]) if a >= 0 else np.inf
+        else:
+            later_low = min(right, columns[a, k]) if a >= 0 else -np.inf
+            later_high = right
+        low, high = max(low, min(later_low, high)), max(low, min(later_high, high))
+        lows[k], highs[k] = low, high
+        ends[k] = high if end_corner else low
+    table[0], table[1] = low, high
+
+
+@piece
+def step_tables(
+    nodes: Integers, parts: Integers, memory: Memory, scratch: Scratch, channels: int, position: int,
+    start_ns: int, begin: int, count: int,
+) -> None:  # fmt: skip
+    """Substitute samples into the tables of the parts without windows below their root.
+
+    Args:
+        position: of the first of the `count` samples; they stand at `begin` in the history.
+        start_ns: time of the first sample of the run.
+    """
+    nominal_high = 1 if channels > 1 else 0
+    wide_low = 2 if channels > 2 else 0
+    ends, lows, highs = scratch.series[0], scratch.series[1], scratch.series[2]
+    for p in range(parts.shape[0]):
+        part, numbers = parts[p], scratch.parts[p]
+        if not part[PART_IS_FLAT]:
+            continue
+        for channel in range(channels):
+            table = memory.tables[
+                channel, part[PART_TABLE_START] : part[PART_TABLE_START] + (1 << part[PART_VARIABLES])
+            ]
+            mirror = channel ^ nominal_high
+            _step_channel(
+                nodes, part, table, channel, mirror, memory, scratch, position, start_ns, begin, count
+            )
+            for k in range(count):
+                if channel == 0:
+                    numbers[0, k] = ends[k]
+                if channel == nominal_high:
+                    numbers[1, k] = ends[k]
+                if channel == wide_low:
+                    numbers[4, k], numbers[6, k] = lows[k], ends[k]
+                if channel == wide_low + nominal_high:
+                    numbers[5, k], numbers[7, k] = highs[k], ends[k]

@@ -1,0 +1,64 @@
+"""Pictures of values in notebooks: `html` shows one as a cell's output, `plot` draws one with matplotlib.
+
+Both dispatch on the type of the value. Views are imported when a value of their type is shown for the first
+time, so that showing a formula loads neither the planner nor matplotlib.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import singledispatch
+from importlib import import_module
+from types import MappingProxyType
+from typing import Any
+
+from spatial_replay.errors import UsageError
+
+_VIEWS: Mapping[str, str] = MappingProxyType(
+    {
+        "spatial_replay.automata.automaton": "automaton_view",
+        "spatial_replay.monitor.evaluate": "evaluation_view",
+        "spatial_replay.planning.decisions": "planning_view",
+        "spatial_replay.planning.gradient_map": "planning_view",
+        "spatial_replay.planning.read": "planning_view",
+        "spatial_replay.spec.formula": "specification_view",
+    }
+)
+"""For each module that defines a value, the view that registers how it is shown."""
+
+
+@singledispatch
+def html(value: Any) -> str:
+    """Return a value as HTML for a notebook's cell.
+
+    Raises:
+        UsageError: there is no view of values of that type.
+    """
+    return str(_after_loading_view(html, value)(value))
+
+
+@singledispatch
+def plot(value: Any, *args: Any, **options: Any) -> Any:
+    """Draw a value with matplotlib and return the axes.
+
+    Raises:
+        UsageError: there is no view of values of that type, or matplotlib is not installed.
+    """
+    return _after_loading_view(plot, value)(value, *args, **options)
+
+
+def svg(value: Any) -> str | None:
+    """Return an automaton as SVG; None if it is large, or if Graphviz cannot draw it here."""
+    from spatial_replay.notebook.automaton_view import automaton_svg
+
+    return automaton_svg(value)
+
+
+def _after_loading_view(function: Any, value: object) -> Any:
+    kind = type(value)
+    generic = function.registry[object]
+    if (view := _VIEWS.get(kind.__module__)) is not None:
+        import_module(f"spatial_replay.notebook.{view}")
+    if (found := function.dispatch(kind)) is generic:
+        raise UsageError(f"there is no picture of a {kind.__name__}")
+    return found

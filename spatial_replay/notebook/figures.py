@@ -1,0 +1,136 @@
+"""The one place that knows the library behind figures; it loads when something is drawn.
+
+HTML for notebooks: texts are escaped, and what is shown suits light pages and dark ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final
+
+from spatial_replay.errors import UsageError
+from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
+from spatial_replay.text import printable
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap
+
+INK: Final = "#24292f"
+"""Of texts on light colours, whatever the style of the page."""
+_MIDDLE: Final = (0.96, 0.96, 0.96)
+
+
+def new_panels(
+    rows: int, columns: int, size: tuple[float, float], *, same_x: bool = False
+) -> tuple[Axes, ...]:
+    """Axes in a new figure, row by row.
+
+    Args:
+        size: width and height of the figure in inches.
+        same_x: whether all show the same times.
+
+    Raises:
+        UsageError: the library is not installed.
+    """
+    _, grid = _pyplot().subplots(
+        rows, columns, figsize=size, squeeze=False, sharex=same_x, layout="constrained"
+    )
+    return tuple(grid.flat)
+
+
+def new_panel(size: tuple[float, float]) -> Axes:
+    """Axes that are alone in a new figure of some width and height in inches.
+
+    Raises:
+        UsageError: the library is not installed.
+    """
+    return new_panels(1, 1, size)[0]
+
+
+def signed_colours() -> Colormap:
+    """From vermillion over almost white to blue: for numbers whose sign matters."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("robustness", [NEGATIVE, _MIDDLE, POSITIVE])
+
+
+def draw_curve(ax: Axes, points: Sequence[tuple[float, float]], colour: str) -> None:
+    """A chain of cubic Bézier curves, each from where the last one ends: 1 + 3n points."""
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    codes = [Path.MOVETO, *[Path.CURVE4] * (len(points) - 1)]
+    ax.add_patch(PathPatch(Path(points, codes), fill=False, edgecolor=colour, linewidth=1.0))
+
+
+def draw_disc(ax: Axes, centre: tuple[float, float], radius: float, colour: str) -> None:
+    """A disc with an outline."""
+    from matplotlib.patches import Circle
+
+    ax.add_patch(Circle(centre, radius, facecolor=colour, edgecolor=INK, linewidth=1.0, zorder=3))
+
+
+def plain(text: str, longest: int = 72) -> str:
+    """A text that a figure shows as it stands, cut after so many characters."""
+    return printable(text, longest).replace("$", r"\$")
+
+
+def _pyplot() -> Any:
+    try:
+        from matplotlib import pyplot
+    except ImportError:
+        raise UsageError(
+            "figures take matplotlib, which is not installed: pip install 'spatial-replay[notebook]'"
+        ) from None
+    return pyplot
+
+
+_VERDICT_COLOURS: Final[Mapping[str, tuple[float, float, float]]] = MappingProxyType(
+    {"satisfied": POSITIVE, "violated": NEGATIVE}
+)
+_CELL: Final = "text-align:left; padding:0.1em 1em 0.1em 0; vertical-align:baseline; background:transparent"
+
+
+class Html(str):
+    """A text that is HTML already."""
+
+    __slots__ = ()
+
+
+def element(tag: str, *content: str, **attributes: str) -> Html:
+    """An element with some content; texts in it that are not `Html` are escaped."""
+    written = "".join(f' {name}="{escape(value)}"' for name, value in attributes.items())
+    inner = "".join(each if isinstance(each, Html) else escape(printable(each)) for each in content)
+    return Html(f"<{tag}{written}>{inner}</{tag}>")
+
+
+def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Html:
+    """A table."""
+    head = element("tr", *(element("th", each, style=_CELL) for each in headings))
+    body = [element("tr", *(element("td", each, style=_CELL) for each in row)) for row in rows]
+    return element("table", element("thead", head), element("tbody", *body), style="border-collapse:collapse")
+
+
+def code(*content: str) -> Html:
+    """Content in letters of one width, with all of its spaces."""
+    return element("span", *content, style="font-family:ui-monospace,monospace; white-space:pre")
+
+
+def folded(summary: str, *content: str) -> Html:
+    """Content that unfolds where its summary is clicked."""
+    return element("details", element("summary", summary, style="cursor:pointer"), *content)
+
+
+def quiet(text: str) -> Html:
+    """A text that matters less."""
+    return element("span", text, style="opacity:0.7")
+
+
+def verdict_mark(verdict: str) -> Html:
+    """A verdict behind its colour."""
+    colour = hexadecimal(_VERDICT_COLOURS.get(verdict, NEUTRAL))
+    mark = element("span", "■", style=f"color:{colour}")
+    return element("span", mark, " ", verdict, style="white-space:nowrap")

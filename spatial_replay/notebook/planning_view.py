@@ -1,0 +1,309 @@
+"""Gradient maps in notebooks: drawn over the scene, and counted.
+
+Decisions in notebooks: in words, and as the maps that they rest on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from textwrap import wrap
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from spatial_replay.annotate.scene_entities import outlines_of
+from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.notebook import html, plot
+from spatial_replay.notebook.figures import (
+    INK,
+    Html,
+    element,
+    new_panel,
+    new_panels,
+    plain,
+    quiet,
+    signed_colours,
+    table,
+)
+from spatial_replay.planning.decisions import Candidate, Consideration, Step
+from spatial_replay.planning.gradient_map import FREE, REASONS, GradientMap, moved_object
+from spatial_replay.planning.read import LoggedStep
+from spatial_replay.text import counted
+from spatial_replay.trace.sample import Sample
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.image import AxesImage
+
+    from spatial_replay.planning.decisions import Target
+
+_HATCHES: Final = ("", "////", "xxxx", "....", "oooo")
+"""What covers blocked cells, by the number of the reason."""
+_BLOCKED: Final = "#e4e4e4"
+_HATCH: Final = "#9a9a9a"
+
+
+@html.register(GradientMap)
+def map_html(found: GradientMap) -> Html:
+    """What a map is about, how good its best free cell is, and why how many cells are blocked."""
+    grid = found.grid
+    size = f"{grid.columns} x {grid.rows} cells of {grid.cell_size:g}"
+    turned = f", {counted(len(found.turns), 'orientation')}" if len(found.turns) > 1 else ""
+    best = found.best()
+    words = "no free cell" if best == -math.inf else f"robustness {best:.4g} at the best free cell"
+    counts = np.bincount(found.blocked.ravel(), minlength=len(REASONS)).tolist()
+    rows = [(f"{count:,}", reason) for count, reason in zip(counts, REASONS, strict=True) if count]
+    title = element("div", "gradient map of ", element("b", found.name), quiet(f" {size}{turned}"))
+    return element("div", title, element("div", words), table(["cells", "which are"], rows))
+
+
+@plot.register(GradientMap)
+def draw_map(
+    found: GradientMap,
+    ax: Axes | None = None,
+    *,
+    turn: int | None = None,
+    sample: Sample | None = None,
+    target: Target | None = None,
+) -> Axes:
+    """Draw a map: blue where the progress set would hold, vermillion where not, blocked cells hatched.
+
+    Args:
+        turn: which orientation, by its place among the map's; that of the target or the best free cell by
+            default.
+        sample: whose objects are drawn over it.
+        target: where the object is to go; the way there is drawn too.
+
+    Raises:
+        UsageError: matplotlib is not installed.
+    """
+    ax = new_panel((6.4, 5.2)) if ax is None else ax
+    image = draw_cells(found, ax, best_turn(found, target) if turn is None else turn, reach_of([found]))
+    draw_objects(ax, sample, found.name)
+    if target is not None:
+        draw_target(ax, target, sample)
+    ax.figure.colorbar(image, ax=ax, label="robustness of what is to hold")
+    ax.set_title(plain(f"where {found.name} could go"), loc="left", fontsize=10)
+    ax.set_xlabel("x in the unit of the log")
+    ax.set_ylabel("y in the unit of the log")
+    if keys := hatch_keys(ax, [found]):
+        ax.legend(
+            handles=keys, loc="upper left", bbox_to_anchor=(0.0, -0.14), ncols=2, frameon=False, fontsize=8.5
+        )
+    return ax
+
+
+def best_turn(found: GradientMap, target: Target | None) -> int:
+    """The orientation that the object is to have, or that of the best free cell, by its place."""
+    if target is not None:
+        return int(np.abs(found.turns - target.turn).argmin())
+    best = np.where(found.blocked == FREE, found.robustness, -np.inf).max(axis=(1, 2))
+    return int(best.argmax())
+
+
+def reach_of(maps: Sequence[GradientMap]) -> float:
+    """The greatest robustness in the free cells of some maps, whatever its sign: what colours reach up to."""
+    values = np.abs(np.concatenate([found.values.ravel() for found in maps]))
+    return float(values[np.isfinite(values)].max(initial=0.0)) or 1.0
+
+
+def draw_cells(found: GradientMap, ax: Axes, turn: int, reach: float) -> AxesImage:
+    """Draw the cells of one orientation.
+
+    Args:
+        reach: the robustness of the full colours.
+    """
+    grid = found.grid
+    right, top = grid.xmin + grid.columns * grid.cell_size, grid.ymin + grid.rows * grid.cell_size
+    ax.set_facecolor(_BLOCKED)
+    image = ax.imshow(
+        found.values[turn], cmap=signed_colours(), vmin=-reach, vmax=reach, origin="lower",
+        extent=(grid.xmin, right, grid.ymin, top), interpolation="nearest",
+    )  # fmt: skip
+    for reason, hatch in enumerate(_HATCHES):
+        cells = found.blocked[turn] == reason
+        if hatch and cells.any() and min(cells.shape) > 1:
+            x, y = (axis.reshape(grid.shape) for axis in grid.centres().T)
+            hatched = ax.contourf(x, y, cells, levels=[0.5, 1.5], colors="none", hatches=[hatch])
+            hatched.set(edgecolor=_HATCH, linewidth=0.0)
+    return image
+
+
+def draw_objects(ax: Axes, sample: Sample | None, name: str) -> None:
+    """Draw the objects of a sample, the one that is to be moved in bolder lines."""
+    for each, tracked in (sample.objects if sample is not None else {}).items():
+        if isinstance(tracked, TrackedObject):
+            _draw_footprint(ax, tracked.footprint, 2.0 if each == name else 1.0)
+            x, y = np.concatenate(outlines_of(tracked.footprint)).max(axis=0).tolist()
+            ax.annotate(
+                plain(each, 24), (x, y), (2, 2), textcoords="offset points", fontsize=8.5, color=INK,
+                annotation_clip=True,
+            )  # fmt: skip
+
+
+def draw_target(ax: Axes, target: Target, sample: Sample | None) -> None:
+    """Draw where an object is to go, and the way there."""
+    ax.plot(*zip(*target.waypoints, strict=True), color="white", linewidth=3.5, solid_capstyle="round")
+    ax.plot(*zip(*target.waypoints, strict=True), color=INK, linewidth=1.5, solid_capstyle="round")
+    ax.plot(target.x, target.y, "o", color="white", markeredgecolor=INK, markersize=6)
+    tracked = None if sample is None else sample.objects.get(target.name)
+    if isinstance(tracked, TrackedObject):
+        there = moved_object(tracked, target.x, target.y, target.turn)
+        _draw_footprint(ax, there.footprint, 1.5, "--")
+
+
+def hatch_keys(ax: Axes, maps: Sequence[GradientMap]) -> list[Artist]:
+    """What a legend says of the hatches that some maps have."""
+    reasons = np.unique(np.concatenate([found.blocked.ravel() for found in maps])).tolist()
+    return [
+        ax.fill([], [], facecolor=_BLOCKED, edgecolor=_HATCH, hatch=_HATCHES[reason], label=REASONS[reason])[
+            0
+        ]
+        for reason in reasons
+        if reason != FREE
+    ]
+
+
+def _draw_footprint(ax: Axes, footprint: Footprint, width: float, style: str = "-") -> None:
+    for ring in outlines_of(footprint):
+        ax.fill(*ring.T, facecolor="none", edgecolor=INK, linewidth=width, linestyle=style)
+
+
+_MOST_EDGES: Final = 4
+_MOST_CANDIDATES: Final = 4
+_PANEL: Final = 3.4
+"""Its side, in inches."""
+_LINE: Final = 40
+"""Characters of a title's line."""
+
+
+@html.register(Step)
+def step_html(step: Step) -> Html:
+    """What was decided, on which edges and objects."""
+    states = ", ".join(map(str, step.states))
+    title = element("b", f"step {step.number}: {step.kind}")
+    place = quiet(f" at {step.time_ns / 1e9:.3f} s in state {states}")
+    shown = step.considered[-_MOST_EDGES:]
+    left_out = len(step.considered) - len(shown)
+    more = [element("div", quiet(f"{left_out} edges before were given up, too"))] if left_out else []
+    return element(
+        "div", element("div", title, place), element("div", step.reason), *more, *map(_edge, shown)
+    )
+
+
+@plot.register(Step)
+def draw_step(step: Step, sample: Sample | None = None) -> tuple[Axes, ...]:
+    """Draw the maps that a step rests on: a row for each edge looked into, a column for each object.
+
+    Args:
+        sample: what was seen then; its objects are drawn over the maps.
+
+    Returns:
+        The axes of each map; none where no map was needed.
+
+    Raises:
+        UsageError: matplotlib is not installed.
+    """
+    edges = [edge for edge in step.considered if edge.candidates][-_MOST_EDGES:]
+    if not edges:
+        return ()
+    columns = min(max(len(edge.candidates) for edge in edges), _MOST_CANDIDATES)
+    size = (0.8 + _PANEL * columns, 0.5 + _PANEL * len(edges))
+    panels = new_panels(len(edges), columns, size)
+    places = [
+        (row * columns + column, edge, candidate)
+        for row, edge in enumerate(edges)
+        for column, candidate in enumerate(edge.candidates[:columns])
+    ]
+    maps = [candidate.map for _, _, candidate in places]
+    for panel in panels:
+        panel.set_axis_off()
+    drawn = tuple(panels[number] for number, _, _ in places)
+    reach = reach_of(maps)
+    images = [
+        _draw_candidate(panel, edge, candidate, sample, reach)
+        for panel, (_, edge, candidate) in zip(drawn, places, strict=True)
+    ]
+    drawn[0].figure.colorbar(images[0], ax=panels, label="robustness of what is to hold", shrink=0.6)
+    keys = hatch_keys(drawn[0], maps)
+    if keys:
+        drawn[0].figure.legend(
+            handles=keys, loc="outside lower left", ncols=len(keys), frameon=False, fontsize=8.5
+        )
+    return drawn
+
+
+def _draw_candidate(
+    ax: Axes, edge: Consideration, candidate: Candidate, sample: Sample | None, reach: float
+) -> AxesImage:
+    """Draw one map, and say what came of it."""
+    found = candidate.map
+    ax.set_axis_on()
+    image = draw_cells(found, ax, best_turn(found, candidate.target), reach)
+    draw_objects(ax, sample, candidate.name)
+    if candidate.target is not None:
+        draw_target(ax, candidate.target, sample)
+    ax.set_title(
+        plain(f"{_arrow(edge)}: move {candidate.name}?") + "\n" + _came_of(candidate), fontsize=9, loc="left"
+    )
+    ax.tick_params(labelsize=7.5)
+    return image
+
+
+def _came_of(candidate: Candidate) -> str:
+    """Whether a candidate is the one to move, and how well that will do, or why not."""
+    if candidate.target is None:
+        return "\n".join(wrap(plain(f"no: {candidate.rejected}", 90), _LINE))
+    choice = "chosen" if candidate.is_chosen else "possible"
+    return f"{choice}: robustness {candidate.target.robustness:.3g}"
+
+
+def _arrow(edge: Consideration) -> str:
+    return f"{edge.edge[0]} → {edge.edge[1]}"
+
+
+def _edge(edge: Consideration) -> Html:
+    """An edge looked into, and a row for each object."""
+    path = " → ".join(map(str, edge.path))
+    rows = [
+        (element("b", each.name), f"{each.map.best():.4g}", _came_of(each).replace("\n", " "), _way(each))
+        for each in edge.candidates
+    ]
+    lines = [f"to reach: {edge.progress}"]
+    if edge.constraints.texts:
+        lines.append(f"never: {edge.constraints}")
+    pruned = [element("div", element("b", "given up: "), edge.pruned.split(" (")[0])] if edge.pruned else []
+    return element(
+        "div",
+        element("div", element("b", f"edge {_arrow(edge)}"), quiet(f" on the path {path}")),
+        *(element("div", line) for line in lines),
+        table(["object", "best", "choice", "way"], rows),
+        *pruned,
+        style="margin-top:0.5em",
+    )
+
+
+def _way(candidate: Candidate) -> str:
+    target = candidate.target
+    if target is None:
+        return ""
+    return f"to ({target.x:.4g}, {target.y:.4g}), {target.length:.3g} long"
+
+
+@plot.register(LoggedStep)
+def draw_logged_step(logged: LoggedStep) -> tuple[Axes, ...]:
+    """Draw the maps of a logged step with the objects as they were; see `draw_step`."""
+    return draw_step(logged.step, logged.sample)
+
+
+@html.register(LoggedStep)
+def logged_step_html(logged: LoggedStep) -> Html:
+    """The step, and how its execution went."""
+    parts = [step_html(logged.step)]
+    if logged.outcome is not None and logged.end_ns is not None:
+        how = "done" if logged.outcome.succeeded else "failed"
+        ended = f" at {logged.end_ns / 1e9:.3f} s: {logged.outcome.reason}"
+        parts.append(element("div", element("b", how), ended))
+    return element("div", *parts)

@@ -1,0 +1,367 @@
+"""The planner's messages in a log: what it decided, on which maps, and how that went.
+
+Decisions, and what came of them, as messages.
+
+Gradient maps as messages that viewers draw, one for each way in which an object may be turned.
+
+The path of an object that is moved, as a message that viewers draw.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+import numpy as np
+from foxglove_schemas_protobuf.Grid_pb2 import Grid as GridMessage
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.message import Message
+
+from spatial_replay.annotate.scene_entities import FRAME, outlines_of
+from spatial_replay.annotate.scene_update import cell_colours
+from spatial_replay.errors import UsageError
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.logs.messages import Messages, merge, messages_of
+from spatial_replay.logs.schemas.PlanDecision_pb2 import (
+    PlanCandidate,
+    PlanDecision,
+    PlanEdge,
+    PlanGuard,
+    PlanMap,
+    PlanOutcome,
+    PlanTarget,
+    PrunedEdge,
+)
+from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_DECISION, PLAN_PATH, protobuf_channel
+from spatial_replay.palette import NEUTRAL, POSITIVE
+from spatial_replay.planning.decisions import (
+    Candidate,
+    Consideration,
+    Guards,
+    Kind,
+    Outcome,
+    Step,
+    Target,
+    wait_outcome,
+)
+from spatial_replay.planning.gradient_map import GradientMap, centre_of, moved_object
+from spatial_replay.planning.planner import Planner
+from spatial_replay.trace.sample import Sample
+
+CELL: Final = np.dtype([("robustness", "<f4"), ("colour", "u1", (4,))])
+"""A map's cell: its robustness, NaN where it is blocked, and red, green, blue and alpha."""
+
+_COLOURS: Final = ("red", "green", "blue", "alpha")
+_DEPTH: Final = 0.1
+"""How far below the plane a map lies, by the size of its cells: regions are drawn in the plane."""
+
+
+class TurnedMap(NamedTuple):
+    """A candidate's map with the object turned in one way, by its place among the map's turns."""
+
+    candidate: Candidate
+    turn: int
+
+
+def maps_of(step: Step) -> list[TurnedMap]:
+    """Every map that a step rests on, edge after edge, in the order in which a log has them.
+
+    Viewers draw the last one: that of the object chosen, turned as it is to be.
+    """
+    return [
+        TurnedMap(candidate, turn)
+        for edge in step.considered
+        for candidate in sorted(edge.candidates, key=lambda each: each.is_chosen)
+        for turn in sorted(range(len(candidate.map.turns)), key=lambda turn: _is_meant(candidate, turn))
+    ]
+
+
+def _is_meant(candidate: Candidate, turn: int) -> bool:
+    """Whether the object is to be turned in this way."""
+    return candidate.target is not None and candidate.target.turn == candidate.map.turns[turn]
+
+
+def map_message(turned: TurnedMap, time_ns: int) -> GridMessage:
+    """A map that lies under the scene, in its colours; those of blocked cells are clear."""
+    found = turned.candidate.map
+    grid, values = found.grid, found.values[turned.turn]
+    cells = np.empty(values.shape, CELL)
+    cells["robustness"] = values
+    cells["colour"] = cell_colours(values)
+    message = GridMessage(
+        frame_id=FRAME,
+        column_count=grid.columns,
+        row_stride=CELL.itemsize * grid.columns,
+        cell_stride=CELL.itemsize,
+        data=cells.tobytes(),
+    )
+    message.timestamp.FromNanoseconds(time_ns)
+    message.pose.position.x, message.pose.position.y = grid.xmin, grid.ymin
+    message.pose.position.z = -_DEPTH * grid.cell_size
+    message.pose.orientation.w = 1.0
+    message.cell_size.x = message.cell_size.y = grid.cell_size
+    message.fields.add(name="robustness", offset=0, type=PackedElementField.FLOAT32)
+    for offset, name in enumerate(_COLOURS, 4):
+        message.fields.add(name=name, offset=offset, type=PackedElementField.UINT8)
+    return message
+
+
+def map_digest(found: GradientMap) -> bytes:
+    """SHA-256 of a map's values: little-endian float64 by turn, row and column, NaN where blocked."""
+    return hashlib.sha256(np.ascontiguousarray(found.values, "<f8").tobytes()).digest()
+
+
+_KINDS: MappingProxyType[Kind, PlanDecision.Kind.ValueType] = MappingProxyType(
+    {
+        "execute": PlanDecision.KIND_EXECUTE,
+        "hold": PlanDecision.KIND_HOLD,
+        "wait": PlanDecision.KIND_WAIT,
+        "no path": PlanDecision.KIND_NO_PATH,
+    }
+)
+
+
+def decision_message(step: Step, specification: str, first_map: int) -> PlanDecision:
+    """A decision, without an outcome.
+
+    Args:
+        first_map: how many maps the log has before those of this step.
+    """
+    numbers = {turned: number for number, turned in enumerate(maps_of(step), first_map)}
+    return PlanDecision(
+        time_ns=step.time_ns,
+        number=step.number,
+        specification=specification,
+        kind=_KINDS[step.kind],
+        states=step.states,
+        considered=[_edge(each, numbers) for each in step.considered],
+        target=None if step.target is None else _target(step.target),
+        pruned=[
+            PrunedEdge(source=source, target=target, reason=reason)
+            for (source, target), reason in step.pruned
+        ],
+        reason=step.reason,
+    )
+
+
+def outcome_message(
+    outcome: Outcome, end_ns: int, states: Sequence[int], travelled: Sequence[tuple[float, float]]
+) -> PlanOutcome:
+    """How a step went, and where its object and the automaton were then."""
+    return PlanOutcome(
+        end_ns=end_ns,
+        succeeded=outcome.succeeded,
+        reason=outcome.reason,
+        states=states,
+        travelled=[coordinate for point in travelled for coordinate in point],
+    )
+
+
+def _edge(consideration: Consideration, numbers: Mapping[TurnedMap, int]) -> PlanEdge:
+    return PlanEdge(
+        path=consideration.path,
+        source=consideration.edge[0],
+        target=consideration.edge[1],
+        progress=_guards(consideration.progress),
+        constraints=_guards(consideration.constraints),
+        candidates=[_candidate(each, numbers) for each in consideration.candidates],
+        pruned=consideration.pruned,
+    )
+
+
+def _guards(guards: Guards) -> list[PlanGuard]:
+    return [
+        PlanGuard(text=text, propositions=[number for number, _ in cube], values=[value for _, value in cube])
+        for cube, text in zip(guards.cubes, guards.texts, strict=True)
+    ]
+
+
+def _candidate(candidate: Candidate, numbers: Mapping[TurnedMap, int]) -> PlanCandidate:
+    return PlanCandidate(
+        object=candidate.name,
+        best=candidate.map.best(),
+        map_sha256=map_digest(candidate.map),
+        target=None if candidate.target is None else _target(candidate.target),
+        rejected=candidate.rejected,
+        chosen=candidate.is_chosen,
+        maps=[
+            PlanMap(number=numbers[TurnedMap(candidate, place)], turn=turn)
+            for place, turn in enumerate(candidate.map.turns.tolist())
+        ],
+    )
+
+
+def _target(target: Target) -> PlanTarget:
+    return PlanTarget(
+        object=target.name,
+        x=target.x,
+        y=target.y,
+        turn=target.turn,
+        yaw=target.yaw,
+        waypoints=[coordinate for point in target.waypoints for coordinate in point],
+        robustness=target.robustness,
+    )
+
+
+_WAY, _TRAVELLED = "plan/way", "plan/travelled"
+_PIXELS = 3.0
+
+
+def path_message(
+    target: Target | None,
+    tracked: TrackedObject | None,
+    time_ns: int,
+    travelled: Sequence[tuple[float, float]] = (),
+) -> SceneUpdate:
+    """The way to a target, its object's outline there, the way it has travelled; all gone without one."""
+    message = SceneUpdate()
+    lines: dict[str, list[tuple[list[tuple[float, float]], bool, tuple[float, float, float]]]] = {}
+    height = 0.0
+    if target is not None and tracked is not None:
+        height = 0.0 if tracked.height is None else tracked.height[1]
+        there = moved_object(tracked, target.x, target.y, target.turn)
+        outlines = [(points, True, POSITIVE) for points in map(_points, outlines_of(there.footprint))]
+        lines[_WAY] = [(list(target.waypoints), False, POSITIVE), *outlines]
+        if travelled:
+            lines[_TRAVELLED] = [(list(travelled), False, NEUTRAL)]
+    for identifier in (_WAY, _TRAVELLED):
+        if identifier not in lines:
+            deletion = message.deletions.add(type=SceneEntityDeletion.MATCHING_ID, id=identifier)
+            deletion.timestamp.FromNanoseconds(time_ns)
+            continue
+        entity = message.entities.add(id=identifier, frame_id=FRAME)
+        entity.timestamp.FromNanoseconds(time_ns)
+        for points, is_closed, colour in lines[identifier]:
+            _add_line(entity, points, height, colour, is_closed=is_closed)
+    return message
+
+
+def _add_line(
+    entity: SceneEntity,
+    points: list[tuple[float, float]],
+    height: float,
+    colour: tuple[float, float, float],
+    *,
+    is_closed: bool,
+) -> None:
+    kind = LinePrimitive.LINE_LOOP if is_closed else LinePrimitive.LINE_STRIP
+    line = entity.lines.add(type=kind, thickness=_PIXELS, scale_invariant=True)
+    line.pose.position.z, line.pose.orientation.w = height, 1.0
+    for x, y in points:
+        line.points.add(x=x, y=y)
+    line.color.r, line.color.g, line.color.b, line.color.a = *colour, 1.0
+
+
+def _points(ring: Floats) -> list[tuple[float, float]]:
+    return [(x, y) for x, y in ring.tolist()]
+
+
+PLAN_METADATA: Final = "spatial_replay_plan"
+"""The metadata record with what decisions depend on besides samples: settings, and which specification."""
+
+_DECISIONS: Final = protobuf_channel(PLAN_DECISION, PlanDecision)
+_MAPS: Final = protobuf_channel(GRADIENT_MAP, GridMessage)
+_PATHS: Final = protobuf_channel(PLAN_PATH, SceneUpdate)
+_CHANNELS: Final = (_DECISIONS, _MAPS, _PATHS)
+
+
+class BlackBox:
+    """A planner and a record of everything it decides.
+
+    Samples, `decide` and `conclude` go through it in the order in which they happen; equal ones give equal
+    bytes.
+    """
+
+    def __init__(self, planner: Planner) -> None:
+        """Begin before the first sample."""
+        self.planner = planner
+        self._written = dict.fromkeys(_CHANNELS, 0)
+        self._sample: Sample | None = None
+        self._step: Step | None = None
+        self._decision = PlanDecision()
+        self._tracked: TrackedObject | None = None
+        self._travelled: list[tuple[float, float]] = []
+
+    def observe(self, sample: Sample) -> None:
+        """Take in the next sample.
+
+        Raises:
+            TraceError: it does not come after the one before.
+        """
+        self.planner.observe(sample)
+        self._sample = sample
+        tracked = self._object_moved()
+        if tracked is not None:
+            self._travelled.append(centre_of(tracked.footprint))
+
+    def decide(self) -> tuple[Step, Messages]:
+        """The planner's next step, and the messages that tell of it; none while the same wait goes on.
+
+        What became of a wait is told when something else is decided.
+
+        Raises:
+            UsageError: nothing was observed yet, or the last step was not concluded.
+        """
+        step = self.planner.next_step()
+        if step is self._step:
+            return step, self._messages(step.time_ns, [], [], [])
+        waited = self._waited(step.time_ns)
+        self._step = step
+        self._tracked = self._object_moved()
+        self._travelled = [] if self._tracked is None else [centre_of(self._tracked.footprint)]
+        self._decision = decision_message(step, self.planner.automaton.name, self._written[_MAPS])
+        maps = [map_message(turned, step.time_ns) for turned in maps_of(step)]
+        path = path_message(step.target, self._tracked, step.time_ns)
+        return step, self._messages(step.time_ns, [*waited, self._decision], maps, [path])
+
+    def conclude(self, outcome: Outcome) -> Messages:
+        """Say how the last step went; the messages that tell of it.
+
+        Raises:
+            UsageError: no step is being executed.
+        """
+        self.planner.conclude(outcome)
+        if self._step is None or self._sample is None:
+            raise UsageError("no step is being executed; decide on one first")
+        step, end_ns = self._step, self._sample.time_ns
+        told = self._concluded(outcome, end_ns)
+        path = path_message(step.target, self._tracked, end_ns, self._travelled)
+        self._step = None
+        return self._messages(end_ns, [told], [], [path])
+
+    def _waited(self, end_ns: int) -> list[PlanDecision]:
+        """The last decision with its outcome, if it was to wait."""
+        if self._step is None or self._step.kind != "wait":
+            return []
+        return [self._concluded(wait_outcome(self._step, self.planner.states), end_ns)]
+
+    def _concluded(self, outcome: Outcome, end_ns: int) -> PlanDecision:
+        """The last decision with its outcome."""
+        told = outcome_message(outcome, end_ns, self.planner.states, self._travelled)
+        self._decision.outcome.CopyFrom(told)
+        return self._decision
+
+    def _object_moved(self) -> TrackedObject | None:
+        """The object that the last step moves, as it is now."""
+        if self._step is None or self._step.target is None or self._sample is None:
+            return None
+        tracked = self._sample.objects.get(self._step.target.name)
+        return tracked if isinstance(tracked, TrackedObject) else None
+
+    def _messages(self, time_ns: int, *of_channels: Sequence[Message]) -> Messages:
+        """Messages of each channel, as the log numbers them."""
+        streams = []
+        for channel, messages in zip(_CHANNELS, of_channels, strict=True):
+            first = self._written[channel]
+            self._written[channel] += len(messages)
+            payloads = [message.SerializeToString(deterministic=True) for message in messages]
+            times_ns = np.full(len(payloads), time_ns, np.int64)
+            streams.append(messages_of(channel, times_ns, payloads, first))
+        return merge(streams)

@@ -1,0 +1,410 @@
+"""Gradient maps (Def. 19): how well guards would hold with one object somewhere else.
+
+How well propositions would hold with one object somewhere else.
+
+The grid's positions are the samples of a trace in which nothing but that object moves, so the kernels that
+evaluate a log evaluate a map, all relations in one call, and a map's number is that of a log's sample.
+
+What propositions are about: which objects, and whether the present alone.
+
+Objects put elsewhere: one at a time, or at every cell of a grid at once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spatial_replay.errors import UsageError
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
+from spatial_replay.geometry.measure import Operand, Request, measure
+from spatial_replay.lazy import Displayed
+from spatial_replay.monitor.atoms.measurements import leaf_values
+from spatial_replay.monitor.atoms.terms import Scene
+from spatial_replay.planning.workspace import Grid, Workspace, refuse_faults
+from spatial_replay.spec.diagnostics import nearest_hint
+from spatial_replay.spec.format import format_formula
+from spatial_replay.spec.formula import (
+    Atom,
+    Earlier,
+    Enlarged,
+    Formula,
+    Group,
+    Outline,
+    Quantified,
+    SignedDistance,
+    Term,
+    TrackedName,
+)
+from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, terms_of
+from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Trace
+
+_LESS_THAN_AREA = 1e-12
+
+
+def centre_of(footprint: Footprint) -> tuple[float, float]:
+    """The point that says where an object is: the centroid of its parts' areas.
+
+    Each part counts by its area, with the centroid of its polygon before it is rounded: for one without area,
+    the mean of their vertices. Where parts overlap, their area counts twice.
+    """
+    weights, centres = zip(*map(_weight_and_centre, footprint.parts), strict=True)
+    if sum(weights) <= 0.0:
+        weights = (1.0,) * len(centres)
+    total = sum(weights)
+    x = sum(weight * centre[0] for weight, centre in zip(weights, centres, strict=True)) / total
+    y = sum(weight * centre[1] for weight, centre in zip(weights, centres, strict=True)) / total
+    return x, y
+
+
+def moved_object(tracked: TrackedObject, x: float, y: float, turn: float = 0.0) -> TrackedObject:
+    """The object with its centre at (x, y), turned by an angle in radians; heights stay."""
+    footprint = tracked.footprint
+    centre = np.array(centre_of(footprint))
+    parts = tuple(
+        ConvexPart(_placed(part.vertices, centre, np.array([[x, y]]), turn)[0], part.radius)
+        for part in footprint.parts
+    )
+    yaw = None if tracked.yaw is None else tracked.yaw + turn
+    return replace(tracked, footprint=Footprint(parts), yaw=yaw)
+
+
+def moved_batch(tracked: TrackedObject, positions: Floats, turns: Floats) -> FootprintBatch:
+    """The object turned by each angle (A,) in radians and put at each position (M, 2), as A * M rows."""
+    footprint = tracked.footprint
+    centre = np.array(centre_of(footprint))
+    count = len(positions) * len(turns)
+    vertices = np.concatenate([part.vertices for part in footprint.parts])
+    sizes = np.array([len(part.vertices) for part in footprint.parts], np.int64)
+    bottom, top = tracked.height or (math.nan, math.nan)
+    return FootprintBatch(
+        part_start=np.arange(count + 1, dtype=np.int64) * len(sizes),
+        vertex_start=_starts(np.tile(sizes, count)),
+        vertices=np.concatenate(
+            [_placed(vertices, centre, positions, turn) for turn in turns.tolist()]
+        ).reshape(-1, 2),
+        radius=np.tile([part.radius for part in footprint.parts], count),
+        bottom=np.full(count, bottom),
+        top=np.full(count, top),
+    )
+
+
+def turns_for(tracked: TrackedObject, yaws: tuple[float, ...]) -> Floats:
+    """(A,): by how much to turn an object so that it has each orientation; [0] to leave it as it is."""
+    if not yaws:
+        return np.zeros(1)
+    return np.array(yaws) - (tracked.yaw or 0.0)
+
+
+def _placed(vertices: Floats, centre: Floats, positions: Floats, turn: float) -> Floats:
+    """(M, n, 2): vertices (n, 2) turned around the centre, which is then moved to each position (M, 2)."""
+    local = vertices - centre
+    if turn != 0.0:
+        cosine, sine = math.cos(turn), math.sin(turn)
+        x, y = local[:, 0], local[:, 1]
+        local = np.stack((x * cosine - y * sine, x * sine + y * cosine), axis=1)
+    placed: Floats = positions[:, None, :] + local[None, :, :]
+    return placed
+
+
+def _weight_and_centre(part: ConvexPart) -> tuple[float, tuple[float, float]]:
+    """A part's area, and the centroid of its polygon before it is rounded."""
+    # a few vertices at most: plain numbers are quicker than arrays
+    corners = part.vertices.tolist()
+    (x0, y0), *_ = corners
+    doubled = sum_x = sum_y = length = 0.0
+    for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
+        cross = (ax - x0) * (by - y0) - (bx - x0) * (ay - y0)
+        doubled += cross
+        sum_x += cross * (ax + bx - 2.0 * x0)
+        sum_y += cross * (ay + by - 2.0 * y0)
+        length += math.hypot(bx - ax, by - ay)
+    # a rounded polygon: its own area, a strip along its sides and a disc in all of its corners together
+    area = doubled / 2 + length * part.radius + math.pi * part.radius**2
+    if len(corners) > 2 and doubled > _LESS_THAN_AREA * length**2:
+        return area, (x0 + sum_x / (3.0 * doubled), y0 + sum_y / (3.0 * doubled))
+    count = len(corners)
+    return area, (sum(x for x, _ in corners) / count, sum(y for _, y in corners) / count)
+
+
+def _starts(counts: Integers) -> Integers:
+    return np.concatenate(([0], np.cumsum(counts)))
+
+
+def concerns(formula: Formula, name: str) -> bool:
+    """Whether what a formula says depends on where an object is."""
+    for each in iter_formulas(formula):
+        if isinstance(each, Quantified):
+            return True
+        if isinstance(each, Atom) and any(_is_about(term, name) for term in terms_of(each.expression)):
+            return True
+    return False
+
+
+def _is_about(term: Term, name: str) -> bool:
+    base = base_of(term)
+    if isinstance(base, Group):
+        return base.members is None or name in base.members
+    return isinstance(base, TrackedName) and base.name == name
+
+
+def refuse_delays(propositions: Sequence[Formula]) -> None:
+    """That propositions are about one sample each.
+
+    Raises:
+        UsageError: one looks at earlier samples, which moving an object now does not change.
+    """
+    for proposition in propositions:
+        for each in iter_formulas(proposition):
+            terms = list(terms_of(each.expression)) if isinstance(each, Atom) else []
+            terms += [each.group] if isinstance(each, Quantified) else []
+            if any(map(_looks_back, terms)):
+                raise UsageError(
+                    f"{format_formula(each)} looks at earlier samples, so there is no map of it; plan "
+                    "without it, and evaluate it with replay"
+                )
+
+
+def _looks_back(term: Term) -> bool:
+    while isinstance(term, Enlarged):
+        term = term.term
+    return isinstance(term, Earlier)
+
+
+def refuse_unknown(names: Sequence[str], sample: Sample, propositions: Sequence[Formula]) -> None:
+    """That objects are in a sample, or may come later: what propositions are about may.
+
+    Raises:
+        UsageError: with every name that is neither.
+    """
+    faults = []
+    for name in names:
+        if name not in sample.objects and not any(concerns(each, name) for each in propositions):
+            hint = nearest_hint(name, sample.objects)
+            faults.append(
+                f"{name!r} is movable, but neither the specification nor the first sample has it; "
+                f"{hint or 'the sample has: ' + (', '.join(sample.objects) or 'none')}"
+            )
+    refuse_faults(faults)
+
+
+@dataclass(frozen=True, eq=False)
+class PropositionMaps:
+    """Every proposition with one object at every cell of a grid, in A orientations.
+
+    Attributes:
+        name: of the object.
+        grid: the cells.
+        lower, upper: (P, A, rows, columns), robustness; -inf and +inf where it is unknown.
+        clearance: (A, rows, columns), signed distance to the nearest obstacle; +inf where there is none.
+        turns: (A,) radians by which the object is turned.
+    """
+
+    name: str
+    grid: Grid
+    lower: Floats
+    upper: Floats
+    clearance: Floats
+    turns: Floats
+
+
+def proposition_maps(
+    propositions: Sequence[Formula],
+    regions: Mapping[str, Outline],
+    sample: Sample,
+    name: str,
+    workspace: Workspace,
+    grid: Grid | None = None,
+) -> PropositionMaps:
+    """Each proposition with the object `name` of a sample at every cell of a grid.
+
+    Args:
+        grid: other cells than those of the workspace.
+
+    Raises:
+        UsageError: the sample does not have the object, or a proposition looks at earlier samples.
+    """
+    refuse_delays(propositions)
+    tracked = sample.objects.get(name)
+    if not isinstance(tracked, TrackedObject):
+        seen = ", ".join(sample.objects) or "none"
+        raise UsageError(f"there is no object {name!r} to move; the sample has: {seen}")
+    cells = workspace.grid if grid is None else grid
+    turns = turns_for(tracked, workspace.yaws)
+    here = Trace.from_samples([sample])
+    everywhere = _trace_over_cells(here, tracked, name, cells, turns)
+    moves = np.array([concerns(each, name) for each in propositions], np.bool_)
+    concerned = [each for each, is_moving in zip(propositions, moves, strict=True) if is_moving]
+    others = [each for each, is_moving in zip(propositions, moves, strict=True) if not is_moving]
+    standing = _standing(propositions, sample, name, workspace)
+    shape = (len(turns), *cells.shape)
+    over_cells = _intervals(everywhere, [*concerned, *standing], regions)
+    # what the object has no part in is measured once
+    fixed = _intervals(here, others, regions)
+    ends = []
+    for moving, still in zip(over_cells, fixed, strict=True):
+        values = np.empty((len(propositions), len(everywhere)))
+        values[moves], values[~moves] = moving[: len(concerned)], still
+        ends.append(values.reshape(len(propositions), *shape))
+    clearance = over_cells[0][len(concerned) :].min(axis=0, initial=np.inf)
+    if workspace.obstacles:
+        clearance = np.minimum(clearance, _to_static(everywhere, name, workspace))
+    lower, upper = ends
+    return PropositionMaps(name, cells, lower, upper, clearance.reshape(shape), turns)
+
+
+def _intervals(
+    trace: Trace, formulas: Sequence[Formula], regions: Mapping[str, Outline]
+) -> tuple[Floats, Floats]:
+    """(K, T), twice: formulas without temporal operators as intervals of their robustness."""
+    leaves = leaf_values(Scene(trace, regions), formulas, {})
+    return leaves[0], leaves[min(1, len(leaves) - 1)]
+
+
+def _standing(propositions: Sequence[Formula], sample: Sample, name: str, workspace: Workspace) -> list[Atom]:
+    """The distance from the object to each other one in its way.
+
+    It is at most 0 just where the object's centre lies in the Minkowski sum of the other with the object
+    mirrored.
+    """
+    measured = {
+        part
+        for proposition in propositions
+        for each in iter_formulas(proposition)
+        if isinstance(each, Atom)
+        for part in iter_expressions(each.expression)
+    }
+    atoms = []
+    for other in sorted(sample.objects):
+        if other != name and other not in workspace.supports:
+            one, two = TrackedName(name), TrackedName(other)
+            # what a proposition measures anyway is not measured twice
+            swapped = SignedDistance(two, one)
+            atoms.append(Atom("", "dist", swapped if swapped in measured else SignedDistance(one, two)))
+    return atoms
+
+
+def _to_static(trace: Trace, name: str, workspace: Workspace) -> Floats:
+    """(T,): the distance from the object to what stands in its way besides objects."""
+    own = trace.rows[:, [trace.names.index(name)]]
+    static = np.arange(len(workspace.obstacles), dtype=np.int64) + len(trace.footprints)
+    obstacles = FootprintBatch.from_footprints(workspace.obstacles)
+    batch = FootprintBatch.concatenate([trace.footprints, obstacles])
+    operands = (Operand(own), Operand(np.tile(static, (len(trace), 1))))
+    distance: Floats = measure(batch, operands, [Request("signed_distance", 0, 1)])[0]
+    return distance
+
+
+def _trace_over_cells(here: Trace, tracked: TrackedObject, name: str, grid: Grid, turns: Floats) -> Trace:
+    """A trace whose samples are that of `here` but for one object, put elsewhere by turn, row and column."""
+    places = moved_batch(tracked, grid.centres(), turns)
+    count, column = len(places), here.names.index(name)
+    own = np.full(count, here.rows[0, column])
+    rows = np.repeat(here.rows, count, axis=0)
+    rows[:, column] = len(here.footprints) + np.arange(count)
+    return Trace(
+        times_ns=np.arange(count, dtype=np.int64),
+        names=here.names,
+        rows=rows,
+        footprints=FootprintBatch.concatenate([here.footprints, places]),
+        yaw=np.concatenate((here.yaw, here.yaw[own] + np.repeat(turns, count // len(turns)))),
+        uncertainty=np.concatenate((here.uncertainty, here.uncertainty[own])),
+        class_code=np.concatenate((here.class_code, here.class_code[own])),
+        classes=here.classes,
+        signals={signal: np.repeat(values, count) for signal, values in here.signals.items()},
+    )
+
+
+Cube: TypeAlias = tuple[tuple[int, bool], ...]
+"""A conjunction of propositions, by number, each to hold or not to; the empty one always holds."""
+
+Cubes: TypeAlias = tuple[Cube, ...]
+"""A disjunction of cubes; none never holds."""
+
+FREE: Final = 0
+CONSTRAINED: Final = 1
+OCCUPIED: Final = 2
+OUT_OF_REACH: Final = 3
+UNKNOWN: Final = 4
+REASONS: Final = ("free", "a constraint would hold", "an obstacle is there", "out of reach", "unknown")
+"""Why a cell is blocked, by the number that `GradientMap.blocked` has for it."""
+
+
+@dataclass(frozen=True, eq=False)
+class GradientMap(Displayed):
+    """How well a progress set would hold with an object at each cell (Def. 19).
+
+    Attributes:
+        name: of the object.
+        grid: the cells; more than the workspace has where an object that is to be pushed lies outside.
+        robustness: (A, rows, columns), in the unit of the relations; also at blocked cells.
+        blocked: (A, rows, columns) uint8, `FREE` or why the object must not be there (see `REASONS`).
+        clearance: (A, rows, columns), signed distance to the nearest obstacle; +inf where there is none.
+        turns: (A,) radians by which the object is turned.
+    """
+
+    name: str
+    grid: Grid
+    robustness: Floats
+    blocked: NDArray[np.uint8]
+    clearance: Floats
+    turns: Floats
+
+    @property
+    def values(self) -> Floats:
+        """(A, rows, columns): the robustness, NaN where cells are blocked."""
+        return np.where(self.blocked == FREE, self.robustness, np.nan)
+
+    def best(self) -> float:
+        """The greatest robustness at a free cell; -inf where there is none."""
+        free = self.blocked == FREE
+        return float(self.robustness[free].max()) if free.any() else -np.inf
+
+    def __repr__(self) -> str:
+        cells = f"{self.grid.columns} x {self.grid.rows}"
+        return f"<GradientMap of {self.name}: {cells} cells, {self.best():.4g} at best>"
+
+
+def gradient_map(
+    maps: PropositionMaps,
+    progress: Cubes,
+    constraints: Cubes,
+    workspace: Workspace,
+    margin: float = 0.0,
+) -> GradientMap:
+    """The map of a progress set, blocked where the constraint set would hold.
+
+    Args:
+        progress: one of these cubes is to hold.
+        constraints: none of these may hold, not even by -`margin`; what may hold for being unknown counts.
+        margin: in the unit of the relations, at least 0.
+    """
+    shape = maps.clearance.shape
+    robustness = np.full(shape, -np.inf)
+    for cube in progress:
+        np.maximum(robustness, _holds(maps.lower, maps.upper, cube, shape), out=robustness)
+    danger = np.full(shape, -np.inf)
+    for cube in constraints:
+        np.maximum(danger, _holds(maps.upper, maps.lower, cube, shape), out=danger)
+    blocked = np.zeros(shape, np.uint8)
+    blocked[robustness == -np.inf] = UNKNOWN
+    blocked[~np.broadcast_to(workspace.within_reach(maps.grid), shape)] = OUT_OF_REACH
+    blocked[maps.clearance <= workspace.clearance] = OCCUPIED
+    blocked[danger >= -margin] = CONSTRAINED
+    return GradientMap(maps.name, maps.grid, robustness, blocked, maps.clearance, maps.turns)
+
+
+def _holds(positive: Floats, negative: Floats, cube: Cube, shape: tuple[int, ...]) -> Floats:
+    """How well a cube holds: the least of its literals."""
+    least = np.full(shape, np.inf)
+    for number, wanted in cube:
+        np.minimum(least, positive[number] if wanted else -negative[number], out=least)
+    return least

@@ -1,0 +1,157 @@
+"""A file of tracked objects recorded as a log."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+
+from spatial_replay.errors import LogError
+from spatial_replay.logs.mcap.writer import LogWriter
+from spatial_replay.logs.output_file import open_output, refuse_inputs
+from spatial_replay.logs.source import Source, read_blocks, reading_options
+from spatial_replay.recording.interruption import leaving, uninterrupted
+from spatial_replay.recording.recording import Recording, refuse_templates
+from spatial_replay.spec import check_names
+from spatial_replay.spec.formula import Diagnostic, Specification
+from spatial_replay.trace.trace import Trace
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """What was recorded.
+
+    Attributes:
+        samples: how many samples.
+        start_ns, end_ns: times of the first and the last.
+        objects: names seen.
+        faults: what was lost while reading, each with its place.
+        unreadable: how many observations held a number that is not finite.
+        missing: names in the specifications that no sample had.
+        remarks: what else there is to know about the source, without anything being lost.
+    """
+
+    samples: int
+    start_ns: int
+    end_ns: int
+    objects: tuple[str, ...]
+    faults: tuple[str, ...]
+    unreadable: int
+    missing: tuple[Diagnostic, ...]
+    remarks: tuple[str, ...] = ()
+
+
+def record_source(
+    source: Source,
+    output: Path,
+    files: Sequence[Specification] = (),
+    *,
+    inputs: Sequence[Path] = (),
+    advance: Callable[[int], None] = lambda samples: None,
+) -> Recorded:
+    """Record the samples of a source, in place under the final name.
+
+    Equal sources and specifications give equal bytes. An interruption leaves a shorter log, closed properly,
+    that says so.
+
+    Args:
+        inputs: files that the output must not be.
+        advance: told how many more samples are done.
+
+    Raises:
+        UsageError: the output is an input, or a specification cannot be recorded.
+        LogError: the source has no sample, or the machine cannot read it to its end.
+        OutputError: the output cannot be written.
+    """
+    refuse_inputs(output, inputs)
+    refuse_templates(files)
+    tally = _Tally()
+    traces = _traces(source, tally)
+    # a source that holds nothing raises here, before the output is touched
+    first = next(traces)
+    with leaving(output), open_output(output) as stream:
+        about = {"source": source.name, "options": json.dumps(reading_options(source))}
+        _record(LogWriter(stream), about, files, chain([first], traces), advance)
+    return tally.recorded(files)
+
+
+def _traces(source: Source, tally: _Tally) -> Iterator[Trace]:
+    """The samples of a source in stretches of one or more.
+
+    Raises:
+        LogError: there are none, or the machine cannot read them.
+    """
+    any_sample = False
+    for block in read_blocks(source):
+        tally.add(block.trace)
+        tally.remarks += block.remarks
+        if len(block.trace):
+            any_sample = True
+            yield block.trace
+    if not any_sample:
+        raise LogError("; ".join([f"{source.name} has no sample", *tally.faults[:1]]))
+
+
+def _record(
+    writer: LogWriter,
+    about: Mapping[str, str],
+    files: Sequence[Specification],
+    traces: Iterator[Trace],
+    advance: Callable[[int], None],
+) -> None:
+    """Write a whole log; it ends where the traces do, or are interrupted."""
+    interrupted = True
+    with ExitStack() as ending:
+        # an interruption between two records would leave a log whose index does not fit
+        with uninterrupted():
+            recording = Recording(writer, files, about)
+            ending.callback(lambda: _end(writer, recording, interrupted=interrupted))
+        for trace in traces:
+            with uninterrupted():
+                recording.add(trace)
+            advance(len(trace))
+        interrupted = False
+
+
+def _end(writer: LogWriter, recording: Recording, *, interrupted: bool) -> None:
+    with uninterrupted():
+        recording.end(interrupted=interrupted)
+        writer.close()
+
+
+class _Tally:
+    """What was recorded so far."""
+
+    def __init__(self) -> None:
+        self._times: list[int] = []
+        self._names: set[str] = set()
+        self._signals: set[str] = set()
+        self.faults: list[str] = []
+        self.remarks: list[str] = []
+        self._samples = self._unreadable = 0
+
+    def add(self, trace: Trace) -> None:
+        self._samples += len(trace)
+        self.faults += trace.faults
+        self._unreadable += trace.unreadable_count
+        self._names.update(trace.names)
+        self._signals.update(trace.signals)
+        if len(trace):
+            self._times = [*self._times[:1], int(trace.times_ns[0]), int(trace.times_ns[-1])]
+
+    def recorded(self, files: Sequence[Specification]) -> Recorded:
+        names, signals = sorted(self._names), sorted(self._signals)
+        remarks = [remark for file in files for remark in check_names(file, names, signals)]
+        return Recorded(
+            self._samples,
+            self._times[0],
+            self._times[-1],
+            tuple(names),
+            tuple(self.faults),
+            self._unreadable,
+            tuple(remark for remark in remarks if remark.severity == "error"),
+            tuple(self.remarks),
+        )

@@ -1,0 +1,120 @@
+"""What a report is about."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from spatial_replay.automata.automaton import Automaton
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.semantics import Semantics
+from spatial_replay.monitor.verdict import Verdict, worst_verdict
+from spatial_replay.report.automaton_panel import StatePath
+from spatial_replay.report.decision_panel import Plan
+from spatial_replay.report.event_panel import ReportedEvent
+from spatial_replay.report.scene_panel import Film
+from spatial_replay.report.tree_panel import final_text
+from spatial_replay.spec.formula import Formula, Specification
+
+MOST_DRAWN: Final = 24
+"""How many results a page explains and has trees and curves of: the worst; it has the verdicts of all."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReportedResult:
+    """One result, with all that was found of it.
+
+    Attributes:
+        name: the name that it is reported under.
+        object: the object that a template's parameter stands for, or None.
+        relations: the names of relations that its file may use.
+        robustness: (N,), each node's value on the whole log.
+        final: (N, 2), lower and upper end of each node for the finished log.
+        first_satisfied_ns: the first sample with a value of at least 0, or None.
+        times_ns, series: (T,) and (N, 4, T): value, now, lower, upper of each node.
+        sentences: why its verdict is what it is; none where that was not asked.
+        decided_ns: the sample that decided that; None where that was not asked.
+        automaton: None if it has none.
+        no_automaton: why not.
+        path: where the run is in it.
+    """
+
+    name: str
+    object: str | None
+    formula: Formula
+    relations: frozenset[str]
+    verdict: Verdict
+    robustness: Floats
+    final: Floats
+    first_satisfied_ns: int | None
+    times_ns: Integers
+    series: Floats
+    sentences: tuple[str, ...]
+    decided_ns: int | None
+    automaton: Automaton | None
+    no_automaton: str
+    path: StatePath
+
+    @property
+    def title(self) -> str:
+        return self.name if self.object is None else f"{self.name}({self.object})"
+
+    @property
+    def fault_ns(self) -> int | None:
+        """The sample that made it violated, or unknown."""
+        return None if self.verdict is Verdict.SATISFIED else self.decided_ns
+
+    @property
+    def robustness_text(self) -> str:
+        """The root's robustness, or between which numbers it lies."""
+        return final_text(float(self.robustness[0]), *self.final[0].tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """A run and what was found of it.
+
+    Attributes:
+        log: base name of the log.
+        first_ns, start_ns, end_ns: times of the log's first sample, and of the first and last evaluated.
+        faults, remarks: what was lost, and what else the log says of its samples.
+        unreadable: how many observations are there and say nothing.
+    """
+
+    log: str
+    samples: int
+    first_ns: int
+    start_ns: int
+    end_ns: int
+    faults: tuple[str, ...]
+    remarks: tuple[str, ...]
+    unreadable: int
+    semantics: Semantics
+    certificate: Mapping[str, str]
+    files: tuple[Specification, ...]
+    results: tuple[ReportedResult, ...]
+    film: Film
+    events: tuple[ReportedEvent, ...]
+    plan: Plan
+
+    @property
+    def verdict(self) -> Verdict:
+        return worst_verdict(result.verdict for result in self.results)
+
+    @property
+    def drawn(self) -> tuple[ReportedResult, ...]:
+        """The results that have a tree and curves on the page, in order: the worst if they are too many."""
+        chosen = worst_results([result.verdict for result in self.results])
+        return tuple(self.results[number] for number in chosen)
+
+
+def worst_results(verdicts: Sequence[Verdict]) -> list[int]:
+    """Which results are looked into, in order: `MOST_DRAWN` of them at most."""
+    return sorted(worst_first(verdicts)[:MOST_DRAWN])
+
+
+def worst_first(verdicts: Sequence[Verdict]) -> list[int]:
+    """The places of results: those violated, those unknown, the others, each kind in order."""
+    severity = {Verdict.VIOLATED: 0, Verdict.UNKNOWN: 1}
+    return sorted(range(len(verdicts)), key=lambda number: severity.get(verdicts[number], 2))

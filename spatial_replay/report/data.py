@@ -1,0 +1,221 @@
+"""A report → what its page reads: facts, numbers, and what there was no room for.
+
+Which samples of a long run a page keeps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.palette import CURVES, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
+from spatial_replay.report.automaton_panel import automaton_value
+from spatial_replay.report.compact import Packing, sentence_parts, singles
+from spatial_replay.report.contents import MOST_DRAWN, Report, ReportedResult
+from spatial_replay.report.decision_panel import plan_value
+from spatial_replay.report.event_panel import MOST_EVENTS, event_values
+from spatial_replay.report.scene_panel import film_value
+from spatial_replay.report.tree_panel import (
+    MOST_NODES,
+    concern_values,
+    named_nodes,
+    series_of,
+    shown_nodes,
+    tree_value,
+)
+
+
+class Curves(NamedTuple):
+    """What is to be seen of some nodes.
+
+    Attributes:
+        times_ns: (T,) int64, a stretch of the run's samples.
+        series: (K, 4, T): value, now, lower, upper.
+    """
+
+    times_ns: Integers
+    series: Floats
+
+
+def kept_samples(times_ns: Integers, curves: Sequence[Curves], most: int) -> Integers:
+    """Indices of the samples to keep, in order: all of them, or at most `most`.
+
+    Of a run that is too long those are the first and the last of all and of each curve, others at equal
+    distances, those before and after changes of sign, and those in which a curve has its least and its
+    greatest number within a stretch: in this order as long as there is room, and spread over the run where
+    there is not.
+
+    Args:
+        times_ns: (T,) int64, of all samples.
+        most: at least 8, and 4 for each of the curves.
+    """
+    count = len(times_ns)
+    if count <= most:
+        return np.arange(count)
+    starts = [int(np.searchsorted(times_ns, each.times_ns[0])) for each in curves]
+    chosen = np.zeros(count, np.bool_)
+    chosen[np.linspace(0, count - 1, most // 4).astype(np.int64)] = True
+    for start, each in zip(starts, curves, strict=True):
+        chosen[[start, start + len(each.times_ns) - 1]] = True
+    stretches = max(1, most // 16)
+    for limit, found_in in ((most * 5 // 8, _turns), (most, lambda series: _extremes(series, stretches))):
+        for start, each in zip(starts, curves, strict=True):
+            _choose(chosen, start + found_in(each.series), limit)
+    return np.flatnonzero(chosen)
+
+
+def _choose(chosen: NDArray[np.bool_], samples: Integers, most: int) -> None:
+    """Add samples as long as no more than `most` are chosen."""
+    new = samples[~chosen[samples]]
+    room = max(0, most - int(np.count_nonzero(chosen)))
+    if len(new) > room:
+        new = new[np.linspace(0, len(new), room, endpoint=False).astype(np.int64)]
+    chosen[new] = True
+
+
+def _turns(series: Floats) -> Integers:
+    """The samples on both sides of a change of sign: of a number, or of an end of its interval."""
+    found = [np.empty(0, np.int64)]
+    for numbers in series.reshape(-1, series.shape[-1]):
+        sign = np.where(np.isnan(numbers), 0, np.where(numbers >= 0.0, 1, -1))
+        after = np.flatnonzero(np.diff(sign)) + 1
+        found += [after - 1, after]
+    return np.unique(np.concatenate(found))
+
+
+def _extremes(series: Floats, stretches: int) -> Integers:
+    """Where value and now are least and greatest within each of so many stretches."""
+    count = series.shape[-1]
+    starts = np.unique(np.linspace(0, count, stretches, endpoint=False).astype(np.int64))
+    found = [np.empty(0, np.int64)]
+    for numbers in series[:, :2].reshape(-1, count):
+        for infinite, extreme in ((np.inf, np.minimum), (-np.inf, np.maximum)):
+            known = np.where(np.isnan(numbers), infinite, numbers)
+            best = np.repeat(extreme.reduceat(known, starts), np.diff([*starts, count]))
+            hits = np.flatnonzero(known == best)
+            # the first in each stretch
+            _, first = np.unique(np.searchsorted(starts, hits, side="right"), return_index=True)
+            found.append(hits[first])
+    return np.unique(np.concatenate(found))
+
+
+MOST_VALUES: Final = 4_000_000
+"""How many numbers of nodes at samples a page holds; of a longer run it keeps fewer samples."""
+_FEWEST_SAMPLES: Final = 200
+
+
+@dataclass(frozen=True)
+class PageData:
+    """What the page reads: facts that JSON can hold, numbers, and what it does not have.
+
+    Attributes:
+        numbers: of `Packing.text`.
+        omissions: sentences on what is left out for the sake of its size.
+    """
+
+    facts: Mapping[str, Any]
+    numbers: str
+    omissions: tuple[str, ...]
+
+
+def page_data(report: Report) -> PageData:
+    """Everything that the page draws; equal reports give equal data."""
+    packing = Packing()
+    drawn = report.drawn
+    times_ns = np.unique(
+        np.concatenate([report.film.times_ns, *(result.times_ns for result in drawn)]).astype(np.int64)
+    )
+    curves = [_curves(each) for each in drawn if len(each.times_ns)]
+    faults_ns = [each.fault_ns for each in drawn if each.fault_ns is not None]
+    room = _room(drawn, len(times_ns)) - len(faults_ns)
+    kept = np.union1d(times_ns[kept_samples(times_ns, curves, room)], np.array(faults_ns, np.int64))
+    plan = plan_value(report.plan, report.first_ns, packing)
+    facts = {
+        "settles": report.semantics == "ltlf",
+        "is_thinned": len(kept) < len(times_ns),
+        "times": packing.add((kept - report.first_ns) / 1e9, "f8"),
+        "palette": {
+            "positive": hexadecimal(POSITIVE),
+            "negative": hexadecimal(NEGATIVE),
+            "neutral": hexadecimal(NEUTRAL),
+            # without those of the signs
+            "curves": CURVES[2:],
+        },
+        "results": [_result_value(each, kept, report.first_ns, packing) for each in drawn],
+        "film": film_value(report.film, report.first_ns, packing),
+        "events": event_values(report.events, report.first_ns),
+        "decisions": plan["decisions"],
+    }
+    omissions = tuple(_omissions(report, len(times_ns), len(kept), plan["maps_left_out"]))
+    return PageData(facts, packing.text(), omissions)
+
+
+def _room(results: Sequence[ReportedResult], samples: int) -> int:
+    """How many samples there is room for."""
+    values = sum(4 * len(shown_nodes(each.formula)) * len(each.times_ns) for each in results)
+    return max(_FEWEST_SAMPLES, MOST_VALUES * max(samples, 1) // max(values, 1))
+
+
+def _curves(result: ReportedResult) -> Curves:
+    return Curves(result.times_ns, result.series[list(named_nodes(result.formula))])
+
+
+def _result_value(
+    result: ReportedResult, kept: Integers, first_ns: int, packing: Packing
+) -> Mapping[str, Any]:
+    samples = np.flatnonzero(np.isin(result.times_ns, kept))
+    here = result.times_ns[samples]
+    series = series_of(result.series, result.formula, samples)
+    value: dict[str, Any] = {
+        "title": result.title,
+        "name": result.name,
+        "object": result.object,
+        "verdict": str(result.verdict),
+        "fault": None if result.fault_ns is None else (result.fault_ns - first_ns) / 1e9,
+        "first": int(np.searchsorted(kept, here[0])) if len(here) else 0,
+        "samples": len(here),
+        "nodes": tree_value(result.formula, result.robustness, result.final, result.relations),
+        "concerns": concern_values(result.formula, result.object),
+        "series": packing.add(singles(series), "f4"),
+        "automaton": None,
+        "no_automaton": sentence_parts(result.no_automaton),
+    }
+    if result.automaton is not None:
+        inside = np.searchsorted(result.path.times_ns, here)
+        value["automaton"] = {
+            **automaton_value(result.automaton, result.path),
+            "sets": result.path.sets,
+            "path": packing.add(result.path.codes[inside], "i4"),
+        }
+    return value
+
+
+def _omissions(report: Report, samples: int, kept: int, maps: int) -> Iterator[str]:
+    if kept < samples:
+        yield (
+            f"Curves and tree have {kept:,} of {samples:,} samples: those at equal distances, those around "
+            "changes of sign, and the extremes of every curve in between."
+        )
+    if report.film.stride > 1:
+        yield f"The scene has every {_ordinal(report.film.stride)} message of /spatial/scene."
+    if len(report.results) > MOST_DRAWN:
+        yield (
+            f"Explanations, trees and curves are of {MOST_DRAWN} of {len(report.results):,} results, "
+            "the worst."
+        )
+    if any(len(result.robustness) > MOST_NODES for result in report.drawn):
+        yield f"Of trees with more than {MOST_NODES} nodes the uppermost {MOST_NODES} are shown."
+    if len(report.events) > MOST_EVENTS:
+        yield f"The first {MOST_EVENTS:,} of {len(report.events):,} events are listed."
+    if maps:
+        yield f"{maps:,} gradient maps are left out."
+
+
+def _ordinal(number: int) -> str:
+    ends = {2: "nd", 3: "rd"} if number % 100 not in (12, 13) else {}
+    return f"{number}{ends.get(number % 10, 'th')}"

@@ -1,0 +1,276 @@
+"""Messages of a planner → its decisions as the page tells them, with their maps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from foxglove_schemas_protobuf.Grid_pb2 import Grid
+from google.protobuf.message import DecodeError
+
+from spatial_replay.annotate.sentences import number_text
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.logs.schemas.PlanDecision_pb2 import (
+    PlanCandidate,
+    PlanDecision,
+    PlanEdge,
+    PlanGuard,
+    PlanTarget,
+)
+from spatial_replay.report.compact import Packing, singles
+
+MOST_CELLS: Final = 1_500_000
+"""How many cells the maps of a page have at most, all together; those of what was chosen come first."""
+_MOST_GUARDS: Final = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What a log tells of decisions.
+
+    Attributes:
+        decisions: in order, each with its outcome if it has one.
+        maps: by the number by which decisions name them, in the order of the log.
+    """
+
+    decisions: tuple[PlanDecision, ...]
+    maps: Mapping[int, Grid]
+
+
+class PlanMaker:
+    """Takes decisions and maps from messages as they come."""
+
+    def __init__(self) -> None:
+        self._decisions: dict[int, PlanDecision] = {}
+        self._maps: dict[int, Grid] = {}
+
+    def add_decision(self, payload: bytes) -> None:
+        """Take in a decision; one that cannot be read tells nothing."""
+        try:
+            decision = PlanDecision.FromString(payload)
+        except DecodeError:
+            return
+        # the one with the outcome comes later and says everything that the first one does
+        self._decisions[decision.number] = decision
+
+    def add_map(self, number: int, payload: bytes) -> None:
+        """Take in a gradient map; one that cannot be read is none."""
+        try:
+            self._maps[number] = Grid.FromString(payload)
+        except DecodeError:
+            return
+
+    def plan(self) -> Plan:
+        """What was taken so far."""
+        return Plan(tuple(self._decisions[number] for number in sorted(self._decisions)), dict(self._maps))
+
+
+class _Owner(NamedTuple):
+    """Whose map one is.
+
+    Attributes:
+        edge, place: of the edge among those considered, and of the candidate among the edge's.
+        turn: how far the object is turned, in radians.
+    """
+
+    edge: int
+    place: int
+    candidate: PlanCandidate
+    turn: float
+
+    @property
+    def target(self) -> PlanTarget | None:
+        """Where the candidate is to go, if that was found on this map."""
+        candidate = self.candidate
+        return (
+            candidate.target if candidate.HasField("target") and candidate.target.turn == self.turn else None
+        )
+
+
+class _Drawn(NamedTuple):
+    """A gradient map as numbers.
+
+    Attributes:
+        values: (rows, columns), NaN where blocked.
+        low, high: where its corners lie.
+        owner: None where the log does not say.
+        is_chosen: whether the decision's target was found on it.
+    """
+
+    values: Floats
+    low: tuple[float, float]
+    high: tuple[float, float]
+    owner: _Owner | None
+    is_chosen: bool
+
+
+def plan_value(
+    plan: Plan, first_ns: int, packing: Packing, most_cells: int = MOST_CELLS
+) -> Mapping[str, Any]:
+    """The decisions as the page reads them, and how many maps there was no room for."""
+    drawn = [list(_maps_of(plan, decision)) for decision in plan.decisions]
+    kept = _kept([each for maps in drawn for each in maps], most_cells)
+    decisions = []
+    for decision, maps in zip(plan.decisions, drawn, strict=True):
+        values = [_map_value(each, packing) for each in maps if id(each) in kept]
+        decisions.append(_decision_value(decision, values, first_ns, packing))
+    return {"decisions": decisions, "maps_left_out": sum(map(len, drawn)) - len(kept)}
+
+
+def _kept(maps: Sequence[_Drawn], most_cells: int) -> set[int]:
+    """Which maps there is room for, by identity: those of what was chosen, then the others, in order."""
+    kept: set[int] = set()
+    cells = 0
+    for each in sorted(maps, key=lambda each: not each.is_chosen):
+        if cells + each.values.size <= most_cells:
+            cells += each.values.size
+            kept.add(id(each))
+    return kept
+
+
+def _maps_of(plan: Plan, decision: PlanDecision) -> Iterator[_Drawn]:
+    """The maps that a decision rests on; of a log that does not say whose they are, those of its time."""
+    owners = {
+        named.number: _Owner(edge, place, candidate, named.turn)
+        for edge, considered in enumerate(decision.considered)
+        for place, candidate in enumerate(considered.candidates)
+        for named in candidate.maps
+    }
+    found: list[tuple[_Owner | None, Grid]] = [
+        (owner, plan.maps[number]) for number, owner in sorted(owners.items()) if number in plan.maps
+    ]
+    if not owners:
+        found = [(None, grid) for _, grid in sorted(plan.maps.items()) if _is_of_time(grid, decision)]
+    for owner, grid in found:
+        drawn = _drawn(grid, owner, _is_chosen(owner, decision, len(found)))
+        if drawn is not None:
+            yield drawn
+
+
+def _is_of_time(grid: Grid, decision: PlanDecision) -> bool:
+    return grid.timestamp.ToNanoseconds() == decision.time_ns
+
+
+def _is_chosen(owner: _Owner | None, decision: PlanDecision, maps: int) -> bool:
+    """Whether a decision's target was found on a map; where maps have no owners, on the only one."""
+    if not decision.HasField("target"):
+        return False
+    if owner is None:
+        return maps == 1
+    is_last = owner.edge == len(decision.considered) - 1
+    return is_last and owner.candidate.chosen and owner.target is not None
+
+
+def _drawn(grid: Grid, owner: _Owner | None, is_chosen: bool) -> _Drawn | None:
+    """A map's robustness; None of a message whose sizes do not fit together, or make no rectangle."""
+    columns, cell, row = grid.column_count, grid.cell_stride, grid.row_stride
+    rows = len(grid.data) // row if row else 0
+    offset = next((field.offset for field in grid.fields if field.name.startswith("robustness")), cell)
+    if not rows or not columns or cell * columns > row or offset + 4 > cell:
+        return None
+    numbers = np.ndarray((rows, columns), "<f4", grid.data, offset, (row, cell))
+    x, y = grid.pose.position.x, grid.pose.position.y
+    high = x + columns * grid.cell_size.x, y + rows * grid.cell_size.y
+    if not np.isfinite([x, y, *high]).all() or high[0] <= x or high[1] <= y:
+        return None
+    return _Drawn(numbers.astype(np.float64), (x, y), high, owner, is_chosen)
+
+
+def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
+    known = drawn.values[np.isfinite(drawn.values)]
+    value: dict[str, Any] = {
+        "columns": drawn.values.shape[1],
+        "low": drawn.low,
+        "high": drawn.high,
+        "scale": float(np.abs(known).max(initial=0.0)),
+        "values": packing.add(singles(drawn.values), "f4"),
+        "chosen": drawn.is_chosen,
+        "edge": None,
+        "candidate": None,
+        "title": "",
+        "target": None,
+    }
+    owner = drawn.owner
+    if owner is None:
+        return value
+    candidate = owner.candidate
+    turned = f", turned by {math.degrees(owner.turn):.3g}°" if len(candidate.maps) > 1 else ""
+    return value | {
+        "edge": owner.edge,
+        "candidate": owner.place,
+        "title": f"{candidate.object}{turned}",
+        "target": None if owner.target is None else _target_value(owner.target),
+    }
+
+
+def _decision_value(
+    decision: PlanDecision, maps: Sequence[Mapping[str, Any]], first_ns: int, packing: Packing
+) -> Mapping[str, Any]:
+    value: dict[str, Any] = {
+        "number": decision.number,
+        "time": (decision.time_ns - first_ns) / 1e9,
+        "specification": decision.specification,
+        "kind": decision.Kind.Name(decision.kind).removeprefix("KIND_").lower().replace("_", " "),
+        "states": list(decision.states),
+        "reason": decision.reason,
+        "edges": [
+            _edge_value(edge, edge is decision.considered[-1] and not edge.pruned)
+            for edge in decision.considered
+        ],
+        "maps": maps,
+        "target": _target_value(decision.target) if decision.HasField("target") else None,
+        "outcome": None,
+    }
+    if decision.HasField("outcome"):
+        outcome = decision.outcome
+        value["outcome"] = {
+            "time": (outcome.end_ns - first_ns) / 1e9,
+            "succeeded": outcome.succeeded,
+            "reason": outcome.reason,
+            "states": list(outcome.states),
+            "travelled": packing.add(np.array(outcome.travelled), "f8"),
+        }
+    return value
+
+
+def _edge_value(edge: PlanEdge, is_aim: bool) -> Mapping[str, Any]:
+    return {
+        "path": list(edge.path),
+        "aim": is_aim,
+        "progress": _guard_texts(edge.progress),
+        "constraints": _guard_texts(edge.constraints),
+        "candidates": [_candidate_value(candidate) for candidate in edge.candidates],
+        "pruned": edge.pruned.split(" (", 1)[0],
+    }
+
+
+def _guard_texts(guards: Sequence[PlanGuard]) -> list[str]:
+    more = [f"and {len(guards) - _MOST_GUARDS} more"] if len(guards) > _MOST_GUARDS else []
+    return [guard.text for guard in guards[:_MOST_GUARDS]] + more
+
+
+def _candidate_value(candidate: PlanCandidate) -> Mapping[str, Any]:
+    return {
+        "object": candidate.object,
+        "best": "nowhere free" if math.isinf(candidate.best) else number_text(candidate.best),
+        "standing": "rejected" if candidate.rejected else "chosen" if candidate.chosen else "possible",
+        "rejected": candidate.rejected,
+        "target": _target_value(candidate.target) if candidate.HasField("target") else None,
+    }
+
+
+def _target_value(target: PlanTarget) -> Mapping[str, Any]:
+    """A target in words, and as points to be drawn: none of them if one is not finite."""
+    points = [target.x, target.y, *target.waypoints]
+    is_drawn = bool(np.isfinite(points).all())
+    turned = f", turned by {math.degrees(target.turn):.3g}°" if target.turn else ""
+    return {
+        "object": target.object,
+        "at": points[:2] if is_drawn else None,
+        "words": f"({target.x:.4g}, {target.y:.4g}){turned}",
+        "robustness": number_text(target.robustness),
+        "way": points[2:] if is_drawn else [],
+    }

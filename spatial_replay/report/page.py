@@ -1,0 +1,281 @@
+"""A report → one HTML page that needs nothing else.
+
+What a page says before any script runs: what it is about, verdicts and why, panels to be filled.
+
+The page's colours, on light ground and on dark.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from html import escape
+from importlib.resources import files
+from types import MappingProxyType
+from typing import Final
+
+from spatial_replay import __version__
+from spatial_replay.annotate.sentences import time_text
+from spatial_replay.notebook.figures import Html, element
+from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
+from spatial_replay.report.compact import json_text, sentence_parts
+from spatial_replay.report.contents import Report, ReportedResult, worst_first
+from spatial_replay.report.data import page_data
+from spatial_replay.text import counted, printable
+
+_CALENDAR_NS: Final = 500_000_000 * 10**9
+"""Times of logs from here on count from 1970; other clocks began when something was switched on."""
+_MANY: Final = 6
+"""Of more results than these only the first explanation is unfolded, else those of the gravest verdict."""
+_WITHOUT_SCRIPTS: Final = "Without scripts this page shows verdicts and explanations alone."
+
+
+def header(report: Report, omissions: Sequence[str]) -> Html:
+    """Which run this is, and what a reader has to know before the verdicts.
+
+    Args:
+        omissions: what the page leaves out for the sake of its size.
+    """
+    title = element("div", element("h1", text(report.log)), _chip(report.verdict), **{"class": "title"})
+    return element(
+        "header",
+        element("a", "Skip to the run", **{"class": "skip", "href": "#main"}),
+        title,
+        element("p", text(" · ".join(_about(report))), **{"class": "about"}),
+        *_notices(report, omissions),
+        element("noscript", element("p", _WITHOUT_SCRIPTS, **{"class": "notice"})),
+        **{"class": "top"},
+    )
+
+
+def panels(report: Report) -> Html:
+    """The verdicts, and a place for everything that is drawn."""
+    has_automaton = any(result.automaton is not None for result in report.drawn)
+    sections = [
+        _panel("verdicts", "Verdicts", *_verdicts(report)),
+        _panel("scene", "Scene"),
+        _panel("tree", "Specification"),
+        _panel("timeline", "Over time"),
+        _panel("automaton", "Automaton", kind="panel" if has_automaton else "panel wide"),
+        _panel("events", "Events"),
+    ]
+    if report.plan.decisions:
+        sections.append(_panel("decisions", "Decisions"))
+    return element("main", *sections, id="main", tabindex="-1")
+
+
+def footer(report: Report) -> Html:
+    """The texts of the specifications, and the certificate."""
+    texts = [
+        element("details", element("summary", text(file.filename)), element("pre", text(file.source)))
+        for file in report.files
+    ]
+    hashes = [
+        element("div", element("dt", text(key)), element("dd", text(value)))
+        for key, value in report.certificate.items()
+    ]
+    certificate = element("details", element("summary", "Certificate"), element("dl", *hashes))
+    return element("footer", *texts, certificate, **{"class": "foot"})
+
+
+def text(words: str) -> Html:
+    """A text of any length, escaped; within its lines, signs that do not show give way to spaces."""
+    return Html("\n".join(escape(printable(line, len(line))) for line in words.split("\n")))
+
+
+def _about(report: Report) -> Iterator[str]:
+    yield ", ".join(file.filename for file in report.files)
+    if report.first_ns >= _CALENDAR_NS:
+        yield f"{datetime.fromtimestamp(report.first_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    start, end = (time_text(time_ns, report.first_ns) for time_ns in (report.start_ns, report.end_ns))
+    yield f"{start} to {end}" if report.start_ns != report.first_ns else end
+    yield counted(report.samples, "sample")
+    yield f"semantics {report.semantics}"
+    yield f"spatial-replay {__version__}"
+
+
+def _notices(report: Report, omissions: Sequence[str]) -> Iterator[Html]:
+    if report.faults:
+        what = "The log is damaged: verdicts are over what could be read."
+        yield _notice("alert", what, report.faults)
+    if report.unreadable:
+        verb = "holds" if report.unreadable == 1 else "hold"
+        what = f"{counted(report.unreadable, 'observation')} {verb} no finite number: unknown there."
+        yield _notice("note", what, report.remarks)
+    elif report.remarks:
+        yield _notice("note", "The log says of its samples:", report.remarks)
+    if report.semantics != "ltlf" and report.results:
+        yield _notice("note", "Explanations are given under the semantics ltlf alone.", ())
+    if omissions:
+        yield _notice("note", "The run is large, and the page leaves something out:", omissions)
+
+
+def _notice(role: str, what: str, details: Sequence[str]) -> Html:
+    listed = element("ul", *(element("li", text(each)) for each in details)) if details else Html("")
+    return element("div", element("strong", what), listed, role=role, **{"class": f"notice {role}"})
+
+
+def _panel(name: str, title: str, *content: Html, kind: str = "panel") -> Html:
+    heading = element("h2", title, id=f"{name}-title")
+    body = element("div", *content, id=f"{name}-body")
+    return element("section", heading, body, id=name, **{"class": kind, "aria-labelledby": f"{name}-title"})
+
+
+def _verdicts(report: Report) -> Iterator[Html]:
+    if not report.results:
+        yield element("p", "No object was there for a template to stand for.")
+    places = {id(result): place for place, result in enumerate(report.drawn)}
+    are_many = len(report.results) > _MANY
+    worst = worst_first([result.verdict for result in report.results])
+    for number, result in enumerate(report.results[place] for place in worst):
+        # which result the page shows when something in the verdict is chosen
+        drawn = {"data-result": str(places[id(result)])} if id(result) in places else {}
+        is_unfolded = result.verdict == report.verdict and not (are_many and number)
+        unfolded = {"open": ""} if result.sentences and is_unfolded else {}
+        attributes = {"class": "verdict", **drawn, **unfolded}
+        sentences = [element("p", *_with_code(sentence)) for sentence in result.sentences]
+        yield element(
+            "details" if sentences else "div", _summary(result, report.first_ns), *sentences, **attributes
+        )
+
+
+def _summary(result: ReportedResult, first_ns: int) -> Html:
+    numbers = f"robustness {result.robustness_text or 'not determined'}"
+    if result.first_satisfied_ns is not None:
+        numbers += f", first satisfied at {time_text(result.first_satisfied_ns, first_ns)}"
+    return element(
+        "summary" if result.sentences else "div",
+        _chip(result.verdict),
+        element("span", text(result.title), **{"class": "name"}),
+        element("span", text(numbers), **{"class": "numbers"}),
+        **{"class": "summary"},
+    )
+
+
+def _with_code(sentence: str) -> Iterator[Html]:
+    """A sentence whose quoted parts are code."""
+    for number, part in enumerate(sentence_parts(sentence)):
+        yield element("code", text(part)) if number % 2 else text(part)
+
+
+def _chip(verdict: str) -> Html:
+    return element("span", verdict, **{"class": f"chip is-{verdict}"})
+
+
+_BOTH: Final = MappingProxyType(
+    {
+        "positive": hexadecimal(POSITIVE),
+        "negative": hexadecimal(NEGATIVE),
+        "neutral": hexadecimal(NEUTRAL),
+    }
+)
+LIGHT: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "paper": "#f6f6f3",
+        "panel": "#ffffff",
+        "ink": "#1f2328",
+        "quiet": "#59626b",
+        "line": "#d9dce0",
+        "grid": "#e4e6e9",
+        "band": "rgb(120 130 140 / 0.16)",
+        "lit": "#ffe9a8",
+        "positive-line": "#0072b2",
+        "negative-line": "#d55e00",
+        "positive-text": "#00598c",
+        "negative-text": "#a34700",
+    }
+)
+DARK: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "paper": "#111417",
+        "panel": "#191d21",
+        "ink": "#e8eaed",
+        "quiet": "#a3acb5",
+        "line": "#343a41",
+        "grid": "#2b3137",
+        "band": "rgb(170 180 190 / 0.15)",
+        "lit": "#5c4a12",
+        "positive-line": "#3fa2dd",
+        "negative-line": "#f0802b",
+        "positive-text": "#7cc3ee",
+        "negative-text": "#ffa35c",
+    }
+)
+"""By their names in the style sheets; texts in them stand out from paper and panel by 4.5 to 1 or more."""
+
+
+def theme() -> str:
+    """The colours as a style sheet: those of the system, unless the page was asked for the other ones."""
+    light = _rule({"color-scheme": "light", **_variables(_BOTH), **_variables(LIGHT)})
+    dark = _rule({"color-scheme": "dark", **_variables(DARK)})
+    return (
+        f':root{light}:root[data-theme="dark"]{dark}'
+        f'@media (prefers-color-scheme:dark){{:root:not([data-theme="light"]){dark}}}'
+        f'@media print{{:root,:root[data-theme="dark"],:root:not([data-theme="light"]){light}}}'
+    )
+
+
+def _variables(colours: Mapping[str, str]) -> dict[str, str]:
+    return {f"--{name}": colour for name, colour in colours.items()}
+
+
+def _rule(declarations: Mapping[str, str]) -> str:
+    return "{" + "".join(f"{name}:{value};" for name, value in declarations.items()) + "}"
+
+
+_STYLES: Final = ("uplot/uPlot.min.css", "browser/page.css", "browser/panels.css")
+_LIBRARY: Final = "uplot/uPlot.iife.min.js"
+_SCRIPTS: Final = (
+    "run", "elements", "clock", "standing", "transport", "verdicts", "tree", "lanes", "blocks", "curves",
+    "gradient", "trails", "asked", "caption", "scene", "automaton", "events", "decisions", "page",
+)  # fmt: skip
+"""Files of browser/, in the order in which they need each other."""
+
+
+def page(report: Report) -> bytes:
+    """The page, in UTF-8; equal reports give equal bytes."""
+    data = page_data(report)
+    style = "\n".join([theme(), *map(_asset, _STYLES)])
+    library, script = _asset(_LIBRARY), _script()
+    parts = [
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">',
+        f'<meta http-equiv="Content-Security-Policy" content="{_policy([library, script], style)}">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        '<meta name="color-scheme" content="light dark">',
+        element("title", text(f"{report.log}: {report.verdict}")),
+        f"<style>{style}</style></head><body>",
+        header(report, data.omissions),
+        panels(report),
+        footer(report),
+        '<div id="transport" class="transport" role="group" aria-label="Time"></div>',
+        f'<script type="application/json" id="facts">{json_text(data.facts)}</script>',
+        f'<script type="application/octet-stream" id="numbers">{data.numbers}</script>',
+        f"<script>{library}</script>",
+        f"<script>{script}</script></body></html>\n",
+    ]
+    return "".join(parts).encode("utf-8")
+
+
+def _asset(name: str) -> str:
+    return files(__package__).joinpath(name).read_text("utf-8")
+
+
+def _script() -> str:
+    """Our scripts as one, whose names nobody else sees."""
+    scripts = "\n".join(_asset(f"browser/{name}.js") for name in _SCRIPTS)
+    return f'(() => {{\n"use strict";\n{scripts}\n}})();\n'
+
+
+def _policy(scripts: Sequence[str], style: str) -> str:
+    """That the browser loads nothing, and runs nothing but what the page was made with."""
+    allowed = " ".join(map(_digest, scripts))
+    return (
+        f"default-src 'none'; script-src {allowed}; style-src {_digest(style)}; "
+        "base-uri 'none'; form-action 'none'"
+    )
+
+
+def _digest(content: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()}'"

@@ -1,0 +1,140 @@
+"""A formula's nodes as the page lists them, and their numbers at the samples that it keeps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from spatial_replay.annotate.requirements import concerns_of
+from spatial_replay.annotate.sentences import number_text
+from spatial_replay.annotate.specification import unit_of
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.monitor.verdict import final_verdict
+from spatial_replay.spec.format import format_formula
+from spatial_replay.spec.formula import Boolean, Formula, Temporal, iter_nodes, operands_of, operator_of
+
+MOST_NODES: Final = 400
+"""How many nodes of a tree a page shows at most."""
+_LONGEST: Final = 400
+"""Characters after which the text of a node is cut."""
+_PLACE: Final = "…"
+
+
+def shown_nodes(formula: Formula) -> tuple[int, ...]:
+    """Ids of the nodes on the page, in order: all of them or, of a large tree, the uppermost."""
+    nodes = list(iter_nodes(formula))
+    if len(nodes) <= MOST_NODES:
+        return tuple(range(len(nodes)))
+    depth: list[int] = []
+    for _, parent, _ in nodes:
+        depth.append(0 if parent is None else depth[parent] + 1)
+    uppermost = sorted(range(len(nodes)), key=lambda identifier: (depth[identifier], identifier))
+    return tuple(sorted(uppermost[:MOST_NODES]))
+
+
+def asked_nodes(formula: Formula) -> frozenset[int]:
+    """Ids of the nodes that are asked at the first sample alone: no temporal operator stands above them."""
+    asked: set[int] = set()
+    formulas: list[Formula] = []
+    for identifier, parent, node in iter_nodes(formula):
+        formulas.append(node)
+        if parent is None or (parent in asked and not isinstance(formulas[parent], Temporal)):
+            asked.add(identifier)
+    return frozenset(asked)
+
+
+def tree_value(
+    formula: Formula, robustness: Floats, final: Floats, relations: frozenset[str]
+) -> list[Mapping[str, Any]]:
+    """The shown nodes, each with its text and with how it stands when the log has ended.
+
+    Args:
+        robustness: (N,), each node's value on the whole log.
+        final: (N, 2), lower and upper end of each node for the finished log.
+    """
+    shown, asked = shown_nodes(formula), asked_nodes(formula)
+    place = {identifier: index for index, identifier in enumerate(shown)}
+    return [
+        {
+            "id": identifier,
+            "parent": None if parent is None else place[parent],
+            "name": node.name or "",
+            "head": _cut(_head(node, relations)),
+            "text": _cut(format_formula(node, relations=relations)),
+            "unit": unit_of(node, {}),
+            "asked": identifier in asked,
+            "verdict": str(final_verdict(*final[identifier].tolist())),
+            "value": final_text(float(robustness[identifier]), *final[identifier].tolist()),
+        }
+        for identifier, parent, node in iter_nodes(formula)
+        if identifier in place
+    ]
+
+
+def concern_values(formula: Formula, object: str | None) -> list[Mapping[str, Any]]:
+    """What the formula asks of objects (see `involvement`), as far as the nodes for it are shown.
+
+    Args:
+        object: what the parameter of a template stands for.
+    """
+    place = {identifier: index for index, identifier in enumerate(shown_nodes(formula))}
+    return [
+        {
+            "node": place[concern.node],
+            "sign": concern.sign,
+            "duty": None if concern.duty is None else place[concern.duty.node],
+            "duty_sign": None if concern.duty is None else concern.duty.sign,
+        }
+        for concern in concerns_of(formula, object)
+        # a duty stands above its concern, and is shown where that is
+        if concern.node in place
+    ]
+
+
+def final_text(robustness: float, lower: float, upper: float) -> str:
+    """A node's robustness when the log has ended, or the ends that it lies between."""
+    if math.isnan(robustness) or not (lower == upper == robustness):
+        if math.isnan(lower):
+            return "" if math.isnan(robustness) else number_text(robustness)
+        return f"{number_text(lower)} … {number_text(upper)}"
+    return number_text(robustness)
+
+
+def named_nodes(formula: Formula) -> tuple[int, ...]:
+    """The root and the named nodes among those shown: what curves are drawn of."""
+    shown = set(shown_nodes(formula))
+    return tuple(
+        identifier
+        for identifier, parent, node in iter_nodes(formula)
+        if identifier in shown and (parent is None or node.name)
+    )
+
+
+def series_of(series: Floats, formula: Formula, samples: np.ndarray[Any, np.dtype[np.int64]]) -> Floats:
+    """The numbers (nodes, 4, samples) of the shown nodes at some samples."""
+    return np.asarray(series[list(shown_nodes(formula))][:, :, samples])
+
+
+def _head(node: Formula, relations: frozenset[str]) -> str:
+    """A node's own part of its text: its operands give way to dots."""
+    if isinstance(node, Boolean):
+        return operator_of(node)
+    text = format_formula(node, relations=relations)
+    for operand in _operand_texts(node, relations):
+        for written in (f"({operand})", operand):
+            if written in text:
+                text = text.replace(written, _PLACE, 1)
+                break
+    return text
+
+
+def _operand_texts(node: Formula, relations: frozenset[str]) -> Iterator[str]:
+    for operand in operands_of(node):
+        yield format_formula(operand, relations=relations)
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1].rstrip()}…"

@@ -1,0 +1,98 @@
+"""A live server from its start to its end.
+
+Work that the end of the process does not wait for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, wait
+from contextlib import contextmanager
+from dataclasses import dataclass
+from threading import Thread
+
+from spatial_replay.annotate.curves import CURVES_CHANNEL
+from spatial_replay.errors import UsageError
+from spatial_replay.replay.playback import Playback
+from spatial_replay.replay.tuning import Tuned
+from spatial_replay.serve.player import Player
+from spatial_replay.serve.services import Questions
+from spatial_replay.serve.session import Session
+
+
+def in_background(work: Callable[[], None], name: str) -> Future[None]:
+    """Do something on a thread of its own; whoever waits for it is told how it ended."""
+    ended: Future[None] = Future()
+
+    def run() -> None:
+        try:
+            work()
+        except BaseException as error:
+            ended.set_exception(error)
+        else:
+            ended.set_result(None)
+
+    Thread(target=run, name=name, daemon=True).start()
+    return ended
+
+
+LOOPBACK = "127.0.0.1"
+PORT = 8765
+"""Where viewers look for a server unless told otherwise."""
+
+_FAREWELL_S = 0.25
+"""How long an evaluation that is at work is waited for in the end."""
+
+
+@dataclass(frozen=True)
+class Serving:
+    """A server at work.
+
+    Attributes:
+        address: what viewers connect to: ws://127.0.0.1:8765.
+    """
+
+    address: str
+    _loop: Future[None]
+
+    def wait(self) -> None:
+        """Wait until it ends, which it does only when something fails, and raise that."""
+        self._loop.result()
+
+
+@contextmanager
+def serving(tuned: Tuned, *, host: str = LOOPBACK, port: int = PORT, play: bool = False) -> Iterator[Serving]:
+    """Let viewers look at a log, and change the constants of its specifications, for a while.
+
+    Args:
+        tuned: what is shown at first, with the constants as they are written.
+        host: the address to listen at; anyone who reaches it can read the log.
+        port: 0 for any that is free.
+        play: play from the start, rather than wait there for a viewer to do so.
+
+    Raises:
+        UsageError: nothing can listen there, or the library for it is not installed.
+        LogError: the log cannot be read.
+    """
+    try:
+        from spatial_replay.serve.server import LiveServer
+    except ImportError:
+        raise UsageError(
+            "serving takes foxglove-sdk, which is not installed: pip install 'spatial-replay[live]'"
+        ) from None
+    playback = Playback(tuned)
+    playback.seek(playback.start_ns)
+    session = Session(tuned.tuning, playback.start_ns, playback.end_ns)
+    questions = Questions(session)
+    server = LiveServer(session, questions, (*playback.channels, CURVES_CHANNEL), host, port)
+    loop = in_background(Player(playback, session, server).run, "player")
+    answering = in_background(questions.run, "questions")
+    try:
+        if play:
+            session.control(is_playing=True, speed=1.0)
+        yield Serving(server.address, loop)
+    finally:
+        session.stop()
+        questions.stop()
+        wait([loop, answering], _FAREWELL_S)
+        server.stop()

@@ -1,0 +1,198 @@
+"""Opens any log: the content of a file decides its format, and the format decides who reads it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from os import PathLike
+from pathlib import Path
+from reprlib import repr as shortened
+from types import MappingProxyType
+from typing import NamedTuple
+
+from spatial_replay.errors import LogError, MissingFileError, UsageError
+from spatial_replay.geometry.footprint import Concave
+from spatial_replay.logs.formats.commonroad import is_scenario, iter_scenario
+from spatial_replay.logs.formats.csv_tracks import COLUMNS, iter_csv
+from spatial_replay.logs.formats.drone import FRAMES_A_SECOND, is_annotations, iter_annotations
+from spatial_replay.logs.formats.tracks import iter_jsonl, open_text
+from spatial_replay.logs.mcap.chunks import MAGIC
+from spatial_replay.logs.mcap.reader import McapSource, holds_samples
+from spatial_replay.logs.read_options import Lost, OnTimeJump, ReadOptions, count_of
+from spatial_replay.logs.source import IterTraces, Source, TrackSource
+from spatial_replay.trace.trace import Trace
+
+_BAG_FILE = re.compile(r"^metadata\.yaml$|\.(db3|mcap)(\.zstd)?$")
+
+_HEAD = 4096
+"""Bytes by which a file's format is told."""
+
+
+def open_source(
+    path: str | PathLike[str],
+    *,
+    concave: Concave = "decompose",
+    mapping: str | PathLike[str] | None = None,
+    on_time_jump: OnTimeJump = "error",
+    rate: float | None = None,
+    lost: Lost = "drop",
+) -> Source:
+    """The log in a file, in whatever format it is; the content decides, not the name.
+
+    Args:
+        concave: what becomes of polygons that are not convex.
+        mapping: a mapping file: which topics of a log of messages carry which objects.
+        on_time_jump: what becomes of a log of messages whose clock jumps back.
+        rate: frames a second of annotations that count frames; 30 unless given.
+        lost: whether annotations that are marked as lost are dropped or kept.
+
+    Raises:
+        UsageError: no path was given, or an option that says nothing to this format.
+        MissingFileError: there is no such file, or it cannot be opened.
+        LogError: the file is none of the known formats.
+    """
+    _require_path(path)
+    options = ReadOptions(concave, mapping, on_time_jump, rate, lost)
+    path = Path(path)
+    if is_bag_folder(path):
+        options.refuse_except(_MESSAGES, "ROS 2 bag", path.name)
+        return _open_messages(path, "ROS 2 bag", options)
+    head = _head(path)
+    for kind, format_ in FORMATS.items():
+        if format_.recognise(head):
+            options.refuse_except(format_.options, kind, path.name)
+            return format_.open(path, kind, options)
+    if not head:
+        raise LogError(f"{path.name} is empty; give a log with at least one sample")
+    known = ", ".join(FORMATS)
+    raise LogError(f"{path.name} is no log that can be read here; known formats are {known}")
+
+
+def read_trace(
+    path: str | PathLike[str],
+    *,
+    mapping: str | PathLike[str] | None = None,
+    concave: Concave = "decompose",
+    on_time_jump: OnTimeJump = "error",
+    rate: float | None = None,
+    lost: Lost = "drop",
+    allow_damage: bool = False,
+) -> Trace:
+    """A whole log in memory.
+
+    Args:
+        path: a log in any format that `open_source` knows.
+        mapping, concave, on_time_jump, rate, lost: how to read it, as for `open_source`.
+        allow_damage: return what can be read of a damaged log, with its `faults`.
+
+    Raises:
+        UsageError: no path was given, or an option that says nothing to this format.
+        MissingFileError: there is no such file.
+        LogError: the file is no log, or is damaged and `allow_damage` is not set.
+    """
+    source = open_source(
+        path, concave=concave, mapping=mapping, on_time_jump=on_time_jump, rate=rate, lost=lost
+    )
+    traces = [replace(block.trace, remarks=block.remarks) for block in source.iter_blocks()]
+    trace = Trace.concatenate(traces)
+    if trace.faults and not allow_damage:
+        others = count_of(trace.faults) - 1
+        more = f"\n… and {others} more" if others else ""
+        raise LogError(f"{trace.faults[0]}{more}; allow_damage=True reads the rest")
+    return trace
+
+
+def _require_path(value: object) -> None:
+    if not isinstance(value, (str, PathLike)):
+        remedy = "give the path of a log; Trace.from_samples(samples) takes samples"
+        raise UsageError(f"path is {shortened(value)}; {remedy}")
+
+
+def is_bag_folder(path: Path) -> bool:
+    """Whether a folder holds what a ROS 2 bag is made of."""
+    try:
+        return path.is_dir() and any(_BAG_FILE.search(each.name) for each in path.iterdir())
+    except (OSError, ValueError):
+        return False
+
+
+def _head(path: Path) -> bytes:
+    """The first bytes of a file, decompressed; what is missing from a broken one is left out."""
+    try:
+        with open_text(path) as stream:
+            return stream.read(_HEAD)
+    except (EOFError, ValueError):
+        return b"{"
+    except OSError as error:
+        raise MissingFileError.of(path, error) from None
+
+
+def _is_jsonl(head: bytes) -> bool:
+    return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{")
+
+
+def _is_csv(head: bytes) -> bool:
+    first = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 1)[0]
+    return any(name.encode() in first.split(b",") for name in COLUMNS)
+
+
+class Format(NamedTuple):
+    """A format of logs.
+
+    Attributes:
+        recognise: whether a file that begins with the given bytes is of this format.
+        open: a source of the file, given what the format is called.
+        options: the names of the `ReadOptions` that it understands, but for `concave`.
+    """
+
+    recognise: Callable[[bytes], bool]
+    open: Callable[[Path, str, ReadOptions], Source]
+    options: frozenset[str] = frozenset()
+
+
+def _tracks(iter_traces: IterTraces) -> Callable[[Path, str, ReadOptions], Source]:
+    return lambda path, kind, options: TrackSource(path, kind, options.concave, iter_traces)
+
+
+def _open_annotations(path: Path, kind: str, options: ReadOptions) -> Source:
+    rate = FRAMES_A_SECOND if options.rate is None else options.rate
+    reader = partial(iter_annotations, rate=rate, lost=options.lost)
+    return TrackSource(path, kind, options.concave, reader, MappingProxyType(options.given()))
+
+
+def _open_messages(path: Path, kind: str, options: ReadOptions) -> Source:
+    """A log of messages that others recorded."""
+    if options.mapping is None:
+        raise UsageError(
+            f"{path.name} is a {kind}, which does not say what its objects are; give a mapping file that"
+            " does, with --mapping FILE or mapping=FILE"
+        )
+    # what reads the logs of others is loaded when there is one
+    from spatial_replay.mapping.mapped_source import ForeignSource
+    from spatial_replay.mapping.mapping_file import load_mapping
+
+    return ForeignSource(path, load_mapping(options.mapping), kind, options.concave, options.on_time_jump)
+
+
+def _open_mcap(path: Path, kind: str, options: ReadOptions) -> Source:
+    """A log of ours, which knows its objects, or one that others recorded, given a mapping."""
+    if not options.given():
+        return McapSource(path, kind, options.concave)
+    if holds_samples(path):
+        options.refuse_except(frozenset(), kind, path.name)
+    return _open_messages(path, kind, options)
+
+
+_MESSAGES = frozenset({"mapping", "on_time_jump"})
+
+FORMATS: dict[str, Format] = {
+    "MCAP": Format(lambda head: head.startswith(MAGIC), _open_mcap, _MESSAGES),
+    "ROS 1 bag": Format(lambda head: head.startswith(b"#ROSBAG V2.0\n"), _open_messages, _MESSAGES),
+    "ROS 2 bag": Format(lambda head: head.startswith(b"SQLite format 3\x00"), _open_messages, _MESSAGES),
+    "track JSONL": Format(_is_jsonl, _tracks(iter_jsonl)),
+    "track CSV": Format(_is_csv, _tracks(iter_csv)),
+    "drone annotations": Format(is_annotations, _open_annotations, frozenset({"rate", "lost"})),
+    "CommonRoad scenario": Format(is_scenario, _tracks(iter_scenario)),
+}

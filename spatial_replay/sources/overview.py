@@ -1,0 +1,324 @@
+"""What a log holds, in numbers and names.
+
+A look through a log of messages by others: its topics, and what could be read as objects.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from spatial_replay.bags.mcap_log import McapLog
+from spatial_replay.bags.open import open_messages
+from spatial_replay.bags.reader import Decoder, Message, MessageReader, Topic
+from spatial_replay.errors import LogError, MissingFileError, UsageError
+from spatial_replay.logs.mcap.reader import McapSource
+from spatial_replay.logs.mcap.summary import LogSummary, summarise_mcap
+from spatial_replay.logs.read_options import FaultList
+from spatial_replay.logs.source import Source, TrackSource
+from spatial_replay.logs.topics import OBJECTS
+from spatial_replay.mapping.suggest import EXAMPLES, candidates, suggest_mapping
+from spatial_replay.sources.open_log import is_bag_folder
+from spatial_replay.trace.trace import Trace
+
+_STEP = 10_000
+"""Messages between two reports of progress."""
+_ENOUGH = 1024
+"""Messages of a topic after which nothing new is expected of it."""
+_LOOKED_AT = frozenset({*range(1, EXAMPLES + 1), *(2**n for n in range(5, 20))})
+"""Which messages of a topic are decoded: the first ones, and ever fewer of those that come later."""
+_EXAMPLE_BYTES = 2**22
+"""How much of a topic is decoded, beyond its first message: pictures and clouds of points are large."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicSurvey:
+    """A topic by others.
+
+    Attributes:
+        messages: how many were read.
+        entry: what a mapping could say of it; empty if nothing looks like an object.
+    """
+
+    topic: Topic
+    messages: int
+    entry: str
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What is in a log of messages by others.
+
+    Attributes:
+        start_ns, end_ns: log times of the first and the last message; None without messages.
+        mapping: a mapping file to start from.
+        faults: what is damaged, each with its place.
+        remarks: what was set aside without a loss.
+    """
+
+    name: str
+    kind: str
+    start_ns: int | None
+    end_ns: int | None
+    topics: tuple[TopicSurvey, ...]
+    mapping: str
+    faults: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+    @property
+    def messages(self) -> int:
+        return sum(each.messages for each in self.topics)
+
+
+def messages_in(path: Path) -> MessageReader | None:
+    """A reader of a log of messages that needs a mapping; None for logs that name their objects themselves.
+
+    Raises:
+        MissingFileError: there is no such file.
+    """
+    if path.is_dir() and not is_bag_folder(path):
+        return None
+    try:
+        reader = open_messages(path)
+        if isinstance(reader, McapLog) and any(topic.name == OBJECTS for topic in reader.topics()):
+            return None
+    except MissingFileError:
+        raise
+    except LogError:
+        return None
+    return reader
+
+
+def survey(
+    reader: MessageReader, advance: Callable[[int], object] = lambda messages: None, *, whole: bool = True
+) -> Survey:
+    """Look through a log.
+
+    Args:
+        advance: called with the number of messages read, again and again.
+        whole: read all of it, to find what is damaged; else only until enough is known of every topic.
+
+    Raises:
+        LogError: nothing can be read.
+    """
+    topics = reader.topics()
+    counter = _Counter(reader, topics)
+    for count, message in enumerate(reader.iter_messages({topic.name for topic in topics}), 1):
+        counter.add(message)
+        if count % _STEP == 0:
+            advance(_STEP)
+        if not whole and counter.knows_enough:
+            break
+    found = candidates(topics, counter.examples)
+    faults = FaultList()
+    reader.move_faults(faults)
+    return Survey(
+        name=reader.name,
+        kind=reader.kind,
+        start_ns=counter.start_ns,
+        end_ns=counter.end_ns,
+        topics=tuple(TopicSurvey(each.topic, counter.counts[each.topic.name], each.entry) for each in found),
+        mapping=suggest_mapping(reader.name, topics, counter.examples, counter.first_ns),
+        faults=faults.take(last=True),
+        remarks=(*reader.take_remarks(), *counter.take_remarks()),
+    )
+
+
+class _Counter:
+    """Counts messages, and decodes the first ones of each topic."""
+
+    def __init__(self, reader: MessageReader, topics: Sequence[Topic]) -> None:
+        self.start_ns: int | None = None
+        self.end_ns: int | None = None
+        self.first_ns: dict[str, int] = {}
+        self.counts = {topic.name: 0 for topic in topics}
+        self.examples: dict[str, list[object]] = {}
+        self._remarks: list[str] = []
+        self._undecodable: dict[str, tuple[int, str]] = {}
+        self._looked_at: dict[str, int] = {}
+        self._decoders: dict[str, Decoder] = {}
+        self._missing = {topic.name for topic in topics if topic.count != 0}
+        for topic in topics:
+            try:
+                self._decoders[topic.name] = reader.decoder(topic.name)
+                self.examples[topic.name] = []
+            except LogError as error:
+                self._remarks.append(_of_topic(topic.name, str(error)))
+        self._declared = {topic.name: topic.count for topic in topics}
+        self._bytes = dict.fromkeys(self._declared, 0)
+
+    @property
+    def knows_enough(self) -> bool:
+        return not self._missing
+
+    def add(self, message: Message) -> None:
+        time_ns, topic = message.log_time_ns, message.topic
+        self.start_ns = time_ns if self.start_ns is None else min(self.start_ns, time_ns)
+        self.end_ns = time_ns if self.end_ns is None else max(self.end_ns, time_ns)
+        self.first_ns.setdefault(topic, time_ns)
+        self.counts[topic] += 1
+        if self.counts[topic] in _LOOKED_AT and topic in self.examples:
+            self._look(message)
+        if self.counts[topic] >= _ENOUGH or self.counts[topic] == self._declared[topic]:
+            self._missing.discard(topic)
+
+    def _look(self, message: Message) -> None:
+        topic = message.topic
+        self._bytes[topic] += len(message.payload)
+        if self.counts[topic] > 1 and self._bytes[topic] > _EXAMPLE_BYTES:
+            return
+        self._looked_at[topic] = self._looked_at.get(topic, 0) + 1
+        try:
+            self.examples[topic].append(self._decoders[topic](message.payload))
+        except LogError as error:
+            count, first = self._undecodable.get(topic, (0, f"{error}, at {message.log_time_ns} ns"))
+            self._undecodable[topic] = count + 1, first
+
+    def take_remarks(self) -> list[str]:
+        """Topics that cannot be decoded, and messages that cannot, of those that were looked at."""
+        return self._remarks + [
+            f"{_of_topic(topic, first)} ({count} of {self._looked_at[topic]} messages looked at)"
+            for topic, (count, first) in self._undecodable.items()
+        ]
+
+
+def _of_topic(name: str, what: str) -> str:
+    start = f"topic {name!r}: "
+    return what if what.startswith(start) else start + what
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectOverview:
+    """One object over a log.
+
+    Attributes:
+        classes: the class names it was given, in order of code points.
+        samples: in how many samples it was seen.
+        unreadable: in how many of them its coordinates were not all finite.
+    """
+
+    name: str
+    classes: tuple[str, ...]
+    samples: int
+    unreadable: int
+
+
+@dataclass(frozen=True, slots=True)
+class Overview:
+    """What a log holds.
+
+    Attributes:
+        start_ns, end_ns: times of the first and the last sample; None without samples.
+        faults: what was lost or set aside, in words.
+        container: channels, metadata and attachments of an MCAP log; None for other formats.
+        remarks: what else there is to know, without anything being lost.
+    """
+
+    name: str
+    kind: str
+    samples: int
+    start_ns: int | None
+    end_ns: int | None
+    objects: tuple[ObjectOverview, ...]
+    signals: tuple[str, ...]
+    faults: tuple[str, ...]
+    container: LogSummary | None = None
+    remarks: tuple[str, ...] = ()
+
+
+def overview_of(source: Source, advance: Callable[[int], object] = lambda samples: None) -> Overview:
+    """Read a log once and say what it holds.
+
+    Args:
+        advance: called with the number of samples read, again and again.
+
+    Raises:
+        LogError: nothing in the log can be read as a sample.
+    """
+    tally = _Tally()
+    remarks: list[str] = []
+    container = summarise_mcap(source.path) if isinstance(source, McapSource) else None
+    # a log of something else has no samples, and yet something to tell
+    if container is None or container.has_objects:
+        try:
+            for block in source.iter_blocks():
+                tally.add(block.trace)
+                remarks += block.remarks
+                advance(len(block.trace))
+        except UsageError as error:
+            # a scenario without objects is sound; a mapping that does not fit is a mistake to be put right
+            if not isinstance(source, TrackSource):
+                raise
+            remarks.append(str(error))
+    faults = [*tally.faults, *(container.faults if container is not None else ())]
+    return Overview(
+        name=source.name,
+        kind=source.kind,
+        samples=tally.samples,
+        start_ns=tally.start_ns,
+        end_ns=tally.end_ns,
+        objects=tally.objects(),
+        signals=tuple(sorted(tally.signals)),
+        # reading the samples and the rest of the file comes upon the same damage
+        faults=tuple(dict.fromkeys(faults)),
+        container=container,
+        remarks=tuple(remarks),
+    )
+
+
+def overview_of_survey(path: Path, survey: Survey) -> Overview:
+    """What is in a log of messages by others, of which nothing says yet what its samples are."""
+    container = summarise_mcap(path) if survey.kind == McapSource.kind else None
+    return Overview(
+        name=survey.name,
+        kind=survey.kind,
+        samples=0,
+        start_ns=None,
+        end_ns=None,
+        objects=(),
+        signals=(),
+        faults=container.faults if container is not None else (),
+        container=container,
+    )
+
+
+@dataclass(slots=True)
+class _Tally:
+    """Counts over the blocks so far."""
+
+    samples: int = 0
+    start_ns: int | None = None
+    end_ns: int | None = None
+    seen: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    unreadable: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    classes: dict[str, set[str]] = field(default_factory=lambda: defaultdict(set))
+    signals: set[str] = field(default_factory=set)
+    faults: list[str] = field(default_factory=list)
+
+    def add(self, trace: Trace) -> None:
+        self.faults.extend(trace.faults)
+        if not len(trace):
+            return
+        self.samples += len(trace)
+        self.start_ns = int(trace.times_ns[0]) if self.start_ns is None else self.start_ns
+        self.end_ns = int(trace.times_ns[-1])
+        self.signals.update(trace.signals)
+        for column, name in enumerate(trace.names):
+            rows = trace.rows[:, column]
+            readable, unreadable = rows[rows >= 0], -2 - rows[rows <= -2]
+            self.seen[name] += len(readable) + len(unreadable)
+            self.unreadable[name] += len(unreadable)
+            codes = np.unique(trace.class_code[np.concatenate([readable, unreadable])])
+            self.classes[name].update(
+                class_name for code in codes.tolist() if (class_name := trace.classes[code]) is not None
+            )
+
+    def objects(self) -> tuple[ObjectOverview, ...]:
+        return tuple(
+            ObjectOverview(name, tuple(sorted(self.classes[name])), self.seen[name], self.unreadable[name])
+            for name in sorted(self.seen)
+        )

@@ -1,0 +1,239 @@
+"""What is legal, and may not mean what its author thinks.
+
+Names a specification takes from a log: objects and signals, and templates put in place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from types import MappingProxyType
+
+from lark import Token
+
+from spatial_replay.errors import UsageError
+from spatial_replay.spec.diagnostics import Faults, Source, nearest_hint
+from spatial_replay.spec.formula import (
+    FUTURE_OPERATORS,
+    PAST_OPERATORS,
+    Atom,
+    Diagnostic,
+    Formula,
+    Group,
+    NamedSpec,
+    Signal,
+    Span,
+    Specification,
+    Temporal,
+    TrackedName,
+    operands_of,
+)
+from spatial_replay.spec.relations import RELATION_NAMES
+from spatial_replay.spec.resolve import Namespace, kind_of
+from spatial_replay.spec.syntax import BrokenStatement, SpecStatement
+from spatial_replay.spec.tokens import BINARY_TYPES, STATEMENT_TYPES, span_of, tokenize
+from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, substitute, terms_of
+
+_TIGHTNESS = MappingProxyType({"IFF": 0, "IMPLIES": 1, "OR": 2, "XOR": 3, "AND": 4})
+
+
+@dataclass(slots=True)
+class _Level:
+    """Operators met since a bracket opened."""
+
+    prefix: Token | None = None
+    negation: Token | None = None
+    binary: Token | None = None
+
+
+def reach_warnings(tokens: Sequence[Token], source: Source, published: bool) -> Iterator[Diagnostic]:
+    """Operators that, without brackets, reach further or elsewhere than a reader may think.
+
+    Args:
+        published: warn too wherever the published grammar groups otherwise. It knows no precedence:
+            Boolean operators group to the right, `not` reaches as far as F and G, and U takes all
+            on both of its sides.
+    """
+    levels = [_Level()]
+    for token in tokens:
+        level = levels[-1]
+        if token.type in STATEMENT_TYPES:
+            levels = [_Level()]
+        elif token.type == "LPAR":
+            levels.append(_Level())
+        elif token.type == "RPAR":
+            if len(levels) > 1:
+                levels.pop()
+        elif token.type == "PREFIX":
+            levels[-1] = _Level(prefix=token)
+        elif token.type == "COLON":
+            levels[-1] = _Level()
+        elif token.type == "NOT":
+            level.negation = level.negation or token
+        elif token.type in BINARY_TYPES:
+            if level.prefix is not None:
+                yield _reach(level.prefix, token, source)
+                level.prefix = None
+            if published:
+                yield from _regrouped(level, token, source)
+            level.binary = token
+
+
+def _reach(prefix: Token, operator: Token, source: Source) -> Diagnostic:
+    message = f"{prefix.value!r} reaches over {operator.value!r} up to the closing bracket"
+    hint = f"write ({prefix.value} ...) {operator.value} ... or {prefix.value} (... {operator.value} ...)"
+    return source.diagnostic("warning", span_of(prefix), message, hint)
+
+
+def _regrouped(level: _Level, operator: Token, source: Source) -> Iterator[Diagnostic]:
+    if level.negation is not None:
+        message = f"the published grammar takes 'not' over {operator.value!r} as well; here it ends before it"
+        yield source.diagnostic("warning", span_of(level.negation), message, "write the brackets you mean")
+        level.negation = None
+    elif level.binary is not None and _differs(level.binary, operator):
+        pair = f"{level.binary.value!r} and {operator.value!r}"
+        message = f"the published grammar groups {pair} the other way round"
+        yield source.diagnostic("warning", span_of(operator), message, "write the brackets you mean")
+
+
+def _differs(first: Token, second: Token) -> bool:
+    if "INFIX" in (first.type, second.type):
+        return first.type != second.type
+    return _TIGHTNESS[first.type] > _TIGHTNESS[second.type]
+
+
+def past_warnings(specs: Sequence[NamedSpec], source: Source) -> Iterator[Diagnostic]:
+    """Past operators outside any future one: at the first sample, where there is no past, they stay."""
+    warned: set[Span] = set()
+    for spec in specs:
+        stack: list[Formula] = [spec.formula] if spec.is_result else []
+        while stack:
+            node = stack.pop()
+            if isinstance(node, Temporal) and node.operator in FUTURE_OPERATORS:
+                continue
+            if isinstance(node, Temporal) and node.operator in PAST_OPERATORS:
+                if node.span not in warned:
+                    warned.add(node.span)
+                    message = f"{node.operator!r} looks back from the first sample, where there is no past"
+                    hint = f"put it inside a future operator, such as G ({node.operator} ...)"
+                    yield source.diagnostic("warning", node.span, message, hint)
+                continue
+            stack.extend(operands_of(node))
+
+
+def unused_warnings(names: Namespace, source: Source) -> Iterator[Diagnostic]:
+    """Definitions that nothing refers to; a spec is a result by itself."""
+    for name, statement in names.definitions.items():
+        if isinstance(statement, (SpecStatement, BrokenStatement)) or name in names.used:
+            continue
+        message = f"{name!r} is {kind_of(statement)} that nothing uses"
+        yield source.diagnostic("warning", statement.name.span, message, "use it or leave it out")
+
+
+def object_names(specification: Specification) -> tuple[str, ...]:
+    """Tracked objects that the specs are about, members of groups included, in the order of the text."""
+    found: dict[str, None] = {}
+    for atom in _atoms(specification):
+        for term in terms_of(atom.expression):
+            base = base_of(term)
+            if isinstance(base, TrackedName):
+                found[base.name] = None
+            elif isinstance(base, Group):
+                left_out = {excluded.name for excluded in base.excluded if isinstance(excluded, TrackedName)}
+                found.update((name, None) for name in base.members or () if name not in left_out)
+    return tuple(found)
+
+
+def signal_names(specification: Specification) -> tuple[str, ...]:
+    """Numeric signals that the specs compare, in the order of the text."""
+    found: dict[str, None] = {}
+    for atom in _atoms(specification):
+        for part in iter_expressions(atom.expression):
+            if isinstance(part, Signal):
+                found[part.name] = None
+    return tuple(found)
+
+
+def _atoms(specification: Specification) -> Iterable[Atom]:
+    seen: set[int] = set()
+    for spec in specification.results:
+        for formula in iter_formulas(spec.formula):
+            if isinstance(formula, Atom) and id(formula) not in seen:
+                seen.add(id(formula))
+                yield formula
+
+
+def check_names(
+    specification: Specification, known: Iterable[str], signals: Iterable[str], *, where: str = "log"
+) -> tuple[Diagnostic, ...]:
+    """Compare the names of a specification with those of a log.
+
+    Args:
+        known: names of the log's objects.
+        signals: names of its numeric signals.
+        where: what has them, if it is no log.
+
+    Returns:
+        An error for each object and signal that the log never has, with the nearest that it has; a
+        warning for each object of the log that a definition of the same name hides.
+    """
+    objects, numeric = tuple(known), tuple(signals)
+    source = Source.of(specification.source, specification.filename)
+    places, defined = _places(specification, source)
+    missing = [("object", name, objects) for name in object_names(specification) if name not in objects]
+    missing += [("signal", name, numeric) for name in signal_names(specification) if name not in numeric]
+    found = [
+        source.diagnostic(
+            "error",
+            places.get(name, Span(0, 0)),
+            f"the {where} never has the {kind} {name!r}",
+            " ".join(filter(None, (nearest_hint(name, candidates), _listing(kind, candidates)))),
+        )
+        for kind, name, candidates in missing
+    ]
+    for name, span in defined.items():
+        if name in objects:
+            message = f"the {where} has an object {name!r}, which this definition hides"
+            found.append(source.diagnostic("warning", span, message, "give the definition another name"))
+    return tuple(sorted(found, key=lambda each: (each.line, each.column)))
+
+
+_LISTED = 12
+
+
+def _listing(kind: str, names: tuple[str, ...]) -> str:
+    if not names:
+        return f"it has no {kind}s"
+    listed = ", ".join(names[:_LISTED])
+    return f"its {kind}s are {listed}" + (", ..." if len(names) > _LISTED else "")
+
+
+def _places(specification: Specification, source: Source) -> tuple[dict[str, Span], dict[str, Span]]:
+    """Where each name first occurs in the source, and where each definition stands."""
+    relations = RELATION_NAMES | specification.relations
+    tokens = tokenize(specification.source, relations, Faults(source))
+    places: dict[str, Span] = {}
+    defined: dict[str, Span] = {}
+    for token in tokens:
+        if token.type == "NAME":
+            places.setdefault(token.value, span_of(token))
+    for first, second in pairwise(tokens):
+        if first.type in ("CONST", "REGION", "GROUP", "DEF", "SPEC") and second.type == "NAME":
+            defined.setdefault(second.value, span_of(second))
+    return places, defined
+
+
+def instantiate(spec: NamedSpec, parameter_value: str) -> Formula:
+    """The formula of a template about one object.
+
+    Args:
+        spec: a spec with an object parameter.
+        parameter_value: the name of the object.
+
+    Raises:
+        UsageError: for a spec that is no template.
+    """
+    if spec.parameter is None:
+        raise UsageError(f"spec {spec.name!r} is no template; evaluate it as it is")
+    return substitute(spec.formula, {spec.parameter: TrackedName(parameter_value)})

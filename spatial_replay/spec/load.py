@@ -1,0 +1,196 @@
+"""Specifications from texts and files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from reprlib import repr as shortened
+
+from lark import Token
+
+from spatial_replay.errors import MissingFileError, SpecificationError, UsageError
+from spatial_replay.spec.atoms import parameters_of
+from spatial_replay.spec.checks import past_warnings, reach_warnings, unused_warnings
+from spatial_replay.spec.diagnostics import Faults, Source, nearest_hint
+from spatial_replay.spec.elaborate import Elaborator, TooLargeError
+from spatial_replay.spec.formula import Constant, Diagnostic, Expression, Span, Specification
+from spatial_replay.spec.parser import parse_statements
+from spatial_replay.spec.relations import DEFAULT_PROFILE, PROFILES, RELATION_NAMES, Relation
+from spatial_replay.spec.resolve import Namespace
+from spatial_replay.spec.syntax import BrokenStatement, Duration, SpecStatement, Statement, UseStatement
+from spatial_replay.spec.tokens import MAX_TOKENS, is_reserved, tokenize
+
+MAX_LENGTH = 256 * 1024
+"""Characters of a text."""
+
+_MAX_WARNINGS = 100
+_RELATION_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
+
+
+def parse_specification(
+    text: str,
+    *,
+    filename: str = "<text>",
+    profile: str | None = None,
+    relations: Mapping[str, Callable[..., Expression]] | None = None,
+    constants: Mapping[str, float | str] | None = None,
+) -> Specification:
+    """Parse a specification, or a formula by itself.
+
+    Args:
+        text: statements, or one formula, which becomes a spec named "spec".
+        filename: named in messages.
+        profile: relation profile of a text without a `use` line: "paper" (the default) or "spatial_spec".
+        relations: further relations by name, as functions; see `relations`.
+        constants: values to take instead of those of the text's `const` lines: numbers and, as texts,
+            durations such as "2s".
+
+    Raises:
+        SpecificationError: with every fault of the text.
+        UsageError: no text, an unknown profile, a relation that cannot be one, a constant the text does
+            not have.
+    """
+    _require_text(text)
+    given = dict(relations or {})
+    _check_relations(given)
+    if profile is not None and profile not in PROFILES:
+        raise UsageError(f"unknown profile {profile!r}; the profiles are {', '.join(PROFILES)}")
+    text = text.removeprefix("\ufeff")
+    faults = Faults(Source.of(text, filename))
+    names = RELATION_NAMES | given.keys()
+    tokens = _tokens(text, names, faults)
+    statements = parse_statements(tokens, names, faults)
+    used_profile = _profile(statements, faults) or profile or DEFAULT_PROFILE
+    namespace = Namespace(faults, dict(constants or {}))
+    namespace.declare(statements)
+    elaborator = Elaborator(
+        namespace, {**PROFILES[used_profile], **given}, frozenset(token.value for token in tokens), faults
+    )
+    specs = [statement for statement in statements if isinstance(statement, SpecStatement)]
+    if not specs and not any(isinstance(statement, BrokenStatement) for statement in statements):
+        end = Span(len(text), len(text))
+        if not faults.found:
+            faults.add(end, "this text holds no spec", "write a formula, or: spec name = formula")
+    try:
+        done = elaborator.specs(specs)
+    except TooLargeError:
+        done = ()
+    faults.raise_if_any()
+    warnings: list[Diagnostic] = [
+        *reach_warnings(tokens, faults.source, used_profile == "spatial_spec"),
+        *past_warnings(done, faults.source),
+        *unused_warnings(namespace, faults.source),
+    ]
+    warnings.sort(key=lambda warning: (warning.line, warning.column))
+    return Specification(
+        done,
+        used_profile,
+        namespace.regions,
+        namespace.groups,
+        frozenset(given),
+        {name: _constant(value) for name, value in namespace.constants.items() if value is not None},
+        source=text,
+        filename=filename,
+        warnings=tuple(warnings[:_MAX_WARNINGS]),
+    )
+
+
+def load_specification(
+    path: str | Path,
+    *,
+    profile: str | None = None,
+    relations: Mapping[str, Callable[..., Expression]] | None = None,
+    constants: Mapping[str, float | str] | None = None,
+) -> Specification:
+    """Parse a specification file (UTF-8); see `parse_specification`.
+
+    Raises:
+        MissingFileError: no such file, or one that cannot be read.
+        SpecificationError: with every fault of the text.
+        UsageError: no path, and what `parse_specification` raises.
+    """
+    _require_path(path)
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            content = file.read(4 * MAX_LENGTH + 4)
+    except (OSError, ValueError) as error:
+        raise MissingFileError.of(path, error) from error
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        before = content[: error.start].decode("utf-8")
+        source = Source.of(before + "\ufffd", path.name)
+        message = f"byte 0x{content[error.start]:02x} is no UTF-8 text"
+        hint = "save the file as UTF-8"
+        place = Span(len(before), len(before) + 1)
+        raise SpecificationError([source.diagnostic("error", place, message, hint)]) from error
+    return parse_specification(
+        text, filename=path.name, profile=profile, relations=relations, constants=constants
+    )
+
+
+def require_specification(value: object) -> None:
+    """
+    Raises:
+        UsageError: for anything else than a specification.
+    """
+    if not isinstance(value, Specification):
+        remedy = "give a Specification, from parse_specification(text) or load_specification(path)"
+        raise UsageError(f"specification is {shortened(value)}; {remedy}")
+
+
+def _require_text(value: object) -> None:
+    if not isinstance(value, str):
+        remedy = "give the text as a str; load_specification(path) reads a file"
+        raise UsageError(f"text is {shortened(value)}; {remedy}")
+
+
+def _require_path(value: object) -> None:
+    if not isinstance(value, (str, PathLike)):
+        remedy = "give the path of a file; parse_specification(text) takes a text"
+        raise UsageError(f"path is {shortened(value)}; {remedy}")
+
+
+def _check_relations(relations: Mapping[str, Relation]) -> None:
+    for name, relation in relations.items():
+        if not isinstance(name, str) or not _RELATION_NAME.match(name):
+            raise UsageError(f"relations: {name!r} is no name; use letters, digits and _")
+        if is_reserved(name, RELATION_NAMES):
+            raise UsageError(f"relations: {name!r} is already part of the language; choose another name")
+        if not callable(relation):
+            raise UsageError(f"relations: {name!r} is {relation!r}; give a function")
+        parameters_of(name, relation)
+
+
+def _constant(value: float | Duration) -> Constant:
+    if isinstance(value, Duration):
+        return Constant(value.ns / 1e9, value.ns)
+    return Constant(value)
+
+
+def _tokens(text: str, names: frozenset[str], faults: Faults) -> list[Token]:
+    if len(text) > MAX_LENGTH:
+        message = f"the text has {len(text)} characters, more than {MAX_LENGTH}"
+        faults.add(Span(0, 1), message, "split it into several files")
+        faults.raise_if_any()
+    tokens = tokenize(text, names, faults)
+    if len(tokens) == MAX_TOKENS:
+        faults.raise_if_any()
+    return tokens
+
+
+def _profile(statements: Sequence[Statement], faults: Faults) -> str | None:
+    uses = [statement for statement in statements if isinstance(statement, UseStatement)]
+    for statement in uses[1:]:
+        faults.add(statement.name.span, "a second use line", "a text has one relation profile")
+    if not uses:
+        return None
+    name = uses[0].name
+    if name.text in PROFILES:
+        return name.text
+    hint = nearest_hint(name.text, PROFILES) or f"the profiles are {', '.join(PROFILES)}"
+    faults.add(name.span, f"unknown profile {name.text!r}", hint)
+    return None
