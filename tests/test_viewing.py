@@ -14,8 +14,8 @@ from google.protobuf.message import Message
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from inspection.layouts import layout_of, panels, paths_of
-from inspection.message_paths import newest, values
+from annotate.layouts import layout_of, panels, paths_of
+from annotate.message_paths import newest, values
 from spatial_replay.cli.application import run as run_in_process
 
 RECORDINGS = Path(__file__).resolve().parent.parent / "recordings"

@@ -7,12 +7,15 @@ import subprocess
 from collections.abc import Sequence
 from dataclasses import replace
 from textwrap import wrap
+from typing import TYPE_CHECKING
 
-from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import Transition
 from spatial_replay.errors import OutputError, UsageError
 from spatial_replay.palette import NEGATIVE, POSITIVE, hexadecimal, light
 from spatial_replay.text import counted
+
+if TYPE_CHECKING:
+    from spatial_replay.automata.automaton import Automaton
 
 _DRAWING_S = 120.0
 """How long Graphviz may take."""

@@ -49,9 +49,9 @@ def plot(value: Any, *args: Any, **options: Any) -> Any:
 
 def svg(value: Any) -> str | None:
     """Return an automaton as SVG; None if it is large, or if Graphviz cannot draw it here."""
-    from spatial_replay.notebook.automaton_view import automaton_svg
-
-    return automaton_svg(value)
+    view = import_module("spatial_replay.notebook.automaton_view")
+    drawing: str | None = view.automaton_svg(value)
+    return drawing
 
 
 def _after_loading_view(function: Any, value: object) -> Any:

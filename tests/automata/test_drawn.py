@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from automata.test_picture import automaton
+from notebook.test_automaton_view import automaton
 
 pytestmark = [
     pytest.mark.skipif(shutil.which("dot") is None, reason="Graphviz is not installed"),

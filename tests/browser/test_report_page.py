@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Error, Locator, Page, expect
 
 import spatial_replay as sr
-from inspection.report_pages import (
+from report.report_pages import (
     RECORDINGS,
     report_of_recording,
     report_of_samples,

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 import spatial_replay as sr
-from inspection.report_pages import RECORDINGS, page_of
+from report.report_pages import RECORDINGS, page_of
 from spatial_replay.cli.application import application
 from spatial_replay.errors import SpecificationError, UsageError
 

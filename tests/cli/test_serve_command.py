@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from cli.program import PROGRAM, environment, run_program
-from runs.viewer import State, viewer
+from serve.viewer import State, viewer
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 TABLE = ("serve", str(RECORDINGS / "table.jsonl"), "--spec", str(RECORDINGS / "table.spatial"))

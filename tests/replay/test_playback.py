@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import spatial_replay as sr
-from inspection.layouts import panels, paths_of
-from inspection.message_paths import values
+from annotate.layouts import panels, paths_of
+from annotate.message_paths import values
 from replay.runs import STEP_NS, PiecewiseSource, content_of, record, run, sample
 from spatial_replay.annotate.curves import CURVES_CHANNEL
 from spatial_replay.logs.mcap.writer import LogWriter

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from logs.mapping.feeding import SECOND, Feed, header, make, pose_stamped, ros
+from mapping.feeding import SECOND, Feed, header, make, pose_stamped, ros
 from spatial_replay.bags.columns import MessageColumns
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.mapping.assemble import Assembler

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from logs.mapping.feeding import SECOND, Feed, make
+from mapping.feeding import SECOND, Feed, make
 from spatial_replay.errors import LogError, UsageError
 
 POINT = {"x": 1.0, "y": 2.0, "z": 0.0}

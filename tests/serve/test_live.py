@@ -17,7 +17,7 @@ from websockets.exceptions import WebSocketException
 
 import spatial_replay as sr
 from replay.runs import STEP_NS, PiecewiseSource, content_of, record, run
-from runs.viewer import ENDED, PATIENCE_S, PAUSED, PLAYING, PROTOCOL, Message, State, Viewer, viewer
+from serve.viewer import ENDED, PATIENCE_S, PAUSED, PLAYING, PROTOCOL, Message, State, Viewer, viewer
 from spatial_replay.annotate.curves import MOST_POINTS
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.mcap.writer import LogWriter

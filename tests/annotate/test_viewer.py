@@ -10,8 +10,8 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 import spatial_replay as sr
-from inspection.layouts import layout_of, panels, paths_of
-from inspection.message_paths import split, values
+from annotate.layouts import layout_of, panels, paths_of
+from annotate.message_paths import split, values
 from spatial_replay.annotate.foxglove_layout import Contents, layout_for_live
 from spatial_replay.logs.source import MemorySource
 from spatial_replay.replay import run_replay

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-from logs.mapping.feeding import pose_stamped, tf, transform
+from mapping.feeding import pose_stamped, tf, transform
 from spatial_replay.errors import UsageError
 from spatial_replay.mapping.field_paths import (
     FieldError,

@@ -13,7 +13,7 @@ import pytest
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
 
 import spatial_replay as sr
-from inspection.report_pages import (
+from report.report_pages import (
     RECORDINGS,
     Page,
     page_of,

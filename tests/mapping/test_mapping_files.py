@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from jsonschema import Draft202012Validator
 
-from logs.mapping.feeding import Feed, make, pose_stamped
+from mapping.feeding import Feed, make, pose_stamped
 from spatial_replay.bags.reader import Topic
 from spatial_replay.errors import MissingFileError, UsageError
 from spatial_replay.mapping import mapping_file as schema
@@ -146,7 +146,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
 def test_the_published_schema_is_the_one_that_is_used() -> None:
     used = files("spatial_replay.mapping").joinpath(schema.SCHEMA_FILE).read_text(encoding="utf-8")
     Draft202012Validator.check_schema(json.loads(used))
-    published = Path(__file__).parents[3] / "schemas" / schema.SCHEMA_FILE
+    published = Path(__file__).parents[2] / "schemas" / schema.SCHEMA_FILE
     assert published.read_text(encoding="utf-8") == used
 
 

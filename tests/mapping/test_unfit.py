@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from logs.mapping.feeding import SECOND, Feed, make, pose_stamped
+from mapping.feeding import SECOND, Feed, make, pose_stamped
 from spatial_replay.bags.reader import Topic
 from spatial_replay.errors import UsageError
 from spatial_replay.mapping.assemble import Assembler

@@ -12,7 +12,7 @@ import pytest
 from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.mapping.message_types import BUILT_IN
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/mapping.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
 

@@ -11,7 +11,7 @@ import pytest
 from mcap.records import Statistics
 from mcap.writer import Writer
 
-from logs.foreign.bag_files import (
+from bags.bag_files import (
     POINT,
     SECOND,
     START_NS,

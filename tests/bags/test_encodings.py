@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from logs.foreign.bag_files import (
+from bags.bag_files import (
     POINT,
     ROS1,
     ROS2,

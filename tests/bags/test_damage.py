@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import pytest
 
-from logs.foreign.bag_files import (
+from bags.bag_files import (
     START_NS,
     TEXT,
     Sent,

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType
 
-from logs.foreign.bag_files import (
+from bags.bag_files import (
     POINT,
     ROS2,
     SECOND,

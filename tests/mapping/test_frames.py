@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 
-from logs.mapping.feeding import SECOND, Feed, make, pose_stamped, tf, transform
+from mapping.feeding import SECOND, Feed, make, pose_stamped, tf, transform
 from spatial_replay.mapping.transforms import FrameTree
 
 MS = 10**6

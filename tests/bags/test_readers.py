@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from logs.foreign.bag_files import (
+from bags.bag_files import (
     POINT,
     SECOND,
     START_NS,
