@@ -47,7 +47,7 @@ from spatial_replay.logs.topics import (
 )
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.semantics import Semantics, instance_evaluation
-from spatial_replay.monitor.stream import EvaluationStream, Stretch
+from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
 from spatial_replay.spec import format_specification, parse_specification
 from spatial_replay.spec.formula import Outline, Specification, iter_nodes
 from spatial_replay.trace.trace import Trace
@@ -102,7 +102,7 @@ class Annotator:
         """What a viewer shows after the messages so far."""
         return self._scene
 
-    def messages(self, trace: Trace, stretches: Sequence[Stretch]) -> list[Messages]:
+    def messages(self, trace: Trace, stretches: Sequence[SeriesBlock]) -> list[Messages]:
         """What to write beside the next samples.
 
         Args:
@@ -120,7 +120,7 @@ class Annotator:
         messages.append(self._drawn(trace, stretches))
         return messages
 
-    def pass_over(self, trace: Trace, stretches: Sequence[Stretch]) -> list[Messages]:
+    def pass_over(self, trace: Trace, stretches: Sequence[SeriesBlock]) -> list[Messages]:
         """Take in the next samples and write nothing of them but the events."""
         if not len(trace):
             return []
@@ -160,7 +160,7 @@ class Annotator:
         has_states = [bool(self._written[AUTOMATON]) and run is not None for run in self._runs]
         return Contents(self._trees, has_states, self._extent, written | set(beside))
 
-    def _robustness(self, stretches: Sequence[Stretch]) -> Messages:
+    def _robustness(self, stretches: Sequence[SeriesBlock]) -> Messages:
         """One message per sample and result."""
         encoded = [
             encode_robustness(tree.name, tree.object, names, stretch.times_ns, stretch.series)
@@ -168,7 +168,7 @@ class Annotator:
         ]
         return self._in_order(_ROBUSTNESS, stretches, encoded)
 
-    def _told(self, stretches: Sequence[Stretch]) -> list[Told]:
+    def _told(self, stretches: Sequence[SeriesBlock]) -> list[Told]:
         """What changed, by time, then in the order of results and of their nodes."""
         told = [
             each
@@ -184,7 +184,7 @@ class Annotator:
             self._messages(_EVENT_LOG, times_ns, [each.log for each in told]),
         ]
 
-    def _automaton_states(self, stretches: Sequence[Stretch]) -> Messages:
+    def _automaton_states(self, stretches: Sequence[SeriesBlock]) -> Messages:
         """One message per sample and result that has an automaton."""
         running = [
             (run, stretch) for run, stretch in zip(self._runs, stretches, strict=True) if run is not None
@@ -192,7 +192,7 @@ class Annotator:
         encoded = [run.encode(stretch) for run, stretch in running]
         return self._in_order(_AUTOMATON, [stretch for _, stretch in running], encoded)
 
-    def _drawn(self, trace: Trace, stretches: Sequence[Stretch]) -> Messages:
+    def _drawn(self, trace: Trace, stretches: Sequence[SeriesBlock]) -> Messages:
         """The scene."""
         evaluated = [
             Evaluated(concerns, stretch.times_ns, stretch.series)
@@ -207,7 +207,7 @@ class Annotator:
         return self._messages(_SCENE, drawn.times_ns, drawn.payloads)
 
     def _in_order(
-        self, channel: Channel, stretches: Sequence[Stretch], encoded: Sequence[Sequence[bytes]]
+        self, channel: Channel, stretches: Sequence[SeriesBlock], encoded: Sequence[Sequence[bytes]]
     ) -> Messages:
         """Messages of stretches by time, numbered in the order of results however the samples are cut."""
         times_ns = np.concatenate([np.empty(0, np.int64), *(stretch.times_ns for stretch in stretches)])
@@ -275,11 +275,11 @@ class AnnotatedEvaluation:
         self.streams = [stream for evaluation in self._evaluations for stream in evaluation.streams]
         self.trees = reported_trees(files, instances)
 
-    def extend(self, trace: Trace) -> list[Stretch]:
+    def extend(self, trace: Trace) -> list[SeriesBlock]:
         """Take in the next samples; one stretch for each of `trees`."""
         return [stretch for evaluation in self._evaluations for stretch in evaluation.extend(trace)]
 
-    def messages(self, trace: Trace, stretches: Sequence[Stretch]) -> list[Messages]:
+    def messages(self, trace: Trace, stretches: Sequence[SeriesBlock]) -> list[Messages]:
         """What to write beside samples, from the stretches that `extend` gave for them."""
         return self._annotator.messages(trace, stretches)
 

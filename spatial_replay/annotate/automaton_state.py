@@ -24,7 +24,7 @@ from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.topics import AUTOMATA_PREFIX
 from spatial_replay.monitor.offline import finished
 from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.monitor.stream import Stretch
+from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Atom, Formula, NamedSpec, Quantified, Specification, iter_nodes
 
 _NOW = 1
@@ -76,7 +76,7 @@ class AutomatonRun:
         about = (automaton.accepting, automaton.can_accept, automaton.can_reject)
         self._about = np.array([[state in each for each in about] for state in automaton.states], np.bool_)
 
-    def encode(self, stretch: Stretch) -> list[bytes]:
+    def encode(self, stretch: SeriesBlock) -> list[bytes]:
         """Take in the next samples; one message for each."""
         if not len(stretch.times_ns):
             return []
@@ -97,12 +97,12 @@ class AutomatonRun:
                 payloads[index] = payload
         return payloads
 
-    def pass_over(self, stretch: Stretch) -> None:
+    def pass_over(self, stretch: SeriesBlock) -> None:
         """Take in the next samples without a message."""
         if len(stretch.times_ns):
             self._steps(self._values(stretch))
 
-    def _values(self, stretch: Stretch) -> Flags:
+    def _values(self, stretch: SeriesBlock) -> Flags:
         """(P, T): whether each proposition is true in each sample, or unknown."""
         now = stretch.series[list(self.propositions), _NOW]
         values = np.where(now >= 0.0, TRUE, FALSE).astype(np.int8)

@@ -13,7 +13,7 @@ from spatial_replay.logs.messages import Channel
 from spatial_replay.logs.schemas.Curves_pb2 import Curves, NodeCurves, SpecificationCurves
 from spatial_replay.logs.topics import CURVES_TOPIC, protobuf_channel
 from spatial_replay.monitor.online.operators import looks_ahead
-from spatial_replay.monitor.stream import Stretch
+from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import final_verdict
 from spatial_replay.spec.formula import Formula, iter_nodes
 
@@ -34,7 +34,7 @@ class CurvedResult(NamedTuple):
     """
 
     tree: ReportedTree
-    stretch: Stretch
+    stretch: SeriesBlock
     robustness: float
     lower: float
     upper: float

@@ -20,7 +20,7 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online.codes import low_and_high
-from spatial_replay.monitor.stream import Stretch
+from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Atom, Boolean, Formula, Quantified, iter_nodes
 
 
@@ -142,7 +142,7 @@ class Parts:
         self._values = np.full(len(self._parts), np.nan)
         self._leaves: dict[int, Floats] = {}
 
-    def extend(self, stretch: Stretch) -> None:
+    def extend(self, stretch: SeriesBlock) -> None:
         """Take in the next samples, at least one."""
         values = stretch.series[self._parts, 0]
         before = np.concatenate([self._values[:, None], values[:, :-1]], axis=1)

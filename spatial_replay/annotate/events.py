@@ -35,7 +35,7 @@ from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.online.operators import looks_ahead
 from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.monitor.stream import Stretch
+from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, Specification, TrackedName, iter_nodes
@@ -158,7 +158,7 @@ class EventTeller:
         self._carried: dict[tuple[int, int], Attained | None] = {}
         self._last_ns: int | None = None
 
-    def tell(self, stretch: Stretch) -> list[Told]:
+    def tell(self, stretch: SeriesBlock) -> list[Told]:
         """Take in the next samples; the changes that they confirm, by node, then in the order of time."""
         if not len(stretch.times_ns) or self._standings.are_final:
             return []
@@ -189,7 +189,7 @@ class EventTeller:
             return []
         return [self._told_at_end(node, time_ns, self._last_ns, final) for node in self._standings.pending]
 
-    def _attained(self, node: int, period: Period, stretch: Stretch) -> Attained | None:
+    def _attained(self, node: int, period: Period, stretch: SeriesBlock) -> Attained | None:
         """The leaf that a period's worst number is that of, if it is one's at the sample in which it came."""
         if period.place < 0:
             return self._carried.get((node, period.place))
@@ -198,7 +198,7 @@ class EventTeller:
         ends = leaves[low], leaves[high]
         return attained(self._watched[node].below, ends, period.worst, low=period.code != VIOLATED)
 
-    def _told(self, change: Change, stretch: Stretch) -> Told:
+    def _told(self, change: Change, stretch: SeriesBlock) -> Told:
         watched, after, before = self._watched[change.node], change.after, change.before
         witness = self._words(self._attained(change.node, after, stretch))
         now = Stated(after, witness, change_sentence(watched.title, after, witness))

@@ -13,7 +13,7 @@ from spatial_replay.annotate.requirements import Concern, Evaluated
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.contact import contacts
 from spatial_replay.geometry.measure import Operand
-from spatial_replay.monitor.atoms.terms import Scene
+from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.spec.formula import (
@@ -160,7 +160,7 @@ def _point(
     pointing: Pointing, leaf: Integers, trace: Trace, samples: Integers, here: Integers, found: Pointers
 ) -> None:
     """Fill in the samples `here` (H,), whose leaves (H,) are given."""
-    scene = Scene(trace, pointing.regions)
+    scene = TraceScene(trace, pointing.regions)
     for index in np.unique(leaf[leaf >= 0]).tolist():
         pair = pointing.pairs[index]
         if pair is None:

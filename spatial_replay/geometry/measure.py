@@ -57,7 +57,7 @@ class Operand:
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class MeasureRequest:
     """One quantity of one operand, or between two (indices into the operands)."""
 
     quantity: Quantity
@@ -65,7 +65,7 @@ class Request:
     second: int = -1
 
 
-def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequence[Request]) -> Floats:
+def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequence[MeasureRequest]) -> Floats:
     """Each requested quantity in each sample.
 
     signed_distance(A, B) is the least over pairs of parts of the signed distance of two rounded convex
@@ -114,7 +114,7 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
     return values
 
 
-def _check_request(request: Request, operand_count: int) -> None:
+def _check_request(request: MeasureRequest, operand_count: int) -> None:
     if request.quantity not in QUANTITY_CODES:
         raise GeometryError(f"no quantity {request.quantity!r}; there are {', '.join(QUANTITY_CODES)}")
     needed = [request.first, request.second] if request.quantity in _BETWEEN_TWO else [request.first]

@@ -18,7 +18,7 @@ from spatial_replay.lazy import Displayed
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.offline import full_signal, window_signal
 from spatial_replay.monitor.semantics import Semantics, checked_semantics, instance_evaluation
-from spatial_replay.monitor.stream import EvaluationStream, InstanceEvaluation, Stretch
+from spatial_replay.monitor.stream import EvaluationStream, InstanceEvaluation, SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, final_verdict, worst_verdict
 from spatial_replay.monitor.witness.path import Evidence
 from spatial_replay.monitor.witness.witness import Witness, find_witness
@@ -386,7 +386,7 @@ def _require_trace(value: object) -> None:
         raise UsageError(f"trace is {shortened(value)}; {remedy}")
 
 
-def _result(stream: InstanceEvaluation, stretch: Stretch, inquiry: Inquiry) -> SpecResult:
+def _result(stream: InstanceEvaluation, stretch: SeriesBlock, inquiry: Inquiry) -> SpecResult:
     return SpecResult(
         stream.instance.name,
         stream.instance.object,

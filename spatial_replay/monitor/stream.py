@@ -20,11 +20,11 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.atoms.live import SampleLeaves
 from spatial_replay.monitor.atoms.live_rows import iter_delays
 from spatial_replay.monitor.atoms.measurements import leaf_values
-from spatial_replay.monitor.atoms.terms import Scene
+from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.online.program import Program
-from spatial_replay.monitor.online.step import Run
+from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.formula import Formula, Outline
 from spatial_replay.trace.sample import Sample
@@ -32,7 +32,7 @@ from spatial_replay.trace.trace import Trace, window_of
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch:
+class SeriesBlock:
     """What one instance says about some samples.
 
     Attributes:
@@ -45,16 +45,18 @@ class Stretch:
     series: Floats
     leaves: Floats
 
-    def between(self, start_ns: int, end_ns: int) -> Stretch:
+    def between(self, start_ns: int, end_ns: int) -> SeriesBlock:
         """The samples from the first at or after `start_ns` to the last before `end_ns`."""
         begin, end = window_of(self.times_ns, start_ns, end_ns)
-        return Stretch(self.times_ns[begin:end], self.series[:, :, begin:end], self.leaves[:, :, begin:end])
+        return SeriesBlock(
+            self.times_ns[begin:end], self.series[:, :, begin:end], self.leaves[:, :, begin:end]
+        )
 
 
-def join_stretches(stretches: Sequence[Stretch]) -> Stretch:
+def join_blocks(stretches: Sequence[SeriesBlock]) -> SeriesBlock:
     """One stretch of one or more of the same instance that follow each other."""
     channels = max(len(stretch.leaves) for stretch in stretches)
-    return Stretch(
+    return SeriesBlock(
         np.concatenate([stretch.times_ns for stretch in stretches]),
         np.concatenate([stretch.series for stretch in stretches], axis=2),
         np.concatenate([in_channels(stretch.leaves, channels) for stretch in stretches], axis=2),
@@ -83,7 +85,7 @@ class InstanceEvaluation(Protocol):
     def verdict(self) -> Verdict:
         """The root's verdict if the log ends here; unknown before the first sample."""
 
-    def extend(self, scene: Scene) -> Stretch:
+    def extend(self, scene: TraceScene) -> SeriesBlock:
         """Take in the samples of a scene that fall into the instance's window."""
 
     def __len__(self) -> int:
@@ -96,7 +98,7 @@ class InstanceStream:
     def __init__(self, instance: Instance) -> None:
         self.instance = instance
         self.first_satisfied_ns: int | None = None
-        self._run = Run(instance.program)
+        self._run = OnlineRun(instance.program)
         self._robustness = np.full(len(instance.program.reports), np.nan)
 
     def __len__(self) -> int:
@@ -118,21 +120,21 @@ class InstanceStream:
         """The root's verdict if the log ends here; unknown before the first sample."""
         return final_verdict(*self.final[0]) if len(self) else Verdict.UNKNOWN
 
-    def extend(self, scene: Scene) -> Stretch:
+    def extend(self, scene: TraceScene) -> SeriesBlock:
         """Take in the samples of a scene that fall into the instance's window."""
         times = scene.trace.times_ns[scene.skip :]
         begin, end = window_of(times, self.instance.start_ns, self.instance.end_ns)
         times = times[begin:end]
         if not len(times):
             no_leaves = np.empty((1, len(self.instance.program.leaves), 0))
-            return Stretch(times, np.empty((len(self._robustness), 4, 0)), no_leaves)
+            return SeriesBlock(times, np.empty((len(self._robustness), 4, 0)), no_leaves)
         leaves = leaf_values(scene, self.instance.program.leaves, self.instance.bindings)[:, :, begin:end]
         series = self._run.extend(leaves, times)
         self._robustness = series[:, 0, -1].copy()
         if self.first_satisfied_ns is None:
             satisfied = np.flatnonzero(series[0, 0] >= 0.0)
             self.first_satisfied_ns = int(times[satisfied[0]]) if len(satisfied) else None
-        return Stretch(times, series, leaves)
+        return SeriesBlock(times, series, leaves)
 
 
 class EvaluationStream:
@@ -154,14 +156,14 @@ class EvaluationStream:
         self._reach = look_back([instance.formula for instance in instances])
         self._before: Trace | None = None
 
-    def extend(self, trace: Trace) -> list[Stretch]:
+    def extend(self, trace: Trace) -> list[SeriesBlock]:
         """Take in the next samples; one stretch for each of `streams`.
 
         Raises:
             TraceError: samples that do not come after those before.
         """
         if not len(trace):
-            return [stream.extend(Scene(trace, self._regions)) for stream in self.streams]
+            return [stream.extend(TraceScene(trace, self._regions)) for stream in self.streams]
         skip = 0
         if self._before is not None:
             before_ns = self._before.times_ns[-1]
@@ -175,7 +177,7 @@ class EvaluationStream:
                 skip = len(recent)
                 trace = Trace.concatenate([recent, trace])
         self._before = trace
-        scene = Scene(trace, self._regions, skip)
+        scene = TraceScene(trace, self._regions, skip)
         return [stream.extend(scene) for stream in self.streams]
 
 
@@ -220,7 +222,7 @@ class LiveRuns:
         """Start before the first sample; those before `start_ns` are only there to be looked back at."""
         ends = accumulate((len(program.leaves) for program in programs), initial=0)
         self._runs = [
-            (Run(program, room=ROOM, tile=1), slice(*ends))
+            (OnlineRun(program, room=ROOM, tile=1), slice(*ends))
             for program, ends in zip(programs, pairwise(ends), strict=True)
         ]
         self._leaves = SampleLeaves([program.leaves for program in programs], regions)

@@ -24,10 +24,10 @@ from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
-from spatial_replay.geometry.measure import Operand, Request, measure
+from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 from spatial_replay.lazy import Displayed
 from spatial_replay.monitor.atoms.measurements import leaf_values
-from spatial_replay.monitor.atoms.terms import Scene
+from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.planning.workspace import Grid, Workspace, refuse_faults
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_formula
@@ -265,7 +265,7 @@ def _intervals(
     trace: Trace, formulas: Sequence[Formula], regions: Mapping[str, Outline]
 ) -> tuple[Floats, Floats]:
     """(K, T), twice: formulas without temporal operators as intervals of their robustness."""
-    leaves = leaf_values(Scene(trace, regions), formulas, {})
+    leaves = leaf_values(TraceScene(trace, regions), formulas, {})
     return leaves[0], leaves[min(1, len(leaves) - 1)]
 
 
@@ -299,7 +299,7 @@ def _to_static(trace: Trace, name: str, workspace: Workspace) -> Floats:
     obstacles = FootprintBatch.from_footprints(workspace.obstacles)
     batch = FootprintBatch.concatenate([trace.footprints, obstacles])
     operands = (Operand(own), Operand(np.tile(static, (len(trace), 1))))
-    distance: Floats = measure(batch, operands, [Request("signed_distance", 0, 1)])[0]
+    distance: Floats = measure(batch, operands, [MeasureRequest("signed_distance", 0, 1)])[0]
     return distance
 
 

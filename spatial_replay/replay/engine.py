@@ -20,7 +20,7 @@ from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import REPLAYED_PREFIX
 from spatial_replay.monitor.evaluate import Inquiry
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
-from spatial_replay.monitor.stream import InstanceEvaluation, Stretch, join_stretches
+from spatial_replay.monitor.stream import InstanceEvaluation, SeriesBlock, join_blocks
 from spatial_replay.monitor.verdict import Verdict, final_verdict, worst_verdict
 from spatial_replay.monitor.witness.path import Evidence
 from spatial_replay.replay.selection import Selection, Window, first_sample_ns
@@ -95,7 +95,7 @@ def replayed_spec(
     tree: ReportedTree,
     stream: InstanceEvaluation,
     evidence: Evidence,
-    kept: Stretch | None,
+    kept: SeriesBlock | None,
     semantics: Semantics,
     *,
     has_series: bool,
@@ -163,7 +163,7 @@ class Replay:
         )
         self.trees = self._evaluation.trees
         self._keep_series, self._keep_leaves = keep_series, keep_leaves
-        self._kept: list[list[Stretch]] = [[] for _ in self.trees]
+        self._kept: list[list[SeriesBlock]] = [[] for _ in self.trees]
         hashing = Hashing()
         self._sample_hash, self._message_hash = SampleHash(hashing), MessageHash(hashing)
         self._result_hash = ResultHash([(tree.name, tree.object) for tree in self.trees], hashing)
@@ -246,7 +246,7 @@ class Replay:
         """The certificate over what was taken in so far."""
         return certificate(self._sample_hash, self._message_hash, self._files, self._result_hash)
 
-    def _count(self, trace: Trace, own: Messages, stretches: Sequence[Stretch]) -> None:
+    def _count(self, trace: Trace, own: Messages, stretches: Sequence[SeriesBlock]) -> None:
         self._faults += trace.faults
         self._names.update(trace.names)
         self._signals.update(trace.signals)
@@ -263,10 +263,10 @@ class Replay:
             if self._keep_series or self._keep_leaves:
                 self._kept[index].append(self._worth_keeping(stretch))
 
-    def _worth_keeping(self, stretch: Stretch) -> Stretch:
+    def _worth_keeping(self, stretch: SeriesBlock) -> SeriesBlock:
         series = stretch.series if self._keep_series else np.empty((len(stretch.series), 4, 0))
         leaves = stretch.leaves if self._keep_leaves else np.empty((1, stretch.leaves.shape[1], 0))
-        return Stretch(stretch.times_ns, series, leaves)
+        return SeriesBlock(stretch.times_ns, series, leaves)
 
     def _results(self) -> Iterator[ReplayedSpec]:
         regions = [file.regions for file, own in zip(self.files, self._instances, strict=True) for _ in own]
@@ -278,7 +278,7 @@ class Replay:
                 tree,
                 stream,
                 evidence,
-                join_stretches(kept) if kept else None,
+                join_blocks(kept) if kept else None,
                 self._semantics,
                 has_series=self._keep_series,
                 has_leaves=self._keep_leaves,

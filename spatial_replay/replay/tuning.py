@@ -17,7 +17,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.source import MemorySource, Source
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
-from spatial_replay.monitor.stream import Stretch
+from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.monitor.witness.path import Evidence
 from spatial_replay.replay.engine import Replayed, ReplayedSpec, replayed_spec
@@ -190,7 +190,7 @@ class Tuned:
     files: tuple[Specification, ...]
     constants: Mapping[str, Constant]
     evaluation: AnnotatedEvaluation
-    stretches: tuple[Stretch, ...]
+    stretches: tuple[SeriesBlock, ...]
     selection: Selection
 
     @property
@@ -242,7 +242,7 @@ class Tuned:
         """Who writes the messages of these samples, from the first on; see `AnnotatedEvaluation`."""
         return self.evaluation.annotator(scene)
 
-    def part(self, begin: int, end: int) -> tuple[Trace, list[Stretch]]:
+    def part(self, begin: int, end: int) -> tuple[Trace, list[SeriesBlock]]:
         """Samples `begin` to before `end` of those in the window, and what the evaluation says of them."""
         trace = self.tuning.inside.slice(begin, end)
         if not len(trace):

@@ -11,7 +11,7 @@ import numpy as np
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.geometry.measure import Operand, Request, measure
+from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 from spatial_replay.simulation.arm import Arm
 from spatial_replay.simulation.bullet import Engine
 from spatial_replay.simulation.shapes import Pose, footprint, height
@@ -58,7 +58,7 @@ class Scene:
 def _distance(covered: Footprint, others: Sequence[Footprint]) -> float:
     batch = FootprintBatch.from_footprints([covered, *others])
     operands = [Operand(np.array([[0]])), Operand(np.arange(1, len(batch))[None, :])]
-    return float(measure(batch, operands, [Request("signed_distance", 0, 1)])[0, 0])
+    return float(measure(batch, operands, [MeasureRequest("signed_distance", 0, 1)])[0, 0])
 
 
 def extent(covered: Footprint, angle: float) -> tuple[float, float]:

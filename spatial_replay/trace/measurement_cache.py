@@ -1,9 +1,9 @@
-"""What has been computed from a trace, kept for the next edit of a specification."""
+"""Cache the measurements taken from one trace, so that an edited specification reuses them."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from threading import Lock
 
 from spatial_replay.geometry.arrays import Floats
@@ -11,40 +11,32 @@ from spatial_replay.geometry.arrays import Floats
 _BYTES = 1 << 30
 
 
-class Memo:
-    """Arrays computed from one frozen trace, by what they are; the least recently used go beyond 1 GiB.
+class MeasurementCache:
+    """Arrays computed from one frozen trace; above 1 GiB the least recently used are dropped.
 
-    It belongs to one trace and lives as long as that, so nothing computed from one trace can be taken for
-    another's. Its keys are compared whole, never by their hash alone. Several threads may evaluate one trace.
+    Each trace owns one, so a result for one trace is never taken for another's. Keys are compared by
+    equality, never by hash alone. Several threads may evaluate the same trace.
     """
 
     def __init__(self) -> None:
         self._arrays: OrderedDict[Hashable, Floats] = OrderedDict()
         self._bytes = 0
-        self._changing = Lock()
+        self._lock = Lock()
 
     def get(self, key: Hashable) -> Floats | None:
-        """The array kept under a key, or None."""
-        with self._changing:
-            found = self._arrays.get(key)
-            if found is not None:
+        """Return the array stored under a key, or None."""
+        with self._lock:
+            array = self._arrays.get(key)
+            if array is not None:
                 self._arrays.move_to_end(key)
-            return found
+            return array
 
-    def keep(self, key: Hashable, array: Floats) -> None:
-        """Keep an array, which must not be written to afterwards."""
-        with self._changing:
+    def put(self, key: Hashable, array: Floats) -> None:
+        """Store an array, which must not be written to afterwards."""
+        with self._lock:
             replaced = self._arrays.pop(key, None)
             self._bytes += array.nbytes - (0 if replaced is None else replaced.nbytes)
             self._arrays[key] = array
             while self._bytes > _BYTES and len(self._arrays) > 1:
                 _, dropped = self._arrays.popitem(last=False)
                 self._bytes -= dropped.nbytes
-
-    def or_compute(self, key: Hashable, compute: Callable[[], Floats]) -> Floats:
-        """The array kept under a key, computed now if there is none."""
-        found = self.get(key)
-        if found is None:
-            found = compute()
-            self.keep(key, found)
-        return found

@@ -13,7 +13,7 @@ from spatial_replay.errors import TraceError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.trace.measurement_cache import Memo
+from spatial_replay.trace.measurement_cache import MeasurementCache
 from spatial_replay.trace.sample import Sample
 
 ABSENT = -1
@@ -44,7 +44,7 @@ class Trace:
         signals: numeric signals by name, each (T,) float64, NaN where not known.
         faults: what was lost or set aside while reading, in words, each with its place.
         remarks: what else the log says of its samples, where nothing was lost.
-        memo: what has been computed from this trace.
+        cache: measurements already taken from this trace.
 
     Raises:
         TraceError: columns whose lengths do not fit together, or times that do not increase.
@@ -61,7 +61,7 @@ class Trace:
     signals: Mapping[str, Floats] = field(default_factory=dict)
     faults: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
-    memo: Memo = field(default_factory=Memo, init=False, repr=False, compare=False)
+    cache: MeasurementCache = field(default_factory=MeasurementCache, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name in ("times_ns", "rows", "class_code"):

@@ -10,7 +10,7 @@ import pytest
 from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.geometry.measure import Operand, Request, measure
+from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 
 UNIT = Footprint.box(0, 0, 1, 1)
 POINT = Footprint.polygon([(0, 0)])
@@ -23,7 +23,7 @@ def rows(*numbers):
 
 def between(quantity, first, second):
     batch = FootprintBatch.from_footprints([first, second])
-    return float(measure(batch, [rows(0), rows(1)], [Request(quantity, 0, 1)])[0, 0])
+    return float(measure(batch, [rows(0), rows(1)], [MeasureRequest(quantity, 0, 1)])[0, 0])
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,7 @@ def test_centroids_are_those_of_areas_and_of_each_part():
     )
     names = ("centroid_min_x", "centroid_max_x", "centroid_min_y", "centroid_max_y")
     batch = FootprintBatch.from_footprints([shapes])
-    values = measure(batch, [rows(0)], [Request(name, 0) for name in names])
+    values = measure(batch, [rows(0)], [MeasureRequest(name, 0) for name in names])
     assert values[:, 0].tolist() == [1, 6, 1, 7]
 
 
@@ -114,46 +114,65 @@ def test_prisms_count_when_both_have_heights():
     batch = FootprintBatch.from_footprints(
         [UNIT, Footprint.box(4, 0, 5, 1), Footprint.box(0, 0, 2, 2)], [(0, 1), (5, 6), None]
     )
-    requests = [Request("signed_distance", 0, 1), Request("signed_distance", 0, 2), Request("max_z", 1)]
+    requests = [
+        MeasureRequest("signed_distance", 0, 1),
+        MeasureRequest("signed_distance", 0, 2),
+        MeasureRequest("max_z", 1),
+    ]
     assert measure(batch, [rows(0), rows(1), rows(2)], requests)[:, 0].tolist() == [5, -1, 6]
-    assert np.isnan(measure(batch, [rows(0, 2)], [Request("min_z", 0), Request("max_z", 0)])).all()
-    assert measure(batch, [rows(0, 1)], [Request("min_z", 0), Request("max_z", 0)])[:, 0].tolist() == [0, 6]
+    assert np.isnan(
+        measure(batch, [rows(0, 2)], [MeasureRequest("min_z", 0), MeasureRequest("max_z", 0)])
+    ).all()
+    assert measure(batch, [rows(0, 1)], [MeasureRequest("min_z", 0), MeasureRequest("max_z", 0)])[
+        :, 0
+    ].tolist() == [0, 6]
 
 
 def test_empty_places_are_left_out_and_an_empty_union_is_infinitely_far():
     batch = FootprintBatch.from_footprints([UNIT, Footprint.box(3, 0, 4, 1), Footprint.box(9, 0, 10, 1)])
     nobody, some = rows(-1, -7), rows(-1, 2, 1)
     requests = [
-        Request("signed_distance", 0, 2),
-        Request("signed_distance", 0, 1),
-        Request("protrusion", 1, 0),
+        MeasureRequest("signed_distance", 0, 2),
+        MeasureRequest("signed_distance", 0, 1),
+        MeasureRequest("protrusion", 1, 0),
     ]
-    requests += [Request("min_x", 1), Request("max_x", 1), Request("max_x", 2), Request("protrusion", 0, 1)]
+    requests += [
+        MeasureRequest("min_x", 1),
+        MeasureRequest("max_x", 1),
+        MeasureRequest("max_x", 2),
+        MeasureRequest("protrusion", 0, 1),
+    ]
     values = measure(batch, [rows(0), nobody, some], requests)[:, 0]
     assert values.tolist() == [2, math.inf, -math.inf, math.inf, -math.inf, 10, math.inf]
-    assert measure(batch, [rows(0), rows()], [Request("signed_distance", 0, 1)])[0, 0] == math.inf
+    assert measure(batch, [rows(0), rows()], [MeasureRequest("signed_distance", 0, 1)])[0, 0] == math.inf
 
 
 def test_each_sample_has_its_own_rows():
     batch = FootprintBatch.from_footprints([UNIT, *(Footprint.box(x, 0, x + 1, 1) for x in (2, 3, 4))])
     operands = [Operand(np.zeros((3, 1), dtype=np.int64)), Operand(np.array([[1], [2], [3]]), 0.5)]
-    assert measure(batch, operands, [Request("signed_distance", 0, 1)]).tolist() == [[0.5, 1.5, 2.5]]
+    assert measure(batch, operands, [MeasureRequest("signed_distance", 0, 1)]).tolist() == [[0.5, 1.5, 2.5]]
 
 
 def test_nothing_asked_is_nothing_answered():
     batch = FootprintBatch.from_footprints([])
     assert measure(batch, [], []).shape == (0, 0)
-    assert measure(batch, [Operand(np.full((4, 1), -1))], [Request("min_x", 0)]).tolist() == [[math.inf] * 4]
+    assert measure(batch, [Operand(np.full((4, 1), -1))], [MeasureRequest("min_x", 0)]).tolist() == [
+        [math.inf] * 4
+    ]
 
 
 @pytest.mark.parametrize(
     ("operands", "request_", "message"),
     [
-        ([rows(0), Operand(np.zeros((2, 1), dtype=np.int64))], Request("min_x", 0), r"\[1, 2\] samples"),
-        ([rows(1)], Request("min_x", 0), "row 1"),
-        ([rows(0)], Request("signed_distance", 0, 1), "operand 1"),
-        ([rows(0)], Request("protrusion", 0), "operand -1"),
-        ([rows(0)], Request("width", 0), "'width'.*signed_distance"),
+        (
+            [rows(0), Operand(np.zeros((2, 1), dtype=np.int64))],
+            MeasureRequest("min_x", 0),
+            r"\[1, 2\] samples",
+        ),
+        ([rows(1)], MeasureRequest("min_x", 0), "row 1"),
+        ([rows(0)], MeasureRequest("signed_distance", 0, 1), "operand 1"),
+        ([rows(0)], MeasureRequest("protrusion", 0), "operand -1"),
+        ([rows(0)], MeasureRequest("width", 0), "'width'.*signed_distance"),
     ],
 )
 def test_what_cannot_be_measured_is_refused(operands, request_, message):

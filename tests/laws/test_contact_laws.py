@@ -11,7 +11,7 @@ from laws.strategies_geometry import footprints, radii
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.contact import contact, contacts, enlarged, protrusion_contact
 from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.geometry.measure import Operand, Request, measure
+from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 
 TOLERANCE = 1e-6
 
@@ -19,7 +19,7 @@ TOLERANCE = 1e-6
 def measured(quantity, first, second):
     batch = FootprintBatch.from_footprints([first, second])
     operands = [Operand(np.array([[row]])) for row in range(2)]
-    return float(measure(batch, operands, [Request(quantity, 0, 1)])[0, 0])
+    return float(measure(batch, operands, [MeasureRequest(quantity, 0, 1)])[0, 0])
 
 
 def to(point, footprint):

@@ -22,7 +22,7 @@ from laws.strategies_geometry import (
 )
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import ConvexPart, Footprint
-from spatial_replay.geometry.measure import Operand, Request, measure
+from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 from spatial_replay.geometry.outline import SOUND, normalise_polygons
 
 TOLERANCE = 1e-6
@@ -34,7 +34,7 @@ heights = st.tuples(st.integers(-20, 20), st.integers(0, 20)).map(lambda pair: (
 def between(quantity, first, second, *, grow=(0.0, 0.0), heights=None):
     batch = FootprintBatch.from_footprints([first, second], heights)
     operands = [Operand(np.array([[row]]), radius) for row, radius in enumerate(grow)]
-    return float(measure(batch, operands, [Request(quantity, 0, 1)])[0, 0])
+    return float(measure(batch, operands, [MeasureRequest(quantity, 0, 1)])[0, 0])
 
 
 def signed_distance(first, second, **options):
@@ -48,7 +48,7 @@ def protrusion(first, second, **options):
 def projections(footprint):
     names = ("min_x", "max_x", "min_y", "max_y")
     batch = FootprintBatch.from_footprints([footprint])
-    return measure(batch, [Operand(np.array([[0]]))], [Request(name, 0) for name in names])[:, 0]
+    return measure(batch, [Operand(np.array([[0]]))], [MeasureRequest(name, 0) for name in names])[:, 0]
 
 
 def outline_of(vertices):
@@ -120,7 +120,7 @@ def test_radii_come_off_the_signed_distance_and_shift_the_protrusion(first, seco
 @given(footprints, radii)
 def test_enlarging_pushes_every_side_outwards(footprint, radius):
     batch = FootprintBatch.from_footprints([footprint])
-    requests = [Request(name, 0) for name in ("min_x", "max_x", "min_y", "max_y")]
+    requests = [MeasureRequest(name, 0) for name in ("min_x", "max_x", "min_y", "max_y")]
     grown = measure(batch, [Operand(np.array([[0]]), radius)], requests)[:, 0]
     assert grown == pytest.approx(projections(footprint) + np.array([-1, 1, -1, 1]) * radius)
 
@@ -180,7 +180,11 @@ def test_results_do_not_depend_on_what_else_is_asked(shapes):
     count = len(shapes)
     first = np.repeat(np.arange(count), count)[:, None]
     second = np.tile(np.arange(count), count)[:, None]
-    requests = [Request("protrusion", 0, 1), Request("signed_distance", 0, 1), Request("centroid_max_x", 0)]
+    requests = [
+        MeasureRequest("protrusion", 0, 1),
+        MeasureRequest("signed_distance", 0, 1),
+        MeasureRequest("centroid_max_x", 0),
+    ]
     together = measure(batch, [Operand(first), Operand(second)], requests)
     for t in range(count * count):
         alone = batch.select(np.array([first[t, 0], second[t, 0]]))

@@ -31,7 +31,7 @@ from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.monitor import Monitor
 from spatial_replay.monitor.online.program import compile_formula
-from spatial_replay.monitor.online.step import Run
+from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.monitor.stream import EvaluationStream
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
 from spatial_replay.spec.formula import Boolean, Temporal, Truth
@@ -46,7 +46,7 @@ few = settings(max_examples=50)
 def run_of(formula, run, *, room=256, cuts=()):
     """(N, 4, T) and (N, 2): what a run says of some leaves, in stretches."""
     program = compile_formula(formula)
-    going = Run(program, room=room)
+    going = OnlineRun(program, room=room)
     leaves, times = run.values(program.leaves), np.array(run.times_ns)
     ends = cuts or (0, len(run))
     series = [going.extend(fewest(leaves[:, :, i:j]), times[i:j]) for i, j in pairwise(ends)]

@@ -30,11 +30,11 @@ from spatial_replay.monitor.atoms.instructions import LeafCode
 from spatial_replay.monitor.atoms.live_kernel import ABSENT, PlanArrays, leaves_of_sample, packed
 from spatial_replay.monitor.atoms.live_rows import (
     NO_DELAY,
-    Frame,
     Leaves,
     Member,
+    PlanContext,
+    PlanRows,
     RecentSamples,
-    Rows,
     iter_delays,
 )
 from spatial_replay.monitor.atoms.measurements import measured_terms, quantity_of
@@ -59,14 +59,14 @@ from spatial_replay.trace.sample import Sample
 class LeafPlan:
     """How the leaves of formulas follow from a sample and the earlier ones that it looks back at."""
 
-    def __init__(self, frame: Frame, members: frozenset[Member]) -> None:
+    def __init__(self, frame: PlanContext, members: frozenset[Member]) -> None:
         """Plan for samples that hold no other members of open groups.
 
         Raises:
             UsageError: more bindings than `MAX_BINDINGS`.
         """
         self._classes = frame.classes
-        rows = Rows(frame, members)
+        rows = PlanRows(frame, members)
         code = LeafCode(rows)
         outputs = [number for leaves in frame.leaves for number in code.add_leaves(leaves, {})]
         self._arrays = packed(_arrays(frame, rows, code, outputs))
@@ -137,7 +137,7 @@ def class_code(tracked: TrackedObject, classes: Mapping[str, int]) -> int:
     return classes.get((tracked.class_name or "").casefold(), 0) if classes else 0
 
 
-def _arrays(frame: Frame, rows: Rows, code: LeafCode, outputs: Sequence[int]) -> PlanArrays:
+def _arrays(frame: PlanContext, rows: PlanRows, code: LeafCode, outputs: Sequence[int]) -> PlanArrays:
     measurements = list(code.measurements)
     operands: dict[Term, int] = {}
     geometric = [k for k, each in enumerate(measurements) if not isinstance(each, Misalignment)]
@@ -224,7 +224,7 @@ class SampleLeaves:
         open_classes = {base.class_name or "" for base in bases if isinstance(base, Group) and base.is_open}
         regions_named = {base.name for base in bases if isinstance(base, RegionName)}
         classes = sorted({name.casefold() for name in open_classes if name != ANY_CLASS})
-        self._frame = Frame(
+        self._frame = PlanContext(
             leaves,
             tuple(dict.fromkeys((NO_DELAY, *iter_delays(formulas)))),
             {name: code for code, name in enumerate(classes, start=1)},

@@ -91,7 +91,7 @@ class Member(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class PlanContext:
     """What plans for a specification share.
 
     Attributes:
@@ -114,10 +114,10 @@ class Row(NamedTuple):
     class_code: int = ANY
 
 
-class Rows:
+class PlanRows:
     """Rows for what terms are about, numbered as they are asked for (see `plan_kernel`)."""
 
-    def __init__(self, frame: Frame, members: frozenset[Member]) -> None:
+    def __init__(self, frame: PlanContext, members: frozenset[Member]) -> None:
         self._frame = frame
         self._members = members
         self._sample = {delay: number for number, delay in enumerate(frame.delays)}

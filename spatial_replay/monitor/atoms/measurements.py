@@ -11,9 +11,9 @@ from dataclasses import replace
 import numpy as np
 
 from spatial_replay.geometry.arrays import Flags, Floats
-from spatial_replay.geometry.measure import Operand, Quantity, Request, measure, misalignment
+from spatial_replay.geometry.measure import MeasureRequest, Operand, Quantity, measure, misalignment
 from spatial_replay.monitor.atoms.instructions import LeafCode, Membership, run_instructions
-from spatial_replay.monitor.atoms.terms import Bindings, Scene
+from spatial_replay.monitor.atoms.terms import Bindings, TraceScene
 from spatial_replay.spec.formula import (
     CentroidProjection,
     Earlier,
@@ -29,21 +29,21 @@ from spatial_replay.spec.formula import (
 )
 
 
-def measured(scene: Scene, measurements: Sequence[Measurement]) -> tuple[Floats, Floats]:
+def measured(scene: TraceScene, measurements: Sequence[Measurement]) -> tuple[Floats, Floats]:
     """Each measurement in each sample of a scene.
 
     Returns:
         Values (K, T), NaN where unknown, and how far each may be off for uncertainty (K, T).
     """
     keys = [_key(scene, measurement) for measurement in measurements]
-    memo = scene.trace.memo
-    found = {key: array for key in keys if (array := memo.get(key)) is not None}
+    cache = scene.trace.cache
+    found = {key: array for key in keys if (array := cache.get(key)) is not None}
     missing = {
         key: measurement for key, measurement in zip(keys, measurements, strict=True) if key not in found
     }
     if missing:
         for key, array in zip(missing, _measure(scene, list(missing.values())), strict=True):
-            memo.keep(key, array)
+            cache.put(key, array)
             found[key] = array
     if not keys:
         return np.empty((0, len(scene))), np.empty((0, len(scene)))
@@ -51,7 +51,7 @@ def measured(scene: Scene, measurements: Sequence[Measurement]) -> tuple[Floats,
     return values, spreads
 
 
-def _measure(scene: Scene, measurements: Sequence[Measurement]) -> list[Floats]:
+def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Floats]:
     """(2, T) for each: value, NaN where unknown, and uncertainty; all in one kernel call."""
     numbers: dict[Term, int] = {}
     operands: list[Operand] = []
@@ -63,7 +63,7 @@ def _measure(scene: Scene, measurements: Sequence[Measurement]) -> list[Floats]:
         return numbers[term]
 
     requests = [
-        Request(quantity_of(each), *(operand(term) for term in measured_terms(each)))
+        MeasureRequest(quantity_of(each), *(operand(term) for term in measured_terms(each)))
         for each in measurements
         if not isinstance(each, Misalignment)
     ]
@@ -109,7 +109,7 @@ def quantity_of(measurement: Measurement) -> Quantity:
             raise TypeError("an orientation is no quantity of footprints")
 
 
-def _key(scene: Scene, measurement: Measurement) -> Hashable:
+def _key(scene: TraceScene, measurement: Measurement) -> Hashable:
     """What a measurement is apart from the specification it stands in: regions by shape, not by name."""
     shapes = tuple(
         scene.regions[name] for name in map(_region, measured_terms(measurement)) if name is not None
@@ -143,7 +143,7 @@ def _unnamed(term: Term) -> Term:
     return RegionName("") if _region(term) is not None else term
 
 
-def leaf_values(scene: Scene, leaves: Sequence[Formula], bindings: Bindings) -> Floats:
+def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings) -> Floats:
     """Each leaf in each sample of a scene.
 
     Returns:
@@ -181,7 +181,7 @@ def leaf_values(scene: Scene, leaves: Sequence[Formula], bindings: Bindings) -> 
     return result
 
 
-def _flags(scene: Scene, membership: Membership) -> Flags:
+def _flags(scene: TraceScene, membership: Membership) -> Flags:
     """(T,): what a binding is in each sample (see `Membership`)."""
     _, members, unknown = scene.members(membership.group)
     if not membership.chosen:

@@ -31,7 +31,7 @@ Bindings = Mapping[str, str]
 
 
 @dataclass(frozen=True)
-class Found:
+class ResolvedTerm:
     """A term over the samples of a scene.
 
     Attributes:
@@ -50,7 +50,7 @@ class Found:
 _Base: TypeAlias = TrackedName | Variable | RegionName | Group
 
 
-class Scene:
+class TraceScene:
     """The samples `skip` and after of a trace, and the regions of a specification.
 
     Earlier samples are there for terms that look back (`a[-3]`).
@@ -61,7 +61,7 @@ class Scene:
         self.regions = regions
         self.skip = skip
         self._column = {name: index for index, name in enumerate(trace.names)}
-        self._found: dict[Term, Found] = {}
+        self._found: dict[Term, ResolvedTerm] = {}
         self._members: dict[Group | Earlier, tuple[tuple[str, ...], Flags, Booleans]] = {}
 
     def __len__(self) -> int:
@@ -78,7 +78,7 @@ class Scene:
             [self.trace.footprints, FootprintBatch.from_footprints(regions, heights)]
         )
 
-    def find(self, term: Term) -> Found:
+    def find(self, term: Term) -> ResolvedTerm:
         """A term without variables (see `bind`)."""
         if term not in self._found:
             self._found[term] = self._find(term)
@@ -111,11 +111,11 @@ class Scene:
         present = (rows != ABSENT)[np.maximum(source, 0)] & ~before[:, None]
         return names, present.astype(np.int8), before
 
-    def _find(self, term: Term) -> Found:
+    def _find(self, term: Term) -> ResolvedTerm:
         if isinstance(term, Enlarged):
             inner = self.find(term.term)
             operand = Operand(inner.operand.rows, inner.operand.enlargement + term.radius)
-            return Found(operand, inner.unknown, inner.spread, inner.yaw)
+            return ResolvedTerm(operand, inner.unknown, inner.spread, inner.yaw)
         base, source = self._base_and_source(term)
         if isinstance(base, RegionName):
             return self._found_region(base, source < 0)
@@ -140,7 +140,7 @@ class Scene:
         wanted = times[self.skip :] - (term.duration_ns or 0)
         return term.term, np.searchsorted(times, wanted, side="right").astype(np.int64) - 1
 
-    def _found_rows(self, rows: Integers, unknown: Booleans) -> Found:
+    def _found_rows(self, rows: Integers, unknown: Booleans) -> ResolvedTerm:
         seen = rows >= 0
         at = np.maximum(rows, 0)
         if len(self.trace.uncertainty) and seen.shape[1]:
@@ -148,12 +148,12 @@ class Scene:
             yaw = np.where(seen[:, 0], self.trace.yaw[at[:, 0]], np.nan)
         else:
             spread, yaw = np.zeros(len(rows)), np.full(len(rows), np.nan)
-        return Found(Operand(rows), unknown, spread, yaw)
+        return ResolvedTerm(Operand(rows), unknown, spread, yaw)
 
-    def _found_region(self, region: RegionName, unknown: Booleans) -> Found:
+    def _found_region(self, region: RegionName, unknown: Booleans) -> ResolvedTerm:
         row = len(self.trace.footprints) + list(self.regions).index(region.name)
         count = len(self)
-        return Found(
+        return ResolvedTerm(
             Operand(np.full((count, 1), row, np.int64)),
             unknown,
             np.zeros(count),

@@ -177,16 +177,16 @@ _RECURRENT_PAST = (codes.PAST_SINCE, codes.PAST_TRIGGER)
 _PAST = (*_RECURRENT_PAST, codes.PAST_WINDOW_MAX, codes.PAST_WINDOW_MIN, codes.PAST_DELAY)
 
 
-def part_of(signals: SignalTable, node: Temporal) -> Part:
+def part_of(signals: SignalTable, node: Temporal) -> WindowedPart:
     """The part of a node: anchored where that does, since it is the cheaper to run.
 
     Raises:
         UsageError: more than `MAX_VARIABLES` unbounded future operators.
     """
     bounded = node.operator in FUTURE_OPERATORS and (node.bound is not None or node.operator in ("X", "WX"))
-    part = Part(signals, node, anchored=bounded)
+    part = WindowedPart(signals, node, anchored=bounded)
     if bounded and not part.is_flat:
-        part = Part(signals, node, anchored=False)
+        part = WindowedPart(signals, node, anchored=False)
     if part.variables > MAX_VARIABLES:
         raise UsageError(
             f"a formula nests {part.variables} unbounded temporal operators under one {node.operator}; "
@@ -195,7 +195,7 @@ def part_of(signals: SignalTable, node: Temporal) -> Part:
     return part
 
 
-class Part:
+class WindowedPart:
     """The rows of one part, operands first; equal subformulas share one.
 
     Attributes:

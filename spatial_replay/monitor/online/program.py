@@ -20,9 +20,9 @@ import numpy as np
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.operators import (
-    Part,
     Row,
     SignalTable,
+    WindowedPart,
     array_of_rows,
     looks_ahead,
     part_of,
@@ -103,7 +103,7 @@ class _Parts:
         self.keeps_history = False
         self._built: dict[tuple[Row, ...], int] = {}
 
-    def add(self, part: Part) -> int:
+    def add(self, part: WindowedPart) -> int:
         """The number of a part."""
         rows = part.rows()
         if rows in self._built:
@@ -140,7 +140,7 @@ def _nodes_with_operands(formula: Formula) -> list[tuple[Formula, list[int]]]:
     return nodes
 
 
-def _now_rule(node: Temporal, part: Part) -> int:
+def _now_rule(node: Temporal, part: WindowedPart) -> int:
     """What a future operator is on the newest sample alone (`now`)."""
     if part.is_remembering:
         return codes.NOW_OF_PART

@@ -365,7 +365,7 @@ def step_with_windows(
     report(tables.reports, tables.operands, memory, scratch, channels, begin, count, t, series, final)
 
 
-class Run:
+class OnlineRun:
     """The state that a compiled formula carries from sample to sample.
 
     Its size depends on the formula and on how many samples its windows span, never on how long the stream

@@ -20,13 +20,13 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.atoms.live import SampleLeaves
 from spatial_replay.monitor.atoms.live_rows import iter_delays
 from spatial_replay.monitor.atoms.measurements import leaf_values
-from spatial_replay.monitor.atoms.terms import Scene
+from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.online.program import Program
 from spatial_replay.monitor.paper.kernel import PaperMemory, step_paper
 from spatial_replay.monitor.paper.scans import OPERATORS, PaperTable, paper_table
-from spatial_replay.monitor.stream import Stretch
+from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.diagnostics import Source
 from spatial_replay.spec.formula import (
@@ -272,14 +272,14 @@ class PaperStream:
         """The sign of the root's value; unknown where that is undetermined."""
         return final_verdict(float(self._robustness[0]), float(self._robustness[0]))
 
-    def extend(self, scene: Scene) -> Stretch:
+    def extend(self, scene: TraceScene) -> SeriesBlock:
         """Take in the samples of a scene that fall into the instance's window."""
         times = scene.trace.times_ns[scene.skip :]
         begin, end = window_of(times, self.instance.start_ns, self.instance.end_ns)
         times = times[begin:end]
         if not len(times):
             no_leaves = np.empty((1, len(self._leaves), 0))
-            return Stretch(times, np.empty((len(self._robustness), 4, 0)), no_leaves)
+            return SeriesBlock(times, np.empty((len(self._robustness), 4, 0)), no_leaves)
         leaves = leaf_values(scene, self._leaves, self.instance.bindings)[:, :, begin:end]
         positions = np.arange(scene.skip + begin, scene.skip + end, dtype=np.int64)
         first_ns = int(scene.trace.times_ns[0])
@@ -288,4 +288,4 @@ class PaperStream:
         if self.first_satisfied_ns is None:
             satisfied = np.flatnonzero(series[0, 0] >= 0.0)
             self.first_satisfied_ns = int(times[satisfied[0]]) if len(satisfied) else None
-        return Stretch(times, series, leaves)
+        return SeriesBlock(times, series, leaves)

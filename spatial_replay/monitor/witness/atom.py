@@ -15,9 +15,9 @@ import numpy as np
 from spatial_replay.geometry.contact import Contact, contact, enlarged, protrusion_contact
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.monitor.atoms.measurements import leaf_values, measured, measured_terms, quantity_of
-from spatial_replay.monitor.atoms.terms import Scene
+from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.online.codes import low_and_high
-from spatial_replay.monitor.witness.path import End, Extremum, Interval, Operand, chosen, extremum_of
+from spatial_replay.monitor.witness.path import End, Extremum, Interval, SignedOperand, chosen, extremum_of
 from spatial_replay.spec.format import format_term
 from spatial_replay.spec.formula import (
     Atom,
@@ -47,13 +47,13 @@ from spatial_replay.spec.walks import base_of, iter_expressions, substitute, ter
 from spatial_replay.trace.trace import ABSENT
 
 
-def unknowns_of(scene: Scene, atom: Atom) -> tuple[str, ...]:
+def unknowns_of(scene: TraceScene, atom: Atom) -> tuple[str, ...]:
     """What is not known of the one sample of a scene, each reason once, in the order of the atom."""
     parts = iter_expressions(atom.expression)
     return tuple(dict.fromkeys(reason for part in parts for reason in _reasons(scene, part)))
 
 
-def _reasons(scene: Scene, part: Expression) -> Iterator[str]:
+def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
     match part:
         case Signal():
             values = scene.trace.signals.get(part.name)
@@ -66,7 +66,7 @@ def _reasons(scene: Scene, part: Expression) -> Iterator[str]:
                 yield from _reasons_of_term(scene, part, term)
 
 
-def _reasons_of_term(scene: Scene, part: Expression, term: Term) -> Iterator[str]:
+def _reasons_of_term(scene: TraceScene, part: Expression, term: Term) -> Iterator[str]:
     found = scene.find(term)
     if found.unknown[0]:
         yield from _missing(scene, term)
@@ -79,7 +79,7 @@ def _reasons_of_term(scene: Scene, part: Expression, term: Term) -> Iterator[str
             yield f"{format_term(term)} has no height"
 
 
-def _missing(scene: Scene, term: Term) -> Iterator[str]:
+def _missing(scene: TraceScene, term: Term) -> Iterator[str]:
     """What of a term is not there."""
     while isinstance(term, Enlarged):
         term = term.term
@@ -107,7 +107,7 @@ def _members(base: Term) -> Sequence[str]:
     return ()
 
 
-def _is_before_the_first(scene: Scene, term: Earlier) -> bool:
+def _is_before_the_first(scene: TraceScene, term: Earlier) -> bool:
     if term.samples is not None:
         return term.samples > scene.skip
     times_ns = scene.trace.times_ns
@@ -169,7 +169,7 @@ class DecidingAtom:
         return tuple(dict.fromkeys(base.name or format_term(base) for base in bases))
 
 
-def deciding_atom(scene: Scene, leaf: Formula, end: End) -> DecidingAtom | None:
+def deciding_atom(scene: TraceScene, leaf: Formula, end: End) -> DecidingAtom | None:
     """The atom that decides a leaf in the one sample of a scene; None where nobody is in its group."""
     while not isinstance(leaf, Atom):
         below = _below(scene, leaf, end)
@@ -184,14 +184,14 @@ def deciding_atom(scene: Scene, leaf: Formula, end: End) -> DecidingAtom | None:
     return DecidingAtom(leaf, end, value, lower, upper, branch, found, unknown)
 
 
-def _intervals(scene: Scene, formulas: Sequence[Formula], *, wide: bool = True) -> list[Interval]:
+def _intervals(scene: TraceScene, formulas: Sequence[Formula], *, wide: bool = True) -> list[Interval]:
     """The interval of each formula in the one sample of a scene."""
     values = leaf_values(scene, formulas, {})[:, :, 0]
     low, high = low_and_high(len(values), wide=wide)
     return [(float(a), float(b)) for a, b in zip(values[low], values[high], strict=True)]
 
 
-def _below(scene: Scene, leaf: Formula, end: End) -> tuple[Formula, End] | None:
+def _below(scene: TraceScene, leaf: Formula, end: End) -> tuple[Formula, End] | None:
     """The operand or the binding that decides a leaf, and which of its ends."""
     match leaf:
         case Boolean():
@@ -199,7 +199,7 @@ def _below(scene: Scene, leaf: Formula, end: End) -> tuple[Formula, End] | None:
             extremum = extremum_of(leaf.operator, range(len(formulas)))
         case Quantified():
             formulas = list(_bodies(scene, leaf))
-            extremum = Extremum(leaf.quantifier == "forall", tuple(map(Operand, range(len(formulas)))))
+            extremum = Extremum(leaf.quantifier == "forall", tuple(map(SignedOperand, range(len(formulas)))))
         case _:
             return None
     if not formulas:
@@ -209,7 +209,7 @@ def _below(scene: Scene, leaf: Formula, end: End) -> tuple[Formula, End] | None:
     return formulas[first.index], end.turned if first.negated else end
 
 
-def _bodies(scene: Scene, formula: Quantified) -> Iterator[Formula]:
+def _bodies(scene: TraceScene, formula: Quantified) -> Iterator[Formula]:
     """The body for each way of binding the variables to members of the group."""
     names, members, _ = scene.members(formula.group)
     present = [name for name, is_member in zip(names, members[0].tolist(), strict=True) if is_member]
@@ -220,7 +220,9 @@ def _bodies(scene: Scene, formula: Quantified) -> Iterator[Formula]:
 # ------------------------------------------------------------------------------------------ expressions
 
 
-def _branch(scene: Scene, expression: Expression, end: End, sign: int) -> Iterator[tuple[int, Expression]]:
+def _branch(
+    scene: TraceScene, expression: Expression, end: End, sign: int
+) -> Iterator[tuple[int, Expression]]:
     """What an expression is the sum of, once its minima and maxima have taken an operand."""
     match expression:
         case Sum():
@@ -231,7 +233,9 @@ def _branch(scene: Scene, expression: Expression, end: End, sign: int) -> Iterat
         case Minimum() | Maximum():
             operands = expression.operands
             intervals = _intervals(scene, [_as_atom(each) for each in operands])
-            extremum = Extremum(isinstance(expression, Minimum), tuple(map(Operand, range(len(operands)))))
+            extremum = Extremum(
+                isinstance(expression, Minimum), tuple(map(SignedOperand, range(len(operands))))
+            )
             first, *_ = chosen(extremum, end, intervals.__getitem__)
             yield from _branch(scene, operands[first.index], end, sign)
         case _:
@@ -245,7 +249,7 @@ def _as_atom(expression: Expression) -> Atom:
 # ----------------------------------------------------------------------------------------- measurements
 
 
-def _measured(scene: Scene, part: Expression) -> Measured:
+def _measured(scene: TraceScene, part: Expression) -> Measured:
     """A signal, or a measurement of single objects: of groups, the members that it is attained by."""
     match part:
         case Signal():
@@ -271,22 +275,22 @@ def _measured(scene: Scene, part: Expression) -> Measured:
     return Measured(quantity, names, value, spread, _contact(scene, single))
 
 
-def _pairs(scene: Scene, part: SignedDistance) -> Iterator[SignedDistance]:
+def _pairs(scene: TraceScene, part: SignedDistance) -> Iterator[SignedDistance]:
     for first, second in product(_singles(scene, part.first), _singles(scene, part.second)):
         yield SignedDistance(first, second)
 
 
-def _least(scene: Scene, candidates: Iterable[Any]) -> Any:
+def _least(scene: TraceScene, candidates: Iterable[Any]) -> Any:
     listed = list(candidates)
     return listed[int(np.argmin(measured(scene, listed)[0][:, 0]))]
 
 
-def _greatest(scene: Scene, candidates: Iterable[Any]) -> Any:
+def _greatest(scene: TraceScene, candidates: Iterable[Any]) -> Any:
     listed = list(candidates)
     return listed[int(np.argmax(measured(scene, listed)[0][:, 0]))]
 
 
-def _singles(scene: Scene, term: Term) -> list[Term]:
+def _singles(scene: TraceScene, term: Term) -> list[Term]:
     """The objects or regions that a term stands for in the sample; the term itself for none."""
     base = base_of(term)
     if not isinstance(base, Group):
@@ -316,7 +320,7 @@ def _of_member(term: Term, name: str) -> Term:
     return TrackedName(name)
 
 
-def _contact(scene: Scene, part: Measurement) -> Contact | None:
+def _contact(scene: TraceScene, part: Measurement) -> Contact | None:
     match part:
         case SignedDistance():
             first, second = _footprint(scene, part.first), _footprint(scene, part.second)
@@ -327,7 +331,7 @@ def _contact(scene: Scene, part: Measurement) -> Contact | None:
     return None
 
 
-def _footprint(scene: Scene, term: Term) -> Footprint | None:
+def _footprint(scene: TraceScene, term: Term) -> Footprint | None:
     """Of a single object or region; None for a group with nobody in it."""
     operand = scene.find(term).operand
     rows = operand.rows[0]

@@ -20,7 +20,7 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.atoms.measurements import leaf_values
-from spatial_replay.monitor.atoms.terms import Scene
+from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.offline import Finished
 from spatial_replay.monitor.online.codes import in_channels
@@ -61,7 +61,7 @@ class End(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Operand:
+class SignedOperand:
     """What enters a minimum or a maximum: number `index` of something, as it is or negated."""
 
     index: int
@@ -73,14 +73,14 @@ class Extremum:
     """A minimum or a maximum of operands, or of others."""
 
     is_minimum: bool
-    operands: tuple[Operand | Extremum, ...]
+    operands: tuple[SignedOperand | Extremum, ...]
 
 
 def extremum_of(operator: str, operands: Sequence[int]) -> Extremum:
     """A Boolean operator over operands of the given numbers, as minima and maxima."""
-    plain = tuple(Operand(index) for index in operands)
+    plain = tuple(SignedOperand(index) for index in operands)
     first, last = plain[0], plain[-1]
-    not_first, not_last = Operand(first.index, True), Operand(last.index, True)
+    not_first, not_last = SignedOperand(first.index, True), SignedOperand(last.index, True)
     match operator:
         case "not":
             return Extremum(True, (not_first,))
@@ -95,13 +95,15 @@ def extremum_of(operator: str, operands: Sequence[int]) -> Extremum:
     return Extremum(True, (Extremum(False, (not_first, last)), Extremum(False, (not_last, first))))
 
 
-def chosen(part: Operand | Extremum, end: End, interval: Callable[[int], Interval]) -> list[Operand]:
+def chosen(
+    part: SignedOperand | Extremum, end: End, interval: Callable[[int], Interval]
+) -> list[SignedOperand]:
     """The operands that a part takes its number from: one, or several equal ones in their order.
 
     Args:
         interval: low and high end of each operand, not negated.
     """
-    if isinstance(part, Operand):
+    if isinstance(part, SignedOperand):
         return [part]
     choose = end.of_minimum if part.is_minimum else end.of_maximum
     keys = [choose(*_interval(each, interval)) for each in part.operands]
@@ -110,8 +112,8 @@ def chosen(part: Operand | Extremum, end: End, interval: Callable[[int], Interva
     return [operand for each in taken for operand in chosen(each, end, interval)]
 
 
-def _interval(part: Operand | Extremum, interval: Callable[[int], Interval]) -> Interval:
-    if isinstance(part, Operand):
+def _interval(part: SignedOperand | Extremum, interval: Callable[[int], Interval]) -> Interval:
+    if isinstance(part, SignedOperand):
         low, high = interval(part.index)
         return (-high, -low) if part.negated else (low, high)
     lows, highs = zip(*(_interval(each, interval) for each in part.operands), strict=True)
@@ -119,7 +121,7 @@ def _interval(part: Operand | Extremum, interval: Callable[[int], Interval]) -> 
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class PathNode:
     """A node at a sample, on the way to what decides.
 
     Attributes:
@@ -141,7 +143,7 @@ class DecidingPath:
         end: which end of the last node's interval decides.
     """
 
-    steps: tuple[Step, ...]
+    steps: tuple[PathNode, ...]
     end: End
 
 
@@ -173,7 +175,7 @@ class _Walk:
 
     def follow(self, node: int, sample: int, end: End) -> DecidingPath:
         """The path from a node at a sample."""
-        here = Step(node, sample)
+        here = PathNode(node, sample)
         match self._nodes[node]:
             case Boolean() as boolean:
                 extremum = extremum_of(boolean.operator, self._operands[node])
@@ -195,11 +197,11 @@ class _Walk:
         low, high = self._done.ends(node)
         return float(low[sample]), float(high[sample])
 
-    def _ends(self, operand: Operand, samples: slice) -> tuple[Floats, Floats]:
+    def _ends(self, operand: SignedOperand, samples: slice) -> tuple[Floats, Floats]:
         low, high = (column[samples] for column in self._done.ends(operand.index))
         return (-high, -low) if operand.negated else (low, high)
 
-    def _taken(self, formula: Temporal, operands: Sequence[int], sample: int, end: End) -> Step | None:
+    def _taken(self, formula: Temporal, operands: Sequence[int], sample: int, end: End) -> PathNode | None:
         """The operand and the sample that an operator takes its number from; None where it looks at none."""
         *_, right = operands
         window = self._window(formula, sample)
@@ -207,17 +209,19 @@ class _Walk:
             return None
         match formula.operator:
             case "G" | "H" | "WX":
-                return self._extreme(Operand(right), window, end, is_minimum=True)
+                return self._extreme(SignedOperand(right), window, end, is_minimum=True)
             case "F" | "O" | "X" | "Y":
-                return self._extreme(Operand(right), window, end, is_minimum=False)
+                return self._extreme(SignedOperand(right), window, end, is_minimum=False)
             case "R":
                 left, right = operands
-                return self._until(Operand(left, True), Operand(right, True), sample, window, end.turned)
+                return self._until(
+                    SignedOperand(left, True), SignedOperand(right, True), sample, window, end.turned
+                )
             case "W":
                 return self._weak_until(operands, sample, window, end)
         left, right = operands
         is_ahead = formula.operator == "U"
-        return self._until(Operand(left), Operand(right), sample, window, end, is_ahead=is_ahead)
+        return self._until(SignedOperand(left), SignedOperand(right), sample, window, end, is_ahead=is_ahead)
 
     def _window(self, formula: Temporal, sample: int) -> range:
         """The samples that an operator looks at."""
@@ -243,15 +247,22 @@ class _Walk:
             0 if high is None else bisect_left(self._times, now - high), bisect_right(self._times, now - low)
         )
 
-    def _extreme(self, operand: Operand, window: range, end: End, *, is_minimum: bool) -> Step:
+    def _extreme(self, operand: SignedOperand, window: range, end: End, *, is_minimum: bool) -> PathNode:
         low, high = self._ends(operand, slice(window.start, window.stop))
         if is_minimum:
-            return Step(operand.index, window[int(np.argmin(end.of_minimum(low, high)))])
-        return Step(operand.index, window[int(np.argmax(end.of_maximum(low, high)))])
+            return PathNode(operand.index, window[int(np.argmin(end.of_minimum(low, high)))])
+        return PathNode(operand.index, window[int(np.argmax(end.of_maximum(low, high)))])
 
     def _until(
-        self, left: Operand, right: Operand, sample: int, window: range, end: End, *, is_ahead: bool = True
-    ) -> Step:
+        self,
+        left: SignedOperand,
+        right: SignedOperand,
+        sample: int,
+        window: range,
+        end: End,
+        *,
+        is_ahead: bool = True,
+    ) -> PathNode:
         """Until or, looking back, since."""
         span = slice(sample, window.stop) if is_ahead else slice(window.start, sample + 1)
         lefts, rights = self._ends(left, span), self._ends(right, slice(window.start, window.stop))
@@ -262,15 +273,15 @@ class _Walk:
         right_key = float(end.of_minimum(*rights)[at - window.start])
         between = range(sample, at) if is_ahead else range(at + 1, sample + 1)
         left_key = end.of_minimum(*lefts)[between.start - span.start : between.stop - span.start]
-        first = [Step(left.index, between[int(np.argmin(left_key))])] if len(between) else []
+        first = [PathNode(left.index, between[int(np.argmin(left_key))])] if len(between) else []
         least = float(left_key.min()) if len(between) else np.inf
         if right_key == least:
-            return min([*first, Step(right.index, at)], key=lambda step: step.sample)
-        return first[0] if least < right_key else Step(right.index, at)
+            return min([*first, PathNode(right.index, at)], key=lambda step: step.sample)
+        return first[0] if least < right_key else PathNode(right.index, at)
 
-    def _weak_until(self, operands: Sequence[int], sample: int, window: range, end: End) -> Step:
+    def _weak_until(self, operands: Sequence[int], sample: int, window: range, end: End) -> PathNode:
         """`phi U psi` or `G phi`, whichever is the greater."""
-        left, right = map(Operand, operands)
+        left, right = map(SignedOperand, operands)
         inside = slice(window.start, window.stop)
         lefts, rights = self._ends(left, slice(sample, window.stop)), self._ends(right, inside)
         kept = [_least_between(each, is_ahead=True)[window.start - sample :] for each in lefts]
@@ -310,7 +321,7 @@ class Evidence:
             formula, {variable: TrackedName(name) for variable, name in self.instance.bindings.items()}
         )
 
-    def scene(self, time_ns: int) -> Scene:
+    def scene(self, time_ns: int) -> TraceScene:
         """The one sample of that time, with those before it that it may look back at.
 
         Raises:
@@ -321,7 +332,7 @@ class Evidence:
             at, end = window_of(trace.times_ns, time_ns, time_ns + 1)
             if at < end:
                 past = tail(trace.slice(0, at), *self._reach) if at else trace.slice(0, 0)
-                return Scene(Trace.concatenate([past, trace.slice(at, end)]), self._regions, len(past))
+                return TraceScene(Trace.concatenate([past, trace.slice(at, end)]), self._regions, len(past))
         raise LookupError(f"there is no sample at {time_ns} ns any more")
 
     def columns(self, formulas: Sequence[Formula]) -> Floats:
@@ -334,7 +345,7 @@ class Evidence:
         channels = max(map(len, parts))
         return np.concatenate([in_channels(part, channels) for part in parts], axis=2)
 
-    def _scenes(self) -> Iterator[Scene]:
+    def _scenes(self) -> Iterator[TraceScene]:
         """The samples, in stretches, each with what it may look back at."""
         past: Trace | None = None
         for trace in self._traces():
@@ -344,4 +355,4 @@ class Evidence:
                 skip = len(recent)
                 trace = Trace.concatenate([recent, trace])
             past = trace if len(trace) else past
-            yield Scene(trace, self._regions, skip)
+            yield TraceScene(trace, self._regions, skip)
