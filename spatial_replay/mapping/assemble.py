@@ -14,9 +14,9 @@ from spatial_replay.geometry.arrays import Integers
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.read_options import FaultList, OnTimeJump
 from spatial_replay.mapping.names import Codes
-from spatial_replay.mapping.reading_plan import DISORDER_NS, Plan
-from spatial_replay.mapping.topic_reader import MISFITS, Channel
-from spatial_replay.mapping.tracker import Instants, Remarks, Scene
+from spatial_replay.mapping.reading_plan import DISORDER_NS, ReadingPlan
+from spatial_replay.mapping.topic_reader import MISFITS, TopicReader
+from spatial_replay.mapping.tracker import Instants, Remarks, Tracker
 from spatial_replay.mapping.transforms import HISTORY_NS, FrameTree
 from spatial_replay.trace.sample import FOREVER, LATEST_NS
 from spatial_replay.trace.trace import Trace
@@ -45,7 +45,7 @@ class Assembler:
 
     def __init__(
         self,
-        plan: Plan,
+        plan: ReadingPlan,
         decoder: Callable[[str], Decoder],
         *,
         name: str,
@@ -67,7 +67,7 @@ class Assembler:
         self._tree = FrameTree()
         names, classes = Codes(), Codes()
         self._channels = {
-            topic.name: Channel(
+            topic.name: TopicReader(
                 topic,
                 decoder,
                 names,
@@ -79,7 +79,7 @@ class Assembler:
             for topic in plan.planned
         }
         self._codes = _Others({name: number for number, name in enumerate(self._channels)})
-        self._scene = Scene(
+        self._scene = Tracker(
             plan, self._channels, names, classes, self._tree, self._remarks, self._add_fault, concave
         )
         self._instants = Instants(plan, name, self._start_ns)
@@ -158,7 +158,7 @@ class Assembler:
         for timed in taken:
             self._put(timed.before(end), arrived)
 
-    def _timed(self, channel: Channel, places: Integers, arrived: MessageColumns) -> _Timed:
+    def _timed(self, channel: TopicReader, places: Integers, arrived: MessageColumns) -> _Timed:
         """The messages of one topic with their times on its clock; decoded, where that is needed."""
         contents: list[Any] = [arrived.payloads[place] for place in places.tolist()]
         clock = channel.planned.clock
@@ -250,7 +250,7 @@ def _columns(messages: Sequence[Message]) -> MessageColumns:
 class _Timed(NamedTuple):
     """Messages of one topic: where they stand among all that came, their times, what they hold."""
 
-    channel: Channel
+    channel: TopicReader
     places: Integers
     times_ns: Integers
     contents: list[Any]

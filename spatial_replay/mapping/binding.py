@@ -23,7 +23,7 @@ from spatial_replay.mapping.field_paths import (
     type_name,
     walk,
 )
-from spatial_replay.mapping.message_types import Reading
+from spatial_replay.mapping.message_types import MessageLayout
 from spatial_replay.mapping.model import Measure, Stamp
 from spatial_replay.mapping.stamps import TimeGetter, bind_time
 
@@ -98,7 +98,7 @@ class _Columns:
         return self.add(FieldPath.of(measure)) if isinstance(measure, str) else float(measure)
 
 
-def bind(reading: Reading, example: object, message: object, *, needs_frame: bool) -> Binding:
+def bind(reading: MessageLayout, example: object, message: object, *, needs_frame: bool) -> Binding:
     """
     Args:
         example: the first object, found in `message`.
@@ -148,7 +148,7 @@ def bind(reading: Reading, example: object, message: object, *, needs_frame: boo
     )
 
 
-def _position(reading: Reading, columns: _Columns) -> tuple[int, ...]:
+def _position(reading: MessageLayout, columns: _Columns) -> tuple[int, ...]:
     def columns_of(paths: tuple[str, ...]) -> tuple[int, ...]:
         if len(paths) == 1:
             return columns.point(FieldPath.of(paths[0]), "xyz")
@@ -166,7 +166,7 @@ def _position(reading: Reading, columns: _Columns) -> tuple[int, ...]:
     return found
 
 
-def _orientation(reading: Reading, columns: _Columns) -> tuple[int, ...]:
+def _orientation(reading: MessageLayout, columns: _Columns) -> tuple[int, ...]:
     def columns_of(path: str) -> tuple[int, ...]:
         found = columns.point(FieldPath.of(path), "xyzw")
         if len(found) != 4:
@@ -176,7 +176,7 @@ def _orientation(reading: Reading, columns: _Columns) -> tuple[int, ...]:
     return _first(reading.orientation, columns_of) or ()
 
 
-def _yaw(reading: Reading, columns: _Columns) -> int | None:
+def _yaw(reading: MessageLayout, columns: _Columns) -> int | None:
     return _first(reading.yaw, lambda path: columns.add(FieldPath.of(path)))
 
 
@@ -195,7 +195,7 @@ def _first(alternatives: Sequence[_Option], resolve: Callable[[_Option], _Found]
     return None
 
 
-def _polygon(reading: Reading, example: object, style: Style) -> Get | None:
+def _polygon(reading: MessageLayout, example: object, style: Style) -> Get | None:
     if not reading.polygon:
         return None
     path = FieldPath.of(reading.polygon[0])
@@ -205,7 +205,9 @@ def _polygon(reading: Reading, example: object, style: Style) -> Get | None:
     return getter(path, style)
 
 
-def _uncertainty(reading: Reading, columns: _Columns, style: Style) -> tuple[float | int | None, Get | None]:
+def _uncertainty(
+    reading: MessageLayout, columns: _Columns, style: Style
+) -> tuple[float | int | None, Get | None]:
     wanted = reading.uncertainty
     if wanted is None:
         return None, None
@@ -220,7 +222,9 @@ def _uncertainty(reading: Reading, columns: _Columns, style: Style) -> tuple[flo
     return None, getter(path, style)
 
 
-def _frame(reading: Reading, example: object, message: object, needs_frame: bool) -> tuple[Get, bool] | None:
+def _frame(
+    reading: MessageLayout, example: object, message: object, needs_frame: bool
+) -> tuple[Get, bool] | None:
     for text in reading.frame:
         path = FieldPath.of(text)
         root = message if path.from_message else example

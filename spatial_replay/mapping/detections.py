@@ -22,14 +22,14 @@ from spatial_replay.mapping.footprints import (
     DISC,
     POLYGON,
     SPHERE,
-    Body,
+    Solid,
     Solids,
-    bodies_of_entity,
-    bodies_of_marker,
-    bodies_of_perceived,
     reader_of,
+    solids_of_entity,
+    solids_of_marker,
+    solids_of_perceived_object,
 )
-from spatial_replay.mapping.message_types import Reading
+from spatial_replay.mapping.message_types import MessageLayout
 from spatial_replay.mapping.transforms import Transforms, matrices_from_quaternions, matrices_from_yaw, yaw_of
 from spatial_replay.trace.observations import starts_from_counts
 
@@ -55,7 +55,7 @@ class Poses:
         return Poses(position, rotation, np.where(np.isnan(self.yaw), np.nan, yaw_of(rotation)))
 
 
-def poses_of(reading: Reading, binding: Binding, numbers: Floats) -> Poses:
+def poses_of(reading: MessageLayout, binding: Binding, numbers: Floats) -> Poses:
     """The poses that the numbers (R, width) of objects hold; no orientation is the frame's own."""
     count = len(numbers)
     position = np.zeros((count, 3))
@@ -70,17 +70,17 @@ def poses_of(reading: Reading, binding: Binding, numbers: Floats) -> Poses:
     return Poses(position, np.broadcast_to(np.eye(3), (count, 3, 3)), np.full(count, np.nan))
 
 
-_BODIES = {"marker": bodies_of_marker, "scene": bodies_of_entity, "primitive": bodies_of_perceived}
+_BODIES = {"marker": solids_of_marker, "scene": solids_of_entity, "primitive": solids_of_perceived_object}
 
 
-def bodies_of(reading: Reading, binding: Binding, objects: Sequence[Any]) -> list[list[Body]]:
+def bodies_of(reading: MessageLayout, binding: Binding, objects: Sequence[Any]) -> list[list[Solid]]:
     """The bodies of each object, of a type that says what they consist of; none where nothing is one."""
     read = reader_of(binding.style)
     take = _BODIES[reading.solids]
     return [take(each, read) for each in objects]
 
 
-def solids_of_bodies(listed: list[list[Body]]) -> tuple[Solids, Poses]:
+def solids_of_bodies(listed: list[list[Solid]]) -> tuple[Solids, Poses]:
     """The solids of objects that have at least one body each, and the pose of each one's first."""
     counts = np.array([len(bodies) for bodies in listed], np.int64)
     bodies = list(chain.from_iterable(listed))
@@ -98,7 +98,7 @@ def solids_of_bodies(listed: list[list[Body]]) -> tuple[Solids, Poses]:
     return Solids(owner, kind, position, rotation, _array([b.size for b in bodies], 3), start, points), poses
 
 
-def shapes(reading: Reading, binding: Binding, poses: Poses, numbers: Floats) -> Solids:
+def shapes(reading: MessageLayout, binding: Binding, poses: Poses, numbers: Floats) -> Solids:
     """One solid each, of the shape that the mapping or the message gives; a point where nobody does."""
     count = len(poses.position)
     shape = reading.shape
@@ -186,12 +186,12 @@ def _array(rows: list[Any], width: int) -> Floats:
     return np.array(rows, np.float64).reshape(len(rows), width)
 
 
-EVERYONE = -1
+EVERY_OBJECT = -1
 """Instead of a name: everything that the topic has told of."""
 
 
 @dataclass(slots=True)
-class Seen:
+class Detections:
     """R objects that M messages of a topic tell of.
 
     Attributes:
@@ -205,7 +205,7 @@ class Seen:
         uncertainty: (R,) radius.
         covariance: (R, 3, 3) of the position with the number of deviations applied, or None.
         lifetime_ns: (R,) 0 for ever; None for all of them.
-        gone: (message, name's code or `EVERYONE`) of those that were deleted.
+        gone: (message, name's code or `EVERY_OBJECT`) of those that were deleted.
         skipped: how many objects had nothing that is a body.
     """
 
@@ -225,8 +225,8 @@ class Seen:
 
 
 @dataclass(slots=True)
-class Part:
-    """What a few messages tell of, before it is put into columns; attributes as of `Seen`."""
+class DetectionChunk:
+    """What a few messages tell of, before it is put into columns; attributes as of `Detections`."""
 
     gone: list[tuple[int, int]]
     message: list[int] = field(default_factory=list)
@@ -237,19 +237,21 @@ class Part:
     numbers: Floats = field(default_factory=lambda: np.empty((0, 0)))
     covariance: Floats | None = None
     lifetimes: list[int] = field(default_factory=list)
-    bodies: list[list[Body]] = field(default_factory=list)
+    bodies: list[list[Solid]] = field(default_factory=list)
     corner_counts: Integers = field(default_factory=lambda: np.empty(0, np.int64))
     corners: Floats = field(default_factory=lambda: np.empty((0, 3)))
     skipped: int = 0
 
-    def shifted(self, count: int) -> Part:
+    def shifted(self, count: int) -> DetectionChunk:
         """The same of messages that come so many later."""
         self.message = [number + count for number in self.message]
         self.gone = [(number + count, name) for number, name in self.gone]
         return self
 
 
-def seen_from_parts(reading: Reading, binding: Binding | None, parts: Sequence[Part]) -> Seen:
+def detections_from_chunks(
+    reading: MessageLayout, binding: Binding | None, parts: Sequence[DetectionChunk]
+) -> Detections:
     """The parts of consecutive messages as columns."""
     gone = [each for part in parts for each in part.gone]
     skipped = sum(part.skipped for part in parts)
@@ -271,7 +273,7 @@ def seen_from_parts(reading: Reading, binding: Binding | None, parts: Sequence[P
             solids = shapes(reading, binding, poses, numbers)
     has_frames, has_stamps = parts[0].frames is not None, parts[0].stamps is not None
     spreads = [part.covariance for part in parts if part.covariance is not None]
-    return Seen(
+    return Detections(
         message=_joined(part.message for part in parts),
         name=name,
         class_code=_joined(part.class_code for part in parts),
@@ -308,7 +310,7 @@ def _uncertainty(binding: Binding, numbers: Floats, count: int) -> Floats:
     return np.full(count, binding.uncertainty or 0.0)
 
 
-def covariances(reading: Reading, binding: Binding, objects: list[Any]) -> Floats | None:
+def covariances(reading: MessageLayout, binding: Binding, objects: list[Any]) -> Floats | None:
     """(R, 3, 3) the position's part, times the square of the number of deviations."""
     if binding.covariance is None or reading.uncertainty is None:
         return None
@@ -320,11 +322,11 @@ def covariances(reading: Reading, binding: Binding, objects: list[Any]) -> Float
     return found * reading.uncertainty.sigmas**2
 
 
-def _nobody(gone: list[tuple[int, int]], skipped: int) -> Seen:
+def _nobody(gone: list[tuple[int, int]], skipped: int) -> Detections:
     none = np.empty(0, np.int64)
     empty = np.empty((0, 3))
     matrices = np.empty((0, 3, 3))
-    return Seen(
+    return Detections(
         message=none,
         name=none,
         class_code=none,

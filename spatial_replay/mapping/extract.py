@@ -10,16 +10,23 @@ import numpy as np
 
 from spatial_replay.mapping.binding import Binding, bind
 from spatial_replay.mapping.detections import (
-    EVERYONE,
-    Part,
-    Seen,
+    EVERY_OBJECT,
+    DetectionChunk,
+    Detections,
     bodies_of,
     covariances,
+    detections_from_chunks,
     points_of,
     rows_of,
-    seen_from_parts,
 )
-from spatial_replay.mapping.field_paths import FieldPath, Get, Template, iter_elements, list_getter, style_of
+from spatial_replay.mapping.field_paths import (
+    FieldPath,
+    Get,
+    NameTemplate,
+    iter_elements,
+    list_getter,
+    style_of,
+)
 from spatial_replay.mapping.footprints import (
     DELETE_ALL_ENTITIES,
     MARKER_ADD,
@@ -27,7 +34,7 @@ from spatial_replay.mapping.footprints import (
     MARKER_DELETE_ALL,
     reader_of,
 )
-from spatial_replay.mapping.message_types import Reading
+from spatial_replay.mapping.message_types import MessageLayout
 from spatial_replay.mapping.names import Codes, Namer, class_codes
 from spatial_replay.mapping.stamps import TimeGetter, bind_time
 
@@ -42,7 +49,7 @@ class Extractor:
 
     def __init__(
         self,
-        reading: Reading,
+        reading: MessageLayout,
         topic: str,
         names: Codes,
         classes: Codes,
@@ -53,7 +60,7 @@ class Extractor:
     ) -> None:
         self.reading = reading
         self._names, self._classes = names, classes
-        self._namer = Namer(Template.of(reading.name), topic, names, only, without)
+        self._namer = Namer(NameTemplate.of(reading.name), topic, names, only, without)
         self._needs_frame = needs_frame
         self._path = FieldPath.of(reading.objects) if reading.objects else None
         self._list: Get | None = None
@@ -100,7 +107,7 @@ class Extractor:
                 times.append(None if first is None else self._time.nanoseconds([first])[0])
         return times
 
-    def harvest(self, messages: Sequence[object], first: int) -> Part:
+    def harvest(self, messages: Sequence[object], first: int) -> DetectionChunk:
         """What some messages tell of objects; `first` is the number of the first of them.
 
         Raises:
@@ -118,7 +125,7 @@ class Extractor:
             texts = list(self._names)
             keep = [self._namer.wants(code, texts[code]) for code in names]
             objects, index, names = _kept(keep, objects, index, names)
-        part = Part(gone=[(number + first, name) for number, name in gone])
+        part = DetectionChunk(gone=[(number + first, name) for number, name in gone])
         if not objects:
             return part
         if self._binding is None:
@@ -131,7 +138,7 @@ class Extractor:
 
     def _fill(
         self,
-        part: Part,
+        part: DetectionChunk,
         binding: Binding,
         messages: Sequence[object],
         objects: list[Any],
@@ -158,9 +165,9 @@ class Extractor:
             part.lifetimes = binding.lifetime.nanoseconds(objects)
         part.message, part.name = index, names
 
-    def seen(self, parts: Sequence[Part]) -> Seen:
+    def seen(self, parts: Sequence[DetectionChunk]) -> Detections:
         """The parts of consecutive messages as columns."""
-        return seen_from_parts(self.reading, self._binding, parts)
+        return detections_from_chunks(self.reading, self._binding, parts)
 
     def _objects(self, messages: Sequence[object]) -> tuple[list[Any], list[int], list[int]]:
         """All objects, the message of each, and its place in that."""
@@ -185,7 +192,7 @@ class Extractor:
             read = reader_of(style_of(message))
             for deletion in read(message, "deletions") or ():
                 if read(deletion, "type") == DELETE_ALL_ENTITIES:
-                    gone.append((number, EVERYONE))
+                    gone.append((number, EVERY_OBJECT))
                 else:
                     (code,) = self._namer.codes([deletion], [0], style_of(deletion))
                     gone.append((number, code))
@@ -203,7 +210,7 @@ class Extractor:
         if any(actions):
             for action, number, name in zip(actions, index, names, strict=True):
                 if action == MARKER_DELETE_ALL:
-                    gone.append((number, EVERYONE))
+                    gone.append((number, EVERY_OBJECT))
                 elif action == MARKER_DELETE:
                     gone.append((number, name))
             keep = [action == MARKER_ADD or not action for action in actions]

@@ -298,7 +298,7 @@ _DROPPED_ENDS = frozenset(
 
 
 @dataclass(frozen=True, slots=True)
-class Template:
+class NameTemplate:
     """Literal text and fields in turn.
 
     Attributes:
@@ -310,7 +310,7 @@ class Template:
     parts: tuple[str | tuple[FieldPath, ...], ...]
 
     @classmethod
-    def of(cls, text: str) -> Template:
+    def of(cls, text: str) -> NameTemplate:
         """
         Raises:
             UsageError: the text is no template.

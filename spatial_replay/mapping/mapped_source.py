@@ -24,7 +24,7 @@ from spatial_replay.logs.read_options import FaultList, OnTimeJump
 from spatial_replay.logs.topics import DERIVED, OBJECTS
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.model import LogMapping
-from spatial_replay.mapping.reading_plan import Plan
+from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
 
@@ -96,7 +96,7 @@ _MOST_UNREAD = 20
 
 
 @dataclass(frozen=True)
-class ForeignSource:
+class MappedSource:
     """A log of messages that others recorded, with a mapping that says what in them are objects."""
 
     path: Path
@@ -151,7 +151,7 @@ class ForeignSource:
             reason = blocks.first_fault or "its messages make none with this mapping"
             raise LogError(f"{self.name} holds no sample: {reason}")
 
-    def _plan(self, reader: MessageReader, topics: Sequence[Topic]) -> Plan:
+    def _plan(self, reader: MessageReader, topics: Sequence[Topic]) -> ReadingPlan:
         """What has to be read, and how.
 
         Raises:
@@ -163,7 +163,7 @@ class ForeignSource:
         if reasons:
             raise LogError("\n".join(f"{self.name}: {reason}" for reason in reasons))
         try:
-            return Plan.of(self.mapping, topics)
+            return ReadingPlan.of(self.mapping, topics)
         except UsageError as error:
             faults = reader.take_faults()
             if faults:
@@ -222,7 +222,7 @@ class _Blocks:
             yield Block(replace(trace, faults=faults), copied, remarks)
 
 
-def _unread(name: str, topics: Sequence[Topic], plan: Plan) -> list[str]:
+def _unread(name: str, topics: Sequence[Topic], plan: ReadingPlan) -> list[str]:
     """Remarks on topics that are not mapped and could not be, with how many messages they have."""
     unread = [each for each in topics if each.unreadable and each.count != 0 and each.name not in plan.topics]
     remarks = []
@@ -236,7 +236,7 @@ def _unread(name: str, topics: Sequence[Topic], plan: Plan) -> list[str]:
 
 
 def _columns(
-    reader: ColumnReader, plan: Plan, start_ns: int | None, end_ns: int | None, *, as_recorded: bool
+    reader: ColumnReader, plan: ReadingPlan, start_ns: int | None, end_ns: int | None, *, as_recorded: bool
 ) -> Columns:
     """The messages that samples of a window depend on."""
     if not plan.by_log_time or (not start_ns and end_ns is None):

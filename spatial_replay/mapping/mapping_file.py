@@ -21,16 +21,16 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from spatial_replay.errors import MissingFileError, UsageError
-from spatial_replay.mapping.field_paths import FieldPath, Template
+from spatial_replay.mapping.field_paths import FieldPath, NameTemplate
 from spatial_replay.mapping.model import (
+    ClassMapping,
     LogMapping,
     Measure,
     Sampling,
-    Shape,
-    Signal,
+    ShapeMapping,
+    SignalMapping,
     Stamp,
     TopicMapping,
-    Translation,
     Uncertainty,
     age_ns,
     duration_ns,
@@ -58,7 +58,7 @@ def topic_mapping_from_values(topic: str, entry: Table[str, Any], shapes: Table[
     if "objects" in entry:
         FieldPath.of(entry["objects"])
     if "name" in entry:
-        Template.of(entry["name"])
+        NameTemplate.of(entry["name"])
     frame = entry.get("frame")
     yaw = entry.get("yaw")
     position = entry.get("position")
@@ -89,15 +89,15 @@ def topic_mapping_from_values(topic: str, entry: Table[str, Any], shapes: Table[
     )
 
 
-def _class(value: Any) -> str | Translation | None:
+def _class(value: Any) -> str | ClassMapping | None:
     if not isinstance(value, dict):
         return None if value is None else str(value)
-    return Translation(
+    return ClassMapping(
         value["field"], MappingProxyType(dict(value.get("names", {}))), value.get("else"), "else" in value
     )
 
 
-def _shape(value: Any, shapes: Table[str, Any]) -> Shape | None:
+def _shape(value: Any, shapes: Table[str, Any]) -> ShapeMapping | None:
     if value is None:
         return None
     if isinstance(value, str):
@@ -105,11 +105,11 @@ def _shape(value: Any, shapes: Table[str, Any]) -> Shape | None:
     x, y = value.get("offset", (0.0, 0.0))
     offset = (float(x), float(y))
     if "box" in value:
-        return Shape("box", tuple(_measure(size) for size in value["box"]), offset=offset)
+        return ShapeMapping("box", tuple(_measure(size) for size in value["box"]), offset=offset)
     if "disc" in value:
-        return Shape("disc", (_measure(value["disc"]),), offset=offset)
+        return ShapeMapping("disc", (_measure(value["disc"]),), offset=offset)
     corners = tuple((float(x), float(y)) for x, y in value["polygon"])
-    return Shape("polygon", points=corners, offset=offset)
+    return ShapeMapping("polygon", points=corners, offset=offset)
 
 
 def _height(value: Any) -> tuple[Measure, Measure] | None:
@@ -138,11 +138,11 @@ def _stamp(value: Any) -> Stamp | None:
     )
 
 
-def _signal(name: str, value: Any) -> Signal:
+def _signal(name: str, value: Any) -> SignalMapping:
     return (
-        Signal(name, value["field"], value.get("unit", ""))
+        SignalMapping(name, value["field"], value.get("unit", ""))
         if isinstance(value, dict)
-        else Signal(name, value)
+        else SignalMapping(name, value)
     )
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Literal, TypeAlias
 
-from spatial_replay.mapping.model import Measure, Shape, Stamp, TopicMapping, Translation, Uncertainty
+from spatial_replay.mapping.model import ClassMapping, Measure, ShapeMapping, Stamp, TopicMapping, Uncertainty
 
 Alternatives: TypeAlias = tuple[str, ...]
 """Field paths of which the first that leads somewhere is taken."""
@@ -17,7 +17,7 @@ _NO_CLASSES: Table[str, str | None] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class MessageLayout:
     """Where in the messages of a topic objects stand, as far as it is known before the first one is seen.
 
     Attributes:
@@ -52,7 +52,7 @@ class Reading:
     frame_name: str | None = None
     stamp: tuple[Stamp, ...] = (Stamp("$.header.stamp"),)
     solids: Literal["", "marker", "scene", "primitive"] = ""
-    shape: Shape | None = None
+    shape: ShapeMapping | None = None
     height: tuple[Measure, Measure] | None = None
     uncertainty: Uncertainty | None = None
     is_generic: bool = False
@@ -84,22 +84,22 @@ _IN_OBJECT = {"frame": ("header.frame_id",), "stamp": (Stamp("header.stamp"),)}
 _TIMESTAMPED = {"frame": ("frame_id",), "stamp": (Stamp("timestamp"),)}
 _RESULT_CLASS = ("results[0].hypothesis.class_id", "results[0].id", "results[0].hypothesis.id")
 
-_POSE = Reading(position=(("pose.position",),), orientation=("pose.orientation",))
-_TRANSFORM = Reading(
+_POSE = MessageLayout(position=(("pose.position",),), orientation=("pose.orientation",))
+_TRANSFORM = MessageLayout(
     name="{child_frame_id}",
     position=(("transform.translation",),),
     orientation=("transform.rotation",),
     frame=("header.frame_id",),
     stamp=(Stamp("header.stamp"),),
 )
-_FRAME_TRANSFORM = Reading(
+_FRAME_TRANSFORM = MessageLayout(
     name="{child_frame_id}",
     position=(("translation",),),
     orientation=("rotation",),
     frame=("parent_frame_id",),
     stamp=(Stamp("timestamp"),),
 )
-_MARKER = Reading(
+_MARKER = MessageLayout(
     name="{ns|topic}_{id}",
     stays=True,
     solids="marker",
@@ -107,33 +107,33 @@ _MARKER = Reading(
     stamp=(Stamp("header.stamp"),),
 )
 
-BUILT_IN: Table[str, Reading] = MappingProxyType(
+BUILT_IN: Table[str, MessageLayout] = MappingProxyType(
     {
         "geometry_msgs/PoseStamped": _POSE,
-        "geometry_msgs/PoseWithCovarianceStamped": Reading(
+        "geometry_msgs/PoseWithCovarianceStamped": MessageLayout(
             position=(("pose.pose.position",),),
             orientation=("pose.pose.orientation",),
             covariance="pose.covariance",
         ),
-        "nav_msgs/Odometry": Reading(
+        "nav_msgs/Odometry": MessageLayout(
             position=(("pose.pose.position",),),
             orientation=("pose.pose.orientation",),
             covariance="pose.covariance",
         ),
-        "geometry_msgs/PoseArray": Reading(
+        "geometry_msgs/PoseArray": MessageLayout(
             objects="poses[*]",
             complete=True,
             name="{topic}_{index}",
             position=(("position",),),
             orientation=("orientation",),
         ),
-        "geometry_msgs/PolygonStamped": Reading(polygon=("polygon.points",)),
+        "geometry_msgs/PolygonStamped": MessageLayout(polygon=("polygon.points",)),
         "geometry_msgs/TransformStamped": _TRANSFORM,
         "tf2_msgs/TFMessage": replace(_TRANSFORM, objects="transforms[*]"),
         "tf/tfMessage": replace(_TRANSFORM, objects="transforms[*]"),
         "visualization_msgs/Marker": _MARKER,
         "visualization_msgs/MarkerArray": replace(_MARKER, objects="markers[*]"),
-        "vision_msgs/Detection2DArray": Reading(
+        "vision_msgs/Detection2DArray": MessageLayout(
             objects="detections[*]",
             complete=True,
             name="{topic}_{id|tracking_id|index}",
@@ -145,7 +145,7 @@ BUILT_IN: Table[str, Reading] = MappingProxyType(
             sizes=(("bbox.size_x", "bbox.size_y"),),
             class_field=_RESULT_CLASS,
         ),
-        "vision_msgs/Detection3DArray": Reading(
+        "vision_msgs/Detection3DArray": MessageLayout(
             objects="detections[*]",
             complete=True,
             name="{topic}_{id|tracking_id|index}",
@@ -154,14 +154,14 @@ BUILT_IN: Table[str, Reading] = MappingProxyType(
             sizes=(("bbox.size.x", "bbox.size.y", "bbox.size.z"),),
             class_field=_RESULT_CLASS,
         ),
-        "apriltag_msgs/AprilTagDetectionArray": Reading(
+        "apriltag_msgs/AprilTagDetectionArray": MessageLayout(
             objects="detections[*]",
             complete=True,
             name="tag{id}",
             polygon=("corners",),
             class_field=("family",),
         ),
-        "derived_object_msgs/ObjectArray": Reading(
+        "derived_object_msgs/ObjectArray": MessageLayout(
             objects="objects[*]",
             complete=True,
             name="object_{id}",
@@ -171,14 +171,14 @@ BUILT_IN: Table[str, Reading] = MappingProxyType(
             class_field=("classification",),
             class_table=_OBJECT_CLASSES,
         ),
-        "foxglove/SceneUpdate": Reading(
+        "foxglove/SceneUpdate": MessageLayout(
             objects="entities[*]",
             stays=True,
             name="{id|index}",
             solids="scene",
             **_TIMESTAMPED,  # type: ignore[arg-type]
         ),
-        "foxglove/PosesInFrame": Reading(
+        "foxglove/PosesInFrame": MessageLayout(
             objects="poses[*]",
             complete=True,
             name="{topic}_{index}",
@@ -203,7 +203,7 @@ TRANSFORM_TYPES = frozenset(
     }
 )
 
-GENERIC = Reading(
+GENERIC = MessageLayout(
     position=(
         ("pose.pose.position",),
         ("pose.position",),
@@ -234,7 +234,7 @@ def short_type(name: str) -> str:
     return re.sub(r"^(ros_)?foxglove_msgs/", "foxglove/", short)
 
 
-def reading_of(topic_type: str, mapping: TopicMapping) -> Reading:
+def layout_of_topic(topic_type: str, mapping: TopicMapping) -> MessageLayout:
     """How a topic is read: as its type is, but for what its mapping says."""
     kept = BUILT_IN.get(short_type(mapping.type or topic_type), GENERIC)
     is_list = mapping.objects is not None
@@ -287,7 +287,7 @@ def _shape_changes(mapping: TopicMapping) -> dict[str, object]:
     return changes
 
 
-def _class_changes(class_name: str | Translation | None) -> dict[str, object]:
+def _class_changes(class_name: str | ClassMapping | None) -> dict[str, object]:
     if class_name is None:
         return {}
     if isinstance(class_name, str):

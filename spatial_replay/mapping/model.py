@@ -27,7 +27,7 @@ Measure: TypeAlias = float | str
 
 
 @dataclass(frozen=True, slots=True)
-class Shape:
+class ShapeMapping:
     """A footprint in an object's own frame.
 
     Attributes:
@@ -43,7 +43,7 @@ class Shape:
 
 
 @dataclass(frozen=True, slots=True)
-class Translation:
+class ClassMapping:
     """What a field's values mean: `table[str(value)]`, or `other` for values that are not in it."""
 
     field: str
@@ -66,7 +66,7 @@ class Uncertainty:
 
 
 @dataclass(frozen=True, slots=True)
-class Signal:
+class SignalMapping:
     """A numeric signal: the field that holds it, and its unit as text."""
 
     name: str
@@ -104,19 +104,19 @@ class TopicMapping:
     objects: str | None = None
     complete: bool | None = None
     name: str | None = None
-    class_name: str | Translation | None = None
+    class_name: str | ClassMapping | None = None
     position: str | tuple[str, ...] | None = None
     orientation: str | None = None
     yaw: str | None = None
     yaw_scale: float = 1.0
     polygon: str | None = None
-    shape: Shape | None = None
+    shape: ShapeMapping | None = None
     height: tuple[Measure, Measure] | None = None
     uncertainty: Uncertainty | None = None
     frame: str | None = None
     frame_field: str | None = None
     stamp: Stamp | None = None
-    signals: tuple[Signal, ...] = ()
+    signals: tuple[SignalMapping, ...] = ()
     only: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     max_age_ns: int | None = None

@@ -13,15 +13,15 @@ from spatial_replay.mapping.field_paths import (
     ContentError,
     FieldError,
     FieldPath,
+    NameTemplate,
     Style,
-    Template,
     field_names,
     getter,
     name_from_topic,
     type_name,
     walk,
 )
-from spatial_replay.mapping.message_types import Reading
+from spatial_replay.mapping.message_types import MessageLayout
 
 Get = Callable[[Any], Any]
 
@@ -38,7 +38,7 @@ class Namer:
     """Objects' names from a template, as codes that several namers share."""
 
     def __init__(
-        self, template: Template, topic: str, codes: Codes, only: Sequence[str], without: Sequence[str]
+        self, template: NameTemplate, topic: str, codes: Codes, only: Sequence[str], without: Sequence[str]
     ) -> None:
         self._template = template
         self._topic = name_from_topic(topic)
@@ -135,7 +135,9 @@ class Namer:
         )
 
 
-def class_codes(reading: Reading, binding: Binding, objects: Sequence[object], codes: Codes) -> list[int]:
+def class_codes(
+    reading: MessageLayout, binding: Binding, objects: Sequence[object], codes: Codes
+) -> list[int]:
     """The code of each object's class."""
     if not binding.class_gets:
         return [codes[reading.class_name]] * len(objects)
@@ -161,7 +163,7 @@ def _first_value(gets: Sequence[Get], thing: object) -> Any:
     return None
 
 
-def _class_name(reading: Reading, value: object) -> str | None:
+def _class_name(reading: MessageLayout, value: object) -> str | None:
     if value is None or value == "":
         return None
     # halves of surrogate pairs, which JSON can spell, cannot be written

@@ -7,7 +7,13 @@ from dataclasses import dataclass
 
 from spatial_replay.bags.reader import Topic
 from spatial_replay.errors import UsageError
-from spatial_replay.mapping.message_types import BUILT_IN, TRANSFORM_TYPES, Reading, reading_of, short_type
+from spatial_replay.mapping.message_types import (
+    BUILT_IN,
+    TRANSFORM_TYPES,
+    MessageLayout,
+    layout_of_topic,
+    short_type,
+)
 from spatial_replay.mapping.model import DEFAULT_MAX_AGE_NS, FOREVER_NS, Clock, LogMapping, TopicMapping
 from spatial_replay.mapping.transforms import HISTORY_NS
 from spatial_replay.text import nearest_hint
@@ -32,7 +38,7 @@ class PlannedTopic:
     name: str
     clock: Clock
     mapping: TopicMapping | None
-    reading: Reading | None
+    reading: MessageLayout | None
     max_age_ns: int
     is_transforms: bool
     is_static: bool
@@ -41,7 +47,7 @@ class PlannedTopic:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ReadingPlan:
     """A mapping that fits a log.
 
     Attributes:
@@ -63,7 +69,7 @@ class Plan:
     lost: tuple[tuple[str, str], ...] = ()
 
     @classmethod
-    def of(cls, mapping: LogMapping, topics: Sequence[Topic]) -> Plan:
+    def of(cls, mapping: LogMapping, topics: Sequence[Topic]) -> ReadingPlan:
         """
         Raises:
             UsageError: the mapping does not fit the topics; all faults are listed.
@@ -144,7 +150,7 @@ def _planned(
 ) -> PlannedTopic:
     is_transforms = needs_frames and short_type(topic.type) in TRANSFORM_TYPES
     is_static = is_transforms and (topic.latched or topic.name.rsplit("/", 1)[-1] == "tf_static")
-    reading = reading_of(topic.type, entry) if entry is not None and entry.reads_objects else None
+    reading = layout_of_topic(topic.type, entry) if entry is not None and entry.reads_objects else None
     stays = topic.latched or (reading is not None and reading.stays)
     default = FOREVER_NS if stays else mapping.max_age_ns or DEFAULT_MAX_AGE_NS
     max_age_ns = (entry.max_age_ns if entry is not None else None) or default

@@ -220,7 +220,7 @@ _MIDDLEWARE = frozenset({"rosout", "rosout_agg", "parameter_events", "clock", "d
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class TopicSuggestion:
     """A topic that may be mapped.
 
     Attributes:
@@ -239,7 +239,9 @@ class Candidate:
     numbers: tuple[str, ...] = ()
 
 
-def candidates(topics: Sequence[Topic], examples: Mapping[str, Sequence[object]]) -> tuple[Candidate, ...]:
+def suggest_topics(
+    topics: Sequence[Topic], examples: Mapping[str, Sequence[object]]
+) -> tuple[TopicSuggestion, ...]:
     """What each topic could be read as.
 
     Args:
@@ -261,7 +263,7 @@ def suggest_mapping(
         examples: some decoded messages of each topic, by its name.
         first_ns: log time of the first message of each topic, by its name.
     """
-    found = candidates(topics, examples)
+    found = suggest_topics(topics, examples)
     mapped = [each for each in found if each.entry and not each.is_transforms]
     transforms = [each for each in found if each.is_transforms]
     active = mapped or [each for each in transforms if each.entry]
@@ -279,25 +281,25 @@ def suggest_mapping(
     return "\n".join(lines) + "\n"
 
 
-def _candidate(topic: Topic, examples: Sequence[object]) -> Candidate:
+def _candidate(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
     if topic.name in DERIVED or topic.name.rstrip("/").split("/")[-1] in _MIDDLEWARE:
-        return Candidate(topic)
+        return TopicSuggestion(topic)
     kind = short_type(topic.type)
     frame = next((name for each in examples if (name := frame_of(each)) is not None), None)
     if topic.unreadable is not None:
-        return Candidate(topic, remarks=(f"cannot be read: {_comment(topic.unreadable)}",))
+        return TopicSuggestion(topic, remarks=(f"cannot be read: {_comment(topic.unreadable)}",))
     if kind in TRANSFORM_TYPES:
-        return Candidate(topic, f"{{shape: {{disc: {_RADIUS}}}}}", _SIZELESS, is_transforms=True)
+        return TopicSuggestion(topic, f"{{shape: {{disc: {_RADIUS}}}}}", _SIZELESS, is_transforms=True)
     if kind in BUILT_IN:
         reading = BUILT_IN[kind]
         has_outline = bool(reading.polygon or reading.sizes or reading.solids)
         entry = "{}" if has_outline else f"{{shape: {{disc: {_RADIUS}}}}}"
-        return Candidate(topic, entry, () if has_outline else _SIZELESS, frame=frame)
+        return TopicSuggestion(topic, entry, () if has_outline else _SIZELESS, frame=frame)
     guesses = [guess for each in examples if (guess := guess_from(each)) is not None]
     if not guesses:
-        return Candidate(topic, numbers=numbers_in(examples[0]) if examples else ())
+        return TopicSuggestion(topic, numbers=numbers_in(examples[0]) if examples else ())
     best = max(guesses, key=lambda guess: guess.score)
-    return Candidate(topic, _entry(topic, best), _remarks(best), frame=frame)
+    return TopicSuggestion(topic, _entry(topic, best), _remarks(best), frame=frame)
 
 
 _SIZELESS = (f"messages have no size: {_RADIUS} is a guess, {{box: [length, width]}} is another shape",)
@@ -345,7 +347,9 @@ def _remarks(guess: Guess) -> tuple[str, ...]:
 
 
 def _frame_lines(
-    active: Sequence[Candidate], transforms: Sequence[Candidate], examples: Mapping[str, Sequence[object]]
+    active: Sequence[TopicSuggestion],
+    transforms: Sequence[TopicSuggestion],
+    examples: Mapping[str, Sequence[object]],
 ) -> Iterator[str]:
     """The fixed frame: needed as soon as coordinates are in more than one."""
     frames = sorted({each.frame for each in active if each.frame is not None})
@@ -389,7 +393,7 @@ class _Attributes:
         return getattr(self._message, name, None)
 
 
-def _time_lines(active: Sequence[Candidate], first_ns: Mapping[str, int]) -> Iterator[str]:
+def _time_lines(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) -> Iterator[str]:
     yield "clock: log    # when a message was recorded; publish: when it was sent; header: its own stamp"
     if active:
         topic = _text(_sampled(active, first_ns).name)
@@ -397,7 +401,7 @@ def _time_lines(active: Sequence[Candidate], first_ns: Mapping[str, int]) -> Ite
         yield "max_age: 1s    # after which an object that nothing is heard of is unknown"
 
 
-def _sampled(active: Sequence[Candidate], first_ns: Mapping[str, int]) -> Topic:
+def _sampled(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) -> Topic:
     """Where to take samples: at the last of the topics that begin together, so that none is missing."""
     topics = [each.topic for each in active]
     begins = [first_ns.get(topic.name, FOREVER) for topic in topics]
@@ -410,7 +414,7 @@ def _sampled(active: Sequence[Candidate], first_ns: Mapping[str, int]) -> Topic:
     return max(together, key=itemgetter(0))[1] if together else topics[0]
 
 
-def _unused(each: Candidate) -> Iterator[str]:
+def _unused(each: TopicSuggestion) -> Iterator[str]:
     topic = _text(each.topic.name)
     if each.entry:
         yield f"  # {topic}: {each.entry}    # {_described(each.topic)}"

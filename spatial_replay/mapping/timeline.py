@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Concave
-from spatial_replay.mapping.detections import Seen
+from spatial_replay.mapping.detections import Detections
 from spatial_replay.mapping.footprints import Solids, footprints_from_solids
 from spatial_replay.mapping.model import FOREVER_NS
 from spatial_replay.mapping.transforms import Transforms
@@ -90,7 +90,7 @@ class Events:
         return self.name[starts], rows, classes
 
 
-def events_of(
+def events_from_messages(
     *,
     name: Integers,
     message: Integers,
@@ -155,7 +155,7 @@ Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class Rows:
+class ObservationRows:
     """R observations as a trace holds them.
 
     Attributes:
@@ -172,7 +172,7 @@ class Rows:
         return len(self.yaw)
 
     @classmethod
-    def blank(cls, class_code: Integers) -> Rows:
+    def blank(cls, class_code: Integers) -> ObservationRows:
         """Objects of which nothing is known but their class."""
         count = len(class_code)
         nowhere = FootprintBatch(
@@ -185,8 +185,8 @@ class Rows:
         )
         return cls(nowhere, np.full(count, np.nan), np.zeros(count), class_code, np.zeros(count, np.bool_))
 
-    def select(self, rows: Integers) -> Rows:
-        return Rows(
+    def select(self, rows: Integers) -> ObservationRows:
+        return ObservationRows(
             self.shapes.select(rows),
             self.yaw[rows],
             self.uncertainty[rows],
@@ -195,7 +195,7 @@ class Rows:
         )
 
     @classmethod
-    def concatenate(cls, several: Sequence[Rows]) -> Rows:
+    def concatenate(cls, several: Sequence[ObservationRows]) -> ObservationRows:
         return cls(
             FootprintBatch.concatenate([rows.shapes for rows in several]),
             np.concatenate([np.empty(0), *(rows.yaw for rows in several)]),
@@ -205,9 +205,9 @@ class Rows:
         )
 
 
-def rows_from_seen(
-    seen: Seen, transforms: Transforms | None, concave: Concave, fault: Callable[[int, str], None]
-) -> Rows:
+def rows_from_detections(
+    seen: Detections, transforms: Transforms | None, concave: Concave, fault: Callable[[int, str], None]
+) -> ObservationRows:
     """The observations in the fixed frame; blank where the transform is not known or there is no footprint.
 
     Args:
@@ -248,14 +248,14 @@ def _radius(covariance: Floats) -> Floats:
 
 
 def _checked(
-    seen: Seen,
+    seen: Detections,
     shapes: FootprintBatch,
     yaw: Floats,
     uncertainty: Floats,
     unknown: Flags,
     concave: Concave,
     fault: Callable[[int, str], None],
-) -> Rows:
+) -> ObservationRows:
     """Each observation as a sample of its own, so that one that makes no footprint costs no other."""
     count = len(seen.name)
     each = np.arange(count, dtype=np.int64)
@@ -283,7 +283,7 @@ def _checked(
     row = np.where(kept > ABSENT, kept, -2 - kept)
     is_kept = np.zeros(count, np.bool_)
     is_kept[trace.times_ns] = ~unknown[trace.times_ns]
-    placed = Rows(
+    placed = ObservationRows(
         trace.footprints, trace.yaw, trace.uncertainty, trace.class_code, np.ones(len(trace), np.bool_)
     )
     if is_kept.all() and (row == each).all():
@@ -291,5 +291,5 @@ def _checked(
     # blank rows come after the others
     number = np.arange(count, dtype=np.int64) + len(placed)
     number[trace.times_ns] = np.where(unknown[trace.times_ns], number[trace.times_ns], row)
-    both = Rows.concatenate([placed, Rows.blank(seen.class_code)])
+    both = ObservationRows.concatenate([placed, ObservationRows.blank(seen.class_code)])
     return replace(both.select(number), is_readable=is_good & is_kept)

@@ -14,7 +14,7 @@ import numpy as np
 from spatial_replay.bags.reader import Decoder
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.mapping.detections import Part, Seen
+from spatial_replay.mapping.detections import DetectionChunk, Detections
 from spatial_replay.mapping.extract import Extractor
 from spatial_replay.mapping.field_paths import (
     ContentError,
@@ -101,12 +101,12 @@ class Harvest:
         kept: which messages could be read; `seen` and `signals` count these only.
     """
 
-    seen: Seen | None
+    seen: Detections | None
     signals: list[Floats]
     kept: list[int]
 
 
-class Channel:
+class TopicReader:
     """One topic: decodes its messages, knows their times, reads objects and signals out of them.
 
     Args:
@@ -201,7 +201,7 @@ class Channel:
         Raises:
             UsageError: the mapping fits none of many messages.
         """
-        parts: list[Part] = []
+        parts: list[DetectionChunk] = []
         values: list[list[float]] = []
         kept: list[int] = []
         times = log_times_ns.tolist()
@@ -231,7 +231,12 @@ class Channel:
         )
 
     def _read_objects(
-        self, extractor: Extractor, chunk: list[Any], log_times_ns: list[int], first: int, parts: list[Part]
+        self,
+        extractor: Extractor,
+        chunk: list[Any],
+        log_times_ns: list[int],
+        first: int,
+        parts: list[DetectionChunk],
     ) -> list[int] | None:
         """Add what a few messages tell of to `parts`; which of them could be read, or None for all."""
         try:
@@ -240,7 +245,7 @@ class Channel:
         except MISFITS:
             pass
 
-        def read(content: object) -> Part:
+        def read(content: object) -> DetectionChunk:
             was_bound = extractor.is_bound
             try:
                 return extractor.harvest([content], 0)

@@ -15,12 +15,18 @@ from numpy.typing import NDArray
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.footprint import Concave
-from spatial_replay.mapping.detections import EVERYONE, Seen
+from spatial_replay.mapping.detections import EVERY_OBJECT, Detections
 from spatial_replay.mapping.model import LogMapping
 from spatial_replay.mapping.names import Codes
-from spatial_replay.mapping.reading_plan import Plan
-from spatial_replay.mapping.timeline import STALE, Events, Rows, events_of, rows_from_seen
-from spatial_replay.mapping.topic_reader import Channel
+from spatial_replay.mapping.reading_plan import ReadingPlan
+from spatial_replay.mapping.timeline import (
+    STALE,
+    Events,
+    ObservationRows,
+    events_from_messages,
+    rows_from_detections,
+)
+from spatial_replay.mapping.topic_reader import TopicReader
 from spatial_replay.mapping.transforms import FrameTree, Transforms
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import ABSENT, Trace
@@ -40,7 +46,7 @@ class Instants:
         start_ns: where the samples begin that matter; those at multiples of a step are counted from there.
     """
 
-    def __init__(self, plan: Plan, name: str, start_ns: int) -> None:
+    def __init__(self, plan: ReadingPlan, name: str, start_ns: int) -> None:
         self._name = name
         self._mapping_name = plan.mapping.name
         self._step_ns = plan.mapping.sampling.step_ns
@@ -184,13 +190,13 @@ class Remarks:
 TakeFault = Callable[[str, int, str], None]
 
 
-class Scene:
+class Tracker:
     """The state of every object and signal, carried from one stretch of a log to the next."""
 
     def __init__(
         self,
-        plan: Plan,
-        channels: Mapping[str, Channel],
+        plan: ReadingPlan,
+        channels: Mapping[str, TopicReader],
         names: Codes,
         classes: Codes,
         tree: FrameTree,
@@ -205,7 +211,7 @@ class Scene:
         self._remarks = remarks
         self._fault = fault
         self._concave = concave
-        self._rows = Rows.blank(np.empty(0, np.int64))
+        self._rows = ObservationRows.blank(np.empty(0, np.int64))
         self._events = {name: Events.none() for name in channels}
         self._signals: dict[tuple[str, int], tuple[Integers, Floats]] = {}
         self._owners: dict[int, str] = {}
@@ -229,7 +235,7 @@ class Scene:
                 self._take_objects(channel, times_ns, log_times_ns, harvest.seen, stored)
             for place, values in enumerate(harvest.signals if harvest is not None else ()):
                 self._take_signal((name, place), times_ns, values)
-        self._rows = Rows.concatenate(stored) if len(stored) > 1 else self._rows
+        self._rows = ObservationRows.concatenate(stored) if len(stored) > 1 else self._rows
         times = instants.upto(np.concatenate([np.empty(0, np.int64), *sampled]), upto_ns)
         times = times[(times >= start_ns) & (times < end_ns)]
         trace = self._trace(times)
@@ -238,11 +244,11 @@ class Scene:
 
     def _take_objects(
         self,
-        channel: Channel,
+        channel: TopicReader,
         times_ns: Integers,
         log_times_ns: Integers,
-        seen: Seen,
-        stored: list[Rows],
+        seen: Detections,
+        stored: list[ObservationRows],
     ) -> None:
         if not len(times_ns):
             return
@@ -255,7 +261,7 @@ class Scene:
             named = f"object {name_of[int(seen.name[index])]!r}{what}"
             self._fault(channel.name, int(log_times_ns[seen.message[index]]), named)
 
-        rows = rows_from_seen(seen, self._transforms(channel, seen, times_ns), self._concave, fault)
+        rows = rows_from_detections(seen, self._transforms(channel, seen, times_ns), self._concave, fault)
         first = sum(map(len, stored))
         number = np.arange(first, first + len(rows), dtype=np.int64)
         stored.append(rows)
@@ -264,7 +270,7 @@ class Scene:
         is_complete = reading is not None and reading.complete
         if is_complete:
             number = self._without_twice_named(seen, number, stored, fault)
-        self._events[channel.name] = events_of(
+        self._events[channel.name] = events_from_messages(
             name=seen.name,
             message=seen.message,
             class_code=seen.class_code,
@@ -286,7 +292,7 @@ class Scene:
                     " give one of them another `name`"
                 )
 
-    def _transforms(self, channel: Channel, seen: Seen, times_ns: Integers) -> Transforms | None:
+    def _transforms(self, channel: TopicReader, seen: Detections, times_ns: Integers) -> Transforms | None:
         """fixed_from_frame of each object; None where everything is in the fixed frame."""
         fixed = self._plan.mapping.fixed_frame
         if seen.frames is None or fixed is None:
@@ -319,13 +325,17 @@ class Scene:
                     )
         return found
 
-    def _matters(self, channel: Channel, times_ns: Integers) -> NDArray[np.bool_]:
+    def _matters(self, channel: TopicReader, times_ns: Integers) -> NDArray[np.bool_]:
         """Whether what a topic says at some times may count in the window."""
         start_ns, end_ns = self._window_ns
         return (times_ns < end_ns) & (times_ns >= start_ns - channel.planned.max_age_ns)
 
     def _without_twice_named(
-        self, seen: Seen, number: Integers, stored: list[Rows], fault: Callable[[int, str], None]
+        self,
+        seen: Detections,
+        number: Integers,
+        stored: list[ObservationRows],
+        fault: Callable[[int, str], None],
     ) -> Integers:
         """The rows, where an object that one message names twice is unknown."""
         order = np.lexsort((seen.name, seen.message))
@@ -335,7 +345,7 @@ class Scene:
             return number
         for index in again.tolist():
             fault(index, " is there twice in one message; name each object once")
-        blank = Rows.blank(seen.class_code[again])
+        blank = ObservationRows.blank(seen.class_code[again])
         number = number.copy()
         number[again] = sum(map(len, stored)) + np.arange(len(again))
         stored.append(blank)
@@ -370,7 +380,9 @@ class Scene:
         everything, is_stale = kept, rows == STALE
         if is_stale.any():
             numbered = np.where(is_stale, -2 - stale_rows, numbered)
-            everything = Rows.concatenate([kept, Rows.blank(np.arange(len(self._classes), dtype=np.int64))])
+            everything = ObservationRows.concatenate(
+                [kept, ObservationRows.blank(np.arange(len(self._classes), dtype=np.int64))]
+            )
         by_code = sorted(self._classes, key=self._classes.__getitem__)
         ordered = sorted(range(len(by_code)), key=lambda i: (by_code[i] is not None, by_code[i] or ""))
         rank = np.zeros(len(by_code), np.int64)
@@ -440,11 +452,13 @@ class _Names:
         return self._texts[code]
 
 
-def _spelt_out(seen: Seen, before: Events) -> list[tuple[int, int]]:
+def _spelt_out(seen: Detections, before: Events) -> list[tuple[int, int]]:
     """Who was deleted by which message, name by name."""
-    if all(name != EVERYONE for _, name in seen.gone):
+    if all(name != EVERY_OBJECT for _, name in seen.gone):
         return seen.gone
     everyone = np.unique(np.concatenate([before.name, seen.name])).tolist()
     return [
-        (message, name) for message, told in seen.gone for name in (everyone if told == EVERYONE else [told])
+        (message, name)
+        for message, told in seen.gone
+        for name in (everyone if told == EVERY_OBJECT else [told])
     ]

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from spatial_replay.simulation.world import Body, Execution, Workspace, World
+from spatial_replay.simulation.world import Body, Execution, ReachableArea, World
 
-__all__ = ["Body", "Execution", "Workspace", "World"]
+__all__ = ["Body", "Execution", "ReachableArea", "World"]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from spatial_replay.simulation.grasp import Point
 from spatial_replay.simulation.picking import picking
 from spatial_replay.simulation.scene import Scene
-from spatial_replay.simulation.world import Body, Execution, Skill, Workspace
+from spatial_replay.simulation.world import Body, Execution, ReachableArea, Skill
 
 Placing = Callable[[Scene, str, Point, float | None], Generator[None, None, Execution]]
 """How a robot picks a body up and places it: `picking`, or something more careful."""
@@ -54,7 +54,7 @@ class Scenario:
 
     name: str
     placements: tuple[Placement, ...]
-    workspace: Workspace
+    workspace: ReachableArea
     skill: Skill
     script: Script
     placing: Placing = picking

@@ -22,7 +22,7 @@ from spatial_replay.simulation.pushing import pushing
 from spatial_replay.simulation.scenario import Scenario
 from spatial_replay.simulation.scene import Scene
 from spatial_replay.simulation.shapes import Box, Pose, footprint, height
-from spatial_replay.simulation.world import Body, Execution, Skill, Workspace
+from spatial_replay.simulation.world import Body, Execution, ReachableArea, Skill
 from spatial_replay.trace.sample import Sample
 
 
@@ -107,7 +107,7 @@ class Tabletop:
         return tuple(each.body for each in self._scenario.placements)
 
     @property
-    def workspace(self) -> Workspace:
+    def workspace(self) -> ReachableArea:
         """See `World`."""
         return self._scenario.workspace
 

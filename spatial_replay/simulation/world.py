@@ -35,7 +35,7 @@ class Body:
 
 
 @dataclass(frozen=True, slots=True)
-class Workspace:
+class ReachableArea:
     """Where the robot can put the centre of an object: a box, cut by a ring around its base at (0, 0).
 
     Attributes:
@@ -92,7 +92,7 @@ class World(Protocol):
         """The objects, in the order of their names in the samples."""
 
     @property
-    def workspace(self) -> Workspace:
+    def workspace(self) -> ReachableArea:
         """Where the robot reaches."""
 
     @property

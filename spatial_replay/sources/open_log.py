@@ -170,10 +170,10 @@ def _open_messages(path: Path, kind: str, options: ReadOptions) -> Source:
             " does, with --mapping FILE or mapping=FILE"
         )
     # what reads the logs of others is loaded when there is one
-    from spatial_replay.mapping.mapped_source import ForeignSource
+    from spatial_replay.mapping.mapped_source import MappedSource
     from spatial_replay.mapping.mapping_file import load_mapping
 
-    return ForeignSource(path, load_mapping(options.mapping), kind, options.concave, options.on_time_jump)
+    return MappedSource(path, load_mapping(options.mapping), kind, options.concave, options.on_time_jump)
 
 
 def _open_mcap(path: Path, kind: str, options: ReadOptions) -> Source:

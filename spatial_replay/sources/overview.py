@@ -21,7 +21,7 @@ from spatial_replay.logs.mcap.summary import LogSummary, summarise_mcap
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.source import Source, TrackSource
 from spatial_replay.logs.topics import OBJECTS
-from spatial_replay.mapping.suggest import EXAMPLES, candidates, suggest_mapping
+from spatial_replay.mapping.suggest import EXAMPLES, suggest_mapping, suggest_topics
 from spatial_replay.sources.open_log import is_bag_folder
 from spatial_replay.trace.trace import Trace
 
@@ -113,7 +113,7 @@ def survey(
             advance(_STEP)
         if not whole and counter.knows_enough:
             break
-    found = candidates(topics, counter.examples)
+    found = suggest_topics(topics, counter.examples)
     faults = FaultList()
     reader.move_faults(faults)
     return Survey(

@@ -13,7 +13,7 @@ from rosbags.typesys.store import Typestore
 from spatial_replay.bags.reader import Decoder, Message, Topic
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.reading_plan import Plan
+from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.trace.trace import Trace
 
 SECOND = 10**9
@@ -179,7 +179,7 @@ class Made:
 
 def make(mapping: str, feed: Feed, *, batch: int = 1000, **options: Any) -> Made:
     """The samples of a feed under a mapping."""
-    plan = Plan.of(parse_mapping(mapping, "test.yaml"), feed.topics())
+    plan = ReadingPlan.of(parse_mapping(mapping, "test.yaml"), feed.topics())
     assembler = Assembler(plan, feed.decoder, name="test.bag", **options)
     raw = [message for message in feed.raw() if message.topic in plan.topics]
     traces = [assembler.add(raw[begin : begin + batch]) for begin in range(0, len(raw), batch)]

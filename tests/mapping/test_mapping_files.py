@@ -14,8 +14,8 @@ from spatial_replay.bags.reader import Topic
 from spatial_replay.errors import MissingFileError, UsageError
 from spatial_replay.mapping import mapping_file as schema
 from spatial_replay.mapping.mapping_file import load_mapping, parse_mapping
-from spatial_replay.mapping.model import FOREVER_NS, Sampling, Shape, Signal, Uncertainty
-from spatial_replay.mapping.reading_plan import Plan
+from spatial_replay.mapping.model import FOREVER_NS, Sampling, ShapeMapping, SignalMapping, Uncertainty
+from spatial_replay.mapping.reading_plan import ReadingPlan
 
 EXAMPLE = """
 fixed_frame: world
@@ -38,17 +38,17 @@ def test_a_mapping_says_what_is_read_and_how() -> None:
     turtle, tags, odom, battery, plain = mapping.topics
     assert (mapping.fixed_frame, mapping.clock, mapping.max_age_ns) == ("world", "header", 1_500_000_000)
     assert mapping.sampling == Sampling(None, 100_000_000)
-    assert (turtle.name, turtle.shape) == ("turtle1", Shape("disc", (0.5,)))
+    assert (turtle.name, turtle.shape) == ("turtle1", ShapeMapping("disc", (0.5,)))
     assert (tags.objects, tags.name, tags.polygon, tags.class_name) == (
         "detections[*]",
         "tag{id}",
         "corners",
         "tag",
     )
-    assert odom.shape == Shape("box", (0.6, 0.4), offset=(0.1, 0.0))
+    assert odom.shape == ShapeMapping("box", (0.6, 0.4), offset=(0.1, 0.0))
     assert (odom.uncertainty, odom.height) == (Uncertainty("", True), (0.0, 0.4))
     assert odom.max_age_ns == FOREVER_NS
-    assert (battery.signals, battery.reads_objects) == ((Signal("battery", "percentage", "1"),), False)
+    assert (battery.signals, battery.reads_objects) == ((SignalMapping("battery", "percentage", "1"),), False)
     assert plain.reads_objects
 
 
@@ -153,7 +153,9 @@ def test_the_published_schema_is_the_one_that_is_used() -> None:
 def test_topics_that_the_log_does_not_have() -> None:
     mapping = parse_mapping("sample: {topic: /tick}\ntopics: {/pse: {}, /other: {type: foo/Bar}}", "m.yaml")
     with pytest.raises(UsageError) as caught:
-        Plan.of(mapping, [Topic("/pose", "geometry_msgs/msg/PoseStamped", "cdr"), Topic("/other", "", "cdr")])
+        ReadingPlan.of(
+            mapping, [Topic("/pose", "geometry_msgs/msg/PoseStamped", "cdr"), Topic("/other", "", "cdr")]
+        )
     assert str(caught.value).splitlines() == [
         "m.yaml: topics./pse: the log has no topic '/pse'; did you mean '/pose'?",
         "m.yaml: sample.topic: the log has no topic '/tick'; its topics are /other, /pose",
@@ -164,7 +166,7 @@ def test_topics_that_the_log_does_not_have() -> None:
 def test_topics_that_cannot_be_decoded() -> None:
     broken = Topic("/pose", "geometry_msgs/msg/PoseStamped", "cdr", unreadable="its definition is missing")
     with pytest.raises(UsageError, match="its messages cannot be decoded: its definition is miss"):
-        Plan.of(parse_mapping("topics: {/pose: {}}"), [broken])
+        ReadingPlan.of(parse_mapping("topics: {/pose: {}}"), [broken])
 
 
 @pytest.mark.parametrize(

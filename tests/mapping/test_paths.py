@@ -12,7 +12,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.mapping.field_paths import (
     FieldError,
     FieldPath,
-    Template,
+    NameTemplate,
     field_names,
     getter,
     iter_elements,
@@ -96,7 +96,7 @@ def test_fields_of_messages_of_every_kind() -> None:
 
 def names(template: str, *things: dict[str, Any], topic: str = "/a/pose") -> list[str]:
     codes = Codes()
-    namer = Namer(Template.of(template), topic, codes, (), ())
+    namer = Namer(NameTemplate.of(template), topic, codes, (), ())
     found = namer.codes(things, range(len(things)), "keys")
     texts = list(codes)
     return [texts[code] for code in found]
@@ -129,7 +129,7 @@ def test_names_that_are_none(template: str, thing: dict[str, Any]) -> None:
 @pytest.mark.parametrize("text", ["{", "}", "a{b", "{}", "{a b}", "{a|}", ""])
 def test_what_is_no_template(text: str) -> None:
     with pytest.raises(UsageError, match="is no name"):
-        Template.of(text)
+        NameTemplate.of(text)
 
 
 def test_names_after_topics() -> None:

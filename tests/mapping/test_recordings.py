@@ -11,7 +11,7 @@ from spatial_replay.bags.open import open_messages
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.reading_plan import Plan
+from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.trace.trace import Trace
 
 TURTLES = ("two_turtles.bag", "two_turtles_lz4.bag", "two_turtles_mcap", "two_turtles_sqlite3")
@@ -30,7 +30,7 @@ topics:
 
 def mapped(path: Path, text: str) -> Trace:
     reader = open_messages(path)
-    plan = Plan.of(parse_mapping(text), reader.topics())
+    plan = ReadingPlan.of(parse_mapping(text), reader.topics())
     assembler = Assembler(plan, reader.decoder, name=path.name)
     trace = Trace.concatenate([assembler.add(list(reader.iter_messages(plan.topics))), assembler.finish()])
     assert (assembler.take_faults(), assembler.take_remarks()) == ((), ())

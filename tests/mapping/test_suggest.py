@@ -8,7 +8,7 @@ import pytest
 
 from spatial_replay.bags.reader import Topic
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.model import LogMapping, Shape
+from spatial_replay.mapping.model import LogMapping, ShapeMapping
 from spatial_replay.mapping.suggest import suggest_mapping
 
 POINT = {"x": 1.0, "y": 2.0, "z": 0.0}
@@ -28,7 +28,7 @@ def test_a_pose_is_an_object_of_its_topic() -> None:
     (topic,) = mapping.topics
     assert (topic.topic, topic.name, topic.position) == ("/robot", "robot", "pose.position")
     assert topic.orientation == "pose.orientation"
-    assert topic.shape == Shape("disc", (0.5,))
+    assert topic.shape == ShapeMapping("disc", (0.5,))
     assert "no size" in text
 
 
@@ -50,7 +50,7 @@ def test_a_list_of_objects_is_found_wherever_it_is() -> None:
     assert topic.objects == "world.moving_object[*]"
     assert topic.name == "moving_object{id.value}"
     assert topic.position == "base.position"
-    assert topic.shape == Shape(
+    assert topic.shape == ShapeMapping(
         "box", ("base.dimension.length", "base.dimension.width", "base.dimension.height")
     )
     assert "world.traffic_sign[*]" in text
@@ -70,7 +70,7 @@ def test_classes_are_texts() -> None:
     (topic,) = mapping.topics
     assert topic.name == "track{name}"
     assert topic.class_name is not None
-    assert topic.shape == Shape("disc", ("radius",))
+    assert topic.shape == ShapeMapping("disc", ("radius",))
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from spatial_replay.bags.columns import MessageColumns
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.reading_plan import Plan
+from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.trace.trace import Trace
 
 MS = 10**6
@@ -223,7 +223,7 @@ def test_columns_of_messages_make_the_same_samples() -> None:
     feed = Feed()
     for tick in range(20):
         feed.add("/p", tick * 10 * MS, point(tick))
-    plan = Plan.of(parse_mapping("topics: {/p: {}}"), feed.topics())
+    plan = ReadingPlan.of(parse_mapping("topics: {/p: {}}"), feed.topics())
     raw = feed.raw()
     columns = MessageColumns(
         topics=[message.topic for message in raw],

@@ -9,7 +9,7 @@ from spatial_replay.bags.reader import Topic
 from spatial_replay.errors import UsageError
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.reading_plan import Plan
+from spatial_replay.mapping.reading_plan import ReadingPlan
 
 HUGE = 10**400
 
@@ -53,7 +53,7 @@ def test_transforms_that_cannot_be_decoded_are_a_loss(count: int | None, faults:
     lost = Topic("/tf", "tf2_msgs/msg/TFMessage", "cdr", count=count, unreadable=reason)
     topics = [Topic("/p", "geometry_msgs/msg/PoseStamped", "cdr"), lost]
     for head, expected in (("fixed_frame: map\n", faults), ("", 0)):
-        plan = Plan.of(parse_mapping(head + "topics: {/p: {}}"), topics)
+        plan = ReadingPlan.of(parse_mapping(head + "topics: {/p: {}}"), topics)
         assert "/tf" not in plan.topics
         told = Assembler(plan, Feed().decoder, name="test.bag").take_faults()
         assert len(told) == expected

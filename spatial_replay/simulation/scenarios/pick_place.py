@@ -9,7 +9,7 @@ from spatial_replay.simulation.picking import picking
 from spatial_replay.simulation.scenario import Placement, Scenario
 from spatial_replay.simulation.scene import Scene
 from spatial_replay.simulation.shapes import Box, Cylinder, Shape
-from spatial_replay.simulation.world import Body, Execution, Workspace
+from spatial_replay.simulation.world import Body, Execution, ReachableArea
 
 
 def _thing(
@@ -57,7 +57,7 @@ SCENARIO = Scenario(
         _thing("kanelbulle", "bun", Cylinder(0.032, 0.03), (0.12, 0.55), 0.08, (0.7, 0.45, 0.2)),
         Placement(_PLATE, 0.48, 0.0, 0.0, 0.8, (0.9, 0.9, 0.95)),
     ),
-    workspace=Workspace(-0.3, -0.7, 0.7, 0.7, nearest=0.33, farthest=0.7),
+    workspace=ReachableArea(-0.3, -0.7, 0.7, 0.7, nearest=0.33, farthest=0.7),
     skill="place",
     script=_script,
 )

@@ -8,7 +8,7 @@ from spatial_replay.simulation.pushing import pushing
 from spatial_replay.simulation.scenario import Placement, Scenario
 from spatial_replay.simulation.scene import Scene
 from spatial_replay.simulation.shapes import Box
-from spatial_replay.simulation.world import Body, Execution, Workspace
+from spatial_replay.simulation.world import Body, Execution, ReachableArea
 
 _BLOCK = Box(0.04, 0.04, 0.04)
 
@@ -35,7 +35,7 @@ SCENARIO = Scenario(
         _block("red", 0.47, -0.09, 0.4, (0.85, 0.2, 0.2)),
         _block("blue", 0.585, 0.1, 0.8, (0.2, 0.35, 0.85)),
     ),
-    workspace=Workspace(0.29, -0.2, 0.69, 0.2, nearest=0.3, farthest=0.71),
+    workspace=ReachableArea(0.29, -0.2, 0.69, 0.2, nearest=0.3, farthest=0.71),
     skill="push",
     script=_script,
     scatter_m=0.008,

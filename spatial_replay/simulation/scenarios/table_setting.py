@@ -10,7 +10,7 @@ from spatial_replay.simulation.grasp import Point
 from spatial_replay.simulation.scenario import Placement, Scenario
 from spatial_replay.simulation.scene import Scene
 from spatial_replay.simulation.shapes import Box, Cylinder
-from spatial_replay.simulation.world import Body, Execution, Workspace
+from spatial_replay.simulation.world import Body, Execution, ReachableArea
 
 _UPRIGHT = math.pi / 2
 """Cutlery points along y, away from who will eat."""
@@ -51,7 +51,7 @@ SCENARIO = Scenario(
         # without a mass it is fixed
         Placement(_MAT, 0.48, 0.0, _UPRIGHT, 0.0, (0.3, 0.45, 0.4)),
     ),
-    workspace=Workspace(-0.3, -0.65, 0.68, 0.65, nearest=0.33, farthest=0.7, yaws=(0.0, _UPRIGHT)),
+    workspace=ReachableArea(-0.3, -0.65, 0.68, 0.65, nearest=0.33, farthest=0.7, yaws=(0.0, _UPRIGHT)),
     skill="place",
     script=_script,
     placing=_placing,
