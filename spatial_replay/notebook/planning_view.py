@@ -27,7 +27,7 @@ from spatial_replay.notebook.figures import (
     table,
 )
 from spatial_replay.planning.decisions import Candidate, Consideration, Step
-from spatial_replay.planning.gradient_map import FREE, REASONS, GradientMap, moved_object
+from spatial_replay.planning.maps import FREE, REASONS, GradientMap, moved_object
 from spatial_replay.planning.read import LoggedStep
 from spatial_replay.text import counted
 from spatial_replay.trace.sample import Sample

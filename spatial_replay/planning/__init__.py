@@ -14,7 +14,7 @@ from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
     from spatial_replay.planning.decisions import Candidate, Executor, Outcome, Step, Target
-    from spatial_replay.planning.gradient_map import GradientMap, gradient_map, moved_object, proposition_maps
+    from spatial_replay.planning.maps import GradientMap, gradient_map, moved_object, proposition_maps
     from spatial_replay.planning.planner import Planner
     from spatial_replay.planning.read import LoggedStep, read_steps
     from spatial_replay.planning.settings import Settings
@@ -42,7 +42,7 @@ _HOMES: Mapping[str, str] = MappingProxyType(
     {
         "Candidate": "spatial_replay.planning.decisions",
         "Executor": "spatial_replay.planning.decisions",
-        "GradientMap": "spatial_replay.planning.gradient_map",
+        "GradientMap": "spatial_replay.planning.maps",
         "Grid": "spatial_replay.planning.workspace",
         "LoggedStep": "spatial_replay.planning.read",
         "Outcome": "spatial_replay.planning.decisions",
@@ -51,9 +51,9 @@ _HOMES: Mapping[str, str] = MappingProxyType(
         "Step": "spatial_replay.planning.decisions",
         "Target": "spatial_replay.planning.decisions",
         "Workspace": "spatial_replay.planning.workspace",
-        "gradient_map": "spatial_replay.planning.gradient_map",
-        "moved_object": "spatial_replay.planning.gradient_map",
-        "proposition_maps": "spatial_replay.planning.gradient_map",
+        "gradient_map": "spatial_replay.planning.maps",
+        "moved_object": "spatial_replay.planning.maps",
+        "proposition_maps": "spatial_replay.planning.maps",
         "read_steps": "spatial_replay.planning.read",
     }
 )

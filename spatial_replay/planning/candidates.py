@@ -13,7 +13,7 @@ import numpy as np
 from spatial_replay.errors import TraceError
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Target
-from spatial_replay.planning.gradient_map import (
+from spatial_replay.planning.maps import (
     CONSTRAINED,
     FREE,
     OUT_OF_REACH,

@@ -51,7 +51,7 @@ from spatial_replay.planning.decisions import (
     Target,
     wait_outcome,
 )
-from spatial_replay.planning.gradient_map import GradientMap, centre_of, moved_object
+from spatial_replay.planning.maps import GradientMap, centre_of, moved_object
 from spatial_replay.planning.planner import Planner
 from spatial_replay.trace.sample import Sample
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import Literal, Protocol, TypeAlias
 
 from spatial_replay.lazy import Displayed
-from spatial_replay.planning.gradient_map import Cubes, GradientMap
+from spatial_replay.planning.maps import Cubes, GradientMap
 
 Kind: TypeAlias = Literal["execute", "hold", "wait", "no path"]
 """What is to be done: move an object; nothing, for the specification is satisfied; nothing yet, for too

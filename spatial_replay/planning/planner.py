@@ -25,7 +25,7 @@ from spatial_replay.planning.edges import (
     why_no_path,
     worst_state,
 )
-from spatial_replay.planning.gradient_map import Cubes, refuse_delays, refuse_unknown
+from spatial_replay.planning.maps import Cubes, refuse_delays, refuse_unknown
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.workspace import Workspace, kind_faults, refuse_faults
 from spatial_replay.spec.formula import Specification

@@ -399,8 +399,7 @@ def test_what_is_kept_with_a_trace_changes_no_later_evaluation(first, second, re
 _PRINT_BITS = """
 import hashlib
 from spatial_replay import Footprint, Sample, Trace, TrackedObject
-from spatial_replay.monitor.evaluation import evaluate
-from spatial_replay.spec.specification import parse_specification
+from spatial_replay import evaluate, parse_specification
 
 text = '''
 region goal = box(0, 0, 4, 4)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import spatial_replay as sr
 from spatial_replay.planning.decisions import Outcome
-from spatial_replay.planning.gradient_map import centre_of, moved_object, proposition_maps
+from spatial_replay.planning.maps import centre_of, moved_object, proposition_maps
 from spatial_replay.planning.planner import MOST_MOTIONS, Planner
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.workspace import Grid, Workspace

@@ -17,7 +17,7 @@ from spatial_replay.planning import (
     proposition_maps,
     read_steps,
 )
-from spatial_replay.planning.gradient_map import FREE
+from spatial_replay.planning.maps import FREE
 
 SAMPLE = sr.Sample(
     0, {"cup": block(1, 1, size=1), "mat": block(6, 6, size=4), "<jug>": sr.Footprint.disc(1, 6, 1)}

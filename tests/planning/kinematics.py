@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import spatial_replay as sr
 from spatial_replay.planning.decisions import Outcome
-from spatial_replay.planning.gradient_map import moved_object
+from spatial_replay.planning.maps import moved_object
 
 
 @dataclass

@@ -7,7 +7,7 @@ import pytest
 
 import spatial_replay as sr
 from spatial_replay.errors import UsageError
-from spatial_replay.planning.gradient_map import (
+from spatial_replay.planning.maps import (
     CONSTRAINED,
     FREE,
     OCCUPIED,

@@ -11,7 +11,7 @@ import spatial_replay as sr
 from planning.kinematics import BLOCKS, PUSHING, Table, block, run
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.planning.decisions import Outcome
-from spatial_replay.planning.gradient_map import moved_object
+from spatial_replay.planning.maps import moved_object
 from spatial_replay.planning.planner import MOST_MOTIONS, Planner
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.workspace import Grid, Workspace

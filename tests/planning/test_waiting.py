@@ -11,7 +11,7 @@ import spatial_replay as sr
 from planning.kinematics import BLOCKS, run
 from planning.plans import PUSH, record_plan_of
 from spatial_replay.planning import read_steps
-from spatial_replay.planning.gradient_map import moved_object
+from spatial_replay.planning.maps import moved_object
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.read import read_decisions
 from spatial_replay.planning.recompute import redo_decisions
