@@ -1,14 +1,13 @@
-"""Specifications evaluated over samples, with all that a log says of that.
+"""Specifications evaluated over samples, and the messages of an annotated log that report the results.
 
-What is written beside the samples of a log: the specification, its robustness, the scene.
+`AnnotatedEvaluation` evaluates; an `Annotator` encodes what the evaluation gives: the specification, its
+robustness, automaton states, events and the scene.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property, partial
-from pathlib import PurePath
 
 import numpy as np
 from foxglove_schemas_protobuf.Event_pb2 import Event
@@ -29,7 +28,6 @@ from spatial_replay.annotate.robustness import encode_robustness
 from spatial_replay.annotate.scene_update import SceneEncoder, SceneState
 from spatial_replay.annotate.specification import ReportedTree, encode_specification, reported_trees
 from spatial_replay.annotate.violations import Judged, pointing_of
-from spatial_replay.errors import SpecificationError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Attachment, Channel, Messages, merge, messages_of
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
@@ -48,7 +46,6 @@ from spatial_replay.logs.topics import (
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.semantics import Semantics, instance_evaluation
 from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
-from spatial_replay.spec import format_specification, parse_specification
 from spatial_replay.spec.formula import Outline, Specification, iter_nodes
 from spatial_replay.trace.trace import Trace
 
@@ -94,7 +91,6 @@ class Annotator:
         ]
         self._encoder = SceneEncoder(shown_regions(files))
         self._scene = scene or SceneState()
-        self._extent: Extent | None = None
         self._written = dict.fromkeys(DERIVED, 0)
 
     @property
@@ -110,7 +106,6 @@ class Annotator:
         """
         if not len(trace):
             return []
-        self._extent = Extent.of(trace, self._extent)
         messages = []
         if self._trees and not self._written[SPECIFICATION]:
             messages.append(self._messages(_SPECIFICATION, trace.times_ns[:1], [self.specification()]))
@@ -124,7 +119,6 @@ class Annotator:
         """Take in the next samples and write nothing of them but the events."""
         if not len(trace):
             return []
-        self._extent = Extent.of(trace, self._extent)
         for run, stretch in zip(self._runs, stretches, strict=True):
             if run is not None:
                 run.pass_over(stretch)
@@ -149,16 +143,6 @@ class Annotator:
         """The message that says what was evaluated."""
         propositions = [() if run is None else run.propositions for run in self._runs]
         return encode_specification(self._files, self._trees, propositions=propositions)
-
-    def contents(self, beside: Collection[str] = ()) -> Contents:
-        """What there is to be shown, once everything else is written.
-
-        Args:
-            beside: topics of messages of others in the log.
-        """
-        written = {topic for topic, count in self._written.items() if count}
-        has_states = [bool(self._written[AUTOMATON]) and run is not None for run in self._runs]
-        return Contents(self._trees, has_states, self._extent, written | set(beside))
 
     def _robustness(self, stretches: Sequence[SeriesBlock]) -> Messages:
         """One message per sample and result."""
@@ -274,13 +258,17 @@ class AnnotatedEvaluation:
         ]
         self.streams = [stream for evaluation in self._evaluations for stream in evaluation.streams]
         self.trees = reported_trees(files, instances)
+        self._extent: Extent | None = None
+        self._has_samples = False
 
     def extend(self, trace: Trace) -> list[SeriesBlock]:
         """Take in the next samples; one stretch for each of `trees`."""
         return [stretch for evaluation in self._evaluations for stretch in evaluation.extend(trace)]
 
     def messages(self, trace: Trace, stretches: Sequence[SeriesBlock]) -> list[Messages]:
-        """What to write beside samples, from the stretches that `extend` gave for them."""
+        """Return what to write beside samples, from the stretches that `extend` gave for them."""
+        self._extent = Extent.of(trace, self._extent)
+        self._has_samples |= len(trace) > 0
         return self._annotator.messages(trace, stretches)
 
     @property
@@ -296,13 +284,33 @@ class AnnotatedEvaluation:
         """
         return merge(self._annotator.end(time_ns, self.finals))
 
-    def layout(self, beside: Collection[str] = ()) -> Attachment:
-        """How to open the log in a viewer, once everything else is written.
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """The channels of the messages that annotate a sample."""
+        specification = [_SPECIFICATION] if self.trees else []
+        return (*specification, _ROBUSTNESS, _AUTOMATON, _EVENTS, _EVENT_LOG, _SCENE)
+
+    def contents(self, extent: Extent | None, topics: Collection[str] = ()) -> Contents:
+        """Return what an annotated log of these results has for a viewer to show.
 
         Args:
-            beside: topics of messages of others in it.
+            extent: of all footprints; None without any.
+            topics: those of messages that are not derived from samples.
         """
-        return layout_attachment(self._annotator.contents(beside))
+        has_states = [each.automaton is not None for each in self.automata]
+        # every result has events: a verdict is reported when it is reached, or else when the log ends
+        derived = {SCENE, *(DERIVED if self.trees else ())} - set(() if any(has_states) else (AUTOMATON,))
+        return Contents(self.trees, has_states, extent, derived | set(topics))
+
+    def layout(self, topics: Collection[str] = ()) -> Attachment:
+        """Return the layout that opens the log in a viewer, once everything else is written.
+
+        Args:
+            topics: those of messages that are not derived from samples.
+        """
+        if not self._has_samples:
+            return layout_attachment(Contents(self.trees, [False] * len(self.trees), None, topics))
+        return layout_attachment(self.contents(self._extent, topics))
 
     def automata_metadata(self) -> Mapping[str, str]:
         """For each spec, how large its automaton is, or why there is none."""
@@ -329,40 +337,3 @@ class AnnotatedEvaluation:
     @cached_property
     def _annotator(self) -> Annotator:
         return self.annotator()
-
-
-def kept_files(files: Sequence[Specification]) -> list[Specification]:
-    """The specifications as a log keeps them, so that who reads it back gets equal ones of equal names.
-
-    Each has a file name whose stem no other has. A text that would not be read back as the same specification
-    (it was parsed with a profile or constants of its own) gives way to the canonical one.
-    """
-    kept: list[Specification] = []
-    stems: set[str] = set()
-    for file in files:
-        path = PurePath(file.filename)
-        own, suffix = path.stem.strip("<>"), path.suffix or ".spatial"
-        stem, count = own, 1
-        while stem in stems:
-            count += 1
-            stem = f"{own}-{count}"
-        stems.add(stem)
-        kept.append(replace(_self_contained(file), filename=f"{stem}{suffix}"))
-    return kept
-
-
-def specification_attachments(files: Sequence[Specification], prefix: str) -> list[Attachment]:
-    """The texts of `kept_files`, to be kept in a log under names that begin with `prefix`."""
-    return [Attachment(f"{prefix}{file.filename}", "text/plain", file.source.encode()) for file in files]
-
-
-def _self_contained(file: Specification) -> Specification:
-    for text in (file.source, format_specification(file)):
-        try:
-            read_back = parse_specification(text, filename=file.filename)
-        except SpecificationError:
-            continue
-        if read_back == file:
-            return file if text == file.source else read_back
-    # relations given in Python cannot be written down
-    return file

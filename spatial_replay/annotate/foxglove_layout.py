@@ -228,7 +228,7 @@ class Extent(NamedTuple):
     ymax: float
 
     @classmethod
-    def of(cls, trace: Trace, before: Extent | None) -> Extent | None:
+    def of(cls, trace: Trace, before: Extent | None = None) -> Extent | None:
         """The box of some samples and of those before; None while nothing was seen."""
         vertices = trace.footprints.vertices
         low, high = _corners(vertices)

@@ -101,6 +101,17 @@ class SceneState:
     templates: Mapping[Layout, SceneTemplate] = field(default_factory=lambda: MappingProxyType({}))
 
 
+def scene_scale(trace: Trace) -> float | None:
+    """Return the scale of a run's scene (see `SceneState`); None if no message shows an object.
+
+    Args:
+        trace: from the first sample on.
+    """
+    rows = trace.rows[_spaced(trace.times_ns, None)]
+    is_shown = (rows >= 0).any(axis=1)
+    return _scale_of(trace, rows[int(is_shown.argmax())]) if is_shown.any() else None
+
+
 class SceneMessages(NamedTuple):
     """Encoded messages, their times (S,) int64, and the state to go on from."""
 
@@ -251,7 +262,7 @@ def _spaced(times_ns: Integers, written_ns: int | None) -> Integers:
 
 
 def _scaled(state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState, Floats]:
-    """The state with its scale, if an object is in sight by now, and the scale (S, 1) for each message."""
+    """Return the state with its scale, once an object is shown, and the scale (S, 1) of each message."""
     if state.scale is not None:
         return state, np.full((len(rows), 1), state.scale)
     scales = np.full((len(rows), 1), _UNSCALED)
@@ -259,10 +270,14 @@ def _scaled(state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState
     if not is_shown.any():
         return state, scales
     first = int(is_shown.argmax())
-    seen = rows[first][rows[first] >= 0]
-    scale = float(np.median(extents(trace.footprints.select(seen)))) or _UNSCALED
+    scale = _scale_of(trace, rows[first])
     scales[first:] = scale
     return replace(state, scale=scale), scales
+
+
+def _scale_of(trace: Trace, rows: Integers) -> float:
+    """Return the median size of the objects in one sample, whose rows are given."""
+    return float(np.median(extents(trace.footprints.select(rows[rows >= 0])))) or _UNSCALED
 
 
 def _cast(trace: Trace, rows: Integers, before: SceneState, scale: float, found: Pointers) -> _Cast:

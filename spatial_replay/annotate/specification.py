@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import PurePath
 from typing import NamedTuple
 
 from spatial_replay.annotate.requirements import iter_subformulas
+from spatial_replay.errors import SpecificationError
+from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
 from spatial_replay.logs.schemas.Specification_pb2 import SpecificationResult
 from spatial_replay.monitor.instances import Instance
-from spatial_replay.spec.format import format_formula, format_specification
+from spatial_replay.spec import format_specification, parse_specification
+from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import (
     Atom,
     Expression,
@@ -152,3 +156,40 @@ def _units(expression: Expression, signal_units: Mapping[str, str]) -> Iterator[
                 pass
             case _:
                 yield FOOTPRINT_UNITS
+
+
+def kept_files(files: Sequence[Specification]) -> list[Specification]:
+    """The specifications as a log keeps them, so that who reads it back gets equal ones of equal names.
+
+    Each has a file name whose stem no other has. A text that would not be read back as the same specification
+    (it was parsed with a profile or constants of its own) gives way to the canonical one.
+    """
+    kept: list[Specification] = []
+    stems: set[str] = set()
+    for file in files:
+        path = PurePath(file.filename)
+        own, suffix = path.stem.strip("<>"), path.suffix or ".spatial"
+        stem, count = own, 1
+        while stem in stems:
+            count += 1
+            stem = f"{own}-{count}"
+        stems.add(stem)
+        kept.append(replace(_self_contained(file), filename=f"{stem}{suffix}"))
+    return kept
+
+
+def specification_attachments(files: Sequence[Specification], prefix: str) -> list[Attachment]:
+    """The texts of `kept_files`, to be kept in a log under names that begin with `prefix`."""
+    return [Attachment(f"{prefix}{file.filename}", "text/plain", file.source.encode()) for file in files]
+
+
+def _self_contained(file: Specification) -> Specification:
+    for text in (file.source, format_specification(file)):
+        try:
+            read_back = parse_specification(text, filename=file.filename)
+        except SpecificationError:
+            continue
+        if read_back == file:
+            return file if text == file.source else read_back
+    # relations given in Python cannot be written down
+    return file

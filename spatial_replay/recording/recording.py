@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 
 from spatial_replay import __version__
-from spatial_replay.annotate.annotator import AnnotatedEvaluation, kept_files, specification_attachments
+from spatial_replay.annotate.annotator import AnnotatedEvaluation
 from spatial_replay.annotate.automaton_state import KeptAutomaton
 from spatial_replay.annotate.certificate import (
     Hashing,
@@ -16,6 +16,7 @@ from spatial_replay.annotate.certificate import (
     certificate,
     described,
 )
+from spatial_replay.annotate.specification import kept_files, specification_attachments
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.messages import Messages, Sink, merge, messages_of
 from spatial_replay.logs.objects.encode import encode_objects

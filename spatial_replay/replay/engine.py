@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spatial_replay.annotate.annotator import AnnotatedEvaluation, kept_files, specification_attachments
+from spatial_replay.annotate.annotator import AnnotatedEvaluation
 from spatial_replay.annotate.automaton_state import KeptAutomaton
 from spatial_replay.annotate.certificate import Hashing, MessageHash, ResultHash, SampleHash, certificate
-from spatial_replay.annotate.specification import ReportedTree
+from spatial_replay.annotate.specification import ReportedTree, kept_files, specification_attachments
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Attachment, Messages, merge
 from spatial_replay.logs.source import Source

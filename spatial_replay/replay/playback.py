@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from spatial_replay.annotate.scene_update import SceneState
+from spatial_replay.annotate.scene_update import SceneState, scene_scale
 from spatial_replay.logs.messages import Channel, Messages, join, merge, select
 from spatial_replay.replay.selection import Reading, standing
 from spatial_replay.replay.tuning import Tuned
@@ -17,9 +17,6 @@ _STANDS_NS: Final = 2_000_000_000
 
 _MOST_EVENTS: Final = 500
 """How many messages are sent at once of what was told before."""
-
-_PIECE: Final = 64
-"""Samples in which objects are looked for at once."""
 
 
 class Playback:
@@ -41,7 +38,7 @@ class Playback:
         self.start_ns, self.end_ns = int(self._times_ns[0]), own.end_ns
         self.time_ns = self.start_ns
         self.tuned = tuned
-        self._annotator = tuned.annotator(SceneState(scale=_scale(tuned)))
+        self._annotator = tuned.annotator(SceneState(scale=scene_scale(tuned.tuning.inside)))
         self._reading = Reading(own, self.start_ns)
         self._next = 0
         self._has_ended = False
@@ -51,8 +48,8 @@ class Playback:
         """All that there can be messages of."""
         own = self.tuned.tuning.own
         first = Reading(own, self.start_ns).take_before(self.start_ns + 1)
-        opening = merge([*self.tuned.annotator().messages(*self.tuned.part(0, 1)), first])
-        return tuple(dict.fromkeys((*opening.channels.values(), *own.channels)))
+        derived = Messages(channels=dict(enumerate(self.tuned.evaluation.channels)))
+        return tuple(dict.fromkeys((*join([derived, first]).channels.values(), *own.channels)))
 
     def seek(self, time_ns: int) -> Messages:
         """Go to a time: what stands there, and what is at that time.
@@ -109,13 +106,3 @@ class Playback:
 
 def _last(told: Messages) -> Messages:
     return select(told, np.arange(max(0, len(told) - _MOST_EVENTS), len(told)))
-
-
-def _scale(tuned: Tuned) -> float | None:
-    """The scale of the annotated log's scene, which the first objects in it set."""
-    annotator = tuned.annotator()
-    for begin in range(0, len(tuned.tuning.inside), _PIECE):
-        annotator.messages(*tuned.part(begin, begin + _PIECE))
-        if annotator.scene.scale is not None:
-            break
-    return annotator.scene.scale

@@ -9,10 +9,11 @@ from pathlib import PurePath
 from types import MappingProxyType
 from typing import Final
 
-from spatial_replay.annotate.annotator import AnnotatedEvaluation, Annotator, kept_files
+from spatial_replay.annotate.annotator import AnnotatedEvaluation, Annotator
 from spatial_replay.annotate.curves import CurvedResult, encode_curves
-from spatial_replay.annotate.foxglove_layout import live_layout_attachment
+from spatial_replay.annotate.foxglove_layout import Extent, live_layout_attachment
 from spatial_replay.annotate.scene_update import SceneState
+from spatial_replay.annotate.specification import kept_files
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.source import MemorySource, Source
@@ -232,11 +233,8 @@ class Tuned:
     @cached_property
     def layout(self) -> Attachment:
         """How to open a server of this log in a viewer."""
-        annotator = self.annotator()
-        annotator.messages(*self.part(0, 1))
-        annotator.pass_over(*self.part(1, len(self.tuning.inside)))
-        annotator.end(self.tuning.own.end_ns, self.evaluation.finals)
-        return live_layout_attachment(annotator.contents({each.topic for each in self.tuning.own.channels}))
+        topics = {each.topic for each in self.tuning.own.channels}
+        return live_layout_attachment(self.evaluation.contents(Extent.of(self.tuning.inside), topics))
 
     def annotator(self, scene: SceneState | None = None) -> Annotator:
         """Who writes the messages of these samples, from the first on; see `AnnotatedEvaluation`."""

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from spatial_replay.annotate.annotator import kept_files
 from spatial_replay.annotate.automaton_state import KeptAutomaton
+from spatial_replay.annotate.specification import kept_files
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.errors import UsageError
 from spatial_replay.monitor.verdict import Verdict
