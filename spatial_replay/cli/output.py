@@ -194,6 +194,8 @@ def _lines(decision: PlanDecision) -> Iterator[str]:
 
 
 def _edge_lines(edge: PlanEdge, *, is_aim: bool) -> Iterator[str]:
+    from spatial_replay.planning.decisions import Reason
+
     path = " -> ".join(map(str, edge.path))
     yield f"  {'aimed at' if is_aim else 'looked into'} {edge.source} -> {edge.target} on the path {path}"
     yield f"    to reach  {_some([guard.text for guard in edge.progress])}"
@@ -202,7 +204,7 @@ def _edge_lines(edge: PlanEdge, *, is_aim: bool) -> Iterator[str]:
     for candidate in edge.candidates:
         yield f"    {_candidate(candidate)}"
     if edge.pruned:
-        yield "    given up: " + edge.pruned.split(" (", 1)[0]
+        yield f"    given up: {Reason.from_text(edge.pruned).kind}"
 
 
 def _candidate(candidate: PlanCandidate) -> str:

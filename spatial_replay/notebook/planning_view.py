@@ -274,7 +274,7 @@ def _edge(edge: Consideration) -> Html:
     lines = [f"to reach: {edge.progress}"]
     if edge.constraints.texts:
         lines.append(f"never: {edge.constraints}")
-    pruned = [element("div", element("b", "given up: "), edge.pruned.split(" (")[0])] if edge.pruned else []
+    pruned = [element("div", element("b", "given up: "), edge.pruned.kind)] if edge.pruned else []
     return element(
         "div",
         element("div", element("b", f"edge {_arrow(edge)}"), quiet(f" on the path {path}")),

@@ -13,8 +13,13 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.planning.decisions import Candidate, Executor, Outcome, Step, Target
-    from spatial_replay.planning.maps import GradientMap, gradient_map, moved_object, proposition_maps
+    from spatial_replay.planning.decisions import Candidate, Executor, Outcome, Reason, Step, Target
+    from spatial_replay.planning.maps import (
+        GradientMap,
+        gradient_map,
+        moved_object,
+        proposition_maps,
+    )
     from spatial_replay.planning.planner import Planner
     from spatial_replay.planning.read import LoggedStep, read_steps
     from spatial_replay.planning.settings import Settings
@@ -28,6 +33,7 @@ __all__ = [
     "LoggedStep",
     "Outcome",
     "Planner",
+    "Reason",
     "Settings",
     "Step",
     "Target",
@@ -47,6 +53,7 @@ _HOMES: Mapping[str, str] = MappingProxyType(
         "LoggedStep": "spatial_replay.planning.read",
         "Outcome": "spatial_replay.planning.decisions",
         "Planner": "spatial_replay.planning.planner",
+        "Reason": "spatial_replay.planning.decisions",
         "Settings": "spatial_replay.planning.settings",
         "Step": "spatial_replay.planning.decisions",
         "Target": "spatial_replay.planning.decisions",

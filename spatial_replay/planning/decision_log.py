@@ -144,7 +144,7 @@ def decision_message(step: Step, specification: str, first_map: int) -> PlanDeci
         considered=[_edge(each, numbers) for each in step.considered],
         target=None if step.target is None else _target(step.target),
         pruned=[
-            PrunedEdge(source=source, target=target, reason=reason)
+            PrunedEdge(source=source, target=target, reason=str(reason))
             for (source, target), reason in step.pruned
         ],
         reason=step.reason,
@@ -172,7 +172,7 @@ def _edge(consideration: Consideration, numbers: Mapping[TurnedMap, int]) -> Pla
         progress=_guards(consideration.progress),
         constraints=_guards(consideration.constraints),
         candidates=[_candidate(each, numbers) for each in consideration.candidates],
-        pruned=consideration.pruned,
+        pruned=str(consideration.pruned or ""),
     )
 
 

@@ -1,30 +1,55 @@
-"""What a planner decides, and what comes of it, as values."""
+"""Decisions of a planner as values: steps, the edges and objects considered, targets, outcomes."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias
 
 from spatial_replay.lazy import Displayed
-from spatial_replay.planning.maps import Cubes, GradientMap
+
+if TYPE_CHECKING:
+    # a report reads reasons without loading the kernels behind maps
+    from spatial_replay.planning.maps import Cubes, GradientMap
 
 Kind: TypeAlias = Literal["execute", "hold", "wait", "no path"]
-"""What is to be done: move an object; nothing, for the specification is satisfied; nothing yet, for too
-little is seen or time has to pass; nothing any more, for there is no path left."""
+"""The kind of a step: move an object; hold, since the specification is satisfied; wait for an observation or
+for time to pass; stop, since no path to acceptance is left."""
 
 Edge: TypeAlias = tuple[int, int]
 """A transition of the automaton, from one state to another."""
 
 
 @dataclass(frozen=True, slots=True)
+class Reason:
+    """Why an edge was pruned.
+
+    Attributes:
+        kind: the same text for all edges pruned for the same cause.
+        detail: what differs from edge to edge, such as the cause for each object; may be empty.
+    """
+
+    kind: str
+    detail: str = ""
+
+    @classmethod
+    def from_text(cls, text: str) -> Reason:
+        """Read a reason from the text that `str` gives, as logs hold it."""
+        kind, _, detail = text.partition(" (")
+        return cls(kind, detail.removesuffix(")"))
+
+    def __str__(self) -> str:
+        return f"{self.kind} ({self.detail})" if self.detail else self.kind
+
+
+@dataclass(frozen=True, slots=True)
 class Guards:
-    """A set of guards: one of them is to hold (a progress set), or none may (a constraint set).
+    """A set of guards: in a progress set one of them has to hold, in a constraint set none may.
 
     Attributes:
         cubes: over the automaton's propositions.
-        texts: each cube in words.
+        texts: each cube as text.
     """
 
     cubes: Cubes
@@ -36,16 +61,15 @@ class Guards:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Where an object is to go.
+    """The pose that an object is to be moved to.
 
     Attributes:
         name: of the object.
-        x, y: for its centre, in footprint units.
-        turn: by how much it is to be turned, in radians.
-        yaw: its orientation then, in radians; None if it has none.
-        waypoints: points (x, y) on the way from where it is, both ends included; these alone where only the
-            end matters.
-        robustness: how well the progress set will hold.
+        x, y: of its centre at the target, in footprint units.
+        turn: angle in radians to turn the object by.
+        yaw: its orientation at the target, in radians; None if it has none.
+        waypoints: points (x, y) of the path, both ends included; only the ends if the path does not matter.
+        robustness: of the progress set with the object at the target.
     """
 
     name: str
@@ -58,7 +82,7 @@ class Target:
 
     @property
     def length(self) -> float:
-        """Of the way, in footprint units."""
+        """Length of the path, in footprint units."""
         return sum(math.dist(one, other) for one, other in pairwise(self.waypoints))
 
 
@@ -68,10 +92,10 @@ class Candidate:
 
     Attributes:
         name: of the object.
-        map: how well the progress set would hold with it elsewhere.
+        map: robustness of the progress set over the positions of the object.
         target: where it would go; None if it was rejected.
-        rejected: why, or "".
-        is_chosen: whether this is the one to move.
+        rejected: why it was rejected; empty if it was not.
+        is_chosen: whether this is the object to move.
     """
 
     name: str
@@ -83,15 +107,15 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Consideration:
-    """An edge that a planner looked into.
+    """An edge that a planner considered.
 
     Attributes:
-        path: the states from the current one to an accepting one that the edge begins.
-        edge: from which state to which.
-        progress: what is to hold for the edge to be taken.
-        constraints: what must not hold on the way, for it leads elsewhere.
-        candidates: the objects looked at, in the order of the settings' `movable`; without it, by name.
-        pruned: why the edge was given up, or "".
+        path: states from the current one to an accepting one; the edge is its first transition.
+        edge: source and target state.
+        progress: what has to hold for the edge to be taken.
+        constraints: what must not hold on the way, since it takes another edge.
+        candidates: the objects considered, in the order of the settings' `movable`; without it, by name.
+        pruned: why the edge was pruned; None if it was not.
     """
 
     path: tuple[int, ...]
@@ -99,7 +123,7 @@ class Consideration:
     progress: Guards
     constraints: Guards
     candidates: tuple[Candidate, ...]
-    pruned: str = ""
+    pruned: Reason | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,15 +131,15 @@ class Step(Displayed):
     """A decision.
 
     Attributes:
-        number: how many decisions came before.
+        number: counts the decisions of a run from 0.
         time_ns: of the sample that it was made on.
-        kind: what is to be done.
-        states: where the automaton is; more than one where not enough is seen to tell.
-        considered: the edges looked into, in order; the last one is aimed at unless it was given up.
+        kind: what to do.
+        states: where the automaton can be; more than one if propositions are unknown.
+        considered: the edges considered, in order; the last one is the aim unless it was pruned.
         target: what to move where, if anything.
-        pruned: all edges given up so far, each with its reason.
-        reason: the decision in words.
-        ahead: of a wait, the states to which time alone is to lead; none where too little is seen.
+        pruned: all edges pruned so far, each with its reason.
+        reason: the decision as a sentence.
+        ahead: the states that a wait expects from time alone; empty if it waits for an observation.
     """
 
     number: int
@@ -124,28 +148,28 @@ class Step(Displayed):
     states: tuple[int, ...]
     considered: tuple[Consideration, ...]
     target: Target | None
-    pruned: tuple[tuple[Edge, str], ...]
+    pruned: tuple[tuple[Edge, Reason], ...]
     reason: str
     ahead: tuple[int, ...] = ()
 
     @property
     def aim(self) -> Consideration | None:
-        """The edge aimed at; None where there is none."""
+        """The edge that the step is for, if any."""
         return self.considered[-1] if self.considered and not self.considered[-1].pruned else None
 
     @property
     def progress(self) -> Guards:
-        """What is to hold next; nothing where nothing is to be done."""
+        """What has to hold next; empty without an aim."""
         return self.aim.progress if self.aim is not None else _NOTHING
 
     @property
     def constraints(self) -> Guards:
-        """What must not hold on the way."""
+        """What must not hold on the way; empty without an aim."""
         return self.aim.constraints if self.aim is not None else _NOTHING
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
-        """Every object that was considered for the edge aimed at."""
+        """The objects considered for the aim."""
         return self.aim.candidates if self.aim is not None else ()
 
 
@@ -154,11 +178,11 @@ _NOTHING = Guards((), ())
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How the execution of a step went, as far as the controller can tell.
+    """How the execution of a step ended, according to the controller.
 
     Attributes:
-        succeeded: whether it thinks that the object is where it was to be.
-        reason: what happened, in words.
+        succeeded: whether the controller takes the object to be at its target.
+        reason: what happened, as a sentence.
     """
 
     succeeded: bool
@@ -166,7 +190,7 @@ class Outcome:
 
 
 def wait_outcome(step: Step, states: tuple[int, ...]) -> Outcome:
-    """How a wait went that ended with the automaton in these states."""
+    """Return the outcome of a wait that ended with the automaton in these states."""
     if not step.ahead:
         return Outcome(succeeded=True, reason="enough is seen")
     if states == step.ahead[-1:]:
@@ -175,10 +199,10 @@ def wait_outcome(step: Step, states: tuple[int, ...]) -> Outcome:
 
 
 class Executor(Protocol):
-    """What moves objects: a controller of a robot."""
+    """A robot controller, which moves objects."""
 
     def execute(self, step: Step) -> Outcome:
-        """Move `step.target.name` to its target, along its waypoints if the way matters to the robot.
+        """Move `step.target.name` to its target, along the waypoints if the path matters to the robot.
 
-        It returns when the robot has come to rest; meanwhile, or after it, the planner observes samples.
+        Return once the robot is at rest. The planner observes samples during the motion, or after it.
         """

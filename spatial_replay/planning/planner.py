@@ -1,7 +1,4 @@
-"""Algorithm 1 of the paper: an edge of the automaton at a time, by moving one object at a time.
-
-What was tried for each edge of the automaton, and where that failed.
-"""
+"""The planner (Algorithm 1 of the paper): takes one edge of the automaton at a time by moving one object."""
 
 from __future__ import annotations
 
@@ -14,14 +11,14 @@ from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compile import automaton as automaton_of
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.planning.candidates import Movables, with_choice
-from spatial_replay.planning.decisions import Consideration, Edge, Kind, Outcome, Step, Target
+from spatial_replay.planning.decisions import Consideration, Edge, Kind, Outcome, Reason, Step, Target
 from spatial_replay.planning.edges import (
     Observer,
     Symbol,
     consideration_of,
-    drift_of,
+    equivalent_edges,
+    idle_transitions,
     refuse_template,
-    twins_of,
     why_no_path,
     worst_state,
 )
@@ -33,43 +30,11 @@ from spatial_replay.text import counted
 from spatial_replay.trace.sample import Sample
 
 MOST_MOTIONS: Final = 100
-"""How many motions an edge gets in all, however often they succeed."""
-
-
-class Attempts:
-    """The motions of a run."""
-
-    def __init__(self) -> None:
-        self._in_vain: Counter[Edge] = Counter()
-        self._in_all: Counter[Edge] = Counter()
-        self._places: dict[tuple[Cubes, str], tuple[tuple[float, float], ...]] = {}
-
-    def why_enough(self, edge: Edge, most_in_vain: int) -> str:
-        """Why an edge is not to be tried again, or ""."""
-        if self._in_vain[edge] >= most_in_vain:
-            return f"tried {self._in_vain[edge]} times"
-        return f"tried {MOST_MOTIONS} times in all" if self._in_all[edge] >= MOST_MOTIONS else ""
-
-    def begin(self, edge: Edge) -> None:
-        """Count a motion for an edge, in vain so far."""
-        self._in_vain[edge] += 1
-        self._in_all[edge] += 1
-
-    def conclude(self, aim: Consideration, target: Target, outcome: Outcome, states: Sequence[int]) -> None:
-        """Take in how a motion went, and where the automaton is then."""
-        if not outcome.succeeded:
-            key = (aim.progress.cubes, target.name)
-            self._places[key] = (*self._places.get(key, ()), (target.x, target.y))
-        elif tuple(states) == aim.edge[1:]:
-            del self._in_vain[aim.edge]
-
-    def failed(self, aim: Consideration, name: str) -> tuple[tuple[float, float], ...]:
-        """The places (x, y) where an object could not be brought for equal progress."""
-        return self._places.get((aim.progress.cubes, name), ())
+"""The most motions for an edge, successful ones included."""
 
 
 class Planner:
-    """Plans towards a specification, step by step, from what is observed (section 5.2 of the paper).
+    """Plans for a specification step by step, from observed samples (section 5.2 of the paper).
 
     Use as:
 
@@ -81,9 +46,9 @@ class Planner:
             if outcome is not None:
                 planner.conclude(outcome)
 
-    It observes every sample, during an execution too: each one moves the automaton. Motions come to an end:
-    an edge of the automaton is given up after so many attempts in vain, and after `MOST_MOTIONS` in all.
-    Equal samples and outcomes give equal steps.
+    It has to observe every sample, also during an execution: each one moves the automaton. A run ends: an
+    edge is pruned after `Settings.attempts` failed motions, and after `MOST_MOTIONS` in all. Equal samples
+    and outcomes give equal steps.
 
     Attributes:
         automaton: of the specification.
@@ -95,14 +60,14 @@ class Planner:
         """Begin before the first sample.
 
         Args:
-            settings: where and how to plan; without them, every object can be picked up and placed around
-                where the first sample shows objects.
-            name: which spec of the file to plan for; without it, its only result.
+            settings: where and how to plan; without them, every object can be picked up, and placed around
+                the objects of the first sample.
+            name: the spec of the file to plan for; without it, its only result.
 
         Raises:
             NoAutomatonError: past operators, bounds in seconds, or too large a formula.
             UsageError: no such spec, several to choose from, a template, propositions about earlier samples,
-                or settings that are none.
+                or a wrong type of settings.
         """
         if settings is not None:
             refuse_faults(kind_faults("settings", settings, Settings, "Settings(workspace), or None"))
@@ -116,8 +81,8 @@ class Planner:
         self._sample: Sample | None = None
         self._observer = Observer(self._formulas, specification.regions)
         self._symbol: Symbol = ()
-        self._pruned: dict[Edge, str] = {}
-        self._attempts = Attempts()
+        self._pruned: dict[Edge, Reason] = {}
+        self._attempts = _Attempts()
         self._running: Step | None = None
         self._waiting: Step | None = None
         self._ahead: tuple[int, ...] = ()
@@ -125,10 +90,10 @@ class Planner:
 
     @property
     def settings(self) -> Settings:
-        """Where and how it plans.
+        """Where and how to plan.
 
         Raises:
-            UsageError: none were given, and no sample has been observed yet.
+            UsageError: they depend on the first sample, which has not been observed yet.
         """
         if self._settings is None:
             raise UsageError("where to plan depends on the first sample; observe one first, or give settings")
@@ -136,19 +101,19 @@ class Planner:
 
     @property
     def states(self) -> tuple[int, ...]:
-        """Where the automaton can be after the samples observed; one state where everything is known."""
+        """The states that the automaton can be in; one if all propositions were known."""
         return tuple(sorted(self._states))
 
     @property
     def is_accepting(self) -> bool:
-        """Whether the samples observed satisfy the specification, as far as propositions tell."""
+        """Whether the samples observed satisfy the specification, by its propositions."""
         return self._sample is not None and self._states <= self.automaton.accepting
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether they satisfy it unless it was violated for good while not enough was seen.
+        """Whether they satisfy it unless it was violated while propositions were unknown.
 
-        No later sample takes that doubt away.
+        No later sample can resolve this doubt.
         """
         if self._sample is None or self._states.isdisjoint(self.automaton.accepting):
             return False
@@ -156,12 +121,12 @@ class Planner:
         return bool(open_states) and open_states.isdisjoint(self.automaton.can_accept)
 
     def observe(self, sample: Sample) -> None:
-        """Take in the next sample.
+        """Take the next sample.
 
         Raises:
-            TraceError: a time that does not come after the last one's.
-            UsageError: what is no sample; at the first one: the settings name objects to be moved that nobody
-                knows, or there are no settings and no objects.
+            TraceError: its time is not after that of the last one.
+            UsageError: not a sample; or, at the first one, the settings name unknown objects, or there are
+                neither settings nor objects.
         """
         if not isinstance(sample, Sample):
             raise UsageError(f"{sample!r} is no sample; give a Sample(time_ns, objects)")
@@ -177,18 +142,17 @@ class Planner:
         self._sample = sample
         self._symbol = self._observer.symbol(sample)
         self._states = self.automaton.step_set(self._states, self._symbol)
-        # a wait goes on while time leads where it was to lead
+        # a wait ends early if the automaton is not where time alone should have taken it
         self._ahead = self._ahead[1:] if not self._states.isdisjoint(self._ahead[:1]) else ()
 
     def next_step(self) -> Step:
-        """Decide on what the samples observed so far say (Algorithm 1).
+        """Return the next decision (Algorithm 1).
 
-        Edges that no movable object can take now are pruned, and the next shortest path is tried, until one
-        can be taken or none is left. Where nothing is to be done but to let time pass, the same step comes
-        again and again until that is over.
+        Edges that no movable object can take now are pruned, and the next shortest path is tried, until an
+        edge can be taken or no path is left. A wait is returned as the same step until it is over.
 
         Raises:
-            UsageError: nothing was observed yet, or a step is being executed and was not concluded.
+            UsageError: nothing was observed yet, or the last step was not concluded.
         """
         self._newest()
         if self._running is not None:
@@ -204,12 +168,12 @@ class Planner:
         return step
 
     def conclude(self, outcome: Outcome) -> None:
-        """Say how the execution of the last step went, once its samples were observed.
+        """Take the outcome of the last step, after the samples of its execution.
 
-        A place where an object could not be brought is avoided when the same progress is tried for again.
+        Later targets for the same progress avoid the place of a failed motion.
 
         Raises:
-            UsageError: what is no outcome, or no step is being executed.
+            UsageError: not an outcome, or no step is being executed.
         """
         if not isinstance(outcome, Outcome):
             raise UsageError(f"{outcome!r} is no outcome; give an Outcome(succeeded, reason)")
@@ -223,7 +187,7 @@ class Planner:
         return bool(self._ahead) if step.ahead else self._is_blind()
 
     def _is_blind(self) -> bool:
-        """Whether too little is seen to tell where the automaton is."""
+        """Return whether unknown propositions leave the automaton's state open."""
         is_accepting = self._states <= self.automaton.accepting
         return len(self._states) > 1 and None in self._symbol and not is_accepting
 
@@ -241,31 +205,31 @@ class Planner:
         return self._step_from(state)
 
     def _step_from(self, state: int) -> Step:
-        """The step for the first edge of a shortest path that can be taken."""
-        drift = drift_of(self.automaton, state, self._symbol)
+        """Return the step for the first edge, over the paths by length, that can be taken."""
+        idle = idle_transitions(self.automaton, state, self._symbol)
         movables = Movables(self._formulas, self._regions, self._newest(), self.settings)
         considered: list[Consideration] = []
-        # what time alone does need not be given up
-        given_up = set(self._pruned) - drift.edges
-        while (way := next(self.automaton.paths(state, given_up), None)) is not None:
-            consideration = consideration_of(self.automaton, way, given_up, self._symbol)
-            if ahead := drift.along(way):
+        # time takes idle transitions without any object being moved, so they stay possible
+        pruned = set(self._pruned) - idle.edges
+        while (path := next(self.automaton.paths(state, pruned), None)) is not None:
+            consideration = consideration_of(self.automaton, path, pruned, self._symbol)
+            if ahead := idle.along(path):
                 return self._waiting_step([*considered, consideration], ahead)
             considered.append(self._considered(consideration, movables))
-            if not considered[-1].pruned:
+            if (reason := considered[-1].pruned) is None:
                 return self._running_step(considered)
             edge = consideration.edge
-            self._pruned[edge] = considered[-1].pruned
-            given_up |= {edge, *twins_of(self.automaton, consideration, drift, given_up, self._symbol)}
+            self._pruned[edge] = reason
+            pruned |= {edge, *equivalent_edges(self.automaton, consideration, idle, pruned, self._symbol)}
         return self._decided("no path", considered, why_no_path(self.automaton, state, self._pruned))
 
     def _considered(self, consideration: Consideration, movables: Movables) -> Consideration:
-        """Look into an edge: which objects could do what it takes."""
-        enough = self._attempts.why_enough(consideration.edge, self.settings.attempts)
-        if enough:
-            return replace(consideration, pruned=enough)
+        """Return an edge with its candidates, or pruned."""
+        exhausted = self._attempts.why_exhausted(consideration.edge, self.settings.attempts)
+        if exhausted is not None:
+            return replace(consideration, pruned=exhausted)
         candidates = [
-            movables.candidate(name, consideration, self._attempts.failed(consideration, name))
+            movables.candidate(name, consideration, self._attempts.failed_places(consideration, name))
             for name in movables.names_for(consideration.progress)
         ]
         return with_choice(consideration, candidates, self.settings)
@@ -299,7 +263,40 @@ class Planner:
         return self._sample
 
     def _unknown(self) -> str:
-        """The propositions that the newest sample says nothing about."""
+        """Return the labels of the propositions that the newest sample leaves unknown."""
         propositions = self.automaton.propositions
         labels = zip(propositions, self._symbol, strict=True)
         return ", ".join(each.label for each, value in labels if value is None)
+
+
+class _Attempts:
+    """The motions of a run, by the edge that they were for."""
+
+    def __init__(self) -> None:
+        self._failed: Counter[Edge] = Counter()
+        self._total: Counter[Edge] = Counter()
+        self._places: dict[tuple[Cubes, str], tuple[tuple[float, float], ...]] = {}
+
+    def why_exhausted(self, edge: Edge, most_failed: int) -> Reason | None:
+        """Return why an edge is not tried again; None if it may be."""
+        if self._failed[edge] >= most_failed:
+            return Reason(f"tried {self._failed[edge]} times")
+        # a motion that succeeds clears the failures, so that G F … would go on without end
+        return Reason(f"tried {MOST_MOTIONS} times in all") if self._total[edge] >= MOST_MOTIONS else None
+
+    def begin(self, edge: Edge) -> None:
+        """Count a motion for an edge, as failed until it is concluded."""
+        self._failed[edge] += 1
+        self._total[edge] += 1
+
+    def conclude(self, aim: Consideration, target: Target, outcome: Outcome, states: Sequence[int]) -> None:
+        """Take the outcome of a motion, and the automaton's states after it."""
+        if not outcome.succeeded:
+            key = (aim.progress.cubes, target.name)
+            self._places[key] = (*self._places.get(key, ()), (target.x, target.y))
+        elif tuple(states) == aim.edge[1:]:
+            del self._failed[aim.edge]
+
+    def failed_places(self, aim: Consideration, name: str) -> tuple[tuple[float, float], ...]:
+        """Return the places (x, y) where moving an object for the same progress failed."""
+        return self._places.get((aim.progress.cubes, name), ())

@@ -20,6 +20,7 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanGuard,
     PlanTarget,
 )
+from spatial_replay.planning.decisions import Reason
 from spatial_replay.report.compact import Packing, singles
 
 MOST_CELLS: Final = 1_500_000
@@ -243,7 +244,7 @@ def _edge_value(edge: PlanEdge, is_aim: bool) -> Mapping[str, Any]:
         "progress": _guard_texts(edge.progress),
         "constraints": _guard_texts(edge.constraints),
         "candidates": [_candidate_value(candidate) for candidate in edge.candidates],
-        "pruned": edge.pruned.split(" (", 1)[0],
+        "pruned": Reason.from_text(edge.pruned).kind,
     }
 
 

@@ -176,7 +176,7 @@ def test_a_planner_comes_to_an_end_and_says_what_it_gave_up(specification, optio
     assert planner.is_accepting or step.kind != "hold" or len(planner.states) > 1
     if step.kind == "no path":
         assert step.reason.startswith("no path left")
-        assert all(reason for _, reason in step.pruned)
+        assert all(reason.kind for _, reason in step.pruned)
 
 
 @given(tasks(), settings_of_planners(), st.integers(0, 2**32 - 1))

@@ -18,6 +18,7 @@ from spatial_replay.errors import LogError, UsageError
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_PATH
 from spatial_replay.planning.decision_log import CELL
+from spatial_replay.planning.decisions import Reason
 from spatial_replay.planning.read import read_decisions
 from spatial_replay.planning.recompute import planner_of, redo_decisions
 from spatial_replay.planning.settings import Settings, settings_from_text, text_from_settings
@@ -44,7 +45,7 @@ def test_decisions_are_told_with_their_outcomes(tmp_path):
     assert told[0].outcome.reason == "it slipped"
     assert not told[-1].HasField("outcome")
     assert told[-1].kind == told[-1].KIND_HOLD
-    assert told[0].considered[0].pruned == steps[0].considered[0].pruned
+    assert Reason.from_text(told[0].considered[0].pruned) == steps[0].considered[0].pruned
     assert [each.object for each in told[0].considered[1].candidates] == ["blue", "green", "red"]
 
 

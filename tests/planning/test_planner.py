@@ -10,7 +10,7 @@ import pytest
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, PUSHING, Table, block, run
 from spatial_replay.errors import TraceError, UsageError
-from spatial_replay.planning.decisions import Outcome
+from spatial_replay.planning.decisions import Outcome, Reason
 from spatial_replay.planning.maps import moved_object
 from spatial_replay.planning.planner import MOST_MOTIONS, Planner
 from spatial_replay.planning.settings import Settings
@@ -35,7 +35,7 @@ def test_three_blocks_are_pushed_as_in_the_paper():
     steps, table = run(planner(PUSHING, PUSH), BLOCKS)
     assert [step.kind for step in steps] == ["execute", "execute", "hold"]
     assert len(steps[0].pruned) == 1
-    assert steps[0].considered[0].pruned.startswith("no object can do it")
+    assert steps[0].considered[0].pruned.kind == "no object can do it"
     assert steps[0].considered[0].path[-1] == steps[1].considered[-1].path[-1]
     result = sr.evaluate(sr.parse_specification(PUSHING), sr.Trace.from_samples(table.samples))
     assert result.verdict == "satisfied"
@@ -128,16 +128,16 @@ def test_what_no_way_leads_to_is_not_pushed():
     walls = (sr.Footprint.box(-0.6, -20, -0.4, 30),)
     workspace = Workspace(Grid.over(0, 0, 10, 10, 0.5), obstacles=walls)
     steps, _ = run(planner(NEAR, Settings(workspace, "push", movable=("cup",))), OUTSIDE)
-    assert "cup: no free path leads into reach" in steps[0].pruned[0][1]
+    assert "cup: no free path leads into reach" in steps[0].pruned[0][1].detail
     far = {**OUTSIDE, "cup": block(-30, 5, size=1)}
     steps, _ = run(planner(NEAR, Settings(workspace, "push", movable=("cup",))), far)
-    assert "cup: it lies too far outside the workspace" in steps[0].pruned[0][1]
+    assert "cup: it lies too far outside the workspace" in steps[0].pruned[0][1].detail
 
 
 def test_what_cannot_be_moved_is_given_up_with_a_reason():
     steps, _ = run(planner("F (cup enclosedin plate)"), THINGS, stuck={"cup", "plate"})
     assert steps[-1].kind == "no path"
-    assert steps[-1].pruned == (((0, 1), "tried 3 times"),)
+    assert steps[-1].pruned == (((0, 1), Reason("tried 3 times")),)
     assert "no path left" in steps[-1].reason
     assert len(steps) == 1 + TABLE.attempts
 
@@ -148,7 +148,7 @@ def test_what_is_impossible_ends_with_the_edges_given_up():
     assert steps[0].reason.startswith("no path left")
     ((edge, reason),) = steps[0].pruned
     assert edge == (0, 1)
-    assert "cup: nowhere would it hold" in reason
+    assert "cup: nowhere would it hold" in reason.detail
 
 
 def test_what_is_violated_for_good_has_no_path():
@@ -191,13 +191,13 @@ def test_where_everything_was_tried_nothing_is_left():
     settings = Settings(Workspace(Grid.over(2.0, 4.5, 3.0, 5.5, 1.0)), movable=("cup",), attempts=9)
     steps, _ = run(planner("F (cup leftof plate and cup dist plate <= 1)", settings), THINGS, stuck={"cup"})
     assert [step.kind for step in steps] == ["execute", "no path"]
-    assert "it was tried wherever it would hold" in steps[-1].pruned[0][1]
+    assert "it was tried wherever it would hold" in steps[-1].pruned[0][1].detail
 
 
 def test_what_nobody_can_move_is_not_planned_for():
     settings = Settings(TABLE.workspace, movable=("fork",))
     steps, _ = run(planner("F (cup leftof plate and cup above plate)", settings), THINGS)
-    assert steps[0].pruned == (((0, 1), "no object that can be moved matters to it"),)
+    assert steps[0].pruned == (((0, 1), Reason("no object that can be moved matters to it")),)
 
 
 def test_equal_samples_give_equal_steps():
@@ -242,7 +242,7 @@ def test_a_reason_names_a_few_edges_of_many():
         "no path left: every way from state 0 was given up "
         "(0 -> 1, 0 -> 2, 0 -> 3, 0 -> 4 and 3 more: no object can do it)"
     )
-    assert all("cup: " in reason for _, reason in steps[-1].pruned)
+    assert all("cup: " in reason.detail for _, reason in steps[-1].pruned)
 
 
 def test_formulas_that_cannot_be_planned_are_refused():
@@ -323,4 +323,4 @@ def test_even_what_succeeds_comes_to_an_end():
         table.look()
     assert step.kind == "no path"
     assert motions == MOST_MOTIONS
-    assert step.pruned[0][1] == f"tried {MOST_MOTIONS} times in all"
+    assert step.pruned[0][1] == Reason(f"tried {MOST_MOTIONS} times in all")
