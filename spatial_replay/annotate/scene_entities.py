@@ -21,13 +21,12 @@ from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletio
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import Floats, Integers, flat_index, starts_from_counts
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.logs.objects.wire import Bytes, Template
 from spatial_replay.palette import LABEL, NEGATIVE
 from spatial_replay.spec.formula import Outline
-from spatial_replay.trace.observations import flat_index, starts_from_counts
 
 FRAME: Final = "world"
 

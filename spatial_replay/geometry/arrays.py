@@ -1,7 +1,11 @@
-"""Names for the arrays that geometry takes and gives."""
+"""Array types of the numerical rooms, and helpers for ragged rows.
+
+Ragged rows keep rows of unequal length in one flat array: row r is `values[start[r] : start[r + 1]]`.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -14,14 +18,33 @@ Booleans: TypeAlias = NDArray[np.bool_]
 
 
 def read_only_floats(values: ArrayLike) -> Floats:
-    """A contiguous float64 view (or, where need be, copy) that cannot be written to."""
+    """Return a contiguous, read-only float64 view, or a copy where a view is not possible."""
     view = np.ascontiguousarray(values, dtype=np.float64).view()
     view.flags.writeable = False
     return view
 
 
 def read_only_integers(values: ArrayLike) -> Integers:
-    """A contiguous int64 view (or, where need be, copy) that cannot be written to."""
+    """Return a contiguous, read-only int64 view, or a copy where a view is not possible."""
     view = np.ascontiguousarray(values, dtype=np.int64).view()
     view.flags.writeable = False
     return view
+
+
+def starts_from_counts(counts: Sequence[int] | Integers) -> Integers:
+    """Return where each of n rows of the given lengths begins and the last one ends, (n + 1,)."""
+    start = np.zeros(len(counts) + 1, np.int64)
+    np.cumsum(counts, out=start[1:])
+    return start
+
+
+def flat_index(first: Integers, counts: Integers) -> Integers:
+    """Return the flat indices of the elements of rows that begin at `first` (n,) with lengths `counts` (n,)."""
+    begins = starts_from_counts(counts)
+    return np.asarray(np.repeat(first - begins[:-1], counts) + np.arange(begins[-1], dtype=np.int64))
+
+
+def count_in_rows(flags: Booleans, start: Integers) -> Integers:
+    """Count the flags set in each row; rows may be empty."""
+    total = starts_from_counts(flags.astype(np.int64))
+    return np.asarray(total[start[1:]] - total[start[:-1]])

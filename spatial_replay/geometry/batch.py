@@ -1,4 +1,4 @@
-"""Many footprints in flat arrays: what the kernels read and what a log fills."""
+"""Many footprints in flat arrays, as logs provide and kernels read them."""
 
 from __future__ import annotations
 
@@ -8,20 +8,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from spatial_replay.errors import GeometryError
-from spatial_replay.geometry.arrays import Floats as Floats
-from spatial_replay.geometry.arrays import Integers as Integers
-from spatial_replay.geometry.arrays import read_only_floats, read_only_integers
+from spatial_replay.geometry.arrays import (
+    Floats,
+    Integers,
+    flat_index,
+    read_only_floats,
+    read_only_integers,
+    starts_from_counts,
+)
 from spatial_replay.geometry.footprint import ConvexPart, Footprint
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FootprintBatch:
-    """R footprints made of P convex parts with V vertices in all, as ragged rows.
+    """R footprints made of P convex parts with V vertices in total, as ragged rows.
 
     Footprint r has the parts part_start[r] up to part_start[r + 1]; part p has the vertices
     vertex_start[p] up to vertex_start[p + 1]. Vertices of a part are in counter-clockwise order, without
-    repeated or collinear ones (one vertex: a point or disc, two: a segment or capsule); for raw ones
-    there is `normalise_polygons`.
+    repeated or collinear ones (one vertex: a point or disc, two: a segment or capsule); raw outlines go
+    through `normalise_polygons` first.
 
     Attributes:
         part_start: (R + 1,) int64.
@@ -29,7 +34,7 @@ class FootprintBatch:
         vertices: (V, 2) float64, in footprint units.
         radius: (P,) float64, rounding radius of each part, at least 0.
         bottom, top: (R,) float64, height interval; NaN where a footprint has none.
-        All of them contiguous and read-only.
+        All are contiguous and read-only.
 
     Raises:
         GeometryError: arrays whose lengths do not fit together.
@@ -72,12 +77,12 @@ class FootprintBatch:
         footprints: Sequence[Footprint],
         heights: Sequence[tuple[float, float] | None] | None = None,
     ) -> FootprintBatch:
-        """One row for each footprint, with its height interval (bottom, top) where it has one."""
+        """Build one row per footprint, with its height interval (bottom, top) if it has one."""
         parts = [part for footprint in footprints for part in footprint.parts]
         intervals = [height or (np.nan, np.nan) for height in heights or [None] * len(footprints)]
         return cls(
-            part_start=_starts([len(footprint.parts) for footprint in footprints]),
-            vertex_start=_starts([len(part.vertices) for part in parts]),
+            part_start=starts_from_counts([len(footprint.parts) for footprint in footprints]),
+            vertex_start=starts_from_counts([len(part.vertices) for part in parts]),
             vertices=np.concatenate([np.empty((0, 2)), *(part.vertices for part in parts)]),
             radius=np.array([part.radius for part in parts], dtype=np.float64),
             bottom=np.array([bottom for bottom, _ in intervals], dtype=np.float64),
@@ -86,10 +91,13 @@ class FootprintBatch:
 
     @classmethod
     def concatenate(cls, batches: Sequence[FootprintBatch]) -> FootprintBatch:
-        """The rows of several batches, one after the other."""
+        """Join the rows of several batches, one after the other."""
+        none = np.empty(0, np.int64)
+        part_counts = np.concatenate([none, *(np.diff(batch.part_start) for batch in batches)])
+        vertex_counts = np.concatenate([none, *(np.diff(batch.vertex_start) for batch in batches)])
         return cls(
-            part_start=_starts(np.concatenate([_NONE, *(np.diff(b.part_start) for b in batches)])),
-            vertex_start=_starts(np.concatenate([_NONE, *(np.diff(b.vertex_start) for b in batches)])),
+            part_start=starts_from_counts(part_counts),
+            vertex_start=starts_from_counts(vertex_counts),
             vertices=np.concatenate([np.empty((0, 2)), *(batch.vertices for batch in batches)]),
             radius=np.concatenate([np.empty(0), *(batch.radius for batch in batches)]),
             bottom=np.concatenate([np.empty(0), *(batch.bottom for batch in batches)]),
@@ -97,23 +105,24 @@ class FootprintBatch:
         )
 
     def select(self, rows: Integers) -> FootprintBatch:
-        """The given rows (K,), in the order given; a row may be given more than once."""
-        parts, part_start = _gather(self.part_start, np.asarray(rows, dtype=np.int64))
-        vertices, vertex_start = _gather(self.vertex_start, parts)
+        """Return the given rows (K,), in the order given; a row may be repeated."""
+        part_counts = self.part_start[rows + 1] - self.part_start[rows]
+        parts = flat_index(self.part_start[rows], part_counts)
+        vertex_counts = self.vertex_start[parts + 1] - self.vertex_start[parts]
         return FootprintBatch(
-            part_start=part_start,
-            vertex_start=vertex_start,
-            vertices=self.vertices[vertices],
+            part_start=starts_from_counts(part_counts),
+            vertex_start=starts_from_counts(vertex_counts),
+            vertices=self.vertices[flat_index(self.vertex_start[parts], vertex_counts)],
             radius=self.radius[parts],
             bottom=self.bottom[rows],
             top=self.top[rows],
         )
 
     def footprint(self, row: int) -> Footprint:
-        """The footprint of one row, as a value of its own.
+        """Return the footprint of one row.
 
         Raises:
-            GeometryError: if the row's coordinates make no convex parts.
+            GeometryError: the row's coordinates are not those of convex parts.
         """
         parts = []
         for part in range(self.part_start[row], self.part_start[row + 1]):
@@ -122,24 +131,7 @@ class FootprintBatch:
         return Footprint(tuple(parts))
 
     def height(self, row: int) -> tuple[float, float] | None:
-        """The height interval (bottom, top) of one row, or None."""
+        """Return the height interval (bottom, top) of one row, or None."""
         if np.isnan(self.bottom[row]):
             return None
         return float(self.bottom[row]), float(self.top[row])
-
-
-_NONE = np.empty(0, dtype=np.int64)
-
-
-def _starts(counts: Sequence[int] | Integers) -> Integers:
-    """(N + 1,) offsets of N ragged rows of the given lengths."""
-    starts = np.zeros(len(counts) + 1, dtype=np.int64)
-    np.cumsum(counts, out=starts[1:])
-    return starts
-
-
-def _gather(starts: Integers, rows: Integers) -> tuple[Integers, Integers]:
-    """Indices of everything in the chosen ragged rows, and the offsets of those rows among them."""
-    counts = starts[rows + 1] - starts[rows]
-    chosen = _starts(counts)
-    return np.repeat(starts[rows] - chosen[:-1], counts) + np.arange(chosen[-1]), chosen

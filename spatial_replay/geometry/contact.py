@@ -1,11 +1,6 @@
-"""Where two footprints are nearest to each other, deepest in each other, or stick out of each other.
+"""Points where two footprints are nearest, overlap deepest, or where one protrudes farthest from another.
 
-For one pair at one time, to be shown to people (see `contacts` for many): what is measured over many samples
-is in `measure`.
-
-Where two unions of footprints are nearest to each other or stick out of each other, in many samples.
-
-What `contact` says of one pair, for pictures of whole runs: to be looked at, not to be measured with.
+For pictures and explanations only; robustness is computed by `measure`.
 """
 
 from __future__ import annotations
@@ -21,20 +16,62 @@ from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import ConvexPart, Footprint
 from spatial_replay.geometry.measure import Operand
 
+Point = tuple[float, float]
+
 _Line = tuple[float, float, float, float, float]
-"""From a point (x, y) of one polygon, in a direction (x, y), as far as (signed) to one of another."""
+"""A point (x, y) of one polygon, a unit direction (x, y), and the signed distance along it to the other."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """A pair of points, one on each of two footprints.
+
+    Attributes:
+        first, second: the nearest points of disjoint footprints; for overlapping ones, the ends of the
+            shortest translation that separates them.
+        distance: signed, negative for overlap; its absolute value is the distance of the points.
+    """
+
+    first: Point
+    second: Point
+    distance: float
+
+
+def contact(a: Footprint, b: Footprint) -> Contact:
+    """Return where the signed distance of two footprints is attained (Def. 2-4)."""
+    return _contact(a, b, is_protrusion=False)
+
+
+def protrusion_contact(inner: Footprint, outer: Footprint) -> Contact:
+    """Return the point of `inner` farthest outside `outer` or least deep in it, and the nearest on its boundary.
+
+    The distance is the protrusion: positive where `inner` sticks out (Prop. 2).
+    """
+    return _contact(inner, outer, is_protrusion=True)
+
+
+def _contact(first: Footprint, second: Footprint, *, is_protrusion: bool) -> Contact:
+    batch = FootprintBatch.from_footprints([first, second])
+    operands = [Operand(np.array([[row]])) for row in range(2)]
+    x, y, other_x, other_y, distance, _ = contacts(batch, *operands, is_protrusion=is_protrusion)[0].tolist()
+    return Contact((x, y), (other_x, other_y), distance)
+
+
+def enlarged(footprint: Footprint, radius: float) -> Footprint:
+    """Return the Minkowski sum of a footprint with a disc of the given radius (at least 0)."""
+    return Footprint(tuple(ConvexPart(part.vertices, part.radius + radius) for part in footprint.parts))
 
 
 def contacts(batch: FootprintBatch, first: Operand, second: Operand, *, is_protrusion: bool) -> Floats:
-    """Where the signed distance of two operands is attained in each sample, or how far one sticks out.
+    """Return where the signed distance (or protrusion) of two operands is attained in each sample.
 
-    Heights play no part.
+    Heights are ignored.
 
     Returns:
-        (T, 6): a point of `first`, one of `second`, their signed distance (or protrusion), and the upper end
-        of the higher of the two footprints, NaN if neither has a height. NaN where either is empty.
+        (T, 6): a point of `first`, a point of `second`, their signed distance (or protrusion), and the upper
+        end of the higher of the two footprints, NaN if neither has a height. NaN where an operand is empty.
     """
-    found = np.full((len(first.rows), 6), np.nan)
+    result = np.full((len(first.rows), 6), np.nan)
     _contacts(
         batch.part_start,
         batch.vertex_start,
@@ -46,9 +83,9 @@ def contacts(batch: FootprintBatch, first: Operand, second: Operand, *, is_protr
         float(first.enlargement),
         float(second.enlargement),
         is_protrusion,
-        found,
+        result,
     )
-    return found
+    return result
 
 
 @kernel
@@ -63,10 +100,10 @@ def _contacts(
     first_enlargement: float,
     second_enlargement: float,
     is_protrusion: bool,
-    found: Floats,
+    result: Floats,
 ) -> None:
-    """Fill `found` (T, 6); `first` and `second` are rows (T, M), below 0 where nobody is."""
-    for t in range(found.shape[0]):
+    """Fill `result` (T, 6); `first` and `second` are rows (T, M), negative for empty places."""
+    for t in range(result.shape[0]):
         greatest = -np.inf
         least = np.inf
         for i in range(first.shape[1]):
@@ -74,6 +111,7 @@ def _contacts(
             if a < 0:
                 continue
             for p in range(part_start[a], part_start[a + 1]):
+                # a protrusion is a maximum over the parts of `first` of minima, a distance one minimum
                 if is_protrusion:
                     least = np.inf
                 px, py, dx, dy, distance = np.nan, np.nan, 1.0, 0.0, np.inf
@@ -99,16 +137,16 @@ def _contacts(
                 is_taken = distance > greatest if is_protrusion else distance < np.inf
                 if is_taken and not math.isnan(px):
                     greatest = distance
-                    found[t, 0], found[t, 1] = px, py
-                    found[t, 2], found[t, 3] = px + dx * distance, py + dy * distance
-                    found[t, 4], found[t, 5] = distance, upper
+                    result[t, 0], result[t, 1] = px, py
+                    result[t, 2], result[t, 3] = px + dx * distance, py + dy * distance
+                    result[t, 4], result[t, 5] = distance, upper
 
 
 @piece
 def _of_parts(
     vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int, is_protrusion: bool
 ) -> _Line:
-    """Of the whole part A to B, or of the vertex of A that is farthest out of B."""
+    """Return the line from part A to B or, for a protrusion, from A's vertex farthest outside B."""
     if not is_protrusion:
         return _line(vertices, a_start, a_stop, b_start, b_stop)
     farthest = _line(vertices, a_start, a_start + 1, b_start, b_stop)
@@ -121,7 +159,7 @@ def _of_parts(
 
 @piece
 def _line(vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int) -> _Line:
-    """The line between two convex polygons, segments or points along which their signed distance is."""
+    """Return the line along which two convex polygons, segments or points attain their signed distance."""
     from_a = _push(vertices, a_start, a_stop, b_start, b_stop)
     from_b = _push(vertices, b_start, b_stop, a_start, a_stop)
     if from_b[4] > from_a[4]:
@@ -139,7 +177,7 @@ def _line(vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
 
 @piece
 def _push(vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int) -> _Line:
-    """From the edge of A that keeps B farthest away, to what is deepest of B; -inf far if A has no edge."""
+    """Return the line from A's most separating edge to the deepest point of B; -inf long if A has no edge."""
     best = (vertices[a_start, 0], vertices[a_start, 1], 1.0, 0.0, -np.inf)
     if a_stop - a_start < 2:
         return best
@@ -153,7 +191,7 @@ def _push(vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
         if height > best[4]:
             place = 0.5 * (min(max(low, 0.0), length) + min(max(high, 0.0), length)) if low < high else low
             best = (x + ax * place, y + ay * place, ay, -ax, height)
-        if a_stop - a_start == 2:  # a segment has ends, too
+        if a_stop - a_start == 2:  # beyond its ends a segment separates too, where its normals see no gap
             x, y = vertices[following, 0], vertices[following, 1]
             height, low, high = _deepest(vertices, b_start, b_stop, x, y, ax, ay)
             if height > best[4]:
@@ -166,10 +204,11 @@ def _push(vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
 def _deepest(
     vertices: Floats, start: int, stop: int, x: float, y: float, nx: float, ny: float
 ) -> tuple[float, float, float]:
-    """The least height of a part above a line with a normal, and from where to where along it that is."""
+    """Return the least height of a part above a line, and the range along the line where it is attained."""
     height, low, high = np.inf, np.inf, -np.inf
     for j in range(start, stop):
         height = min(height, (vertices[j, 0] - x) * nx + (vertices[j, 1] - y) * ny)
+    # an edge parallel to the line is deepest along all of its length, within rounding
     slack = 1e-9 * (abs(height) + abs(x) + abs(y))
     for j in range(start, stop):
         dx, dy = vertices[j, 0] - x, vertices[j, 1] - y
@@ -181,7 +220,7 @@ def _deepest(
 
 @piece
 def _nearest(vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int) -> _Line:
-    """From the point of A's border that is nearest to a vertex of B, to that vertex."""
+    """Return the line from the point of A's boundary nearest to a vertex of B, to that vertex."""
     best = (vertices[a_start, 0], vertices[a_start, 1], 1.0, 0.0, np.inf)
     for i in range(a_start, a_stop):
         following = i + 1 if i + 1 < a_stop else a_start
@@ -197,46 +236,3 @@ def _nearest(vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: 
                 nx, ny = (gx / distance, gy / distance) if distance > 0.0 else (1.0, 0.0)
                 best = (x + share * ax, y + share * ay, nx, ny, distance)
     return best
-
-
-Point = tuple[float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Contact:
-    """A point of each of two footprints.
-
-    Attributes:
-        first, second: of footprints that are apart, the points nearest to each other; of overlapping ones,
-            the ends of the shortest push that would part them.
-        distance: signed, negative where they overlap; its absolute value is the distance of the points.
-    """
-
-    first: Point
-    second: Point
-    distance: float
-
-
-def contact(a: Footprint, b: Footprint) -> Contact:
-    """Where the signed distance of two footprints is attained (Def. 2-4)."""
-    return _contact(a, b, is_protrusion=False)
-
-
-def protrusion_contact(inner: Footprint, outer: Footprint) -> Contact:
-    """The point of `inner` farthest out of `outer`, or least deep in it, and the nearest on its boundary.
-
-    Its distance is the protrusion: positive where `inner` sticks out (Prop. 2).
-    """
-    return _contact(inner, outer, is_protrusion=True)
-
-
-def enlarged(footprint: Footprint, radius: float) -> Footprint:
-    """The Minkowski sum of a footprint with a disc of a radius of at least 0."""
-    return Footprint(tuple(ConvexPart(part.vertices, part.radius + radius) for part in footprint.parts))
-
-
-def _contact(first: Footprint, second: Footprint, *, is_protrusion: bool) -> Contact:
-    batch = FootprintBatch.from_footprints([first, second])
-    operands = [Operand(np.array([[row]])) for row in range(2)]
-    x, y, other_x, other_y, distance, _ = contacts(batch, *operands, is_protrusion=is_protrusion)[0].tolist()
-    return Contact((x, y), (other_x, other_y), distance)

@@ -15,14 +15,14 @@ from spatial_replay.geometry.arrays import Floats, read_only_floats
 from spatial_replay.geometry.outline import NOT_CONVEX, SOUND, convex_hull, convex_pieces, normalise_polygons
 
 Concave: TypeAlias = Literal["decompose", "hull"]
-"""What becomes of a non-convex polygon: convex parts that cover exactly it, or its convex hull."""
+"""How a non-convex polygon is treated: split into convex parts, or replaced by its convex hull."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConvexPart:
-    """A convex polygon, rounded: the Minkowski sum of its hull with a disc.
+    """A rounded convex polygon: the Minkowski sum of its hull with a disc.
 
-    Two parts are equal when their radii are and their vertices, whichever comes first.
+    Two parts are equal when their radii and their rings of vertices are, wherever the rings start.
 
     Attributes:
         vertices: (n, 2) float64, read-only, counter-clockwise, no repeated or collinear ones; one
@@ -31,7 +31,7 @@ class ConvexPart:
 
     Raises:
         GeometryError: no vertex, coordinates that are not finite, vertices that are not convex, a
-            negative radius. Clockwise order, repeated and collinear vertices are accepted and put right.
+            negative radius. Clockwise order, repeated and collinear vertices are accepted and corrected.
     """
 
     vertices: Floats
@@ -64,10 +64,10 @@ class ConvexPart:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Footprint:
-    """A union of rounded convex parts; equal when the parts are, in whatever order.
+    """A union of rounded convex parts; equal when the sets of parts are.
 
     Raises:
-        GeometryError: if there is no part.
+        GeometryError: no part.
     """
 
     parts: tuple[ConvexPart, ...]
@@ -90,11 +90,10 @@ class Footprint:
 
     @classmethod
     def box(cls, xmin: float, ymin: float, xmax: float, ymax: float) -> Footprint:
-        """The axis-aligned box with two opposite corners.
+        """Return an axis-aligned box; equal limits make a segment or a point.
 
         Raises:
-            GeometryError: coordinates that are not finite, a least one above the greatest. Equal ones
-                are accepted: they make a segment or a point.
+            GeometryError: coordinates that are not finite, a minimum above its maximum.
         """
         if xmin > xmax or ymin > ymax:
             raise GeometryError(
@@ -105,7 +104,7 @@ class Footprint:
 
     @classmethod
     def disc(cls, x: float, y: float, radius: float) -> Footprint:
-        """The disc around (x, y); of radius 0, the point.
+        """Return the disc around (x, y); with radius 0, a point.
 
         Raises:
             GeometryError: a value that is not finite, a negative radius.
@@ -114,7 +113,7 @@ class Footprint:
 
     @classmethod
     def capsule(cls, start: ArrayLike, end: ArrayLike, radius: float) -> Footprint:
-        """All points within a distance of the segment from one point (x, y) to another.
+        """Return all points within `radius` of the segment between two points (x, y).
 
         Raises:
             GeometryError: a value that is not finite, a negative radius.
@@ -123,7 +122,7 @@ class Footprint:
 
     @classmethod
     def polygon(cls, vertices: ArrayLike, *, concave: Concave = "decompose") -> Footprint:
-        """The polygon with the given corners (n, 2), in either order.
+        """Return the polygon with the given corners (n, 2), in either order.
 
         Raises:
             GeometryError: no corner, coordinates that are not finite, a boundary that crosses itself
@@ -137,29 +136,29 @@ class Footprint:
         if concave == "hull":
             return cls((ConvexPart(convex_hull(corners)),))
         pieces = [ConvexPart(piece) for piece in convex_pieces(corners)]
-        # A piece thinner than coordinates resolve covers nothing that its neighbours do not.
+        # a piece thinner than coordinates resolve covers nothing beyond its neighbours
         return cls(tuple(piece for piece in pieces if len(piece.vertices) > 2))
 
     @classmethod
     def union(cls, footprints: Iterable[Footprint]) -> Footprint:
-        """All parts of some footprints.
+        """Join all parts of some footprints.
 
         Raises:
-            GeometryError: if there is no footprint.
+            GeometryError: no footprint.
         """
         return cls(tuple(part for footprint in footprints for part in footprint.parts))
 
 
 @dataclass(frozen=True, slots=True)
 class TrackedObject:
-    """A footprint with what else a log may know of an object.
+    """An object at one time: its footprint and what else a log reports of it.
 
     Attributes:
-        footprint: where it is.
-        class_name: what it is, or None.
+        footprint: the area it covers.
+        class_name: its class, or None.
         yaw: its orientation in radians, counter-clockwise from the x axis, or None.
         height: (bottom, top) in footprint units, or None.
-        uncertainty: radius, in footprint units, within which its true outline may differ.
+        uncertainty: how far its true outline may differ, as a radius in footprint units.
 
     Raises:
         GeometryError: a value that is not finite, bottom above top, a negative uncertainty.
@@ -186,10 +185,10 @@ class TrackedObject:
 
 
 def _tidy(vertices: ArrayLike) -> tuple[Floats, bool]:
-    """Normalised vertices, read-only, and whether they are convex.
+    """Return normalised, read-only vertices, and whether they are convex.
 
     Raises:
-        GeometryError: for anything but one or more finite points.
+        GeometryError: anything but one or more finite points.
     """
     try:
         corners = np.array(vertices, dtype=np.float64)
@@ -230,7 +229,7 @@ def _shown(vertices: Floats) -> str:
 
 
 def _ring(vertices: Floats) -> tuple[tuple[float, float], ...]:
-    """The vertices from the least on, so that it does not matter which came first."""
+    """Return the vertices from the least on, a form that equal rings share."""
     corners = [(x, y) for x, y in vertices.tolist()]
     first = corners.index(min(corners))
     return tuple(corners[first:] + corners[:first])

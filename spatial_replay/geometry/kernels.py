@@ -1,11 +1,10 @@
 """Compiled geometry of rounded convex parts: signed distance, protrusion, projections.
 
 All kernels share one layout, that of `FootprintBatch`: part p has the vertices `vertex_start[p]` up to
-`vertex_start[p + 1]`, row r the parts `part_start[r]` up to `part_start[r + 1]`. They stay in one
-module because the compiler's cache notices changes of a kernel's own file only.
+`vertex_start[p + 1]`, row r the parts `part_start[r]` up to `part_start[r + 1]`.
 
-What is measured for one pair of parts never depends on the rest of the call, and every loop over two
-parts treats them alike: equal footprints give equal bits, in either order and in any batch.
+The result for one pair of parts never depends on the rest of the call, and every loop over two parts
+treats them alike: equal footprints give equal bits, in either order and in any batch.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ CENTROID_MIN_X, CENTROID_MAX_X, CENTROID_MIN_Y, CENTROID_MAX_Y = 8, 9, 10, 11
 
 @inlined
 def _fill_edges(vertices: Floats, edges: Floats, start: int, stop: int) -> None:
-    """Set the edges of the part that has the vertices `start` up to `stop`."""
+    """Compute outward normal and length of each edge of the part with the vertices `start` up to `stop`."""
     if stop - start < 2:
         return
     for i in range(start, stop):
@@ -47,7 +46,7 @@ def _fill_rows(
     members: Integers,
     is_filled: NDArray[np.bool_],
 ) -> None:
-    """Set the edges of the rows among `members` that have none yet."""
+    """Compute the edges of the rows among `members` that have none yet."""
     for row in members:
         if row >= 0 and not is_filled[row]:
             is_filled[row] = True
@@ -57,7 +56,7 @@ def _fill_rows(
 
 @inlined
 def _least_height(vertices: Floats, start: int, stop: int, x: float, y: float, nx: float, ny: float) -> float:
-    """The least height of a part's vertices above the line through (x, y) with the normal (nx, ny)."""
+    """Return the least height of a part's vertices above the line through (x, y) with the normal (nx, ny)."""
     least = np.inf
     for j in range(start, stop):
         least = min(least, nx * (vertices[j, 0] - x) + ny * (vertices[j, 1] - y))
@@ -68,12 +67,12 @@ def _least_height(vertices: Floats, start: int, stop: int, x: float, y: float, n
 def _separate(
     vertices: Floats, edges: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
 ) -> tuple[float, float]:
-    """How far the edges of A keep B away.
+    """Return how far the edges of A separate it from B.
 
     Returns:
         (separation, nearest): the greatest, over A's edges, of the least height of B above the edge's
         line (-inf for a point); and the least height of a vertex of B above the edge that it projects
-        into (+inf where none does).
+        into (+inf if there is none).
     """
     separation = -np.inf
     nearest = np.inf
@@ -91,7 +90,7 @@ def _separate(
                 if 0.0 <= nx * dy - ny * dx <= edges[i, 2]:
                     nearest = min(nearest, nx * dx + ny * dy)
         if count == 2:
-            # Beyond the end of a segment the normals alone see no gap.
+            # beyond the ends of a segment its normals alone see no gap
             k = a_start + a_stop - 1 - i
             x, y = vertices[k, 0], vertices[k, 1]
             separation = max(separation, _least_height(vertices, b_start, b_stop, x, y, -ny, nx))
@@ -102,7 +101,7 @@ def _separate(
 def _convex_distance(
     vertices: Floats, edges: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
 ) -> float:
-    """Signed distance of two convex polygons, segments or points (without their radii).
+    """Return the signed distance of two convex polygons, segments or points (without their radii).
 
     Some edge normal attains the penetration depth. The distance of disjoint polygons is attained at a
     vertex and a point inside an edge, whose normal then separates by just that much, or at two vertices.
@@ -127,7 +126,7 @@ def _convex_distance(
 def _convex_protrusion(
     vertices: Floats, edges: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
 ) -> float:
-    """Greatest signed distance from a vertex of A to the polygon B (without their radii)."""
+    """Return the greatest signed distance from a vertex of A to the polygon B (without their radii)."""
     greatest = -np.inf
     for i in range(a_start, a_stop):
         greatest = max(greatest, _convex_distance(vertices, edges, i, i + 1, b_start, b_stop))
@@ -136,7 +135,8 @@ def _convex_protrusion(
 
 @inlined
 def _centroid(vertices: Floats, start: int, stop: int) -> tuple[float, float]:
-    """Area centroid of a polygon; the mean of its vertices where it has no area."""
+    """Return the area centroid of a polygon, or the mean of its vertices if it has no area."""
+    # relative to the first vertex, so that coordinates far from the origin do not cancel
     x0, y0 = vertices[start, 0], vertices[start, 1]
     area = sum_x = sum_y = 0.0
     for i in range(start + 1, stop - 1):
@@ -167,13 +167,14 @@ def _rows_distance(
     b: int,
     enlargement: float,
 ) -> float:
-    """Signed distance of rows a and b, as upright prisms where both have heights."""
+    """Return the signed distance of rows a and b, as upright prisms if both have heights."""
     least = np.inf
     for p in range(part_start[a], part_start[a + 1]):
         for q in range(part_start[b], part_start[b + 1]):
             distance = _convex_distance(
                 vertices, edges, vertex_start[p], vertex_start[p + 1], vertex_start[q], vertex_start[q + 1]
             )
+            # grouped so that swapping p and q cannot change a bit
             least = min(least, distance - ((radius[p] + radius[q]) + enlargement))
     if math.isnan(bottom[a]) or math.isnan(bottom[b]):
         return least
@@ -197,7 +198,7 @@ def _part_protrusion(
     b: int,
     enlargement: float,
 ) -> float:
-    """How far part p of row a sticks out of row b: the least over b's parts."""
+    """Return how far part p of row a sticks out of row b: the least over b's parts."""
     least = np.inf
     for q in range(part_start[b], part_start[b + 1]):
         planar = _convex_protrusion(
@@ -221,7 +222,7 @@ def _row_extreme(
     row: int,
     enlargement: float,
 ) -> float:
-    """A row's greatest coordinate for a MAX_ quantity; for a MIN_, the greatest of their negatives."""
+    """Return a row's greatest coordinate for a MAX_ quantity; for a MIN_, the greatest of their negatives."""
     if quantity == MIN_Z:
         return float(-bottom[row])
     if quantity == MAX_Z:
@@ -254,7 +255,7 @@ def _union_distance(
     second: tuple[int, int],
     enlargement: float,
 ) -> float:
-    """Signed distance of two unions of rows: the least over their pairs."""
+    """Return the signed distance of two unions of rows: the least over their pairs."""
     least = np.inf
     for i in range(first[0], first[1]):
         for j in range(second[0], second[1]):
@@ -281,7 +282,7 @@ def _union_protrusion(
     second: tuple[int, int],
     enlargement: float,
 ) -> float:
-    """How far a union of rows sticks out of another: greatest over parts of the least over parts."""
+    """Return how far a union of rows sticks out of another: greatest over parts of the least over parts."""
     greatest = -np.inf
     for i in range(first[0], first[1]):
         a = members[i]
@@ -313,7 +314,7 @@ def _union_extreme(
     quantity: int,
     enlargement: float,
 ) -> float:
-    """A projection of a union of rows; NaN along z if one of them has no height."""
+    """Return a projection of a union of rows; NaN along z if one of them has no height."""
     greatest = -np.inf
     for i in range(first[0], first[1]):
         row = members[i]
@@ -347,9 +348,10 @@ def measure_rows(
 ) -> None:
     """Fill `values` (K, T) with K quantities in T samples; see `measure`.
 
-    Operand o has, in sample t, the rows from `members[member_start[o] + t * width[o]]` on, `width[o]`
-    of them; `member_start` (O + 1,) ends with the number of all.
+    In sample t, operand o has the `width[o]` rows from `members[member_start[o] + t * width[o]]` on;
+    `member_start` (O + 1,) ends with the total.
     """
+    # edges only of rows that distances need: a log has many more that are projected or unused
     edges = np.empty((len(vertices), 3))
     is_filled = np.zeros(len(part_start), dtype=np.bool_)
     for k in range(len(quantity)):

@@ -1,7 +1,4 @@
-"""Measurements between footprints over many samples, in one kernel call.
-
-Orientation in the plane.
-"""
+"""Measurements of footprints and orientations over many samples, in one kernel call."""
 
 from __future__ import annotations
 
@@ -34,7 +31,7 @@ Quantity: TypeAlias = Literal[
     "centroid_max_y",
 ]
 
-# The kernels know a quantity by its place in the list above.
+# kernels address a quantity by its position in the list above
 QUANTITY_CODES: Mapping[str, int] = MappingProxyType(
     {name: code for code, name in enumerate(get_args(Quantity))}
 )
@@ -44,11 +41,11 @@ _NO_ROWS = np.empty(0, dtype=np.int64)
 
 @dataclass(frozen=True, slots=True)
 class Operand:
-    """A footprint over T samples: the union, in each sample, of the rows given.
+    """A footprint over T samples: the union of some rows in each sample.
 
     Attributes:
-        rows: (T, M) int64, row numbers into a `FootprintBatch`; any negative number leaves that
-            place empty. A single object has M = 1, a group of members M > 1.
+        rows: (T, M) int64, row numbers into a `FootprintBatch`; any negative number leaves the
+            place empty. A single object has M = 1, a group M = its number of members.
         enlargement: radius of the disc added (Minkowski sum), in footprint units.
     """
 
@@ -66,7 +63,7 @@ class MeasureRequest:
 
 
 def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequence[MeasureRequest]) -> Floats:
-    """Each requested quantity in each sample.
+    """Compute each requested quantity in each sample.
 
     signed_distance(A, B) is the least over pairs of parts of the signed distance of two rounded convex
     parts: their distance when apart, minus their penetration depth when not (Def. 2-4 of the paper),
@@ -82,7 +79,7 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
 
     Raises:
         GeometryError: operands over different numbers of samples, a row the batch does not have, a
-            request for an operand that is not there.
+            request for an operand that does not exist.
     """
     samples = {operand.rows.shape[0] for operand in operands}
     if len(samples) > 1:
@@ -125,12 +122,14 @@ def _check_request(request: MeasureRequest, operand_count: int) -> None:
             )
 
 
-@inlined
-def misalignment_of(first: float, second: float) -> float:
-    """`misalignment` of two angles, for kernels."""
-    x = math.cos(first) - math.cos(second)
-    y = math.sin(first) - math.sin(second)
-    return 0.5 * (x * x + y * y)
+def misalignment(first: Floats, second: Floats) -> Floats:
+    """Return half the squared distance of unit vectors at two angles (Def. 10, 11): 1 - cos(difference).
+    Args:
+        first, second: (T,) radians; NaN for no orientation, which makes the result NaN.
+    """
+    result = np.empty(len(first))
+    _misalignment(first, second, result)
+    return result
 
 
 @kernel
@@ -139,12 +138,10 @@ def _misalignment(first: Floats, second: Floats, result: Floats) -> None:
         result[k] = misalignment_of(first[k], second[k])
 
 
-def misalignment(first: Floats, second: Floats) -> Floats:
-    """Half the squared distance of the unit vectors at two angles (Def. 10, 11): 1 - cos of their difference.
-
-    Args:
-        first, second: (T,) radians; NaN where there is none, and then the result is NaN.
-    """
-    result = np.empty(len(first))
-    _misalignment(first, second, result)
-    return result
+@inlined
+def misalignment_of(first: float, second: float) -> float:
+    """Return the `misalignment` of two angles; callable from kernels."""
+    # 1 - cos(first - second) would cancel for nearly equal angles
+    x = math.cos(first) - math.cos(second)
+    y = math.sin(first) - math.sin(second)
+    return 0.5 * (x * x + y * y)

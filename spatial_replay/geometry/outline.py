@@ -1,7 +1,4 @@
-"""Raw outlines put into the form the kernels read: convex, counter-clockwise, nothing superfluous.
-
-Convex parts of a polygon that is not convex.
-"""
+"""Normalise raw outlines for the kernels: counter-clockwise, no superfluous vertex, convex parts only."""
 
 from __future__ import annotations
 
@@ -19,22 +16,26 @@ from spatial_replay.geometry.arrays import Floats, Integers
 SOUND, EMPTY, NOT_FINITE, NOT_CONVEX = 0, 1, 2, 3
 
 LARGEST_COORDINATE = 1e100
-"""Coordinates beyond this are refused: products of a few of them must stay finite."""
+"""Larger coordinates are rejected: products of a few of them must stay finite."""
 
+# A vertex counts as on a line within the greatest of these: relative to the outline's extent, to the
+# resolution of its coordinates, and a floor that keeps squares of the tolerance above zero.
 _FLATNESS = 1e-9
 _ROUNDING = 4 * 2.0**-52
 _SMALLEST = 1e-100
 
+_Ring: TypeAlias = tuple[int, ...]
+"""A polygon, as indices of its vertices."""
+
 
 class Outlines(NamedTuple):
-    """P outlines as ragged rows, and what is wrong with each.
+    """P outlines as ragged rows, each with its fault.
 
     Attributes:
         vertex_start: (P + 1,) int64.
         vertices: (V, 2) float64.
-        fault: (P,) int8: `SOUND`; or, with its vertices left as they were, `EMPTY` (no vertex),
-            `NOT_FINITE` (or beyond `LARGEST_COORDINATE`), `NOT_CONVEX` (which includes a boundary
-            that crosses itself).
+        fault: (P,) int8: `SOUND`; or, with its vertices unchanged, `EMPTY` (no vertex), `NOT_FINITE`
+            (or beyond `LARGEST_COORDINATE`), `NOT_CONVEX` (or a boundary that crosses itself).
     """
 
     vertex_start: Integers
@@ -43,11 +44,11 @@ class Outlines(NamedTuple):
 
 
 def normalise_polygons(vertex_start: Integers, vertices: Floats) -> Outlines:
-    """Each outline counter-clockwise, without repeated or collinear vertices.
+    """Order each outline counter-clockwise and drop repeated or collinear vertices.
 
-    A vertex is superfluous when it is no farther from the segment between its neighbours than a
-    billionth of the outline's extent, or than its coordinates resolve; an outline no wider than that is
-    a segment or a point. What is convex and counter-clockwise already comes back bit for bit.
+    A vertex is superfluous if its distance from the segment between its neighbours is at most a
+    billionth of the outline's extent, or below the resolution of its coordinates; an outline no wider
+    than that becomes a segment or a point. Convex counter-clockwise input is returned bit for bit.
 
     Args:
         vertex_start: (P + 1,) int64; outline p has the vertices vertex_start[p] up to vertex_start[p + 1].
@@ -65,7 +66,7 @@ def normalise_polygons(vertex_start: Integers, vertices: Floats) -> Outlines:
 
 @kernel
 def _normalise_all(start: Integers, vertices: Floats, counts: Integers, fault: NDArray[np.int8]) -> int:
-    """Normalise every outline in place and close the gaps; returns how many vertices are left."""
+    """Normalise every outline in place and close the gaps; return the number of vertices left."""
     used = 0
     scratch = np.empty_like(vertices)
     for p in range(len(counts)):
@@ -77,6 +78,7 @@ def _normalise_all(start: Integers, vertices: Floats, counts: Integers, fault: N
             fault[p] = EMPTY if first == stop else NOT_FINITE
         elif counts[p] > 1:
             winding = _winding(vertices, first, stop, tolerance)
+            # only an outline that is not plainly convex is tidied, so that sound ones keep their bits
             if winding == 0:
                 _copy(vertices, first, scratch, 0, counts[p])
                 left = _tidy(scratch, counts[p], tolerance)
@@ -112,7 +114,7 @@ def _reverse(vertices: Floats, start: int, stop: int) -> None:
 
 @inlined
 def _tolerance(vertices: Floats, first: int, stop: int) -> float:
-    """How far a vertex may stray from a line and still count as on it; -1 for what cannot be used."""
+    """Return how far a vertex may lie from a line and still count as on it; -1 for an unusable outline."""
     least_x = least_y = np.inf
     most_x = most_y = -np.inf
     for i in range(first, stop):
@@ -130,9 +132,9 @@ def _tolerance(vertices: Floats, first: int, stop: int) -> float:
 
 @inlined
 def _winding(vertices: Floats, first: int, stop: int, tolerance: float) -> int:
-    """1 if every turn is to the left and they make one round; -1 if all to the right; else 0.
+    """Return 1 if every turn is to the left and they make one round; -1 if all are to the right; else 0.
 
-    A turn whose vertex strays no more than `tolerance` from its neighbours' line counts as none.
+    A turn whose vertex lies within `tolerance` of its neighbours' line counts as neither.
     """
     left = right = rounds = 0
     count = stop - first
@@ -148,6 +150,7 @@ def _winding(vertices: Floats, first: int, stop: int, tolerance: float) -> int:
             left += cross > 0.0
             right += cross < 0.0
         is_upper = cy > by or (cy == by and cx > bx)
+        # one round changes between rising and falling edges twice; a star with left turns only, more often
         rounds += is_upper != was_upper
         was_upper = is_upper
         ax, ay, bx, by = bx, by, cx, cy
@@ -158,7 +161,7 @@ def _winding(vertices: Floats, first: int, stop: int, tolerance: float) -> int:
 
 @inlined
 def _tidy(vertices: Floats, count: int, tolerance: float) -> int:
-    """Drop superfluous ones of the first `count` vertices in place; returns how many are left."""
+    """Drop superfluous vertices among the first `count`, in place; return the number left."""
     head = _farthest(vertices, count, 0)
     tail = _farthest(vertices, count, head)
     is_flat = True
@@ -169,6 +172,7 @@ def _tidy(vertices: Floats, count: int, tolerance: float) -> int:
         _copy(vertices, first, vertices, 0, 1)
         _copy(vertices, second, vertices, 1, 1)
         return 1 if _distance(vertices, 0, 1) <= tolerance else 2
+    # dropping a vertex can make its neighbours collinear, so repeat until nothing changes
     changed = True
     while changed and count > 2:
         changed = False
@@ -191,7 +195,7 @@ def _distance(vertices: Floats, i: int, j: int) -> float:
 
 @inlined
 def _farthest(vertices: Floats, count: int, origin: int) -> int:
-    """The vertex farthest from one of them."""
+    """Return the vertex farthest from vertex `origin`."""
     greatest, index = -1.0, origin
     for i in range(count):
         distance = _distance(vertices, i, origin)
@@ -202,7 +206,7 @@ def _farthest(vertices: Floats, count: int, origin: int) -> int:
 
 @inlined
 def _strays(vertices: Floats, i: int, head: int, tail: int) -> float:
-    """Distance of vertex i from the segment between two others."""
+    """Return the distance of vertex i from the segment between two others."""
     length = _distance(vertices, head, tail)
     if length == 0.0:
         return _distance(vertices, i, head)
@@ -213,27 +217,24 @@ def _strays(vertices: Floats, i: int, head: int, tail: int) -> float:
     return math.sqrt(ox * ox + oy * oy)
 
 
-_Ring: TypeAlias = tuple[int, ...]
-
-
 def convex_hull(vertices: Floats) -> Floats:
-    """Corners (h, 2) of the convex hull of some points (n, 2)."""
+    """Return the corners (h, 2) of the convex hull of points (n, 2)."""
     from shapely import MultiPoint, get_coordinates
 
     return np.asarray(get_coordinates(MultiPoint(vertices).convex_hull), dtype=np.float64)
 
 
 def convex_pieces(vertices: Floats) -> list[Floats]:
-    """A few convex polygons without common interior that together are exactly the given one.
+    """Split a polygon into few convex polygons with disjoint interiors.
 
-    A Delaunay triangulation, of which every two neighbours are merged, across the longest edges first,
-    as long as the result stays convex (Hertel and Mehlhorn: at most four times as many pieces as needed).
+    Triangulates (Delaunay), then merges neighbours across the longest edges first while the result stays
+    convex (Hertel and Mehlhorn: at most four times the minimal number of pieces).
 
     Args:
-        vertices: (n, 2) float64, corners in either order, no two alike in a row.
+        vertices: (n, 2) float64, corners in either order, no two equal in a row.
 
     Raises:
-        GeometryError: for a boundary that crosses or touches itself.
+        GeometryError: a boundary that crosses or touches itself.
     """
     from shapely import Polygon, constrained_delaunay_triangles, get_coordinates
 
@@ -261,29 +262,29 @@ def _describe_crossing(polygon: object) -> str:
 
 
 def _turn(vertices: Floats, a: int, b: int, c: int) -> float:
-    """Positive where the way from a over b to c turns to the left."""
+    """Return a positive number if the path a, b, c turns left."""
     (ax, ay), (bx, by), (cx, cy) = vertices[a], vertices[b], vertices[c]
     return float((bx - ax) * (cy - by) - (by - ay) * (cx - bx))
 
 
 def _merge(triangles: Iterable[_Ring], vertices: Floats) -> list[_Ring]:
-    """Counter-clockwise triangles, joined across shared edges while the result is convex."""
+    """Join counter-clockwise triangles across shared edges while the result is convex."""
     rings = dict(enumerate(triangles))
     ring_of_edge = {edge: name for name, ring in rings.items() for edge in _edges(ring)}
     shared = [(i, j) for i, j in ring_of_edge if i < j and (j, i) in ring_of_edge]
     for i, j in sorted(shared, key=lambda edge: (-_squared_length(vertices, *edge), edge)):
         left, right = rings[ring_of_edge[i, j]], rings[ring_of_edge[j, i]]
-        # left runs j … i, right runs i … j.
+        # left runs j … i, right runs i … j
         from_j, from_i = _rotated(left, j), _rotated(right, i)
         ring = from_j + from_i[1:-1]
         at_i = _turn(vertices, from_j[-2], i, from_i[1])
         at_j = _turn(vertices, from_i[-2], j, from_j[1])
         if at_i < 0 or at_j < 0:
             continue
-        kept, gone = ring_of_edge[i, j], ring_of_edge[j, i]
-        rings[kept] = ring
-        del rings[gone]
-        ring_of_edge.update((edge, kept) for edge in _edges(ring))
+        merged, removed = ring_of_edge[i, j], ring_of_edge[j, i]
+        rings[merged] = ring
+        del rings[removed]
+        ring_of_edge.update((edge, merged) for edge in _edges(ring))
     return list(rings.values())
 
 
@@ -292,7 +293,7 @@ def _edges(ring: _Ring) -> Iterable[tuple[int, int]]:
 
 
 def _rotated(ring: _Ring, first: int) -> _Ring:
-    """The same ring, written from one of its corners on."""
+    """Return the same ring, starting at one of its corners."""
     place = ring.index(first)
     return ring[place:] + ring[:place]
 

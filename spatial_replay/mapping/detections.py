@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
 from spatial_replay.mapping.binding import Binding
 from spatial_replay.mapping.field_paths import FieldPath, Style, field_names, style_of, tuple_getter
 from spatial_replay.mapping.footprints import (
@@ -31,7 +31,6 @@ from spatial_replay.mapping.footprints import (
 )
 from spatial_replay.mapping.message_types import MessageLayout
 from spatial_replay.mapping.transforms import Transforms, matrices_from_quaternions, matrices_from_yaw, yaw_of
-from spatial_replay.trace.observations import starts_from_counts
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,12 +13,11 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import Floats, Integers, flat_index, starts_from_counts
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.outline import convex_hull
 from spatial_replay.mapping.field_paths import Style
 from spatial_replay.mapping.transforms import is_upright
-from spatial_replay.trace.observations import flat_index, starts_from_counts
 
 BOX, DISC, CYLINDER, SPHERE, POLYGON, HULL = range(6)
 """Kinds of bodies. What their three sizes mean: of a box, length, width, height (NaN: flat); of a disc, its

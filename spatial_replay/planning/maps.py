@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import Floats, starts_from_counts
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
@@ -87,7 +87,7 @@ def moved_batch(tracked: TrackedObject, positions: Floats, turns: Floats) -> Foo
     bottom, top = tracked.height or (math.nan, math.nan)
     return FootprintBatch(
         part_start=np.arange(count + 1, dtype=np.int64) * len(sizes),
-        vertex_start=_starts(np.tile(sizes, count)),
+        vertex_start=starts_from_counts(np.tile(sizes, count)),
         vertices=np.concatenate(
             [_placed(vertices, centre, positions, turn) for turn in turns.tolist()]
         ).reshape(-1, 2),
@@ -133,10 +133,6 @@ def _weight_and_centre(part: ConvexPart) -> tuple[float, tuple[float, float]]:
         return area, (x0 + sum_x / (3.0 * doubled), y0 + sum_y / (3.0 * doubled))
     count = len(corners)
     return area, (sum(x for x, _ in corners) / count, sum(y for _, y in corners) / count)
-
-
-def _starts(counts: Integers) -> Integers:
-    return np.concatenate(([0], np.cumsum(counts)))
 
 
 def concerns(formula: Formula, name: str) -> bool:

@@ -1,7 +1,4 @@
-"""One sample: what was known at one time.
-
-The times that samples can have: whole nanoseconds that fit a signed 64-bit number.
-"""
+"""One sample: the objects and signals known at one time, in whole nanoseconds (signed 64-bit)."""
 
 from __future__ import annotations
 
@@ -25,11 +22,11 @@ class Sample:
 
     Attributes:
         time_ns: nanoseconds, 0 to 2**63 - 1.
-        objects: what was seen, by name; a bare footprint stands for a `TrackedObject` of it.
-        signals: numeric signals by name; NaN means that the value is not known.
+        objects: the detected objects by name; a bare footprint stands for a `TrackedObject` with it.
+        signals: numeric signals by name; NaN for an unknown value.
 
     Raises:
-        TraceError: for a time, a name or a value of another kind.
+        TraceError: an invalid time, name or value.
     """
 
     time_ns: int

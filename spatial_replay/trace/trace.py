@@ -17,20 +17,20 @@ from spatial_replay.trace.measurement_cache import MeasurementCache
 from spatial_replay.trace.sample import Sample
 
 ABSENT = -1
-"""A row number that says: this object was not in the sample."""
+"""The row number of an object that is not in the sample."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trace:
     """T samples with strictly increasing times.
 
-    Objects are kept as observations: rows of flat arrays, one for each time an object was reported.
+    Objects are stored as observations: rows of flat arrays, one for each time an object was reported.
     `rows[t, n]` is the observation of object n in sample t, or `ABSENT`. An observation with a number
-    that is not finite is kept too, so that nothing is lost, but its row number is stored as
-    -2 - row: the object is unknown there (`unreadable`).
+    that is not finite is stored too, so that nothing is lost, but under the row number -2 - row: the
+    object is unknown there (unreadable).
 
-    Two traces are equal when they hold the same samples; `faults`, `remarks`, the order of observations and
-    names that no sample uses do not count.
+    Two traces are equal if they hold the same samples; `faults`, `remarks`, the order of observations and
+    names that no sample uses do not matter.
 
     Attributes:
         times_ns: (T,) int64.
@@ -41,9 +41,9 @@ class Trace:
         uncertainty: (R,) float64, radius in footprint units, at least 0.
         class_code: (R,) int64, index into `classes`.
         classes: class names; None for objects without one.
-        signals: numeric signals by name, each (T,) float64, NaN where not known.
-        faults: what was lost or set aside while reading, in words, each with its place.
-        remarks: what else the log says of its samples, where nothing was lost.
+        signals: numeric signals by name, each (T,) float64, NaN where unknown.
+        faults: messages about samples lost or left out while reading, each with its place.
+        remarks: other messages about the log, where nothing was lost.
         cache: measurements already taken from this trace.
 
     Raises:
@@ -89,12 +89,12 @@ class Trace:
 
     @property
     def unreadable_count(self) -> int:
-        """How many observations hold a number that is not finite."""
+        """Count the observations with a number that is not finite."""
         return int(np.count_nonzero(self.rows < ABSENT))
 
     @classmethod
     def from_samples(cls, samples: Iterable[Sample]) -> Trace:
-        """The trace of the given samples, in their order.
+        """Build the trace of the given samples, in their order.
 
         Raises:
             TraceError: times that do not increase.
@@ -104,23 +104,25 @@ class Trace:
         names = tuple(sorted({name for sample in listed for name in sample.objects}))
         number = {name: index for index, name in enumerate(names)}
         rows = np.full((len(listed), len(names)), ABSENT, np.int64)
-        seen: list[TrackedObject] = []
+        observed: list[TrackedObject] = []
         for index, sample in enumerate(listed):
             for name in sorted(sample.objects):
-                rows[index, number[name]] = len(seen)
-                seen.append(_tracked(sample.objects[name]))
-        classes = _class_order(tracked.class_name for tracked in seen)
+                rows[index, number[name]] = len(observed)
+                observed.append(_tracked(sample.objects[name]))
+        classes = _class_order(tracked.class_name for tracked in observed)
         signals = sorted({name for sample in listed for name in sample.signals})
         return cls(
             times_ns=np.array(times, np.int64),
             names=names,
             rows=rows,
             footprints=FootprintBatch.from_footprints(
-                [tracked.footprint for tracked in seen], [tracked.height for tracked in seen]
+                [tracked.footprint for tracked in observed], [tracked.height for tracked in observed]
             ),
-            yaw=np.array([np.nan if tracked.yaw is None else tracked.yaw for tracked in seen], np.float64),
-            uncertainty=np.array([tracked.uncertainty for tracked in seen], np.float64),
-            class_code=np.array([classes.index(tracked.class_name) for tracked in seen], np.int64),
+            yaw=np.array(
+                [np.nan if tracked.yaw is None else tracked.yaw for tracked in observed], np.float64
+            ),
+            uncertainty=np.array([tracked.uncertainty for tracked in observed], np.float64),
+            class_code=np.array([classes.index(tracked.class_name) for tracked in observed], np.int64),
             classes=classes,
             signals={
                 name: np.array([sample.signals.get(name, np.nan) for sample in listed], np.float64)
@@ -129,7 +131,7 @@ class Trace:
         )
 
     def samples(self) -> Iterator[Sample]:
-        """Each sample as an object; unreadable observations and unknown signals are left out."""
+        """Iterate over the samples as objects, without unreadable observations and unknown signals."""
         for index, time_ns in enumerate(self.times_ns.tolist()):
             yield Sample(
                 time_ns,
@@ -146,7 +148,7 @@ class Trace:
             )
 
     def observation(self, row: int) -> TrackedObject:
-        """The object as row `row` (at least 0) reports it."""
+        """Return the object that row `row` (at least 0) reports."""
         yaw = float(self.yaw[row])
         return TrackedObject(
             self.footprints.footprint(row),
@@ -157,12 +159,12 @@ class Trace:
         )
 
     def slice(self, start: int, stop: int) -> Trace:
-        """The samples start up to stop, with the observations they need."""
+        """Return the samples `start` up to `stop`, with the observations they need."""
         begin, end, _ = slice(start, stop).indices(len(self))
         return self.take(np.arange(begin, max(begin, end), dtype=np.int64))
 
     def take(self, samples: Integers) -> Trace:
-        """The samples with the given indices (K,), which must increase."""
+        """Return the samples with the given indices (K,), which must increase."""
         rows = self.rows[samples]
         used, renumbered = _renumber(rows)
         return replace(
@@ -177,16 +179,16 @@ class Trace:
         )
 
     def compact(self) -> Trace:
-        """The same samples in the one form that equal traces share.
+        """Return the same samples in the normal form that equal traces share.
 
         Observations are numbered by sample, then name; names, classes and signals that no sample uses
         are dropped; classes are sorted, None first.
         """
-        seen = (self.rows != ABSENT).any(axis=0)
+        observed = (self.rows != ABSENT).any(axis=0)
         whole = replace(
             self,
-            names=tuple(name for name, used in zip(self.names, seen.tolist(), strict=True) if used),
-            rows=self.rows[:, seen],
+            names=tuple(name for name, used in zip(self.names, observed.tolist(), strict=True) if used),
+            rows=self.rows[:, observed],
             signals={name: values for name, values in self.signals.items() if not np.isnan(values).all()},
         ).take(np.arange(len(self), dtype=np.int64))
         codes, inverse = np.unique(whole.class_code, return_inverse=True)
@@ -196,10 +198,10 @@ class Trace:
 
     @classmethod
     def concatenate(cls, traces: Sequence[Trace]) -> Trace:
-        """One trace of several that follow each other in time.
+        """Join traces that follow each other in time.
 
         Raises:
-            TraceError: a trace that begins before the one ahead of it has ended.
+            TraceError: a trace that begins before the previous one has ended.
         """
         names = tuple(sorted({name for trace in traces for name in trace.names}))
         number = {name: index for index, name in enumerate(names)}
@@ -209,6 +211,7 @@ class Trace:
         rows = np.full((sum(map(len, traces)), len(names)), ABSENT, np.int64)
         sample = row = 0
         for trace in traces:
+            # an unreadable row is stored as -2 - row, so its shift is negative
             shift = np.where(trace.rows >= 0, row, np.where(trace.rows == ABSENT, 0, -row))
             columns = [number[name] for name in trace.names]
             rows[sample : sample + len(trace), columns] = trace.rows + shift
@@ -234,7 +237,7 @@ class Trace:
 
 
 def window_of(times_ns: Integers, start_ns: int, end_ns: int) -> tuple[int, int]:
-    """Where the times from `start_ns` up to, not including, `end_ns` begin and end.
+    """Return the index range of the times from `start_ns` up to, not including, `end_ns`.
 
     Args:
         times_ns: (T,) int64, in order.
@@ -296,7 +299,7 @@ def _same_samples(a: Trace, b: Trace) -> bool:
 
 
 def _renumber(rows: Integers) -> tuple[Integers, Integers]:
-    """The rows in use, in the order of sample and name, and the row numbers that point at them."""
+    """Return the rows in use, by sample and name, and the row numbers that point at them."""
     present = rows != ABSENT
     marked = rows[present]
     unreadable = marked < ABSENT

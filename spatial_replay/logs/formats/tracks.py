@@ -18,11 +18,12 @@ from typing import Any, BinaryIO, cast
 
 import numpy as np
 
+from spatial_replay.geometry.arrays import starts_from_counts
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.read_options import FaultList
-from spatial_replay.trace.observations import Observations, starts_from_counts, trace_from_observations
+from spatial_replay.trace.observations import Observations, trace_from_observations
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
 

@@ -13,12 +13,12 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.objects.wire import Bytes, LayoutError, Template, Words, rows_of
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectState, ObjectStates
-from spatial_replay.trace.observations import Observations, starts_from_counts, trace_from_observations
+from spatial_replay.trace.observations import Observations, trace_from_observations
 from spatial_replay.trace.trace import Trace
 
 UNKNOWN, ZERO = -2, -1

@@ -11,11 +11,10 @@ import numpy as np
 from google.protobuf.message import Message
 from numpy.typing import NDArray
 
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
 from spatial_replay.logs.objects.decode import decode_objects
 from spatial_replay.logs.objects.wire import Template, payloads_of
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.trace.observations import starts_from_counts
 from spatial_replay.trace.trace import ABSENT, Trace
 
 

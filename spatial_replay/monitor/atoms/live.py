@@ -22,7 +22,7 @@ from typing import TypeAlias, cast
 import numpy as np
 
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.geometry.measure import QUANTITY_CODES
@@ -192,7 +192,7 @@ def _whole(numbers: Iterable[int]) -> Integers:
 
 
 def _starts(among: Sequence[Sequence[object]]) -> Integers:
-    return np.concatenate(([0], np.cumsum([len(each) for each in among], dtype=np.int64)))
+    return starts_from_counts([len(each) for each in among])
 
 
 def _enlargement(term: Term) -> float:
