@@ -18,7 +18,7 @@ from spatial_replay.automata.dot_hoa import size_words
 from spatial_replay.errors import NoAutomatonError
 from spatial_replay.geometry.arrays import Flags, Integers
 from spatial_replay.logs.messages import Attachment
-from spatial_replay.logs.objects.wire import Template, payloads_of
+from spatial_replay.logs.objects.wire import WireTemplate, payloads_of
 from spatial_replay.logs.schemas import AutomatonState_pb2
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.topics import AUTOMATA_PREFIX
@@ -72,7 +72,7 @@ class AutomatonRun:
         self.propositions = tuple(numbers[id(each.formula)] for each in automaton.propositions)
         self._possible = np.zeros(len(automaton.states), np.bool_)
         self._possible[automaton.initial] = True
-        self._templates: dict[bytes, Template] = {}
+        self._templates: dict[bytes, WireTemplate] = {}
         about = (automaton.accepting, automaton.can_accept, automaton.can_reject)
         self._about = np.array([[state in each for each in about] for state in automaton.states], np.bool_)
 
@@ -139,12 +139,12 @@ class AutomatonRun:
 
     def _template(
         self, key: bytes, before: NDArray[np.bool_] | Integers, after: NDArray[np.bool_] | Integers
-    ) -> Template:
+    ) -> WireTemplate:
         if key not in self._templates:
             if len(self._templates) >= _MOST_TEMPLATES:
                 self._templates.clear()
             message = self._message(_members(before).tolist(), _members(after).tolist())
-            self._templates[key] = Template.of(message)
+            self._templates[key] = WireTemplate.of(message)
         return self._templates[key]
 
     def _message(self, sources: list[int], targets: list[int]) -> AutomatonState:

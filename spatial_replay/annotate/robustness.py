@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.objects.wire import LayoutError, Template, payloads_of, rows_of
+from spatial_replay.logs.objects.wire import LayoutError, WireTemplate, payloads_of, rows_of
 from spatial_replay.logs.schemas import Robustness_pb2
 from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
 from spatial_replay.monitor.verdict import Verdict
@@ -74,7 +74,7 @@ def encode_robustness(
     words[:, 0] = times_ns
     words[:, 1:] = series.reshape(4 * len(names), len(times_ns)).T.view(np.uint64)
     verdicts = online_codes(series[:, 2], series[:, 3])
-    return payloads_of(Template.of(message).fill(words, np.ascontiguousarray(verdicts.T)))
+    return payloads_of(WireTemplate.of(message).fill(words, np.ascontiguousarray(verdicts.T)))
 
 
 def online_codes(lower: Floats, upper: Floats) -> Codes:
@@ -139,10 +139,10 @@ def _heading(message: Robustness) -> _Heading:
     return message.specification, message.object, ids, tuple(node.name for node in message.nodes)
 
 
-def _template(message: Robustness) -> Template | None:
+def _template(message: Robustness) -> WireTemplate | None:
     """The layout, if every number is in it; None where one takes its default by absence."""
     try:
-        template = Template.of(message)
+        template = WireTemplate.of(message)
     except LayoutError:
         return None
     nodes = len(message.nodes)
@@ -150,7 +150,7 @@ def _template(message: Robustness) -> Template | None:
     return template if is_full else None
 
 
-def _template_rows(template: Template, encoded: Codes) -> tuple[Integers, Floats, Codes]:
+def _template_rows(template: WireTemplate, encoded: Codes) -> tuple[Integers, Floats, Codes]:
     words = template.words(encoded)
     numbers = np.ascontiguousarray(words[:, 1:]).view(np.float64)
     return (

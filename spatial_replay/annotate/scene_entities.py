@@ -24,7 +24,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from spatial_replay.geometry.arrays import Floats, Integers, flat_index, starts_from_counts
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.logs.objects.wire import Bytes, Template
+from spatial_replay.logs.objects.wire import Bytes, WireTemplate
 from spatial_replay.palette import LABEL, NEGATIVE
 from spatial_replay.spec.formula import Outline
 
@@ -302,7 +302,7 @@ class SceneTemplate:
         stamps: where a timestamp's content begins.
     """
 
-    template: Template
+    template: WireTemplate
     stamps: tuple[int, ...]
 
     def fill(self, times_ns: Integers, words: Floats) -> Bytes:
@@ -332,13 +332,13 @@ def make_template(layout: Layout, regions: tuple[Region, ...], lift: float) -> S
     if layout.witness:
         point_at(_add_entity(message, WITNESS), _A_LABEL, lift)
     payload = np.frombuffer(message.SerializeToString(deterministic=True), np.uint8).copy()
-    words = Template.of(message).word_offsets
+    words = WireTemplate.of(message).word_offsets
     slots = words[np.isnan(payload[words[:, None] + np.arange(8)].view("<f8")[:, 0])]
     if layout.witness:
         # the last text of all: names come before it
         slots = np.append(slots, payload.tobytes().rindex(_A_LABEL.encode()))
     payload[slots[:, None] + np.arange(8)] = 0
-    return SceneTemplate(Template(payload, slots, np.empty(0, np.int64)), _stamp_offsets(payload.tobytes()))
+    return SceneTemplate(WireTemplate(payload, slots, np.empty(0, np.int64)), _stamp_offsets(payload.tobytes()))
 
 
 def words_of_region(region: Region, colour: Floats) -> list[Floats]:

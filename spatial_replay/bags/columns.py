@@ -165,7 +165,7 @@ def in_order(starts_ns: Sequence[int], stretches: Iterable[MessageColumns]) -> C
 
 
 @dataclass(frozen=True)
-class Run:
+class TimedColumns:
     """Messages in order that may be read from a time on."""
 
     start_ns: int
@@ -176,7 +176,7 @@ _Active = list[tuple[int, int, MessageColumns, Columns]]
 """A heap: time of the first message, number of the run, messages, and those that come after them."""
 
 
-def merged(runs: Iterable[Run]) -> Columns:
+def merged(runs: Iterable[TimedColumns]) -> Columns:
     """The messages of several runs by log time; a run is opened when its time has come."""
     waiting = sorted(runs, key=lambda run: run.start_ns, reverse=True)
     active: _Active = []

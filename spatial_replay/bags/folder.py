@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from spatial_replay.bags.columns import Columns, CountedTopics, MessageColumns, Run, merged, one_by_one
+from spatial_replay.bags.columns import Columns, CountedTopics, MessageColumns, TimedColumns, merged, one_by_one
 from spatial_replay.bags.decoders import decoder_of, topics_named
 from spatial_replay.bags.mcap_log import McapLog
 from spatial_replay.bags.metadata import LARGEST_METADATA, BagMetadata, bag_metadata_from_text
@@ -160,7 +160,7 @@ class BagFolder:
             columns: Columns = (each for read in reads for each in read())
         else:
             runs = zip(self._files, reads, strict=True)
-            columns = merged(Run(file.start_ns or 0, read) for file, read in runs)
+            columns = merged(TimedColumns(file.start_ns or 0, read) for file, read in runs)
         if self._metadata and self._metadata.compression == "message":
             columns = map(self._unpacked, columns)
         if start_ns or end_ns is not None or self._metadata is None:

@@ -19,7 +19,7 @@ from spatial_replay.logs.mcap.summary import summarise_mcap
 from spatial_replay.logs.mcap.writer import LogWriter
 from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.objects.encode import decode_objects, encode_objects
-from spatial_replay.logs.objects.wire import Template
+from spatial_replay.logs.objects.wire import WireTemplate
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.source import MemorySource
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
@@ -84,7 +84,7 @@ def test_messages_are_what_the_protobuf_library_writes(trace):
 def test_a_template_reads_what_the_protobuf_library_reads(trace):
     for payload in encode_objects(trace):
         message = ObjectStates.FromString(payload)
-        template = Template.of(message)
+        template = WireTemplate.of(message)
         row = np.frombuffer(payload, np.uint8)[None]
         assert template.matches(row).all()
         assert template.fill(template.words(row)).tobytes() == payload

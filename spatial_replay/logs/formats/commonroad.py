@@ -14,7 +14,7 @@ from pathlib import Path
 
 from spatial_replay.errors import GeometryError, LogError, UsageError
 from spatial_replay.geometry.footprint import Concave, Footprint
-from spatial_replay.logs.formats.tracks import Report, ReportColumns, finished_block
+from spatial_replay.logs.formats.tracks import ObjectReport, ReportColumns, finished_block
 from spatial_replay.logs.formats.xml_elements import Element, iter_elements
 from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.read_options import FaultList
@@ -36,7 +36,7 @@ class ScenarioError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class OutlinePart:
     """A polygon, or (one vertex and a radius) a disc, in metres."""
 
     vertices: Points
@@ -44,7 +44,7 @@ class Part:
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class ObstacleState:
     """Where an obstacle is at a time step.
 
     Attributes:
@@ -61,13 +61,13 @@ class State:
     angle: float = 0.0
     oriented: bool = False
     uncertainty: float = 0.0
-    region: tuple[Part, ...] | None = None
+    region: tuple[OutlinePart, ...] | None = None
     known: bool = True
 
-    def report(self, name: str, class_name: str | None, outline: Sequence[Part]) -> Report:
+    def report(self, name: str, class_name: str | None, outline: Sequence[OutlinePart]) -> ObjectReport:
         """The obstacle with its own outline, around its own centre, as it stands here."""
         if not self.known:
-            return Report(name, class_name, [nan, nan], [1], [0.0], invalid=True)
+            return ObjectReport(name, class_name, [nan, nan], [1], [0.0], invalid=True)
         parts = self.region if self.region is not None else outline
         along_x, along_y = cos(self.angle), sin(self.angle)
         vertices = [
@@ -76,7 +76,7 @@ class State:
             for x, y in part.vertices
             for coordinate in (self.x + along_x * x - along_y * y, self.y + along_y * x + along_x * y)
         ]
-        return Report(
+        return ObjectReport(
             name,
             class_name,
             vertices,
@@ -87,16 +87,16 @@ class State:
         )
 
 
-UNKNOWN = State(known=False)
+UNKNOWN = ObstacleState(known=False)
 
 
-def moving_states(obstacle: Element, outline: Sequence[Part], tell: Tell) -> dict[int, State]:
+def moving_states(obstacle: Element, outline: Sequence[OutlinePart], tell: Tell) -> dict[int, ObstacleState]:
     """The states of an obstacle that moves, by time step.
 
     Args:
         tell: takes what is wrong with one of them, with its line.
     """
-    states: dict[int, State] = {}
+    states: dict[int, ObstacleState] = {}
     initial, trajectory = obstacle.child("initialState"), obstacle.child("trajectory")
     listed = [*([initial] if initial else []), *(trajectory.all("state") if trajectory else ())]
     for each in listed:
@@ -116,7 +116,7 @@ def moving_states(obstacle: Element, outline: Sequence[Part], tell: Tell) -> dic
     return states
 
 
-def state_of(element: Element, outline: Sequence[Part], tell: Tell) -> State:
+def state_of(element: Element, outline: Sequence[OutlinePart], tell: Tell) -> ObstacleState:
     """A state, or that it is unknown, after saying why."""
     try:
         return _state(element, outline)
@@ -125,7 +125,7 @@ def state_of(element: Element, outline: Sequence[Part], tell: Tell) -> State:
         return UNKNOWN
 
 
-def parts_of(shape: Element) -> list[Part]:
+def parts_of(shape: Element) -> list[OutlinePart]:
     """The rectangles, circles and polygons in an element.
 
     Raises:
@@ -137,26 +137,26 @@ def parts_of(shape: Element) -> list[Part]:
     return parts
 
 
-def _part(element: Element) -> Part:
+def _part(element: Element) -> OutlinePart:
     if element.name == "polygon":
         vertices = [_point(point) for point in element.all("point")]
         if not vertices:
             raise ScenarioError("<polygon> has no <point>; give at least one")
-        return Part(vertices)
+        return OutlinePart(vertices)
     middle = element.child("center")
     x, y = _point(middle) if middle is not None else (0.0, 0.0)
     if element.name == "circle":
-        return Part([(x, y)], _size(element, "radius"))
+        return OutlinePart([(x, y)], _size(element, "radius"))
     if element.name == "rectangle":
         length, width = _size(element, "length"), _size(element, "width")
         angle = _number(element, "orientation") if element.child("orientation") is not None else 0.0
         corners = ((-length, -width), (length, -width), (length, width), (-length, width))
         c, s = cos(angle) / 2, sin(angle) / 2
-        return Part([(x + a * c - b * s, y + a * s + b * c) for a, b in corners])
+        return OutlinePart([(x + a * c - b * s, y + a * s + b * c) for a, b in corners])
     raise ScenarioError(f"<{element.name}> is no shape; give <rectangle>, <circle> or <polygon>")
 
 
-def _state(element: Element, outline: Sequence[Part]) -> State:
+def _state(element: Element, outline: Sequence[OutlinePart]) -> ObstacleState:
     """Position and orientation, each exact or somewhere in a region or interval."""
     position = _required(element, "position")
     point = position.child("point")
@@ -172,7 +172,7 @@ def _state(element: Element, outline: Sequence[Part]) -> State:
     # a point of the outline at a distance r of the centre moves by 2 r sin(h/2) when that turns by h
     reach = max((hypot(*vertex) for part in outline for vertex in part.vertices), default=0.0)
     turned = 2 * reach * sin(min(high - low, 2 * pi) / 4)
-    state = State(x, y, (low + high) / 2, oriented=low == high, uncertainty=away + turned)
+    state = ObstacleState(x, y, (low + high) / 2, oriented=low == high, uncertainty=away + turned)
     return state if all(map(isfinite, (x, y, low, high, away))) else UNKNOWN
 
 
@@ -189,7 +189,7 @@ def _orientation(element: Element) -> tuple[float, float]:
     return low, high
 
 
-def _occupied(occupancy: Element, tell: Tell) -> Iterator[tuple[int, State]]:
+def _occupied(occupancy: Element, tell: Tell) -> Iterator[tuple[int, ObstacleState]]:
     """The time steps of a region that the obstacle is somewhere in."""
     try:
         steps = _steps(_required(occupancy, "time"))
@@ -197,7 +197,7 @@ def _occupied(occupancy: Element, tell: Tell) -> Iterator[tuple[int, State]]:
         # its outline is within this one, which is nowhere farther from it than it is wide
         region = _hull(parts)
         _, _, reach = _around([region])
-        state = State(uncertainty=2 * reach, region=(region,)) if isfinite(reach) else UNKNOWN
+        state = ObstacleState(uncertainty=2 * reach, region=(region,)) if isfinite(reach) else UNKNOWN
     except ScenarioError as error:
         tell(occupancy.line, f"{error}; the occupancy is left out")
         return
@@ -205,21 +205,21 @@ def _occupied(occupancy: Element, tell: Tell) -> Iterator[tuple[int, State]]:
         yield step, state
 
 
-def _hull(parts: Sequence[Part]) -> Part:
+def _hull(parts: Sequence[OutlinePart]) -> OutlinePart:
     """A convex outline around all of them."""
     if len(parts) > 1 and any(part.radius for part in parts):
         x, y, radius = _around(parts)
-        return Part([(x, y)], radius)
+        return OutlinePart([(x, y)], radius)
     if len(parts) == 1 and parts[0].radius:
         return parts[0]
     try:
         hull = Footprint.polygon([vertex for part in parts for vertex in part.vertices], concave="hull")
     except GeometryError as error:
         raise ScenarioError(str(error)) from None
-    return Part([(float(x), float(y)) for x, y in hull.parts[0].vertices])
+    return OutlinePart([(float(x), float(y)) for x, y in hull.parts[0].vertices])
 
 
-def _around(parts: Sequence[Part]) -> tuple[float, float, float]:
+def _around(parts: Sequence[OutlinePart]) -> tuple[float, float, float]:
     """A disc around all of them: x, y, radius."""
     vertices = [vertex for part in parts for vertex in part.vertices]
     x, y = (fsum(vertex[axis] for vertex in vertices) / len(vertices) for axis in (0, 1))
@@ -299,11 +299,11 @@ class _Obstacle:
 
     name: str
     class_name: str | None
-    parts: list[Part]
-    moving: dict[int, State] = field(default_factory=dict)
-    standing: State | None = None
+    parts: list[OutlinePart]
+    moving: dict[int, ObstacleState] = field(default_factory=dict)
+    standing: ObstacleState | None = None
 
-    def report(self, step: int) -> Report | None:
+    def report(self, step: int) -> ObjectReport | None:
         """The obstacle at a time step; None if it is not there."""
         state = self.standing or self.moving.get(step)
         return None if state is None else state.report(self.name, self.class_name, self.parts)
@@ -399,7 +399,7 @@ def _obstacle(name: str, element: Element, tell: Tell) -> _Obstacle:
         raise ScenarioError("it has no <shape>; give it one")
     outline = parts_of(shape)
     if element.name == "environmentObstacle":
-        return _Obstacle(name, class_name, outline, standing=State())
+        return _Obstacle(name, class_name, outline, standing=ObstacleState())
     if _stands(element):
         initial = element.child("initialState")
         if initial is None:

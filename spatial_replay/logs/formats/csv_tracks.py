@@ -9,7 +9,7 @@ from pathlib import Path
 
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.footprint import Concave
-from spatial_replay.logs.formats.tracks import Report, ReportColumns, finished_block, iter_lines
+from spatial_replay.logs.formats.tracks import ObjectReport, ReportColumns, finished_block, iter_lines
 from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.trace.sample import LATEST_NS
@@ -40,10 +40,10 @@ def iter_csv(path: Path, faults: FaultList, *, concave: Concave = "decompose") -
         yield finished_block(columns, faults, concave)
 
 
-def _samples(path: Path, faults: FaultList) -> Iterator[tuple[int, str, list[Report]]]:
+def _samples(path: Path, faults: FaultList) -> Iterator[tuple[int, str, list[ObjectReport]]]:
     lines = iter_lines(path, faults)
     order = _column_order(path, next(lines, (1, ""))[1])
-    time_ns, place, reports, broken = -1, "", dict[str, Report](), False
+    time_ns, place, reports, broken = -1, "", dict[str, ObjectReport](), False
     for number, line in lines:
         here = f"{path.name}:{number}"
         try:
@@ -99,7 +99,7 @@ def _time(text: str) -> int:
     return time_ns
 
 
-def _report(row: dict[str, str]) -> Report:
+def _report(row: dict[str, str]) -> ObjectReport:
     if not row["name"]:
         raise _NoObjectError("the name is empty; give each object a name")
     x, y, length, width = (_number(row, column) for column in ("x", "y", "length", "width"))
@@ -117,7 +117,7 @@ def _report(row: dict[str, str]) -> Report:
         for a, b in corners
         for axis, origin in enumerate((x, y))
     ]
-    return Report(row["name"], row["class"] or None, vertices, [4], [0.0], yaw=yaw)
+    return ObjectReport(row["name"], row["class"] or None, vertices, [4], [0.0], yaw=yaw)
 
 
 def _number(row: dict[str, str], column: str) -> float:

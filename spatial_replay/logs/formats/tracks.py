@@ -68,7 +68,7 @@ def iter_lines(path: Path, faults: FaultList) -> Iterator[tuple[int, str]]:
 
 
 @dataclass(slots=True)
-class Report:
+class ObjectReport:
     """One object as a line of a log reports it, unchecked; the defaults stand for what it does not say.
 
     Attributes:
@@ -95,14 +95,14 @@ class ReportColumns:
     def __init__(self) -> None:
         self.times: list[int] = []
         self.places: list[str] = []
-        self._reports: list[Report] = []
+        self._reports: list[ObjectReport] = []
         self._counts: list[int] = []
         self._signals: list[dict[str, float]] = []
 
     def __len__(self) -> int:
         return len(self.times)
 
-    def add(self, time_ns: int, place: str, reports: list[Report], signals: dict[str, float]) -> None:
+    def add(self, time_ns: int, place: str, reports: list[ObjectReport], signals: dict[str, float]) -> None:
         """Take one sample; `place` says where it stands in its file."""
         self.times.append(time_ns)
         self.places.append(place)
@@ -139,7 +139,7 @@ class ReportColumns:
         )
 
 
-def _shapes(reports: list[Report]) -> FootprintBatch:
+def _shapes(reports: list[ObjectReport]) -> FootprintBatch:
     return FootprintBatch(
         part_start=starts_from_counts(np.array([len(r.radii) for r in reports], np.int64)),
         vertex_start=starts_from_counts(np.array([n for r in reports for n in r.vertex_counts], np.int64)),
@@ -189,7 +189,7 @@ def finished_block(columns: ReportColumns, faults: FaultList, concave: Concave) 
     return trace
 
 
-def _sample(line: str) -> tuple[int, list[Report], dict[str, float]]:
+def _sample(line: str) -> tuple[int, list[ObjectReport], dict[str, float]]:
     try:
         sample = json.loads(line)
     except RecursionError:
@@ -211,7 +211,7 @@ def _sample(line: str) -> tuple[int, list[Report], dict[str, float]]:
     return time_ns, reports, _signals(sample.get("signals", {}))
 
 
-def _report(entry: Any) -> Report:
+def _report(entry: Any) -> ObjectReport:
     if not isinstance(entry, dict):
         raise _NoSampleError(f'an object is {_kind(entry)}; give {{"name": …, "polygon": […]}}')
     name = entry.get("name")
@@ -222,7 +222,7 @@ def _report(entry: Any) -> Report:
     class_name = entry.get("class")
     if class_name is not None and not (isinstance(class_name, str) and _is_text(class_name, empty=True)):
         raise _NoSampleError(f"{what}: class is {_short(class_name)}; give a text or leave it out")
-    report = Report(name, class_name)
+    report = ObjectReport(name, class_name)
     if ("polygon" in entry) == ("parts" in entry):
         raise _NoSampleError(f"{what}: give one of polygon and parts")
     if "polygon" in entry:
@@ -249,7 +249,7 @@ def _report(entry: Any) -> Report:
     return report
 
 
-def _add_part(report: Report, vertices: Any, radius: float, what: str) -> None:
+def _add_part(report: ObjectReport, vertices: Any, radius: float, what: str) -> None:
     listed = _list(vertices, what)
     flat = report.vertices
     for point in listed:

@@ -75,7 +75,7 @@ class Batch:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stretch:
+class MessageRange:
     """The messages begin up to stop of a batch."""
 
     batch: Batch
@@ -95,7 +95,7 @@ class Stretch:
         return parts
 
 
-def pack(stretches: list[Stretch], compressor: zstandard.ZstdCompressor) -> PackedChunk:
+def pack(stretches: list[MessageRange], compressor: zstandard.ZstdCompressor) -> PackedChunk:
     content = b"".join([part for stretch in stretches for part in stretch.parts()])
     heads = np.concatenate([stretch.batch.heads[stretch.begin : stretch.stop] for stretch in stretches])
     sizes = np.concatenate([stretch.batch.sizes[stretch.begin : stretch.stop] for stretch in stretches])

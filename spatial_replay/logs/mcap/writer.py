@@ -17,7 +17,7 @@ from mcap import records
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.chunks import MAGIC, encoded
-from spatial_replay.logs.mcap.packing import Batch, McapSummary, PackedChunk, Stretch, pack
+from spatial_replay.logs.mcap.packing import Batch, McapSummary, PackedChunk, MessageRange, pack
 from spatial_replay.logs.messages import Channel, Messages, Schema
 from spatial_replay.logs.output_file import output_error
 
@@ -62,7 +62,7 @@ class LogWriter:
         self._summary = McapSummary()
         self._channels: dict[Channel, int] = {}
         self._schemas: dict[Schema, int] = {}
-        self._open: list[Stretch] = []
+        self._open: list[MessageRange] = []
         self._open_bytes = 0
         self._began_ns = 0
         self._began_s = 0.0
@@ -193,7 +193,7 @@ class LogWriter:
             full = int(np.searchsorted(ends, written + CHUNK_BYTES - self._open_bytes)) + 1
             late = bisect_left(latest, self._began_ns + CHUNK_NS, begin)
             stop = max(begin + 1, min(full, late, len(times_ns)))
-            self._open.append(Stretch(batch, begin, stop))
+            self._open.append(MessageRange(batch, begin, stop))
             self._open_bytes += int(ends[stop - 1]) - written
             if self._open_bytes >= CHUNK_BYTES:
                 self._close_chunk()

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Concave
-from spatial_replay.logs.objects.wire import Bytes, LayoutError, Template, Words, rows_of
+from spatial_replay.logs.objects.wire import Bytes, LayoutError, WireTemplate, Words, rows_of
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectState, ObjectStates
 from spatial_replay.trace.observations import Observations, trace_from_observations
 from spatial_replay.trace.trace import Trace
@@ -30,7 +30,7 @@ class WrongMessageError(Exception):
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class SlotLayout:
     """Which slot of a message holds what; `UNKNOWN` or `ZERO` where none does.
 
     Attributes:
@@ -80,8 +80,8 @@ def parsed(payload: bytes) -> ObjectStates:
     return message
 
 
-def layout_of(message: ObjectStates) -> Layout:
-    """Where `Template.of(message)` has its slots.
+def layout_of(message: ObjectStates) -> SlotLayout:
+    """Where `WireTemplate.of(message)` has its slots.
 
     Raises:
         WrongMessageError: a signal without a name, or with one that another has.
@@ -98,7 +98,7 @@ def layout_of(message: ObjectStates) -> Layout:
         for slot in (state.yaw, state.bottom, state.top)
         if slot != UNKNOWN
     ]
-    return Layout(
+    return SlotLayout(
         time=time,
         names=tuple(state.name for state in message.objects),
         classes=tuple(s.class_name if s.HasField("class_name") else None for s in message.objects),
@@ -172,7 +172,7 @@ class _Group:
     """Samples (K,) of one layout with their numbers (K, W + 2)."""
 
     samples: Integers
-    layout: Layout
+    layout: SlotLayout
     numbers: Floats
 
 
@@ -265,7 +265,7 @@ def _first_group(
     alone[0] = True
     try:
         message = parsed(first.payloads[0])
-        template, layout = Template.of(message), layout_of(message)
+        template, layout = WireTemplate.of(message), layout_of(message)
     except (WrongMessageError, LayoutError) as error:
         faults[int(first.samples[0])] = str(error)
         return None, alone

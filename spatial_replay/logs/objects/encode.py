@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
 from spatial_replay.logs.objects.decode import decode_objects
-from spatial_replay.logs.objects.wire import Template, payloads_of
+from spatial_replay.logs.objects.wire import WireTemplate, payloads_of
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.trace.trace import ABSENT, Trace
 
@@ -66,7 +66,7 @@ def _signal_pieces(name: str, values: Floats) -> list[bytes]:
 
 def _pieces(message: Message, numbers: Floats) -> list[bytes]:
     """Encodings of a message with other numbers (n, W)."""
-    return payloads_of(Template.of(message).fill(np.ascontiguousarray(numbers).view(np.uint64)))
+    return payloads_of(WireTemplate.of(message).fill(np.ascontiguousarray(numbers).view(np.uint64)))
 
 
 def _row_layout(trace: Trace) -> Integers:

@@ -36,7 +36,7 @@ class LayoutError(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class Template:
+class WireTemplate:
     """The layout that some messages share.
 
     Slots are numbered in the order of the fields. A word is a slot of 8 bytes, little-endian: a double or
@@ -53,7 +53,7 @@ class Template:
     mark_offsets: Integers
 
     @classmethod
-    def of(cls, message: Message) -> Template:
+    def of(cls, message: Message) -> WireTemplate:
         """The layout of a message; numbers that shall be slots must be present in it.
 
         Raises:
