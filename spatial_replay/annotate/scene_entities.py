@@ -338,7 +338,9 @@ def make_template(layout: Layout, regions: tuple[Region, ...], lift: float) -> S
         # the last text of all: names come before it
         slots = np.append(slots, payload.tobytes().rindex(_A_LABEL.encode()))
     payload[slots[:, None] + np.arange(8)] = 0
-    return SceneTemplate(WireTemplate(payload, slots, np.empty(0, np.int64)), _stamp_offsets(payload.tobytes()))
+    return SceneTemplate(
+        WireTemplate(payload, slots, np.empty(0, np.int64)), _stamp_offsets(payload.tobytes())
+    )
 
 
 def words_of_region(region: Region, colour: Floats) -> list[Floats]:

@@ -1,0 +1,32 @@
+"""Logs of messages that other software recorded: ROS 1 and ROS 2 bags, MCAP in any encoding.
+
+Names are loaded when they are first used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+from spatial_replay.lazy import loaded_when_used
+
+if TYPE_CHECKING:
+    from spatial_replay.bags.columns import Message
+    from spatial_replay.bags.open import open_messages
+    from spatial_replay.bags.reader import MessageReader
+    from spatial_replay.bags.topic import Decoder, Topic
+
+__all__ = ["Decoder", "Message", "MessageReader", "Topic", "open_messages"]
+
+_HOMES: Mapping[str, str] = MappingProxyType(
+    {
+        "Decoder": "spatial_replay.bags.topic",
+        "Message": "spatial_replay.bags.columns",
+        "MessageReader": "spatial_replay.bags.reader",
+        "Topic": "spatial_replay.bags.topic",
+        "open_messages": "spatial_replay.bags.open",
+    }
+)
+
+__getattr__, __dir__ = loaded_when_used(globals(), _HOMES)

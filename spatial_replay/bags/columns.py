@@ -1,13 +1,11 @@
-"""Many messages as columns.
+"""Messages as columns: texts, numbers and bytes of many messages side by side, in the order of time.
 
-A million small objects that live for a while make the interpreter's collector of cycles look through all
-there is, again and again, which costs more than reading them. Columns of texts, numbers and bytes do not.
+Columns, because a million small objects that live for a while make Python's garbage collection look through
+all of them again and again, which costs more than reading them.
 
-Messages in the order of time, out of stretches and files that overlap.
-
-Logs whose clock was set back while they were recorded, as when a simulation starts again.
-
-Read in the order of time, the two passes over the same time would look like one.
+Chunks and files of a log may overlap in time, so their messages are merged. Logs whose clock was set back
+while they were recorded, as when a simulation restarts, are refused: in the order of time, the two passes
+over the same time would look like one.
 """
 
 from __future__ import annotations
@@ -17,17 +15,36 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from spatial_replay.bags.reader import Message
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.read_options import FaultList
 
 _TOGETHER = 512
-"""Messages made at once: fewer than the collector lets pass before it looks."""
+"""Messages made at once: fewer than the garbage collector lets pass before it runs."""
+
+
+class Message(NamedTuple):
+    """One message of a log.
+
+    Attributes:
+        log_time_ns: when it was recorded.
+        publish_time_ns: when it was sent; the log time where the container does not know.
+        sequence: number within its topic as in the log, 0 where the log has none; of messages of one topic
+            and time, the later one has the greater number.
+        payload: in its topic's encoding.
+    """
+
+    topic: str
+    log_time_ns: int
+    publish_time_ns: int
+    sequence: int
+    payload: bytes
+
+
 _NEW_MESSAGE = partial(tuple.__new__, Message)
 
 
@@ -206,26 +223,17 @@ def _push_next(active: _Active, number: int, following: Columns) -> None:
             return
 
 
-class CountedTopics:
-    """Counts what is read of each topic, and compares it with what a log declares."""
-
-    def __init__(self, declared: Mapping[str, int | None]) -> None:
-        self._declared = declared
-        self._read: Counter[str] = Counter()
-
-    def counted(self, columns: Columns) -> Columns:
-        """The messages as they are."""
-        for each in columns:
-            self._read.update(each.topics)
-            yield each
-
-    def compare(self, name: str, faults: FaultList) -> None:
-        """Tell the faults where a topic has more or fewer messages than declared."""
-        for topic, declared in self._declared.items():
-            if declared is not None and declared != self._read[topic]:
-                faults.add(
-                    f"{name}: it declares {declared} messages on {topic!r}; {self._read[topic]} could be read"
-                )
+def iter_counted(
+    columns: Columns, declared: Mapping[str, int | None], name: str, faults: FaultList
+) -> Columns:
+    """Yield the messages as they are; topics with more or fewer messages than declared go to `faults`."""
+    read = Counter[str]()
+    for each in columns:
+        read.update(each.topics)
+        yield each
+    for topic, count in declared.items():
+        if count is not None and count != read[topic]:
+            faults.add(f"{name}: it declares {count} messages on {topic!r}; {read[topic]} could be read")
 
 
 DISORDER_NS = 10**9

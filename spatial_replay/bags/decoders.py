@@ -1,12 +1,8 @@
-"""Payloads to objects, by the encoding of their topic.
-
-Topics by name, out of what each file or publisher says of them.
-"""
+"""Decoders of payloads by the encoding of their topic, and topics joined from several descriptions."""
 
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache
@@ -16,8 +12,8 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.message_factory import GetMessageClass
 
-from spatial_replay.bags.reader import Decoder, Topic
 from spatial_replay.bags.ros_types import ros_decoder, ros_definitions
+from spatial_replay.bags.topic import Decoder, Topic
 from spatial_replay.errors import LogError
 from spatial_replay.logs.messages import Schema
 
@@ -138,15 +134,7 @@ def _decode_json(payload: bytes) -> object:
         raise LogError(f"a message is no JSON: {error!s:.200}") from None
 
 
-_LATCHED = re.compile(r"durability: *(1|transient_local)\b")
-
-
-def is_latched(qos: str) -> bool:
-    """Whether a ROS 2 publisher's quality of service keeps messages for whoever comes later."""
-    return _LATCHED.search(qos) is not None
-
-
-def topics_named(described: Iterable[Topic], distribution: str | None = None) -> tuple[Topic, ...]:
+def topics_by_name(described: Iterable[Topic], distribution: str | None = None) -> tuple[Topic, ...]:
     """One topic for each name, in order; those that cannot be decoded say why.
 
     Args:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -11,12 +11,13 @@ from typing import TypeAlias
 
 import numpy as np
 
-from spatial_replay.bags.columns import Columns, CountedTopics, MessageColumns, TimedColumns, merged, one_by_one
-from spatial_replay.bags.decoders import decoder_of, topics_named
+from spatial_replay.bags.columns import Columns, MessageColumns, TimedColumns, merged
+from spatial_replay.bags.decoders import topics_by_name
 from spatial_replay.bags.mcap_log import McapLog
 from spatial_replay.bags.metadata import LARGEST_METADATA, BagMetadata, bag_metadata_from_text
-from spatial_replay.bags.reader import Decoder, Message, Topic
+from spatial_replay.bags.reader import MessageReader
 from spatial_replay.bags.sqlite import SQLITE_MAGIC, SqliteBag
+from spatial_replay.bags.topic import Topic
 from spatial_replay.bags.unpacking import ZSTD_MAGIC, temporary_folder, unpack_file, unpacked
 from spatial_replay.errors import LogError, MissingFileError
 from spatial_replay.logs.mcap.chunks import MAGIC
@@ -29,19 +30,14 @@ _ENDINGS = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 _File: TypeAlias = McapLog | SqliteBag
 
 
-class BagFolder:
-    """A folder with the files of one ROS 2 bag; see `MessageReader`."""
+class BagFolder(MessageReader):
+    """A folder with the files of one ROS 2 bag."""
 
     kind = "ROS 2 bag"
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self._faults = FaultList()
+        super().__init__(path)
         self._remarks = FaultList()
-
-    @property
-    def name(self) -> str:
-        return self._path.name or self._path.absolute().name
 
     @cached_property
     def _metadata(self) -> BagMetadata | None:
@@ -90,7 +86,7 @@ class BagFolder:
     def _topics(self) -> tuple[Topic, ...]:
         found = [topic for file in self._files for topic in self._described(file)]
         declared = self._metadata
-        named = topics_named(found, declared.distribution if declared else None)
+        named = topics_by_name(found, self._distribution)
         if declared is None:
             return named
         absent = [
@@ -112,34 +108,33 @@ class BagFolder:
         """Log time of the first message."""
         return min((file.start_ns for file in self._files if file.start_ns is not None), default=None)
 
-    def topics(self) -> tuple[Topic, ...]:
-        """See `MessageReader.topics`."""
-        return self._topics
+    @property
+    def _distribution(self) -> str | None:
+        return self._metadata.distribution if self._metadata else None
 
-    def decoder(self, topic: str) -> Decoder:
-        """See `MessageReader.decoder`."""
-        named = next(each for each in self._topics if each.name == topic)
-        return decoder_of(named, self._metadata.distribution if self._metadata else None)
+    def topics(self) -> tuple[Topic, ...]:
+        """See `MessageReader.topics`; a folder may declare none."""
+        return self._topics
 
     def take_faults(self) -> tuple[str, ...]:
         """See `MessageReader.take_faults`."""
-        return tuple(fault for each in self._told() for fault in each.take_faults()) + self._faults.take()
+        return (
+            tuple(fault for each in self._opened_files() for fault in each.take_faults())
+            + self._faults.take()
+        )
 
     def move_faults(self, other: FaultList) -> None:
         """See `MessageReader.move_faults`."""
-        for each in self._told():
+        for each in self._opened_files():
             each.move_faults(other)
         self._faults.move_to(other)
 
     def take_remarks(self) -> tuple[str, ...]:
         """See `MessageReader.take_remarks`."""
-        return tuple(remark for each in self._told() for remark in each.take_remarks()) + self._remarks.take()
-
-    def iter_messages(
-        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
-    ) -> Iterator[Message]:
-        """See `MessageReader.iter_messages`."""
-        return one_by_one(self.iter_columns(topics, start_ns, end_ns))
+        return (
+            tuple(remark for each in self._opened_files() for remark in each.take_remarks())
+            + self._remarks.take()
+        )
 
     def iter_columns(
         self,
@@ -149,7 +144,7 @@ class BagFolder:
         *,
         as_recorded: bool = False,
     ) -> Columns:
-        """See `ColumnReader.iter_columns`."""
+        """See `MessageReader.iter_columns`."""
         if end_ns is not None and end_ns > LATEST_NS:
             end_ns = None
         reads = [
@@ -167,9 +162,7 @@ class BagFolder:
             yield from columns
             return
         self._compare_types(topics)
-        counted = CountedTopics({each.name: each.count for each in self._topics if each.name in topics})
-        yield from counted.counted(columns)
-        counted.compare(f"{self.name}/{METADATA_FILE}", self._faults)
+        yield from self._counted(columns, topics, f"{self.name}/{METADATA_FILE}")
 
     @staticmethod
     def _read(
@@ -183,7 +176,7 @@ class BagFolder:
         for each in file.iter_columns(topics, start_ns, end_ns, as_recorded=as_recorded):
             yield replace(each, place=(np.int64(number) << 48) + each.place)
 
-    def _told(self) -> Iterable[_File]:
+    def _opened_files(self) -> Iterable[_File]:
         """The files that were opened so far."""
         return self._files if "_files" in self.__dict__ else ()
 

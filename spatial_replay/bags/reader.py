@@ -1,84 +1,91 @@
-"""What every log of messages offers, whoever recorded it: topics, raw messages, and a way to decode them."""
+"""The interface of every log of messages: topics, raw messages, and a way to decode them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field
-from types import MappingProxyType
-from typing import NamedTuple, Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterator
+from pathlib import Path
 
-from spatial_replay.logs.messages import Schema
+from spatial_replay.bags.columns import Columns, Message, iter_counted, one_by_one
+from spatial_replay.bags.decoders import decoder_of
+from spatial_replay.bags.topic import Decoder, Topic
+from spatial_replay.errors import LogError
 from spatial_replay.logs.read_options import FaultList
 
-Decoder = Callable[[bytes], object]
-"""A payload to an object with fields: attributes of ROS and protobuf messages, keys of a JSON object."""
 
-
-@dataclass(frozen=True, slots=True)
-class Topic:
-    """A topic of a log, of one type and encoding.
+class MessageReader(ABC):
+    """A log of messages in a file or folder, which is read again for each iteration.
 
     Attributes:
-        type: as rosbags names ROS types (`turtlesim/msg/Pose`), else the schema's name
-            (`foxglove.SceneUpdate`); empty where the log does not say.
-        encoding: of the messages: ros1, cdr, protobuf, json.
-        count: how many messages the log declares, or None.
-        schema: the definition as the log has it, or None.
-        latched: whether its last message before a window still counts (latched, transient local).
-        unreadable: why its messages cannot be decoded, or None.
-        metadata: of its channel, as an MCAP log keeps it.
+        kind: the format, in a word.
     """
 
-    name: str
-    type: str
-    encoding: str
-    count: int | None = None
-    schema: Schema | None = None
-    latched: bool = False
-    unreadable: str | None = None
-    metadata: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}), hash=False)
+    kind: str
 
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._faults = FaultList()
 
-class Message(NamedTuple):
-    """One message as it stands in the log.
+    @property
+    @abstractmethod
+    def _topics(self) -> tuple[Topic, ...]:
+        """The topics that the log declares, by name."""
 
-    Attributes:
-        log_time_ns: when it was recorded.
-        publish_time_ns: when it was sent; the log time where the container does not know.
-        sequence: number within its topic as in the log, 0 where the log has none; of messages of one topic
-            and time, the later one comes later.
-        payload: in its topic's encoding.
-    """
+    @property
+    def _distribution(self) -> str | None:
+        """The ROS release that the log names, for types that it does not define."""
+        return None
 
-    topic: str
-    log_time_ns: int
-    publish_time_ns: int
-    sequence: int
-    payload: bytes
+    @property
+    @abstractmethod
+    def start_ns(self) -> int | None:
+        """Log time of the first message."""
 
+    @abstractmethod
+    def iter_columns(
+        self,
+        topics: Collection[str],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        *,
+        as_recorded: bool = False,
+    ) -> Columns:
+        """Yield what `iter_messages` gives, as columns.
 
-class MessageReader(Protocol):
-    """A log of messages; it is read from the file anew each time."""
+        Args:
+            as_recorded: in the order of recording instead, which may jump back in time.
+        """
 
     @property
     def name(self) -> str:
-        """What the log is called: the base name of its file or folder."""
-
-    @property
-    def kind(self) -> str:
-        """The format, in a word."""
+        """The base name of its file or folder."""
+        return self._path.name or self._path.absolute().name
 
     def topics(self) -> tuple[Topic, ...]:
-        """The topics, by name.
+        """Return the topics, by name.
 
         Raises:
-            LogError: the log is too damaged to tell.
+            LogError: the log is too damaged, or declares no topic.
         """
+        if not self._topics:
+            reason = next(iter(self._faults.take()), "it is empty")
+            raise LogError(f"{self.name} holds no topic: {reason}")
+        return self._topics
+
+    def decoder(self, topic: str) -> Decoder:
+        """Return a decoder for the messages of a topic.
+
+        The decoder raises LogError for a payload that does not fit, with the reason.
+
+        Raises:
+            LogError: the topic's definition is missing or cannot be understood.
+        """
+        return decoder_of(next(each for each in self._topics if each.name == topic), self._distribution)
 
     def iter_messages(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
-        """The messages of some topics in the order of their log time, as far as the log keeps it.
+        """Yield the messages of some topics in the order of their log time, as far as the log keeps it.
 
         Args:
             start_ns, end_ns: only those logged from `start_ns` up to, not including, `end_ns`.
@@ -86,21 +93,21 @@ class MessageReader(Protocol):
         Raises:
             LogError: nothing can be read.
         """
+        return one_by_one(self.iter_columns(topics, start_ns, end_ns))
 
     def take_faults(self) -> tuple[str, ...]:
-        """What was lost since the last call, each with its place, on topics that were asked for."""
+        """Return what was lost since the last call, each with its place, on the topics that were read."""
+        return self._faults.take()
 
     def move_faults(self, other: FaultList) -> None:
-        """Hand over what `take_faults` would give, with the count of what is no longer told one by one."""
+        """Move what `take_faults` would return to another list, with the count of faults beyond its limit."""
+        self._faults.move_to(other)
 
     def take_remarks(self) -> tuple[str, ...]:
-        """What is wrong with the log since the last call without a loss on topics that were asked for."""
+        """Return what is wrong since the last call without a loss on the topics that were read."""
+        return ()
 
-    def decoder(self, topic: str) -> Decoder:
-        """How to decode the messages of a topic.
-
-        The function that is returned raises LogError, saying what is wrong, for a payload that does not fit.
-
-        Raises:
-            LogError: the topic's definition is missing or cannot be understood.
-        """
+    def _counted(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
+        """Yield all messages of some topics, then compare their number with what the log declares."""
+        declared = {each.name: each.count for each in self._topics if each.name in topics}
+        return iter_counted(columns, declared, name or self.name, self._faults)

@@ -1,4 +1,8 @@
-"""ROS 1 bags, whole or damaged."""
+"""ROS 1 bags, whole or damaged.
+
+The reader is our own because rosbags refuses a whole bag at its first damage, and bags without an index,
+which interrupted recorders leave behind. Here only the damaged chunks are lost, and each is reported.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +16,13 @@ import numpy as np
 
 from spatial_replay.bags.columns import (
     Columns,
-    CountedTopics,
     MessageColumns,
     in_order,
     places_in,
     unnumbered,
 )
-from spatial_replay.bags.decoders import topics_named
-from spatial_replay.bags.file_reader import OneFile
-from spatial_replay.bags.reader import Topic
+from spatial_replay.bags.decoders import topics_by_name
+from spatial_replay.bags.reader import MessageReader
 from spatial_replay.bags.ros1_index import (
     MESSAGE,
     BagChunk,
@@ -32,13 +34,14 @@ from spatial_replay.bags.ros1_index import (
     record_table,
 )
 from spatial_replay.bags.ros_definitions import full_type_name
+from spatial_replay.bags.topic import Topic
 from spatial_replay.logs.mcap.chunks import DamageError
 from spatial_replay.logs.messages import Schema
 from spatial_replay.trace.sample import LATEST_NS
 
 
-class Ros1Bag(OneFile):
-    """A ROS 1 bag, read chunk by chunk; see `MessageReader`."""
+class Ros1Bag(MessageReader):
+    """A ROS 1 bag, read chunk by chunk."""
 
     kind = "ROS 1 bag"
 
@@ -52,7 +55,7 @@ class Ros1Bag(OneFile):
         counts: Counter[int] = Counter()
         for chunk in self._directory.chunks:
             counts.update(chunk.counts or {})
-        return topics_named(
+        return topics_by_name(
             self._topic(each, counts[each.number]) for each in self._directory.connections.values()
         )
 
@@ -69,7 +72,7 @@ class Ros1Bag(OneFile):
         *,
         as_recorded: bool = False,
     ) -> Columns:
-        """See `ColumnReader.iter_columns`."""
+        """See `MessageReader.iter_columns`."""
         first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else min(end_ns, LATEST_NS + 1)
         wanted = {c.number: c for c in self._directory.connections.values() if c.topic in topics}
         chunks = [
@@ -88,10 +91,8 @@ class Ros1Bag(OneFile):
             )
             if (first, last) != (0, LATEST_NS + 1) or not self._directory.is_indexed:
                 yield from columns
-                return
-            counted = CountedTopics({each.name: each.count for each in self._topics if each.name in topics})
-            yield from counted.counted(columns)
-            counted.compare(self.name, self._faults)
+            else:
+                yield from self._counted(columns, topics)
 
     def _messages(
         self,

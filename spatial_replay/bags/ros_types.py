@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
-from spatial_replay.bags.reader import Decoder
 from spatial_replay.bags.ros_definitions import (
+    BASE_BYTES,
     Definitions,
     Field,
     Kind,
@@ -19,6 +19,7 @@ from spatial_replay.bags.ros_definitions import (
     iter_sections,
     msg_from_definitions,
 )
+from spatial_replay.bags.topic import Decoder
 from spatial_replay.errors import LogError
 from spatial_replay.logs.messages import Schema
 
@@ -250,8 +251,6 @@ def _described(definitions: Definitions, store: Typestore) -> Typesdict:
 
 def _description(field: Field) -> FieldDesc:
     from rosbags.interfaces import Nodetype
-
-    from spatial_replay.bags.ros_definitions import BASE_BYTES
 
     item: BaseDesc | NameDesc
     if field.type in BASE_BYTES:

@@ -7,8 +7,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from spatial_replay.bags.columns import MessageColumns
-from spatial_replay.bags.reader import Decoder, Message
+from spatial_replay.bags.columns import Message, MessageColumns
+from spatial_replay.bags.topic import Decoder
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.geometry.footprint import Concave

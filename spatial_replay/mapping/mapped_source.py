@@ -14,9 +14,10 @@ from types import MappingProxyType
 import numpy as np
 
 from spatial_replay.bags.columns import Columns, MessageColumns, in_pieces, joined, without_jumps
-from spatial_replay.bags.open import ColumnReader, open_messages
-from spatial_replay.bags.reader import MessageReader, Topic
+from spatial_replay.bags.open import open_messages
+from spatial_replay.bags.reader import MessageReader
 from spatial_replay.bags.ros_types import standard_schema
+from spatial_replay.bags.topic import Topic
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import Attachment, Block, Channel, Messages
@@ -236,7 +237,7 @@ def _unread(name: str, topics: Sequence[Topic], plan: ReadingPlan) -> list[str]:
 
 
 def _columns(
-    reader: ColumnReader, plan: ReadingPlan, start_ns: int | None, end_ns: int | None, *, as_recorded: bool
+    reader: MessageReader, plan: ReadingPlan, start_ns: int | None, end_ns: int | None, *, as_recorded: bool
 ) -> Columns:
     """The messages that samples of a window depend on."""
     if not plan.by_log_time or (not start_ns and end_ns is None):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from spatial_replay.bags.reader import Topic
+from spatial_replay.bags.topic import Topic
 from spatial_replay.errors import UsageError
 from spatial_replay.mapping.message_types import (
     BUILT_IN,

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from operator import itemgetter
 from types import MappingProxyType
 
-from spatial_replay.bags.reader import Topic
+from spatial_replay.bags.topic import Topic
 from spatial_replay.logs.topics import DERIVED
 from spatial_replay.mapping.field_paths import field_names, get_field, is_list, name_from_topic
 from spatial_replay.mapping.message_types import BUILT_IN, TRANSFORM_TYPES, short_type

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from spatial_replay.bags.reader import Decoder
+from spatial_replay.bags.topic import Decoder
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.mapping.detections import DetectionChunk, Detections

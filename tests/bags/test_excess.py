@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
+from spatial_replay.bags import Topic
 from spatial_replay.bags.decoders import decoder_of
-from spatial_replay.bags.reader import Topic
 from spatial_replay.errors import LogError
 from spatial_replay.logs.messages import Schema
 

@@ -20,8 +20,7 @@ from bags.bag_files import (
     write_ros1,
     write_ros2,
 )
-from spatial_replay.bags.open import open_messages
-from spatial_replay.bags.reader import MessageReader, Topic
+from spatial_replay.bags import MessageReader, Topic, open_messages
 from spatial_replay.errors import LogError, MissingFileError
 
 Write = Callable[[Path, list[Sent]], Path]
@@ -312,7 +311,7 @@ def test_what_is_no_log_is_said(tmp_path: Path) -> None:
     with pytest.raises(MissingFileError):
         open_messages(tmp_path / "gone.bag")
     (tmp_path / "text.bag").write_text("hello")
-    with pytest.raises(LogError, match="no ROS bag and no MCAP log"):
+    with pytest.raises(LogError, match="neither a ROS bag nor an MCAP log"):
         open_messages(tmp_path / "text.bag")
     (tmp_path / "empty").mkdir()
     with pytest.raises(LogError, match="no ROS 2 bag that can be read"):

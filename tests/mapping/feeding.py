@@ -10,7 +10,8 @@ from typing import Any
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from spatial_replay.bags.reader import Decoder, Message, Topic
+from spatial_replay.bags import Message
+from spatial_replay.bags.topic import Decoder, Topic
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.mapping.reading_plan import ReadingPlan

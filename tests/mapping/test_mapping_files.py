@@ -10,7 +10,7 @@ import pytest
 from jsonschema import Draft202012Validator
 
 from mapping.feeding import Feed, make, pose_stamped
-from spatial_replay.bags.reader import Topic
+from spatial_replay.bags import Topic
 from spatial_replay.errors import MissingFileError, UsageError
 from spatial_replay.mapping import mapping_file as schema
 from spatial_replay.mapping.mapping_file import load_mapping, parse_mapping

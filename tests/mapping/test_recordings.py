@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spatial_replay.bags.open import open_messages
+from spatial_replay.bags import open_messages
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import parse_mapping

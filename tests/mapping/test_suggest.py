@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from spatial_replay.bags.reader import Topic
+from spatial_replay.bags import Topic
 from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.mapping.model import LogMapping, ShapeMapping
 from spatial_replay.mapping.suggest import suggest_mapping

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mapping.feeding import SECOND, Feed, make, pose_stamped
-from spatial_replay.bags.reader import Topic
+from spatial_replay.bags import Topic
 from spatial_replay.errors import UsageError
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import parse_mapping

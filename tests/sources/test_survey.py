@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
-from spatial_replay.bags.reader import MessageReader
+from spatial_replay.bags import MessageReader
 from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.sources.overview import messages_in, survey
 

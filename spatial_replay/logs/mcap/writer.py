@@ -17,7 +17,7 @@ from mcap import records
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.chunks import MAGIC, encoded
-from spatial_replay.logs.mcap.packing import Batch, McapSummary, PackedChunk, MessageRange, pack
+from spatial_replay.logs.mcap.packing import Batch, McapSummary, MessageRange, PackedChunk, pack
 from spatial_replay.logs.messages import Channel, Messages, Schema
 from spatial_replay.logs.output_file import output_error
 
