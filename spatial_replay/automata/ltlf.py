@@ -6,9 +6,10 @@ What keeps a formula from having an automaton, told with its place.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import reduce
 from typing import Literal, NamedTuple
 
-from spatial_replay.automata.propositions import Propositions, is_spatial
+from spatial_replay.automata.propositions import Propositions
 from spatial_replay.errors import NoAutomatonError
 from spatial_replay.spec.diagnostics import Source
 from spatial_replay.spec.format import format_bound
@@ -20,6 +21,7 @@ from spatial_replay.spec.formula import (
     NamedSpec,
     Temporal,
     Truth,
+    expand,
     iter_nodes,
     operator_of,
 )
@@ -85,7 +87,7 @@ def _width(node: Formula) -> int:
 
 
 def _unnamed(formula: Formula) -> Formula:
-    """What a formula that only names another spec stands for."""
+    """Return the formula that one that only names another spec stands for."""
     while isinstance(formula, Boolean) and formula.operator == "spec":
         (formula,) = formula.operands
     return formula
@@ -139,66 +141,52 @@ class Skeleton:
         self._source = source
         self.chains: dict[tuple[int, bool], int] = {}
         self._known: dict[tuple[int, bool], int] = {}
-        self._unrolled: Temporal | None = None
+        # messages name the operators of the text, not those of their expansions
+        self._written = {id(node) for node in _temporal(formula)}
+        self._operator: Formula | None = None
+        self._unrolled: Formula | None = None
         self._node("false"), self._node("true")
         self.root = self._of(formula, True)
 
     def _of(self, formula: Formula, positive: bool) -> int:
-        """The number of a formula, or of its negation."""
+        """Return the number of a formula, or of its negation."""
+        proposition = self._propositions.literal(formula)
+        if proposition is not None:
+            number, value = proposition
+            return self._node("literal", number, int(value == positive))
+        outer = self._operator
+        if id(formula) in self._written:
+            self._operator = formula
+        formula = expand(formula)
         key = (id(formula), positive)
         if key not in self._known:
             self._known[key] = self._built(formula, positive)
+        self._operator = outer
         return self._known[key]
 
     def _built(self, formula: Formula, positive: bool) -> int:
-        if isinstance(formula, Truth):
-            return TRUE if formula.value == positive else FALSE
-        if is_spatial(formula):
-            number, value = self._propositions.literal(formula)
-            return self._node("literal", number, int(value == positive))
-        if isinstance(formula, Boolean):
-            return self._boolean(formula, positive)
-        if isinstance(formula, Temporal):
-            return self._temporal(formula, [self._of(each, positive) for each in formula.operands], positive)
-        raise ValueError(f"{formula!r} is no formula")
-
-    def _boolean(self, formula: Boolean, positive: bool) -> int:
-        first, *rest = formula.operands
-        match formula.operator:
-            case "not":
-                return self._of(first, not positive)
-            case "spec":
-                return self._of(first, positive)
-            case "and" | "or":
+        match formula:
+            case Truth():
+                return TRUE if formula.value == positive else FALSE
+            case Boolean(operator="not"):
+                return self._of(formula.operands[0], not positive)
+            case Boolean():
                 join = self._both if (formula.operator == "and") == positive else self._either
-                result = self._of(first, positive)
-                for operand in rest:
-                    result = join(result, self._of(operand, positive))
-                return result
-            case "->":
-                join = self._either if positive else self._both
-                return join(self._of(first, not positive), self._of(rest[0], positive))
-        second = rest[0]
-        one, other = self._of(first, True), self._of(second, True)
-        not_one, not_other = self._of(first, False), self._of(second, False)
-        if (formula.operator == "xor") == positive:
-            return self._either(self._both(one, not_other), self._both(not_one, other))
-        return self._both(self._either(not_one, other), self._either(one, not_other))
+                return reduce(join, [self._of(each, positive) for each in formula.operands])
+            case Temporal():
+                return self._temporal(
+                    formula, [self._of(each, positive) for each in formula.operands], positive
+                )
+        raise ValueError(f"{formula!r} is not a proposition")
 
     def _temporal(self, formula: Temporal, operands: list[int], positive: bool) -> int:
-        self._unrolled = formula
-        if formula.operator in ("X", "WX"):
-            return self._next(operands[0], strong=(formula.operator == "X") == positive)
-        strong = (formula.operator in ("F", "U", "W")) == positive
-        # the left operand of what is in this polarity an until or a release; F and G have none
-        nothing = TRUE if strong else FALSE
-        left, right = (nothing, operands[0]) if formula.operator in ("F", "G") else operands
-        result = self._within(left, right, formula.bound, strong)
-        if formula.operator == "W":
-            # φ W ψ is (φ U ψ) or (G φ), both with the bound
-            always = self._within(FALSE if strong else TRUE, left, formula.bound, not strong)
-            result = self._either(result, always) if positive else self._both(result, always)
-        return result
+        self._unrolled = self._operator
+        # in its polarity the node is an until (strong) or a release
+        strong = (formula.operator != "G") == positive
+        if formula.operator == "X":
+            return self._next(operands[0], strong)
+        left = operands[0] if formula.operator == "U" else TRUE if strong else FALSE
+        return self._within(left, operands[-1], formula.bound, strong)
 
     def _within(self, left: int, right: int, bound: Bound | None, strong: bool) -> int:
         """Until, or release where not `strong`, over a window."""

@@ -6,7 +6,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import Boolean, Formula, Quantified, Temporal, Truth, operands_of
+from spatial_replay.spec.formula import (
+    Atom,
+    Boolean,
+    Formula,
+    Quantified,
+    Temporal,
+    Truth,
+    expand,
+    operands_of,
+)
 
 
 @dataclass(frozen=True)
@@ -63,9 +72,12 @@ class Propositions:
         for each in _maximal(formula):
             self._add(each)
 
-    def literal(self, formula: Formula) -> tuple[int, bool]:
-        """Which proposition a maximal spatial subformula is, and whether it is that or its negation."""
-        return self._literals[id(formula)]
+    def literal(self, formula: Formula) -> tuple[int, bool] | None:
+        """Return a maximal spatial subformula's proposition and whether it is that or its negation.
+
+        None for all other formulas, those that expansions are made of included.
+        """
+        return self._literals.get(id(formula))
 
     def _add(self, formula: Formula) -> None:
         number = self._numbers.get(self._shapes.of(formula, True))
@@ -102,6 +114,7 @@ class _Shapes:
 
     def of(self, formula: Formula, positive: bool) -> int:
         """The number of a formula, or of its negation, in negation normal form."""
+        formula = expand(formula)
         key = (id(formula), positive)
         if key not in self._known:
             self._known[key] = self._shape(formula, positive)
@@ -111,35 +124,19 @@ class _Shapes:
         match formula:
             case Truth():
                 return self._intern("truth", formula.value == positive)
+            case Atom():
+                return self._intern("atom", formula.expression, positive)
+            case Boolean(operator="not"):
+                return self.of(formula.operands[0], not positive)
             case Boolean():
-                return self._boolean(formula, positive)
+                is_both = (formula.operator == "and") == positive
+                return self._join(is_both, *(self.of(each, positive) for each in formula.operands))
             case Quantified():
                 body = self.of(formula.body, positive)
                 is_every = (formula.quantifier == "forall") == positive
                 return self._intern("members", is_every, formula.variables, formula.group, body)
             case Temporal():
                 raise ValueError(f"{formula.operator} is no operator about one sample")
-        return self._intern("atom", formula.expression, positive)
-
-    def _boolean(self, formula: Boolean, positive: bool) -> int:
-        first, *rest = formula.operands
-        match formula.operator:
-            case "not":
-                return self.of(first, not positive)
-            case "spec":
-                return self.of(first, positive)
-            case "and" | "or":
-                is_both = (formula.operator == "and") == positive
-                return self._join(is_both, *(self.of(each, positive) for each in formula.operands))
-            case "->":
-                return self._join(not positive, self.of(first, not positive), self.of(rest[0], positive))
-        # `xor` and `<->` are conjunctions or disjunctions of these two
-        second = rest[0]
-        is_xor = (formula.operator == "xor") == positive
-        one, other = self.of(first, True), self.of(second, True)
-        not_one, not_other = self.of(first, False), self.of(second, False)
-        pairs = ((one, not_other), (not_one, other)) if is_xor else ((not_one, other), (one, not_other))
-        return self._join(not is_xor, *(self._join(is_xor, *pair) for pair in pairs))
 
     def _join(self, is_both: bool, *operands: int) -> int:
         """A conjunction or disjunction, whatever the order, repetition and bracketing of its operands."""

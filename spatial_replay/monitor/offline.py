@@ -21,7 +21,7 @@ from spatial_replay.monitor.offline_kernel import run_finished, run_windows
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.codes import FINISHED_TARGET, low_and_high
 from spatial_replay.monitor.online.operators import SignalTable, array_of_rows
-from spatial_replay.spec.formula import FUTURE_OPERATORS, Atom, Formula, Quantified, Temporal, iter_nodes
+from spatial_replay.spec.formula import Atom, Formula, Quantified, Temporal, iter_nodes
 from spatial_replay.trace.sample import LATEST_NS
 
 _MIRRORED = MappingProxyType({"X": "Y", "F": "O", "G": "H", "U": "S"})
@@ -35,11 +35,10 @@ class FinishedTable(SignalTable):
     grows, every operator is a single pass.
     """
 
-    def add(self, formula: Formula) -> int:
-        """The row of a formula."""
-        if isinstance(formula, Temporal) and formula.operator in FUTURE_OPERATORS:
-            return self._future(formula, [self.add(each) for each in formula.operands])
-        return super().add(formula)
+    def _added_row(self, formula: Formula, operands: list[int]) -> int:
+        if isinstance(formula, Temporal) and formula.operator in _MIRRORED:
+            return self._temporal(_MIRRORED[formula.operator], operands, formula.bound, codes.AHEAD)
+        return super()._added_row(formula, operands)
 
     def instructions(self, nodes: Sequence[int]) -> Integers:
         """Rows with the columns that they read and write: that of node n is n, others come after.
@@ -61,20 +60,6 @@ class FinishedTable(SignalTable):
         copies = [(codes.AND, column[row], column[row], 0, 0, 0, n) for n, row in enumerate(nodes)]
         result += [copy for copy in copies if copy[1] != copy[-1]]
         return array_of_rows(result, codes.FINISHED_WIDTH)
-
-    def _future(self, formula: Temporal, operands: list[int]) -> int:
-        match formula.operator:
-            case "WX":
-                return self._delay(operands[0], codes.SAMPLES, 1, codes.AHEAD, is_weak=True)
-            case "R":
-                negated = [self._row(codes.NOT, each) for each in operands]
-                until = self._temporal("S", negated, formula.bound, codes.AHEAD)
-                return self._row(codes.NOT, until)
-            case "W":
-                until = self._temporal("S", operands, formula.bound, codes.AHEAD)
-                always = self._temporal("H", operands[:1], formula.bound, codes.AHEAD)
-                return self._row(codes.OR, until, always)
-        return self._temporal(_MIRRORED[formula.operator], operands, formula.bound, codes.AHEAD)
 
 
 @dataclass(frozen=True, eq=False)

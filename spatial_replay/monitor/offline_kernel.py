@@ -19,7 +19,6 @@ from spatial_replay.monitor.online.codes import (
     DELAY,
     FINISHED_TARGET,
     HISTORICALLY,
-    IFF,
     LEAF,
     NOT,
     ONCE,
@@ -27,7 +26,6 @@ from spatial_replay.monitor.online.codes import (
     SAMPLES,
     SINCE,
     WINDOW_MAX,
-    XOR,
 )
 
 
@@ -120,24 +118,17 @@ def _run_boolean(
 ) -> None:
     code, a, b = row[0], row[1], row[2]
     first, second = columns[channel, a], columns[channel, b]
-    mirrored_first, mirrored_second = columns[mirror, a], columns[mirror, b]
     if code == CONSTANT:
         target[begin:end] = row[4] * np.inf
     elif code == NOT:
         for k in range(begin, end):
-            target[k] = -mirrored_first[k]
+            target[k] = -columns[mirror, a, k]
     elif code == AND:
         for k in range(begin, end):
             target[k] = min(first[k], second[k])
     elif code == OR:
         for k in range(begin, end):
             target[k] = max(first[k], second[k])
-    elif code == XOR:
-        for k in range(begin, end):
-            target[k] = max(min(first[k], -mirrored_second[k]), min(-mirrored_first[k], second[k]))
-    elif code == IFF:
-        for k in range(begin, end):
-            target[k] = min(max(-mirrored_first[k], second[k]), max(-mirrored_second[k], first[k]))
 
 
 @kernel

@@ -302,12 +302,20 @@ BooleanOperator: TypeAlias = Literal["not", "and", "or", "xor", "->", "<->", "sp
 
 @dataclass(frozen=True, slots=True)
 class Boolean:
-    """A Boolean operator: `not` and `spec` have one operand; `and` and `or` two or more; the rest two."""
+    """A Boolean operator: `not` and `spec` have one operand; `and` and `or` two or more; the rest two.
+
+    Attributes:
+        expansion: the formula that defines it; None for `not`, `and` and `or` (see `expand`).
+    """
 
     operator: BooleanOperator
     operands: tuple[Formula, ...]
     name: str | None = None
     span: Span = field(default_factory=_unspanned, compare=False)
+    expansion: Formula | None = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "expansion", _boolean_expansion(self.operator, self.operands))
 
 
 TemporalOperator: TypeAlias = Literal["X", "WX", "F", "G", "U", "R", "W", "Y", "O", "H", "S"]
@@ -317,13 +325,21 @@ PAST_OPERATORS: frozenset[str] = frozenset({"Y", "O", "H", "S"})
 
 @dataclass(frozen=True, slots=True)
 class Temporal:
-    """A temporal operator: U, R, W and S have two operands, the others one; X, WX and Y have no bound."""
+    """A temporal operator: U, R, W and S have two operands, the others one; X, WX and Y have no bound.
+
+    Attributes:
+        expansion: the formula that defines R, W and WX; None for the others (see `expand`).
+    """
 
     operator: TemporalOperator
     operands: tuple[Formula, ...]
     bound: Bound | None = None
     name: str | None = None
     span: Span = field(default_factory=_unspanned, compare=False)
+    expansion: Formula | None = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "expansion", _temporal_expansion(self.operator, self.operands, self.bound))
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,6 +362,60 @@ class Quantified:
 
 
 Formula: TypeAlias = Truth | Atom | Boolean | Temporal | Quantified
+
+
+def expand(formula: Formula) -> Formula:
+    """Return a formula of the same value whose own operator is one that engines implement.
+
+    These are `not`, `and`, `or`, X, F, G, U, Y, O, H and S. All others are written in terms of them when a
+    node is made; trees, texts and ids are those of the formula as written. Operands stay as they are.
+    """
+    while isinstance(formula, (Boolean, Temporal)) and formula.expansion is not None:
+        formula = formula.expansion
+    return formula
+
+
+def _boolean_expansion(operator: BooleanOperator, operands: tuple[Formula, ...]) -> Formula | None:
+    first, *rest = operands
+    match operator:
+        case "spec":
+            return first
+        case "->":
+            return _or(_not(first), rest[0])
+        case "xor":
+            return _or(_and(first, _not(rest[0])), _and(_not(first), rest[0]))
+        case "<->":
+            return _and(_or(_not(first), rest[0]), _or(_not(rest[0]), first))
+    return None
+
+
+def _temporal_expansion(
+    operator: TemporalOperator, operands: tuple[Formula, ...], bound: Bound | None
+) -> Formula | None:
+    first, last = operands[0], operands[-1]
+    match operator:
+        case "WX":
+            return _not(Temporal("X", (_not(first),)))
+        case "R":
+            return _not(Temporal("U", (_not(first), _not(last)), bound))
+        case "W" if bound is None:
+            # not "U or G": that would count as two unbounded operators, each doubling the online state
+            return Temporal("R", (last, _or(first, last)))
+        case "W":
+            return _or(Temporal("U", operands, bound), Temporal("G", (first,), bound))
+    return None
+
+
+def _not(operand: Formula) -> Boolean:
+    return Boolean("not", (operand,))
+
+
+def _and(*operands: Formula) -> Boolean:
+    return Boolean("and", operands)
+
+
+def _or(*operands: Formula) -> Boolean:
+    return Boolean("or", operands)
 
 
 def operands_of(formula: Formula) -> tuple[Formula, ...]:

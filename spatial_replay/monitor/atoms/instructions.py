@@ -8,7 +8,7 @@ reads from measurements, signals and constants.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import permutations
 from math import inf, perm
 from typing import NamedTuple, Protocol
@@ -41,14 +41,16 @@ from spatial_replay.spec.formula import (
     Sum,
     Temporal,
     Truth,
+    operands_of,
+    operator_of,
 )
 
 # instructions: operation, a, b, c
 CONSTANT, MEASURED, SIGNAL = 0, 1, 2  # number a of its kind
 ADD, NEGATE, LEAST, GREATEST = 3, 4, 5, 6  # numbers; not a number where an operand is not
 HOLDS = 7  # a number as an interval: all of the reals where it is not a number
-AND, OR, XOR, IFF = 8, 9, 10, 11  # intervals
-AND_MEMBER, OR_MEMBER = 12, 13  # a, and b where members c is 1, anything where it is -1
+AND, OR = 8, 9  # intervals
+AND_MEMBER, OR_MEMBER = 10, 11  # a, and b where members c is 1, anything where it is -1
 
 TILE = 128
 """How many samples are taken at a time, so that their columns stay in the processor's cache."""
@@ -106,14 +108,6 @@ def run_instructions(
                         target[k] = min(first[k], second[k])
                     elif op == OR:
                         target[k] = max(first[k], second[k])
-                    elif op == XOR:
-                        target[k] = max(
-                            min(first[k], -columns[b, mirror, k]), min(-columns[a, mirror, k], second[k])
-                        )
-                    elif op == IFF:
-                        target[k] = min(
-                            max(-columns[a, mirror, k], second[k]), max(-columns[b, mirror, k], first[k])
-                        )
                     else:
                         value = second[k]
                         if members[c, t + k] < 0:
@@ -192,8 +186,8 @@ class LeafCode:
             case Quantified():
                 return self._quantified(formula, bindings)
             case Boolean():
-                first, *rest = [self._add(each, bindings) for each in formula.operands]
-                return self._boolean(formula.operator, first, rest)
+                rows = {id(each): self._add(each, bindings) for each in formula.operands}
+                return self._joined(formula.expansion or formula, rows)
             case Temporal():
                 raise TypeError("a temporal operator in the body of an open quantifier")
 
@@ -223,16 +217,17 @@ class LeafCode:
         measurement = _bound(expression, bindings)
         return self._row(MEASURED, self.measurements.setdefault(measurement, len(self.measurements)))
 
-    def _boolean(self, operator: str, first: int, rest: Sequence[int]) -> int:
-        match operator:
-            case "not":
-                return self._row(NEGATE, first)
-            case "xor":
-                return self._row(XOR, first, rest[0])
-            case "<->":
-                return self._row(IFF, first, rest[0])
-            case "->":
-                return self._row(OR, self._row(NEGATE, first), rest[0])
+    def _joined(self, formula: Formula, rows: Mapping[int, int]) -> int:
+        """Return the row of an expansion, given the rows of the operands that were written, by `id`.
+
+        An expansion holds an operand more than once: compiling it each time would take 2**depth steps.
+        """
+        if id(formula) in rows:
+            return rows[id(formula)]
+        first, *rest = [self._joined(each, rows) for each in operands_of(formula)]
+        operator = operator_of(formula)
+        if operator == "not":
+            return self._row(NEGATE, first)
         for other in rest:
             first = self._row(AND if operator == "and" else OR, first, other)
         return first

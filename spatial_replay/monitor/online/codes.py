@@ -24,7 +24,7 @@ FINISHED_WIDTH = 7
 # codes of signals
 LEAF = 0  # leaf a
 CONSTANT = 1  # low times infinity
-NOT, AND, OR, XOR, IFF = 2, 3, 4, 5, 6
+NOT, AND, OR = 2, 3, 4
 ONCE, HISTORICALLY, SINCE = 7, 8, 9
 WINDOW_MAX, WINDOW_MIN = 10, 11  # of a, over [low, high] back
 DELAY = 12  # a, low back; high times infinity where there is none

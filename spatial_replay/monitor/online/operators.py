@@ -8,6 +8,7 @@ The signal table: subformulas without a future operator, compiled for `signals.s
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial, reduce
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from spatial_replay.spec.formula import (
     Quantified,
     Temporal,
     Truth,
+    expand,
     operands_of,
 )
 
@@ -66,6 +68,8 @@ class SignalTable:
         self.leaves: list[Atom | Quantified] = []
         self._leaf_numbers: dict[tuple[object, ...], int] = {}
         self._rows: dict[Row, int] = {}
+        # an expansion holds an operand more than once; without this, nested ones would take 2**depth steps
+        self._added: dict[int, int] = {}
         for leaf in leaves:
             self._leaf_number(leaf)
 
@@ -90,16 +94,22 @@ class SignalTable:
         return array_of_rows(rows, codes.SIGNAL_WIDTH)
 
     def add(self, formula: Formula) -> int:
-        """The row of a formula without future operators."""
+        """Return the row of a formula without future operators."""
+        formula = expand(formula)
+        if id(formula) not in self._added:
+            operands = [self.add(each) for each in operands_of(formula)]
+            self._added[id(formula)] = self._added_row(formula, operands)
+        return self._added[id(formula)]
+
+    def _added_row(self, formula: Formula, operands: list[int]) -> int:
         match formula:
             case Truth():
                 return self._row(codes.CONSTANT, low=1 if formula.value else -1)
             case Atom() | Quantified():
                 return self._row(codes.LEAF, self._leaf_number(formula))
             case Boolean():
-                return self._boolean(formula.operator, [self.add(each) for each in formula.operands])
+                return self._boolean(formula.operator, operands)
             case Temporal():
-                operands = [self.add(each) for each in formula.operands]
                 return self._temporal(formula.operator, operands, formula.bound)
 
     def _row(self, code: int, a: int = 0, b: int = 0, unit: int = 0, low: int = 0, high: int = 0) -> int:
@@ -118,21 +128,11 @@ class SignalTable:
 
     def _boolean(self, operator: str, operands: list[int]) -> int:
         first, *rest = operands
-        match operator:
-            case "not":
-                return self._row(codes.NOT, first)
-            case "spec":
-                return first
-            case "and" | "or":
-                for operand in rest:
-                    first = self._row(codes.AND if operator == "and" else codes.OR, first, operand)
-                return first
-            case "xor":
-                return self._row(codes.XOR, first, rest[0])
-            case "->":
-                return self._row(codes.OR, self._row(codes.NOT, first), rest[0])
-            case _:
-                return self._row(codes.IFF, first, rest[0])
+        if operator == "not":
+            return self._row(codes.NOT, first)
+        for operand in rest:
+            first = self._row(codes.AND if operator == "and" else codes.OR, first, operand)
+        return first
 
     def _temporal(self, operator: str, operands: list[int], bound: Bound | None, ahead: int = 0) -> int:
         """A past operator; with `codes.AHEAD`, the future operator that is its mirror image in time."""
@@ -217,7 +217,7 @@ class WindowedPart:
         self._rows: dict[Row, int] = {}
         self._added: dict[tuple[int, bool], int] = {}
         if anchored:
-            self._anchored(root.operator, [self._add(each, True) for each in root.operands], root.bound)
+            self._anchored(root, True)
         else:
             self._add(root, True)
 
@@ -277,70 +277,36 @@ class WindowedPart:
         return self._rows[key]
 
     def _add(self, formula: Formula, positive: bool) -> int:
-        """The row of a formula, or of its negation, in negation normal form.
+        """Return the row of a formula, or of its negation, in negation normal form.
 
-        Each is built once in either polarity: `xor` and `<->` ask for their operands in both.
+        Each is built once in either polarity: the expansion of `xor` holds its operands in both.
         """
+        formula = expand(formula)
+        while isinstance(formula, Boolean) and formula.operator == "not":
+            formula, positive = expand(formula.operands[0]), not positive
         key = (id(formula), positive)
         if key not in self._added:
             self._added[key] = self._built(formula, positive)
         return self._added[key]
 
     def _built(self, formula: Formula, positive: bool) -> int:
-        if isinstance(formula, Boolean) and looks_ahead(formula):
-            return self._boolean(formula, positive)
-        if isinstance(formula, Temporal) and looks_ahead(formula):
+        if isinstance(formula, Boolean | Temporal) and looks_ahead(formula):
             operands = [self._add(each, positive) for each in formula.operands]
-            if formula.operator in FUTURE_OPERATORS:
-                return self._future(formula.operator, operands, formula.bound, positive)
-            return self._past(formula.operator, operands, formula.bound, positive)
-        return self._row(codes.LITERAL, self._signals.add(formula), 0 if positive else 1)
-
-    def _boolean(self, formula: Boolean, positive: bool) -> int:
-        first, *rest = formula.operands
-        match formula.operator:
-            case "not":
-                return self._add(first, not positive)
-            case "spec":
-                return self._add(first, positive)
-            case "and" | "or":
+            if isinstance(formula, Boolean):
                 is_both = (formula.operator == "and") == positive
-                row = self._add(first, positive)
-                for operand in rest:
-                    row = self._join(row, self._add(operand, positive), is_both=is_both)
-                return row
-            case "->":
-                operands = self._add(first, not positive), self._add(rest[0], positive)
-                return self._join(*operands, is_both=not positive)
-        return self._either_way(first, rest[0], positive, is_xor=formula.operator == "xor")
-
-    def _either_way(self, first: Formula, second: Formula, positive: bool, *, is_xor: bool) -> int:
-        """`xor` or `<->`, from its operands as they stand and negated, in the polarity of this node."""
-        a, b = self._add(first, positive), self._add(second, positive)
-        not_a, not_b = self._add(first, not positive), self._add(second, not positive)
-        pairs = ((a, not_b), (not_a, b)) if is_xor else ((not_a, b), (not_b, a))
-        inner = is_xor == positive
-        return self._join(*(self._join(*pair, is_both=inner) for pair in pairs), is_both=not inner)
+                return reduce(partial(self._join, is_both=is_both), operands)
+            build = self._future if formula.operator in FUTURE_OPERATORS else self._past
+            return build(formula.operator, operands, formula.bound, positive)
+        return self._row(codes.LITERAL, self._signals.add(formula), 0 if positive else 1)
 
     def _join(self, first: int, second: int, *, is_both: bool) -> int:
         return self._row(codes.PART_AND if is_both else codes.PART_OR, first, second)
 
     def _future(self, operator: str, operands: list[int], bound: Bound | None, positive: bool) -> int:
-        operator, left, right, bound = _as_until_or_release(operator, operands, bound)
-        unit, low, high = window_of(bound)
-        # In its polarity the node is one of: until (U; weak: W) or release (R; strong: M)
-        is_until = (operator in ("F", "U", "W")) == positive
-        if operator == "W" and bound is not None:
-            until = self._bounded(left, right, unit, low, high, is_until=is_until)
-            always = self._bounded(NOTHING, left, unit, low, high, is_until=not is_until)
-            return self._join(until, always, is_both=not positive)
-        if operator == "W":
-            return self._unbounded(left, right, is_until=is_until, weak=positive)
-        return self._bounded(left, right, unit, low, high, is_until=is_until)
-
-    def _unbounded(self, left: int, right: int, *, is_until: bool, weak: bool, variable: bool = True) -> int:
-        code = codes.UNTIL if is_until else codes.RELEASE
-        return self._row(code, left, right, int(weak), variable=variable)
+        left, right, bound = _as_until(operator, operands, bound)
+        # in its polarity the node is an until or a release, the negation of an until
+        is_until = (operator != "G") == positive
+        return self._bounded(left, right, *window_of(bound), is_until=is_until)
 
     def _bounded(
         self, left: int, right: int, unit: int, low: int, high: int | None, *, is_until: bool
@@ -351,7 +317,8 @@ class WindowedPart:
         within = None if high is None else self._row(own, right, 0, weak, unit, low, high)
         if within is not None and left == NOTHING:
             return within
-        running = self._unbounded(left, right, is_until=is_until, weak=bool(weak), variable=high is None)
+        code = codes.UNTIL if is_until else codes.RELEASE
+        running = self._row(code, left, right, weak, variable=high is None)
         if low > 0 or high is not None:
             running = self._row(codes.SHIFT, running, 0, weak, unit, low, NOTHING if high is None else high)
         if low > 0 and left != NOTHING:
@@ -378,29 +345,27 @@ class WindowedPart:
                 result = self._join(before, result, is_both=is_since)
         return result if within is None else self._join(within, result, is_both=is_since)
 
-    def _anchored(self, operator: str, operands: list[int], bound: Bound | None) -> int:
-        operator, left, right, bound = _as_until_or_release(operator, operands, bound)
-        unit, low, high = window_of(bound)
-
-        def window(code: int, left: int, right: int) -> int:
-            weak = int(code == codes.ANCHORED_RELEASE)
+    def _anchored(self, formula: Formula, positive: bool) -> int:
+        formula = expand(formula)
+        if isinstance(formula, Temporal):
+            operands = [self._add(each, positive) for each in formula.operands]
+            left, right, bound = _as_until(formula.operator, operands, formula.bound)
+            unit, low, high = window_of(bound)
+            is_until = (formula.operator != "G") == positive
+            code = codes.ANCHORED_UNTIL if is_until else codes.ANCHORED_RELEASE
             end = NOTHING if high is None else high
-            return self._row(code, left, right, weak, unit, low, end, variable=True)
+            return self._row(code, left, right, int(not is_until), unit, low, end, variable=True)
+        if isinstance(formula, Boolean) and formula.operator == "not":
+            return self._anchored(formula.operands[0], not positive)
+        windows = [self._anchored(each, positive) for each in operands_of(formula)]
+        return reduce(partial(self._join, is_both=not positive), windows)
 
-        if operator == "W":
-            until = window(codes.ANCHORED_UNTIL, left, right)
-            return self._join(until, window(codes.ANCHORED_RELEASE, NOTHING, left), is_both=False)
-        return window(codes.ANCHORED_UNTIL if operator in ("F", "U") else codes.ANCHORED_RELEASE, left, right)
 
-
-def _as_until_or_release(
-    operator: str, operands: list[int], bound: Bound | None
-) -> tuple[str, int, int, Bound | None]:
-    """A future operator with a left operand, `NOTHING` for F and G; X is F[1,1], and WX is G[1,1]."""
-    if operator in ("X", "WX"):
-        operator, bound = ("F" if operator == "X" else "G"), Bound(1, 1, "samples")
-    left, right = (NOTHING, operands[0]) if operator in ("F", "G") else operands
-    return operator, left, right, bound
+def _as_until(operator: str, operands: list[int], bound: Bound | None) -> tuple[int, int, Bound | None]:
+    """Return the operands and bound of U for a future operator: X is F[1,1]; F and G have no left operand."""
+    if operator == "U":
+        return operands[0], operands[1], bound
+    return NOTHING, operands[0], Bound(1, 1, "samples") if operator == "X" else bound
 
 
 def _by_kind(greatest: int, least: int, is_strong: bool) -> tuple[int, int]:

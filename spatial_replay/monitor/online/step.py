@@ -27,7 +27,6 @@ from spatial_replay.monitor.online.codes import (
     CONSTANT,
     DELAY,
     HISTORICALLY,
-    IFF,
     LEAF,
     NOT,
     NOW_EITHER,
@@ -52,7 +51,6 @@ from spatial_replay.monitor.online.codes import (
     SINCE,
     WINDOW_MAX,
     WINDOW_MIN,
-    XOR,
     in_channels,
 )
 from spatial_replay.monitor.online.program import Program
@@ -222,18 +220,6 @@ def step_signals(
             elif code == OR:
                 for k in range(count):
                     target[k] = max(first[k], second[k])
-            elif code == XOR:
-                for k in range(count):
-                    target[k] = max(
-                        min(first[k], -history[mirror, b, begin + k]),
-                        min(-history[mirror, a, begin + k], second[k]),
-                    )
-            elif code == IFF:
-                for k in range(count):
-                    target[k] = min(
-                        max(-history[mirror, a, begin + k], second[k]),
-                        max(-history[mirror, b, begin + k], first[k]),
-                    )
             elif code in (ONCE, HISTORICALLY, SINCE):
                 _run_past(code, first, second, target, running[channel, s], position == 0)
             elif code == DELAY:

@@ -25,7 +25,18 @@ from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.offline import Finished
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.stream import look_back, tail
-from spatial_replay.spec.formula import Boolean, Formula, Outline, Temporal, TrackedName, iter_nodes
+from spatial_replay.spec.formula import (
+    Boolean,
+    BooleanOperator,
+    Formula,
+    Outline,
+    Temporal,
+    TrackedName,
+    Truth,
+    iter_nodes,
+    operands_of,
+    operator_of,
+)
 from spatial_replay.spec.walks import substitute
 from spatial_replay.trace.trace import Trace, window_of
 
@@ -76,23 +87,23 @@ class Extremum:
     operands: tuple[SignedOperand | Extremum, ...]
 
 
-def extremum_of(operator: str, operands: Sequence[int]) -> Extremum:
-    """A Boolean operator over operands of the given numbers, as minima and maxima."""
-    plain = tuple(SignedOperand(index) for index in operands)
-    first, last = plain[0], plain[-1]
-    not_first, not_last = SignedOperand(first.index, True), SignedOperand(last.index, True)
-    match operator:
-        case "not":
-            return Extremum(True, (not_first,))
-        case "and" | "spec":
-            return Extremum(True, plain)
-        case "or":
-            return Extremum(False, plain)
-        case "->":
-            return Extremum(False, (not_first, last))
-        case "xor":
-            return Extremum(False, (Extremum(True, (first, not_last)), Extremum(True, (not_first, last))))
-    return Extremum(True, (Extremum(False, (not_first, last)), Extremum(False, (not_last, first))))
+def extremum_of(operator: BooleanOperator, operands: Sequence[int]) -> SignedOperand | Extremum:
+    """Return a Boolean operator over operands of the given numbers, as minima and maxima."""
+    # stand-ins, because equal operands may be one object and still are two places in the text
+    stand_ins = tuple(Truth(True) for _ in operands)
+    numbers = {id(each): number for each, number in zip(stand_ins, operands, strict=True)}
+    formula = Boolean(operator, stand_ins)
+    return _normal_form(formula.expansion or formula, numbers, negated=False)
+
+
+def _normal_form(formula: Formula, numbers: Mapping[int, int], *, negated: bool) -> SignedOperand | Extremum:
+    if id(formula) in numbers:
+        return SignedOperand(numbers[id(formula)], negated)
+    operator = operator_of(formula)
+    if operator == "not":
+        return _normal_form(operands_of(formula)[0], numbers, negated=not negated)
+    operands = tuple(_normal_form(each, numbers, negated=negated) for each in operands_of(formula))
+    return Extremum((operator == "and") != negated, operands)
 
 
 def chosen(
