@@ -1,75 +1,299 @@
-"""The one place that knows the compiler behind the numeric kernels.
+"""Numeric kernels: plain functions over arrays and numbers, run by the interpreter or as machine code.
 
-Kernels are plain functions over arrays and numbers, compiled on first use and kept in a cache on
-disk, so that a second process starts warm. Modules that hold kernels are imported only when numbers
-are needed: the command line answers `--help` without loading the compiler.
+The one module that knows the compiler. Compiling every kernel takes longer than reading a short log, and
+loading the compiled ones from disk takes its time, too. So a kernel is interpreted while its arrays are
+small, and compiled once that has cost about as much time as compiling it would.
 
-Arithmetic keeps IEEE semantics (no fast-math, no fused contraction that would depend on the machine), so
-equal inputs give equal bits in a monitor and in a replay.
+Both ways give the same bits: kernels use sums, products, quotients, square roots, sines and cosines of IEEE
+doubles (no fast-math, no fused contraction), and nothing else whose result depends on who computes it.
+
+Machine code is kept on disk, in a folder named after a digest of all sources of the package, so a changed
+kernel is never mistaken for the one before. `SPATIAL_REPLAY_CACHE` names another place for it;
+`SPATIAL_REPLAY_KERNELS` is `compiled` or `interpreted` to have only one of the two ways.
 """
 
 from __future__ import annotations
 
+import hashlib
+import os
+import shutil
+import sys
+import tempfile
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from functools import partial
-from typing import Any, ParamSpec, TypeVar, cast
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FunctionType
+from typing import Any, Final, Generic, Literal, ParamSpec, TypeVar, cast
 
-import numba
-from numba.core import event
+import numpy as np
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
-
-# Some of the options used here are missing from the compiler's published types.
-_compile: Callable[..., Any] = partial(numba.njit, cache=True, error_model="numpy")
+_COLD_S: Final = 2.0
+_WARM_S: Final = 0.15
+"""How long a kernel may be interpreted before it is compiled, or loaded from the cache."""
+_COLD_GUESS_S: Final = 5e-6
+_WARM_GUESS_S: Final = 2e-6
+"""For each element of its arrays, the time a kernel is expected to take when it was never run."""
+_STALE_S: Final = 7 * 24 * 3600.0
+_PACKAGE: Final = Path(__file__).parent
 
 
 def kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Compile a function of arrays and numbers to machine code."""
-    return cast(Callable[_Arguments, _Result], _compile(function))
+    """Return a function of arrays and numbers that may run as machine code."""
+    return _Kernel(function, {})
 
 
 def long_kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Compile as `kernel`, for calls that may take milliseconds: other threads run meanwhile.
+    """Return a kernel whose calls may take milliseconds: other threads run while it does.
 
-    Not for short calls: the interpreter may be lost to a busy thread at each of them, for milliseconds.
+    Not for short calls: each would hand the interpreter to a busy thread, which keeps it for milliseconds.
     """
-    return cast(Callable[_Arguments, _Result], _compile(nogil=True)(function))
+    return _Kernel(function, {"nogil": True})
 
 
 def piece(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Compile a function that only kernels call: as `kernel`, without the entry from Python."""
-    compiled = _compile(no_cpython_wrapper=True, no_cfunc_wrapper=True)
-    return cast(Callable[_Arguments, _Result], compiled(function))
+    """Return a function that only kernels call: as `kernel`, without the entry from Python."""
+    return _Kernel(function, {"no_cpython_wrapper": True, "no_cfunc_wrapper": True})
 
 
 def inlined(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Compile a small helper into every kernel that calls it, where a call would outweigh its work.
+    """Return a small helper that is compiled into every kernel that calls it.
 
-    Such a helper allocates no array, and so takes no part in the compiler's counting of references,
-    which would dominate a function of a few floating-point operations.
+    It allocates no array, and so takes no part in the compiler's counting of references, which would
+    dominate a function of a few floating-point operations.
     """
-    compiled = _compile(forceinline=True, _nrt=False, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-    return cast(Callable[_Arguments, _Result], compiled(function))
+    options = {"forceinline": True, "_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return _Kernel(function, options)
 
 
-class _Listener(event.Listener):
-    """Hears when the compiler begins."""
+def compile_ahead() -> None:
+    """Interpret no kernel in this process from now on.
 
-    def __init__(self, hear: Callable[[], None]) -> None:
-        self._hear = hear
+    For control loops and servers: a call that is compiled late would keep them waiting in the middle.
+    """
+    _process.interprets = False
 
-    def on_start(self, event: object) -> None:
-        self._hear()
 
-    def on_end(self, event: object) -> None:
-        pass
+@contextmanager
+def only(form: Literal["compiled", "interpreted"]) -> Iterator[None]:
+    """Run kernels in one form only, while this lasts."""
+    before, _process.only = _process.only, form
+    try:
+        yield
+    finally:
+        _process.only = before
 
 
 @contextmanager
 def compilations(hear: Callable[[], None]) -> Iterator[None]:
-    """Call `hear` for a while whenever a function is about to be compiled that no cache holds."""
-    with event.install_listener("numba:compile", _Listener(hear)):
+    """Call `hear`, while this lasts, whenever a function is about to be compiled that no cache holds."""
+    _process.listeners.append(hear)
+    try:
         yield
+    finally:
+        _process.listeners.remove(hear)
+
+
+class _Kernel(Generic[_Arguments, _Result]):
+    """A function in its two forms, each made when it is first needed."""
+
+    def __init__(self, function: Callable[_Arguments, _Result], options: dict[str, Any]) -> None:
+        self.__wrapped__ = function
+        self.__name__ = function.__name__
+        self.__doc__ = function.__doc__
+        self.__module__ = function.__module__
+        self._options = options
+        self._compiled: Callable[_Arguments, _Result] | None = None
+        self._interpreted: Callable[_Arguments, _Result] | None = None
+        self._spent_s = 0.0
+        self._element_s: float | None = None
+
+    def __call__(self, *arguments: _Arguments.args, **named: _Arguments.kwargs) -> _Result:
+        if self._compiled is not None and _process.only is None:
+            return self._compiled(*arguments, **named)
+        elements = 1 + _elements(arguments)
+        if not self._may_interpret(elements):
+            return self.compiled()(*arguments, **named)
+        run = self.interpreted()
+        begin = time.perf_counter()
+        # as in machine code: a quotient by zero or a product out of range is no error and no warning
+        with np.errstate(all="ignore"):
+            result = run(*arguments, **named)
+        took = time.perf_counter() - begin
+        self._spent_s += took
+        self._element_s = max(took / elements, self._element_s or 0.0)
+        return result
+
+    def _may_interpret(self, elements: int) -> bool:
+        if _process.only is not None:
+            return _process.only == "interpreted"
+        if not _process.interprets:
+            return False
+        limit, guess = (_WARM_S, _WARM_GUESS_S) if _process.is_warm else (_COLD_S, _COLD_GUESS_S)
+        expected = elements * (guess if self._element_s is None else self._element_s)
+        return self._spent_s + expected <= limit
+
+    def interpreted(self) -> Callable[_Arguments, _Result]:
+        """Return the function as it stands, calling others as they stand."""
+        if self._interpreted is None:
+            self._interpreted = _linked(self.__wrapped__, _Kernel.interpreted)
+        return self._interpreted
+
+    def compiled(self) -> Callable[_Arguments, _Result]:
+        """Return the function as machine code, calling machine code."""
+        if self._compiled is None:
+            self._compiled = _process.compile(_linked(self.__wrapped__, _Kernel.compiled), self._options)
+        return self._compiled
+
+
+def _linked(
+    function: Callable[_Arguments, _Result], form: Callable[[Any], Any]
+) -> Callable[_Arguments, _Result]:
+    """Return a copy of a function that calls the given form of every kernel that it names."""
+    original = cast(FunctionType, function)
+    names = {name: original.__globals__[name] for name in _names(original) if name in original.__globals__}
+    linked = {name: form(value) if isinstance(value, _Kernel) else value for name, value in names.items()}
+    linked |= {"__builtins__": original.__globals__["__builtins__"], "__name__": original.__module__}
+    copy = FunctionType(original.__code__, linked, original.__name__, original.__defaults__)
+    copy.__qualname__, copy.__doc__ = original.__qualname__, original.__doc__
+    copy.__kwdefaults__ = original.__kwdefaults__
+    return cast(Callable[_Arguments, _Result], copy)
+
+
+def _names(function: FunctionType) -> set[str]:
+    """Return the names that a function, or a comprehension within it, may look up globally."""
+    names, codes = set[str](), [function.__code__]
+    while codes:
+        code = codes.pop()
+        names.update(code.co_names)
+        codes += [constant for constant in code.co_consts if isinstance(constant, type(code))]
+    return names
+
+
+def _elements(values: object) -> int:
+    """Return how many elements there are in arrays, also within tuples."""
+    if isinstance(values, np.ndarray):
+        return values.size
+    if isinstance(values, tuple):
+        return sum(map(_elements, values))
+    return 0
+
+
+class _Process:
+    """What this process knows about its kernels: the compiler, the cache, who listens."""
+
+    def __init__(self) -> None:
+        self.only = _required_form()
+        self.interprets = True
+        self.listeners: list[Callable[[], None]] = []
+        self._folder: Path | None = None
+        self._is_warm: bool | None = None
+        self._compile: Callable[..., Any] | None = None
+
+    @property
+    def is_warm(self) -> bool:
+        """Whether an earlier process has left machine code in the cache."""
+        if self._is_warm is None:
+            self._folder = _cache_folder()
+            self._is_warm = self._folder is not None and _holds_code(self._folder)
+        return self._is_warm
+
+    def compile(self, function: Callable[..., Any], options: dict[str, Any]) -> Any:
+        """Return a function that is compiled for the types of its arguments when it is called."""
+        _ = self.is_warm
+        numba = sys.modules.get("numba") or self._load()
+        if self._folder is None:
+            return numba.njit(error_model="numpy", **options)(function)
+        # the folder is read from the compiler's settings when a function is decorated; they belong to
+        # the user's own functions, too, and are put back
+        before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(self._folder)
+        try:
+            return numba.njit(cache=True, error_model="numpy", **options)(function)
+        finally:
+            numba.config.CACHE_DIR = before
+
+    def _load(self) -> Any:
+        import numba
+        from numba.core import event
+
+        class Listener(event.Listener):  # type: ignore[misc, unused-ignore]
+            def on_start(self, event: object) -> None:
+                for hear in tuple(_process.listeners):
+                    hear()
+
+            def on_end(self, event: object) -> None:
+                pass
+
+        cast(Any, event).register("numba:compile", Listener())
+        return numba
+
+
+def _required_form() -> str | None:
+    value = os.environ.get("SPATIAL_REPLAY_KERNELS")
+    return value if value in ("compiled", "interpreted") else None
+
+
+def _cache_folder() -> Path | None:
+    """Return the folder for machine code of these sources, made if need be; None if none can be written.
+
+    Code in it is loaded as it is, so it lies where only the user, or who installed the package, writes.
+    """
+    name = f"kernels-{_digest()}"
+    shipped: Path | None = None
+    for parent in _cache_parents():
+        folder = parent / name
+        try:
+            is_new = not folder.exists()
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+        except OSError:
+            # code that was compiled when an image was built, and is read-only now
+            shipped = shipped or (folder if _holds_code(folder) else None)
+            continue
+        if is_new:
+            _remove_stale(parent, keep=name)
+            if shipped is not None:
+                with suppress(OSError):
+                    shutil.copytree(shipped, folder, dirs_exist_ok=True)
+        return folder
+    return None
+
+
+def _cache_parents() -> Iterator[Path]:
+    for name in ("SPATIAL_REPLAY_CACHE", "NUMBA_CACHE_DIR"):
+        if value := os.environ.get(name):
+            yield Path(value)
+    yield _PACKAGE / "__pycache__"
+    if value := os.environ.get("XDG_CACHE_HOME"):
+        yield Path(value) / "spatial-replay"
+    # a user without a home folder
+    with suppress(RuntimeError):
+        yield Path.home() / ".cache" / "spatial-replay"
+
+
+def _holds_code(folder: Path) -> bool:
+    return any(folder.rglob("*.nbi"))
+
+
+def _remove_stale(parent: Path, keep: str) -> None:
+    """Remove machine code of other sources that no process has added to for a while."""
+    oldest = time.time() - _STALE_S
+    for folder in parent.glob("kernels-*"):
+        with suppress(OSError):
+            if folder.name != keep and folder.stat().st_mtime < oldest:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def _digest() -> str:
+    """Return a digest of the sources of the package: kernels take constants from anywhere in it."""
+    digest = hashlib.sha256()
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+_process: Final = _Process()

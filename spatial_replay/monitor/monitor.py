@@ -8,6 +8,7 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import NamedTuple
 
+from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.evaluate import no_such_node, require_time
@@ -132,6 +133,7 @@ class Monitor:
         self._specs = specification.results
         self._names = tuple(tuple(node.name for _, _, node in iter_nodes(s.formula)) for s in self._specs)
         self._places = _places_of_names(self._names)
+        compile_ahead()
         trial = live_evaluation(specification, checked, 0)  # loads what samples would wait for otherwise
         for time_ns in range(2 * ROOM):
             trial.take(Sample(time_ns))

@@ -20,6 +20,7 @@ from typing import Self
 import numpy as np
 
 from spatial_replay.annotate.automaton_state import KeptAutomaton
+from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import OutputError, TraceError, UsageError
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.contact import contacts
@@ -48,6 +49,7 @@ def warm_up(files: Sequence[Specification], automata: Sequence[KeptAutomaton]) -
     Args:
         automata: those of the specifications.
     """
+    compile_ahead()
     recording = Recording(MemorySink(), files, known=automata)
     objects = ["object", *(name for file in files for name in object_names(file))]
     signals = {name: 0.0 for file in files for name in signal_names(file)}
@@ -284,6 +286,7 @@ def warm_up_planner() -> None:
 
     With nothing in the compiler's cache this takes many seconds, otherwise a fraction of one.
     """
+    compile_ahead()
     task = parse_specification("F (cup leftof jug and cup dist jug >= 1)")
     workspace = Workspace(Grid(0.0, 0.0, 1.0, 8, 8), obstacles=(Footprint.box(0, 0, 1, 1),))
     box = BlackBox(Planner(task, Settings(workspace, "push")))

@@ -158,11 +158,13 @@ def test_long_work_shows_nothing_in_a_pipe(tmp_path: Path) -> None:
 _COMPILED = """
 import time
 from spatial_replay.cli.progress import progress
-from spatial_replay.compiled import kernel
+from spatial_replay.compiled import compile_ahead, kernel
 
 @kernel
 def doubled(number):
     return 2 * number
+
+compile_ahead()
 
 with progress("samples") as advance:
     doubled(1)
