@@ -45,7 +45,7 @@ def explain(
       spatial-replay explain run.mcap --spec blocks.spatial --node reach --at 12.3s
     """
     # the numerical libraries load when there is work for them
-    from spatial_replay.replay import explanations, has_samples_from, run_replay
+    from spatial_replay.replay import ReplayOptions, explain_results, has_samples_from, run_replay
 
     if at is not None and request.end is not None:
         raise UsageError("--at and --to both say where the samples end; give one of them")
@@ -54,8 +54,7 @@ def explain(
         replayed = run_replay(
             task.source,
             task.files,
-            window=task.window,
-            each=task.each,
+            ReplayOptions(task.window, task.each),
             keep_series=True,
             keep_leaves=True,
             advance=advance,
@@ -65,7 +64,7 @@ def explain(
     if at is not None and not goes_on and replayed.end_ns < task.window.end_ns - 1:
         last = text_from_duration_ns(replayed.end_ns - replayed.first_ns)
         say("warning", f"--at {at} lies after the last sample, at {last}", colour="yellow")
-    found = explanations(replayed, node=node, object=object_name, goes_on=goes_on)
+    found = explain_results(replayed, node=node, object=object_name, goes_on=goes_on)
     if as_json:
         click.echo(json.dumps([each.document for each in found], indent=2, ensure_ascii=False))
     else:

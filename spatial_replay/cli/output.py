@@ -52,10 +52,12 @@ def write_document(
 ) -> None:
     """Write everything found as one JSON object to a file, or to standard output for "-"."""
     from spatial_replay.logs.output_file import replacing
-    from spatial_replay.replay import document
+    from spatial_replay.replay import document_from_replay
 
     text = json.dumps(
-        document(replayed, signal=signal, window_ns=window_ns), ensure_ascii=False, allow_nan=False
+        document_from_replay(replayed, signal=signal, window_ns=window_ns),
+        ensure_ascii=False,
+        allow_nan=False,
     )
     if file == "-":
         click.echo(text)

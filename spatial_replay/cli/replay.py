@@ -70,7 +70,7 @@ def replay(
       spatial-replay replay drive.bag --mapping drive.yaml --spec social.spatial -o annotated.mcap
     """
     # the numerical libraries load when there is work for them
-    from spatial_replay.replay import run_replay
+    from spatial_replay.replay import ReplayOptions, run_replay
 
     if (series or signal) and json_file is None:
         option = "--series" if series else "--signal"
@@ -87,9 +87,7 @@ def replay(
         replayed = run_replay(
             task.source,
             task.files,
-            window=task.window,
-            each=task.each,
-            semantics=semantics,
+            ReplayOptions(task.window, task.each, semantics),
             keep_series=json_file is not None and (series or signal or window_ns is not None),
             keep_leaves=True,
             output=output,

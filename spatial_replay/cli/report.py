@@ -42,6 +42,7 @@ def report(request: Request, output: Path, semantics: Semantics) -> int:
     """
     # the numerical libraries load when there is work for them
     from spatial_replay.logs.output_file import refuse_inputs
+    from spatial_replay.replay import ReplayOptions
     from spatial_replay.report.write import write_report
 
     refuse_inputs(output, request.inputs)
@@ -51,9 +52,7 @@ def report(request: Request, output: Path, semantics: Semantics) -> int:
             task.source,
             task.files,
             output,
-            window=task.window,
-            each=task.each,
-            semantics=semantics,
+            ReplayOptions(task.window, task.each, semantics),
             inputs=request.inputs,
             advance=advance,
         )

@@ -84,19 +84,12 @@ def _serve(tuned: Tuned, host: str, port: int, play: bool) -> None:
 
 
 def _tuned(request: Request, semantics: Semantics) -> Tuned:
-    from spatial_replay.replay.annotated import check_parameters
-    from spatial_replay.replay.tuning import Tuning
+    from spatial_replay.replay import ReplayOptions, Tuning
 
     task = prepared(request)
-    check_parameters(task.files, task.each)
     with progress("samples") as advance:
         tuning = Tuning(
-            task.source,
-            task.files,
-            window=task.window,
-            each=task.each,
-            semantics=semantics,
-            advance=advance,
+            task.source, task.files, ReplayOptions(task.window, task.each, semantics), advance=advance
         )
     return tuning.evaluate()
 

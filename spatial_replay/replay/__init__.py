@@ -1,22 +1,75 @@
-"""Replay: a log and specifications in, verdicts and an annotated log out."""
+"""Replay: a log and specifications in, verdicts and an annotated log out.
+
+`selection` picks the samples, `engine` evaluates them, `annotated` writes the log, `document` the JSON.
+`tuning` evaluates a log in memory with other constants, `playback` plays what that gives.
+
+Names are loaded when they are first used.
+"""
 
 from __future__ import annotations
 
-from spatial_replay.replay.annotated import load_files, run_replay
-from spatial_replay.replay.document import Explanation, document, explanations
-from spatial_replay.replay.engine import Replay, Replayed, ReplayedSpec
-from spatial_replay.replay.selection import Window, first_sample_ns, has_samples_from
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+from spatial_replay.lazy import loaded_when_used
+
+if TYPE_CHECKING:
+    from spatial_replay.replay.annotated import load_files, run_replay
+    from spatial_replay.replay.document import Explanation, document_from_replay, explain_results
+    from spatial_replay.replay.engine import Replay, Replayed, ReplayedSpec
+    from spatial_replay.replay.playback import Playback
+    from spatial_replay.replay.selection import ReplayOptions, Window, first_sample_ns, has_samples_from
+    from spatial_replay.replay.table import QUANTITIES, export_table
+    from spatial_replay.replay.tuning import Tuned, Tuning, constant_text, constant_values
+    from spatial_replay.replay.verification import verify_certificate
 
 __all__ = [
+    "QUANTITIES",
     "Explanation",
+    "Playback",
     "Replay",
+    "ReplayOptions",
     "Replayed",
     "ReplayedSpec",
+    "Tuned",
+    "Tuning",
     "Window",
-    "document",
-    "explanations",
+    "constant_text",
+    "constant_values",
+    "document_from_replay",
+    "explain_results",
+    "export_table",
     "first_sample_ns",
     "has_samples_from",
     "load_files",
     "run_replay",
+    "verify_certificate",
 ]
+
+_HOMES: Mapping[str, str] = MappingProxyType(
+    {
+        "QUANTITIES": "spatial_replay.replay.table",
+        "Explanation": "spatial_replay.replay.document",
+        "Playback": "spatial_replay.replay.playback",
+        "Replay": "spatial_replay.replay.engine",
+        "ReplayOptions": "spatial_replay.replay.selection",
+        "Replayed": "spatial_replay.replay.engine",
+        "ReplayedSpec": "spatial_replay.replay.engine",
+        "Tuned": "spatial_replay.replay.tuning",
+        "Tuning": "spatial_replay.replay.tuning",
+        "Window": "spatial_replay.replay.selection",
+        "constant_text": "spatial_replay.replay.tuning",
+        "constant_values": "spatial_replay.replay.tuning",
+        "document_from_replay": "spatial_replay.replay.document",
+        "explain_results": "spatial_replay.replay.document",
+        "export_table": "spatial_replay.replay.table",
+        "first_sample_ns": "spatial_replay.replay.selection",
+        "has_samples_from": "spatial_replay.replay.selection",
+        "load_files": "spatial_replay.replay.annotated",
+        "run_replay": "spatial_replay.replay.annotated",
+        "verify_certificate": "spatial_replay.replay.verification",
+    }
+)
+
+__getattr__, __dir__ = loaded_when_used(globals(), _HOMES)

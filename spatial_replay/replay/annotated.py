@@ -1,9 +1,9 @@
-"""Replays that write an annotated log."""
+"""Replays that write an annotated log: the source's messages with those of the evaluation beside them."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -23,23 +23,20 @@ from spatial_replay.logs.topics import (
     RECORDED_PREFIX,
     REPLAYED_PREFIX,
 )
-from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.replay.engine import Replay, Replayed
-from spatial_replay.replay.selection import Window
+from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Window
 from spatial_replay.spec import load_specification, parse_specification
 from spatial_replay.spec.formula import Specification
 
 _REPLACED = (REPLAYED_PREFIX, AUTOMATA_PREFIX + REPLAYED_PREFIX)
-"""What the names of attachments begin with that a replay writes anew."""
+"""Prefixes of the attachments that a replay replaces."""
 
 
 def run_replay(
     source: Source,
     files: Sequence[Specification],
+    options: ReplayOptions = DEFAULT_OPTIONS,
     *,
-    window: Window | None = None,
-    each: Mapping[str, str] | None = None,
-    semantics: Semantics = "ltlf",
     keep_series: bool = False,
     keep_leaves: bool = False,
     output: Path | None = None,
@@ -53,14 +50,12 @@ def run_replay(
     log gives what a replay of its source gives.
 
     Args:
-        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
-        semantics: "ltlf", or "paper": Def. 16 of the paper to the letter.
         keep_series: keep every sample's numbers in memory.
-        keep_leaves: keep every sample's atoms in memory, so that results can be inquired into.
-        output: the annotated log; it replaces a file of that name only when it is whole.
+        keep_leaves: keep every sample's atoms in memory, for witnesses and signals.
+        output: the annotated log; it replaces a file of that name only when it is complete.
         inputs: files that the output must not be.
         layer: leave the source's own messages, metadata and attachments out of the output.
-        advance: told how many more samples are done.
+        advance: called with the number of samples of each block that is done.
 
     Raises:
         UsageError: an option that cannot work, no sample in the window, the output is an input.
@@ -68,53 +63,57 @@ def run_replay(
         LogError: no sample in the log.
         OutputError: the output cannot be written.
     """
-    check_parameters(files, each or {})
-    replay = Replay(
-        source,
-        files,
-        window=window,
-        each=each,
-        semantics=semantics,
-        keep_series=keep_series,
-        keep_leaves=keep_leaves,
-    )
+    replay = Replay(source, files, options, keep_series=keep_series, keep_leaves=keep_leaves)
+    if output is None:
+        return replay.run(advance=advance)
     with ExitStack() as stack:
-        sink: LogWriter | None = None
-        if output is not None:
-            sink = stack.enter_context(LogWriter(stack.enter_context(replacing(output, inputs))))
-            _begin(sink, source, replay, window or Window(), each or {}, semantics, layer=layer)
-        for messages, samples in replay.iter_messages(annotate=sink is not None, layer=layer):
-            if sink is not None:
-                sink.write_messages(messages)
-            advance(samples)
-        replayed = replay.result()
-        if sink is not None:
-            layout = replay.layout()
-            sink.add_attachment(layout.name, layout.media_type, layout.data)
-            sink.add_metadata(CERTIFICATE, replayed.certificate)
+        sink = stack.enter_context(LogWriter(stack.enter_context(replacing(output, inputs))))
+        _begin(sink, source, replay, options, layer=layer)
+        replayed = replay.run(sink.write_messages, layer=layer, advance=advance)
+        layout = replay.layout()
+        sink.add_attachment(layout.name, layout.media_type, layout.data)
+        sink.add_metadata(CERTIFICATE, replayed.certificate)
     return replayed
 
 
-def _begin(
-    sink: Sink,
-    source: Source,
-    replay: Replay,
-    window: Window,
-    each: Mapping[str, str],
-    semantics: Semantics,
-    *,
-    layer: bool,
-) -> None:
-    """Write what comes before the first message: our metadata, and what the source keeps."""
+def load_files(paths: Sequence[Path], source: Source, *, profile: str | None = None) -> list[Specification]:
+    """Load the named specifications or, without any, those that the log was written with.
+
+    A replayed log gives those of the last replay, another log those that it was recorded with.
+
+    Raises:
+        UsageError: none was named and the log has none.
+        SpecificationError: a specification with errors.
+    """
+    if paths:
+        return [load_specification(path, profile=profile) for path in dict.fromkeys(paths)]
+    attachments = source.attachments()
+    for prefix in (REPLAYED_PREFIX, RECORDED_PREFIX):
+        texts = [attachment for attachment in attachments if attachment.name.startswith(prefix)]
+        if texts:
+            return [
+                parse_specification(
+                    text.data.decode("utf-8", "replace"),
+                    filename=text.name.removeprefix(prefix),
+                    profile=profile,
+                )
+                for text in texts
+            ]
+    raise UsageError(f"{source.name} holds no specification of its own; give one with --spec FILE")
+
+
+def _begin(sink: Sink, source: Source, replay: Replay, options: ReplayOptions, *, layer: bool) -> None:
+    """Write what comes before the first message: our metadata, and that of the source."""
     before = dict(source.metadata()).get(METADATA, {})
     is_replayed = before.get("written_by") == "replay"
     about = {
         "version": __version__,
         "written_by": "replay",
-        "semantics": semantics,
+        "semantics": options.semantics,
+        # a replay of a replay says what a replay of the first source says
         "source": before.get("source", source.name) if is_replayed else source.name,
         "specifications": described(replay.files),
-        "options": json.dumps(_options(source, window, each, layer=layer)),
+        "options": json.dumps(_recorded_options(source, options, layer=layer)),
     }
     recorded = {key: value for key, value in before.items() if key not in about and key != "source"}
     if not is_replayed and "options" in before:
@@ -122,13 +121,13 @@ def _begin(
     sink.add_metadata(METADATA, {**about, **recorded})
     sink.add_metadata(AUTOMATA, replay.automata_metadata())
     if not layer:
-        _copy_kept(sink, source)
+        _copy_attached(sink, source)
     for attachment in replay.attachments():
         sink.add_attachment(attachment.name, attachment.media_type, attachment.data)
 
 
-def _copy_kept(sink: Sink, source: Source) -> None:
-    """Copy what the source keeps beside its messages, but for what a replay writes anew."""
+def _copy_attached(sink: Sink, source: Source) -> None:
+    """Copy the source's metadata and attachments, except those that a replay replaces."""
     for name, data in source.metadata():
         if name not in (METADATA, AUTOMATA, CERTIFICATE):
             sink.add_metadata(name, data)
@@ -137,56 +136,17 @@ def _copy_kept(sink: Sink, source: Source) -> None:
             sink.add_attachment(attachment.name, attachment.media_type, attachment.data)
 
 
-def _options(source: Source, window: Window, each: Mapping[str, str], *, layer: bool) -> dict[str, object]:
-    """The options that differ from the defaults."""
+def _recorded_options(source: Source, options: ReplayOptions, *, layer: bool) -> dict[str, object]:
+    """Return the options that differ from the defaults, as `verification` reads them back."""
     whole = Window()
-    options: dict[str, object] = reading_options(source)
-    options |= {
-        name: getattr(window, name)
+    recorded: dict[str, object] = reading_options(source)
+    recorded |= {
+        name: getattr(options.window, name)
         for name in ("start_ns", "end_ns", "every")
-        if getattr(window, name) != getattr(whole, name)
+        if getattr(options.window, name) != getattr(whole, name)
     }
-    if each:
-        options["each"] = dict(sorted(each.items()))
+    if options.each:
+        recorded["each"] = dict(sorted(options.each.items()))
     if layer:
-        options["layer"] = True
-    return options
-
-
-def load_files(paths: Sequence[Path], source: Source, *, profile: str | None = None) -> list[Specification]:
-    """The specifications to evaluate: those named or, without any, those that the log was written with.
-
-    A log that was replayed has the last replay's, another one those it was recorded with.
-
-    Raises:
-        UsageError: none was named and the log has none.
-        SpecificationError: a specification with faults.
-    """
-    if paths:
-        return [load_specification(path, profile=profile) for path in dict.fromkeys(paths)]
-    attachments = source.attachments()
-    for prefix in (REPLAYED_PREFIX, RECORDED_PREFIX):
-        kept = [attachment for attachment in attachments if attachment.name.startswith(prefix)]
-        if kept:
-            return [
-                parse_specification(
-                    attachment.data.decode("utf-8", "replace"),
-                    filename=attachment.name.removeprefix(prefix),
-                    profile=profile,
-                )
-                for attachment in kept
-            ]
-    raise UsageError(f"{source.name} holds no specification of its own; give one with --spec FILE")
-
-
-def check_parameters(files: Sequence[Specification], each: Mapping[str, str]) -> None:
-    """That every choice of objects is for the parameter of some template.
-
-    Raises:
-        UsageError: one is not.
-    """
-    templates = [spec for file in files for spec in file.results if spec.parameter is not None]
-    for parameter in each:
-        if parameter not in {spec.parameter for spec in templates}:
-            known = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates) or "none"
-            raise UsageError(f"no template has a parameter {parameter!r}; templates here: {known}")
+        recorded["layer"] = True
+    return recorded

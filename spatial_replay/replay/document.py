@@ -1,7 +1,4 @@
-"""What a replay found, as a value that JSON can hold.
-
-Why results of a replay are what they are, for people and for machines.
-"""
+"""The results of a replay as JSON, and the explanations of their verdicts, as sentences and as JSON."""
 
 from __future__ import annotations
 
@@ -24,15 +21,17 @@ from spatial_replay.spec.formula import iter_nodes, operator_of
 from spatial_replay.text import json_number
 
 
-def document(replayed: Replayed, *, signal: bool = False, window_ns: int | None = None) -> Mapping[str, Any]:
-    """One object; infinite numbers are the strings "inf" and "-inf", undetermined ones null.
+def document_from_replay(
+    replayed: Replayed, *, signal: bool = False, window_ns: int | None = None
+) -> Mapping[str, Any]:
+    """Return one JSON object; infinite numbers are the strings "inf" and "-inf", undetermined ones null.
 
     Args:
         signal: add to the series each node's robustness from each sample to the end.
-        window_ns: add to the series each node's robustness over a window of that width that slides.
+        window_ns: add to the series each node's robustness over a sliding window of that width.
 
     Raises:
-        UsageError: a signal or a window under semantics that do not have them.
+        UsageError: a signal or a window under semantics that lack them.
     """
     return {
         "log": {
@@ -96,7 +95,7 @@ def _result(result: ReplayedSpec, first_ns: int, signal: bool, window_ns: int | 
 
 
 def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
-    """What decides a node's verdict, and the same in sentences that count time from `first_ns`."""
+    """Return what decides a node's verdict, with sentences that count time from `first_ns`."""
     deciding, threshold = witness.deciding, witness.threshold
     value: dict[str, Any] = {
         "node": witness.node,
@@ -145,18 +144,18 @@ def _measured(measured: Measured) -> dict[str, Any]:
 
 
 def _numbers(rows: Floats) -> list[list[float | str | None]]:
-    """One list for each node."""
+    """Return one list for each node."""
     return [[json_number(number) for number in row] for row in rows.tolist()]
 
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """Why one node has its verdict.
+    """The reason for the verdict of one node.
 
     Attributes:
-        time_ns: of the sample that decides.
-        sentences: in words.
-        document: as a value that JSON can hold.
+        time_ns: time of the sample that decides.
+        sentences: the reason in words.
+        document: the reason as JSON.
     """
 
     verdict: Verdict
@@ -165,15 +164,15 @@ class Explanation:
     document: Mapping[str, Any]
 
 
-def explanations(
+def explain_results(
     replayed: Replayed, *, node: str | None = None, object: str | None = None, goes_on: bool = False
 ) -> list[Explanation]:
-    """Why results, or the nodes of a name in them, have their verdicts.
+    """Explain the verdicts of results, or of the nodes of a name in them.
 
     Args:
-        replayed: with series and leaves kept.
-        object: only what is about this object of a template.
-        goes_on: whether there may be samples after those evaluated, which could change a verdict.
+        replayed: a replay that kept series and leaves.
+        object: explain only results about this object of a template.
+        goes_on: whether the log has samples after those evaluated, which could change a verdict.
 
     Raises:
         UsageError: no such node or object, or nothing was evaluated.
@@ -181,19 +180,20 @@ def explanations(
     results = [result for result in replayed.results if object in (None, result.object)]
     if not results:
         known = ", ".join(sorted({result.object for result in replayed.results if result.object})) or "none"
-        asked = "" if object is None else f" about object {object!r}"
-        raise UsageError(f"no result is{asked or ' there'}; objects with a result of their own: {known}")
-    found = [
-        explanation_of(result, identifier, first_ns=replayed.first_ns, goes_on=goes_on)
+        if object is None:
+            raise UsageError(f"there is no result; objects with a result of their own: {known}")
+        raise UsageError(f"no result is about object {object!r}; objects with a result of their own: {known}")
+    explanations = [
+        explain_node(result, identifier, first_ns=replayed.first_ns, goes_on=goes_on)
         for result in results
         for identifier in _nodes_named(result, node)
     ]
-    if not found:
+    if not explanations:
         names = sorted(
             {each.name for result in results for _, _, each in iter_nodes(result.formula) if each.name}
         )
         raise UsageError(no_such_node(node or "", names))
-    return found
+    return explanations
 
 
 def _nodes_named(result: ReplayedSpec, name: str | None) -> Iterator[int]:
@@ -206,12 +206,10 @@ def _nodes_named(result: ReplayedSpec, name: str | None) -> Iterator[int]:
             return
 
 
-def explanation_of(
-    result: ReplayedSpec, node: int = 0, *, first_ns: int, goes_on: bool = False
-) -> Explanation:
-    """Why a node of a result has its verdict; see `explanations`."""
+def explain_node(result: ReplayedSpec, node: int = 0, *, first_ns: int, goes_on: bool = False) -> Explanation:
+    """Explain the verdict of one node of a result; see `explain_results`."""
     if result.inquiry is None or result.series is None or result.times_ns is None:
-        raise ValueError("series and leaves of the replay were not kept")
+        raise ValueError("the replay did not keep series and leaves")
     witness = result.inquiry.witness(node)
     value, _, lower, upper = result.series[node]
     since = _since(value, lower, upper) if witness.verdict is not Verdict.UNKNOWN else None
@@ -230,10 +228,10 @@ def explanation_of(
 
 
 def _since(value: Floats, lower: Floats, upper: Floats) -> int | None:
-    """The first sample from which on it has been as it is at the last; None where it is not known when.
+    """Return the first sample since which the verdict is that of the last one; None if that is unknown.
 
     Args:
-        value, lower, upper: (T,), the node's, of which the last settle its verdict.
+        value, lower, upper: (T,), those of the node; the last ones settle its verdict.
     """
     holds = (value >= 0.0) | (lower >= 0.0)
     fails = (value < 0.0) | (upper < 0.0)

@@ -1,11 +1,8 @@
-"""A recorded run evaluated again: source and specifications to verdicts and an annotated log.
-
-What a replay found: numbers, verdicts, and what can still be asked.
-"""
+"""A recorded run evaluated again: source and specifications → evaluation → verdicts and messages."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,24 +10,24 @@ import numpy as np
 from spatial_replay.annotate.annotator import AnnotatedEvaluation
 from spatial_replay.annotate.automaton_state import KeptAutomaton
 from spatial_replay.annotate.certificate import Hashing, MessageHash, ResultHash, SampleHash, certificate
-from spatial_replay.annotate.specification import ReportedTree, kept_files, specification_attachments
+from spatial_replay.annotate.specification import kept_files, specification_attachments
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Attachment, Messages, merge
 from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import REPLAYED_PREFIX
 from spatial_replay.monitor.evaluate import Inquiry
-from spatial_replay.monitor.semantics import Semantics, checked_semantics
-from spatial_replay.monitor.stream import InstanceEvaluation, SeriesBlock, join_blocks
+from spatial_replay.monitor.semantics import Semantics
+from spatial_replay.monitor.stream import SeriesBlock, join_blocks
 from spatial_replay.monitor.verdict import Verdict, final_verdict, worst_verdict
 from spatial_replay.monitor.witness.path import Evidence
-from spatial_replay.replay.selection import Selection, Window, first_sample_ns
+from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Selection, first_sample_ns
 from spatial_replay.spec.formula import Formula, Specification
 from spatial_replay.trace.trace import Trace
 
 
 @dataclass(frozen=True, eq=False)
 class ReplayedSpec:
-    """What a replay found for one spec, or one object's instance of a template.
+    """The result of one spec, or of one object's instance of a template.
 
     Attributes:
         name: the spec's name; with its file's stem before it where two files have a spec of that name.
@@ -38,8 +35,8 @@ class ReplayedSpec:
         robustness: (N,), each node's value on the whole log.
         final: (N, 2), lower and upper end of each node for the finished log.
         first_satisfied_ns: the first sample with a value of at least 0, or None.
-        times_ns, series: every sample's numbers, (T,) and (N, 4, T), if they were asked for.
-        inquiry: answers what the numbers leave open, if that was asked for.
+        times_ns, series: every sample's numbers, (T,) and (N, 4, T), if the replay was to keep them.
+        inquiry: witnesses and signals, computed on request, if the replay was to keep the leaves.
     """
 
     name: str
@@ -59,7 +56,7 @@ class ReplayedSpec:
 
 @dataclass(frozen=True, eq=False)
 class Replayed:
-    """What a replay found.
+    """The results of a replay.
 
     Attributes:
         log: base name of the log.
@@ -67,11 +64,11 @@ class Replayed:
         first_ns: time of the log's first sample, evaluated or not.
         start_ns, end_ns: times of the first and the last of those evaluated.
         faults: what was lost while reading, each with its place.
-        remarks: what else the source says of its samples, where nothing was lost.
-        unreadable: how many observations are there and say nothing: a number is not finite, or too old.
+        remarks: what the source reports about its samples where nothing was lost.
+        unreadable: how many observations have no usable value: a number is not finite, or too old.
         results: one per spec and object.
         certificate: hashes of what went in and came out.
-        semantics: what the formulas meant.
+        semantics: the semantics of the formulas.
     """
 
     log: str
@@ -91,43 +88,11 @@ class Replayed:
         return worst_verdict(result.verdict for result in self.results)
 
 
-def replayed_spec(
-    tree: ReportedTree,
-    stream: InstanceEvaluation,
-    evidence: Evidence,
-    kept: SeriesBlock | None,
-    semantics: Semantics,
-    *,
-    has_series: bool,
-    has_leaves: bool,
-) -> ReplayedSpec:
-    """What was found for a result, once its stream has taken in all samples.
-
-    Args:
-        kept: what was kept of every sample, if anything.
-        has_series, has_leaves: whether its numbers, and its atoms, are among that.
-    """
-    inquiry = None
-    if has_leaves and kept is not None:
-        inquiry = Inquiry(evidence, kept.times_ns, kept.leaves, semantics)
-    return ReplayedSpec(
-        tree.name,
-        tree.object,
-        tree.formula,
-        stream.robustness,
-        stream.final,
-        stream.first_satisfied_ns,
-        None if kept is None else kept.times_ns,
-        kept.series if kept is not None and has_series else None,
-        inquiry,
-    )
-
-
 class Replay:
-    """One pass over a source: samples in, verdicts out, and messages for whoever writes them.
+    """One pass over a source: samples in, verdicts and messages out.
 
     Attributes:
-        files: the specifications, as an annotated log keeps them.
+        files: the specifications, as an annotated log stores them.
         trees: every result, under the name it is reported by.
     """
 
@@ -135,31 +100,30 @@ class Replay:
         self,
         source: Source,
         files: Sequence[Specification],
+        options: ReplayOptions = DEFAULT_OPTIONS,
         *,
-        window: Window | None = None,
-        each: Mapping[str, str] | None = None,
-        semantics: Semantics = "ltlf",
         keep_series: bool = False,
         keep_leaves: bool = False,
     ) -> None:
-        """Prepare; templates read the source once for the objects that they stand for.
+        """Prepare; templates read the source once to find their objects.
 
         Args:
             keep_series: keep every sample's numbers in memory.
-            keep_leaves: keep every sample's atoms in memory, so that results can be inquired into.
+            keep_leaves: keep every sample's atoms in memory, for witnesses and signals.
 
         Raises:
             UsageError: a template without its objects, or objects for a parameter that no template has; an
                 operator that the semantics lacks.
         """
-        self._semantics = checked_semantics(semantics, files)
         self._source = source
-        self._files = files
+        self._written_files = files
+        self._selection = Selection(source, files, options)
         self.files = kept_files(files)
-        self._selection = Selection(source, window or Window(), files)
-        self._instances = [self._selection.instances(file, each or {}) for file in self.files]
         self._evaluation = AnnotatedEvaluation(
-            self.files, self._instances, self._semantics, source.attachments
+            self.files,
+            [self._selection.instances(file) for file in self.files],
+            options.semantics,
+            source.attachments,
         )
         self.trees = self._evaluation.trees
         self._keep_series, self._keep_leaves = keep_series, keep_leaves
@@ -175,14 +139,24 @@ class Replay:
         self._samples = self._unreadable = self._encoded = self._end_ns = 0
         self._times: list[int] = []
 
-    def iter_messages(self, *, annotate: bool = False, layer: bool = False) -> Iterator[tuple[Messages, int]]:
-        """Evaluate the whole source, yielding for each block what an annotated log holds, and its samples.
-
-        What the end of the log brings comes last, with no samples.
+    def run(
+        self,
+        write: Callable[[Messages], None] | None = None,
+        *,
+        layer: bool = False,
+        advance: Callable[[int], None] = lambda samples: None,
+    ) -> Replayed:
+        """Evaluate the whole source and return the results.
 
         Args:
-            annotate: yield messages; without it, nothing.
+            write: receives the messages of the annotated log, block by block; without it, none are made.
             layer: leave out the source's own messages.
+            advance: called with the number of samples of each block that is done.
+
+        Raises:
+            LogError: no sample in the log.
+            UsageError: no sample in the window.
+            SpecificationError: names that the log never has.
         """
         for block, trace in self._selection.iter_blocks():
             stretches = self._evaluation.extend(trace)
@@ -192,61 +166,34 @@ class Replay:
             self._remarks += block.remarks
             if not layer:
                 self._topics.update(channel.topic for channel in own.channels.values())
-            self._count(inside, own, stretches)
-            derived = self._evaluation.messages(inside, stretches) if annotate else []
-            written = [*derived, *([] if layer else [own])]
-            yield (merge(written) if annotate else Messages()), len(inside)
-        if annotate and self._samples:
-            yield self._evaluation.end(self._end_ns), 0
-
-    def result(self) -> Replayed:
-        """What was found, once all of `iter_messages` was taken.
-
-        Raises:
-            LogError: no sample in the log.
-            UsageError: no sample in the window.
-            SpecificationError: names that the log never has.
-        """
-        if not self._samples:
-            raise self._selection.nothing_to_evaluate(self._faults)
-        self._selection.check_names(self._names, self._signals)
-        return Replayed(
-            log=self._source.name,
-            samples=self._samples,
-            first_ns=first_sample_ns(self._source) if self._selection.window.start_ns else self._times[0],
-            start_ns=self._times[0],
-            end_ns=self._times[-1],
-            faults=tuple(self._faults),
-            remarks=tuple(self._remarks),
-            unreadable=self._unreadable,
-            results=tuple(self._results()),
-            certificate=self.certificate(),
-            semantics=self._semantics,
-        )
+            self._add(inside, own, stretches)
+            if write is not None:
+                derived = self._evaluation.messages(inside, stretches)
+                write(merge([*derived, *([] if layer else [own])]))
+            advance(len(inside))
+        if write is not None and self._samples:
+            write(self._evaluation.end(self._end_ns))
+        return self._replayed()
 
     @property
     def automata(self) -> Sequence[KeptAutomaton]:
-        """The automaton of each of `trees`, or why it has none."""
+        """The automaton of each of `trees`, or the reason why it has none."""
         return self._evaluation.automata
 
     def automata_metadata(self) -> Mapping[str, str]:
-        """For each spec, how large its automaton is, or why there is none."""
+        """Return for each spec how large its automaton is, or why it has none."""
         return self._evaluation.automata_metadata()
 
     def attachments(self) -> list[Attachment]:
-        """What an annotated log keeps of the specifications: their texts and their automata."""
+        """Return the texts and automata of the specifications, as an annotated log stores them."""
         texts = specification_attachments(self.files, REPLAYED_PREFIX)
         return [*texts, *self._evaluation.automata_attachments(REPLAYED_PREFIX)]
 
     def layout(self) -> Attachment:
-        """How to open the annotated log in a viewer, once all messages were taken."""
+        """Return the viewer layout of the annotated log; call it after `run`."""
         return self._evaluation.layout(self._topics)
 
-    def certificate(self) -> Mapping[str, str]:
-        """The certificate over what was taken in so far."""
-        return certificate(self._sample_hash, self._message_hash, self._files, self._result_hash)
-
-    def _count(self, trace: Trace, own: Messages, stretches: Sequence[SeriesBlock]) -> None:
+    def _add(self, trace: Trace, own: Messages, stretches: Sequence[SeriesBlock]) -> None:
         self._faults += trace.faults
         self._names.update(trace.names)
         self._signals.update(trace.signals)
@@ -261,25 +208,75 @@ class Replay:
         for index, stretch in enumerate(stretches):
             self._result_hash.add(index, stretch.series)
             if self._keep_series or self._keep_leaves:
-                self._kept[index].append(self._worth_keeping(stretch))
+                self._kept[index].append(self._kept_part(stretch))
 
-    def _worth_keeping(self, stretch: SeriesBlock) -> SeriesBlock:
+    def _kept_part(self, stretch: SeriesBlock) -> SeriesBlock:
+        """Return a stretch without what is not to stay in memory."""
         series = stretch.series if self._keep_series else np.empty((len(stretch.series), 4, 0))
         leaves = stretch.leaves if self._keep_leaves else np.empty((1, stretch.leaves.shape[1], 0))
         return SeriesBlock(stretch.times_ns, series, leaves)
 
-    def _results(self) -> Iterator[ReplayedSpec]:
-        regions = [file.regions for file, own in zip(self.files, self._instances, strict=True) for _ in own]
-        for tree, stream, kept, own in zip(
-            self.trees, self._evaluation.streams, self._kept, regions, strict=True
-        ):
-            evidence = Evidence(stream.instance, own, self._selection.iter_traces)
-            yield replayed_spec(
-                tree,
-                stream,
-                evidence,
-                join_blocks(kept) if kept else None,
-                self._semantics,
+    def _replayed(self) -> Replayed:
+        if not self._samples:
+            raise self._selection.nothing_to_evaluate(self._faults)
+        self._selection.check_names(self._names, self._signals)
+        options = self._selection.options
+        return Replayed(
+            log=self._source.name,
+            samples=self._samples,
+            first_ns=first_sample_ns(self._source) if options.window.start_ns else self._times[0],
+            start_ns=self._times[0],
+            end_ns=self._times[-1],
+            faults=tuple(self._faults),
+            remarks=tuple(self._remarks),
+            unreadable=self._unreadable,
+            results=replayed_specs(
+                self._evaluation,
+                self.files,
+                [join_blocks(kept) if kept else None for kept in self._kept],
+                self._selection,
                 has_series=self._keep_series,
                 has_leaves=self._keep_leaves,
+            ),
+            certificate=certificate(
+                self._sample_hash, self._message_hash, self._written_files, self._result_hash
+            ),
+            semantics=options.semantics,
+        )
+
+
+def replayed_specs(
+    evaluation: AnnotatedEvaluation,
+    files: Sequence[Specification],
+    kept: Sequence[SeriesBlock | None],
+    selection: Selection,
+    *,
+    has_series: bool = True,
+    has_leaves: bool = True,
+) -> tuple[ReplayedSpec, ...]:
+    """Return the results of an evaluation that has taken in all samples.
+
+    Args:
+        kept: for each of its trees every sample, or None if nothing was kept.
+        has_series, has_leaves: whether the stretches hold the numbers, and the atoms.
+    """
+
+    def results() -> Iterator[ReplayedSpec]:
+        for tree, stream, stretch in zip(evaluation.trees, evaluation.streams, kept, strict=True):
+            inquiry = None
+            if has_leaves and stretch is not None:
+                evidence = Evidence(stream.instance, files[tree.file].regions, selection.iter_traces)
+                inquiry = Inquiry(evidence, stretch.times_ns, stretch.leaves, selection.options.semantics)
+            yield ReplayedSpec(
+                tree.name,
+                tree.object,
+                tree.formula,
+                stream.robustness,
+                stream.final,
+                stream.first_satisfied_ns,
+                None if stretch is None else stretch.times_ns,
+                stretch.series if stretch is not None and has_series else None,
+                inquiry,
             )
+
+    return tuple(results())

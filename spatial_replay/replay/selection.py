@@ -1,36 +1,33 @@
-"""The samples of a source that are evaluated, with the messages beside them.
-
-Which samples of a log are evaluated.
-
-The messages of a log itself, from any time on, and those of them that still stand then.
-"""
+"""What of a log is evaluated: the options of a replay, and the samples and messages that they select."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import numpy as np
 
 from spatial_replay.errors import LogError, SpecificationError, UsageError
-from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.messages import Block, Channel, Messages, merge, messages_of, select
+from spatial_replay.logs.messages import Block, Messages, merge, messages_of, select
 from spatial_replay.logs.objects.encode import encode_objects
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.source import Source, read_ahead, read_blocks, within
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
 from spatial_replay.monitor.instances import Choice, Instance, find_instances
+from spatial_replay.monitor.semantics import Semantics, checked_semantics
 from spatial_replay.monitor.stream import look_back
 from spatial_replay.spec import check_names
 from spatial_replay.spec.formula import Diagnostic, Specification
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace, window_of
 
+_OBJECTS = protobuf_channel(OBJECTS, ObjectStates)
+
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Which samples are evaluated: from `start_ns` to before `end_ns`, of every `every`th of the log."""
+    """The samples to evaluate: every `every`th of the log, from `start_ns` to before `end_ns`."""
 
     start_ns: int = 0
     end_ns: int = FOREVER
@@ -47,8 +44,26 @@ class Window:
         return self == Window()
 
 
+@dataclass(frozen=True, slots=True)
+class ReplayOptions:
+    """How specifications are evaluated over a log.
+
+    Attributes:
+        window: the samples to evaluate.
+        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
+        semantics: "ltlf", or "paper": Def. 16 of the paper to the letter.
+    """
+
+    window: Window = Window()
+    each: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    semantics: Semantics = "ltlf"
+
+
+DEFAULT_OPTIONS = ReplayOptions()
+
+
 def first_sample_ns(source: Source) -> int:
-    """The time of a log's first sample.
+    """Return the time of a log's first sample.
 
     Raises:
         LogError: it has none.
@@ -60,48 +75,60 @@ def first_sample_ns(source: Source) -> int:
 
 
 def has_samples_from(source: Source, time_ns: int) -> bool:
-    """Whether a log goes on at or after a time."""
+    """Say whether a log has samples at or after a time."""
     return any(len(block.trace) for block in read_blocks(source, time_ns))
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """What of a source specifications are evaluated over; it can be read any number of times.
+    """The part of a source that specifications are evaluated over; it can be read any number of times.
 
     Attributes:
-        files: the specifications: what they look back at is read, too.
+        files: the specifications; samples before the window that they look back at are read, too.
+
+    Raises:
+        UsageError: objects for a parameter that no template has, an operator that the semantics lacks.
     """
 
     source: Source
-    window: Window
     files: Sequence[Specification]
+    options: ReplayOptions
+
+    def __post_init__(self) -> None:
+        _check_parameters(self.files, self.options.each)
+        checked_semantics(self.options.semantics, self.files)
+
+    @property
+    def window(self) -> Window:
+        return self.options.window
 
     def iter_blocks(self) -> Iterator[tuple[Block, Trace]]:
-        """Each block, with the samples that count: those in the window, and before it, if any looks back."""
+        """Read each block, with its samples in the window, and before it if a specification looks back."""
         window = self.window
         looks_back = any(look_back([spec.formula for spec in file.specs]) != (0, 0) for file in self.files)
+        # every Nth sample is counted from the log's first, wherever the window starts
         from_start = looks_back or window.every > 1
-        seen = 0
+        read = 0
         blocks = read_blocks(self.source, None if from_start else window.start_ns, window.end_ns)
         for block in read_ahead(blocks):
             trace = block.trace
             if window.every > 1:
-                chosen = np.arange(-seen % window.every, len(trace), window.every, dtype=np.int64)
-                seen += len(trace)
+                chosen = np.arange(-read % window.every, len(trace), window.every, dtype=np.int64)
+                read += len(trace)
                 trace = trace.take(chosen)
             yield block, trace
 
     def iter_traces(self) -> Iterator[Trace]:
-        """The samples that count."""
+        """Read the samples of `iter_blocks`."""
         for _, trace in self.iter_blocks():
             yield trace
 
     def inside(self, trace: Trace) -> Trace:
-        """Those samples that are in the window."""
+        """Return those samples that are in the window."""
         return within(trace, self.window.start_ns, self.window.end_ns)
 
     def own_messages(self, block: Block, first: int) -> Messages:
-        """The source's messages in the window, and its samples where those are not among its messages.
+        """Return the source's messages in the window; samples that are not among them are encoded.
 
         Args:
             first: the number of the block's first sample in the window.
@@ -115,36 +142,36 @@ class Selection:
         trace = self.inside(block.trace)
         return merge([chosen, messages_of(_OBJECTS, trace.times_ns, encode_objects(trace), first)])
 
-    def instances(self, file: Specification, each: Mapping[str, str]) -> list[Instance]:
-        """What is to be evaluated of a specification; a template reads the source for its objects.
-
-        Args:
-            each: for each parameter of a template, of this file or another, the objects that it stands for.
+    def instances(self, file: Specification) -> list[Instance]:
+        """Return what is to be evaluated of a specification; for templates, the source is read for objects.
 
         Raises:
             UsageError: a template without its objects, or objects of a class that the log does not have.
         """
         parameters = {spec.parameter for spec in file.results}
-        own = {parameter: choice for parameter, choice in each.items() if parameter in parameters}
+        own = {
+            parameter: choice for parameter, choice in self.options.each.items() if parameter in parameters
+        }
         choices = [Choice.parse(parameter, choice) for parameter, choice in own.items()]
         classes: set[str | None] = set()
         traces = self._iter_with_classes(classes)
-        found = find_instances(file, own, traces, self.window.start_ns, self.window.end_ns)
+        instances = find_instances(file, own, traces, self.window.start_ns, self.window.end_ns)
         for choice in choices:
             self._check_class(choice, classes)
-        return found
+        return instances
 
     def check_names(self, objects: Collection[str], signals: Collection[str]) -> None:
-        """That the log has every object and signal that a specification names.
+        """Check that the log has every object and signal that a specification names.
 
         Args:
-            objects, signals: names that were met in the window.
+            objects, signals: names in the window.
 
         Raises:
             SpecificationError: it lacks some.
         """
         missing = self._missing_names(set(objects), set(signals))
         if missing and not self.window.is_whole:
+            # an object that appears outside the window is no mistake in the specification
             names, others = set(objects), set(signals)
             for block in read_blocks(self.source):
                 names.update(block.trace.names)
@@ -154,10 +181,10 @@ class Selection:
             raise SpecificationError(missing)
 
     def nothing_to_evaluate(self, faults: Sequence[str]) -> LogError | UsageError:
-        """What to say where no sample is in the window.
+        """Return the error for a window without any sample.
 
         Args:
-            faults: of the log, as far as they are known.
+            faults: those of the log that are known so far.
         """
         name = self.source.name
         spans = [
@@ -169,18 +196,18 @@ class Selection:
             return LogError("; ".join([f"{name} has no sample", *faults[:1]]))
         first_ns, last_ns = spans[0][0], spans[-1][1]
         return UsageError(
-            f"{name} has no sample in the window asked for; its samples are from {first_ns} to {last_ns} ns, "
+            f"{name} has no sample in the requested window; its samples are from {first_ns} to {last_ns} ns, "
             f"{(last_ns - first_ns) / 1e9:.3f} s"
         )
 
     def _iter_with_classes(self, classes: set[str | None]) -> Iterator[Trace]:
-        """The samples that count; the classes of their objects go to `classes`."""
+        """Read the samples, and collect the classes of their objects in `classes`."""
         for block, trace in self.iter_blocks():
             classes.update(block.trace.classes)
             yield trace
 
     def _check_class(self, choice: Choice, classes: set[str | None]) -> None:
-        """That some object of the log is of the class that was chosen, if none of those in the window is."""
+        """Check that the log has an object of the chosen class, in the window or elsewhere."""
         if not any(map(choice.fits, classes)) and not self.window.is_whole:
             for block in read_blocks(self.source):
                 classes.update(block.trace.classes)
@@ -198,148 +225,10 @@ class Selection:
         return [remark for remark in remarks if remark.severity == "error"]
 
 
-_OBJECTS = protobuf_channel(OBJECTS, ObjectStates)
-
-
-_FEW: Final = 2_000
-_FEW_BYTES: Final = 1 << 26
-"""Messages of one topic, and bytes of all such topics, that are held in memory."""
-
-_PIECE: Final = 256
-"""Samples that are made messages of at once."""
-
-
-class OwnMessages:
-    """What a copy of a log keeps of it: messages of any topic, samples where they are not among those.
-
-    Topics with few messages are held in memory, since viewers show each message until the next one of its
-    topic, however old it is; the others are read again when they are played.
-
-    Attributes:
-        channels: in the order in which they were met.
-        start_ns, end_ns: times of the first and the last message or sample; 0 and -1 if there are none.
-    """
-
-    def __init__(self, selection: Selection) -> None:
-        self._selection = selection
-        self._samples: list[Trace] = []
-        self._few: dict[Channel, list[Messages]] = {}
-        self._counts: dict[Channel, int] = {}
-        self._bytes = 0
-        self.start_ns, self.end_ns = 0, -1
-
-    @property
-    def channels(self) -> tuple[Channel, ...]:
-        return tuple(self._counts)
-
-    def add(self, block: Block) -> None:
-        """Take in the next block of the log."""
-        window = self._selection.window
-        begin, end = window_of(block.messages.log_time_ns, window.start_ns, window.end_ns)
-        messages = select(block.messages, np.arange(begin, end))
-        self._span(messages.log_time_ns)
-        self._span(self._selection.inside(block.trace).times_ns)
-        self._count(messages)
-        if self._counts:
-            self._samples = []
-        else:
-            self._samples.append(block.trace)
-
-    def iter_from(self, start_ns: int) -> Iterator[Messages]:
-        """Those at or after a time, in order, in pieces of bounded size.
-
-        Raises:
-            LogError: the log cannot be read any more.
-        """
-        selection = self._selection
-        first = 0
-        for block in self._iter_blocks(max(start_ns, selection.window.start_ns)):
-            yield selection.own_messages(block, first)
-            first += len(selection.inside(block.trace))
-
-    def few_before(self, time_ns: int) -> Messages:
-        """Of each topic with few messages the last one before a time."""
-        before = [
-            select(messages, np.arange(np.searchsorted(messages.log_time_ns, time_ns)))
-            for pieces in self._few.values()
-            for messages in pieces
-        ]
-        return standing(merge(before), time_ns)
-
-    def _iter_blocks(self, start_ns: int) -> Iterator[Block]:
-        """The log from a time on; from memory, in small pieces, where its samples are all that it has."""
-        if self._counts:
-            yield from read_blocks(self._selection.source, start_ns, self._selection.window.end_ns)
-            return
-        if len(self._samples) > 1:
-            self._samples = [Trace.concatenate(self._samples)]
-        for trace in self._samples:
-            begin = int(np.searchsorted(trace.times_ns, start_ns))
-            for at in range(begin, len(trace), _PIECE):
-                yield Block(trace.slice(at, at + _PIECE))
-
-    def _span(self, times_ns: Integers) -> None:
-        if len(times_ns):
-            first_ns, last_ns = times_ns[[0, -1]].tolist()
-            self.start_ns = first_ns if self.end_ns < 0 else min(self.start_ns, first_ns)
-            self.end_ns = max(self.end_ns, last_ns)
-
-    def _count(self, messages: Messages) -> None:
-        """Take in messages in the window; topics that have many are held no longer."""
-        for number, channel in messages.channels.items():
-            chosen = np.flatnonzero(messages.channel == number)
-            if not len(chosen):
-                continue
-            if channel not in self._counts:
-                self._few[channel] = []
-            self._counts[channel] = self._counts.get(channel, 0) + len(chosen)
-            if channel in self._few:
-                own = select(messages, chosen)
-                self._few[channel].append(own)
-                self._bytes += _size(own)
-                if self._counts[channel] > _FEW or self._bytes > _FEW_BYTES:
-                    self._bytes -= sum(map(_size, self._few.pop(channel)))
-
-
-class Reading:
-    """A log's own messages from a time on, taken stretch by stretch."""
-
-    def __init__(self, own: OwnMessages, start_ns: int) -> None:
-        self._pieces = own.iter_from(start_ns)
-        self._waiting = Messages()
-        self._taken = 0
-        self._is_over = False
-
-    def take_before(self, end_ns: int) -> Messages:
-        """Those before a time that were not taken yet.
-
-        Raises:
-            LogError: the log cannot be read any more.
-        """
-        while not self._is_over and not _reaches(self._waiting, end_ns):
-            piece = next(self._pieces, None)
-            if piece is None:
-                self._is_over = True
-            else:
-                rest = select(self._waiting, np.arange(self._taken, len(self._waiting)))
-                self._waiting, self._taken = merge([rest, piece]), 0
-        begin = self._taken
-        self._taken = max(begin, int(np.searchsorted(self._waiting.log_time_ns, end_ns)))
-        return select(self._waiting, np.arange(begin, self._taken))
-
-
-def standing(messages: Messages, time_ns: int) -> Messages:
-    """Of each channel the messages from a time on or, where there are none, the last one before."""
-    _, last = np.unique(messages.channel[::-1], return_index=True)
-    chosen = messages.log_time_ns >= time_ns
-    chosen[len(messages) - 1 - last] = True
-    return select(messages, np.flatnonzero(chosen))
-
-
-def _reaches(messages: Messages, end_ns: int) -> bool:
-    return len(messages) > 0 and int(messages.log_time_ns[-1]) >= end_ns
-
-
-def _size(messages: Messages) -> int:
-    payloads: Sequence[bytes] = messages.payloads
-    return sum(map(len, payloads))
+def _check_parameters(files: Sequence[Specification], each: Mapping[str, str]) -> None:
+    """Check that every choice of objects is for the parameter of some template."""
+    templates = [spec for file in files for spec in file.results if spec.parameter is not None]
+    for parameter in each:
+        if parameter not in {spec.parameter for spec in templates}:
+            known = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates) or "none"
+            raise UsageError(f"no template has a parameter {parameter!r}; templates here: {known}")

@@ -31,8 +31,8 @@ _Result: TypeAlias = tuple[str, str | None]
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
-    """Some rows of a table.
+class TableRows:
+    """Consecutive rows of a table.
 
     Attributes:
         times_ns: (T,) int64.
@@ -51,20 +51,20 @@ def export_table(
     inputs: Sequence[Path] = (),
     advance: Callable[[int], None] = lambda rows: None,
 ) -> tuple[int, int, tuple[str, ...]]:
-    """Write the robustness in an annotated log as CSV or, by the output's ending, Parquet.
+    """Write the robustness in an annotated log as CSV or Parquet, by the output's ending.
 
     Returns:
-        Rows, columns, and what was lost while reading, each with its place.
+        The numbers of rows and columns, and what was lost while reading, each with its place.
 
     Raises:
-        UsageError: an ending that says neither, Parquet without its library, or a log without robustness.
+        UsageError: another ending, Parquet without its library, or a log without robustness.
         LogError: a damaged log of which no robustness is left.
         OutputError: the output cannot be written.
     """
     writer = _WRITERS.get(output.suffix.lower())
     if writer is None:
         raise UsageError(
-            f"{output.name} ends in neither {' nor '.join(_WRITERS)}; the ending says the format"
+            f"{output.name} ends in neither {' nor '.join(_WRITERS)}; the ending gives the format"
         )
     titles = _columns(source)
     faults: list[str] = []
@@ -80,15 +80,15 @@ def export_table(
 
 
 def _iter_series(source: Source) -> Iterator[tuple[list[RobustnessSeries], tuple[str, ...]]]:
-    """The robustness of a log, block by block, and what was lost.
+    """Read the robustness of a log, block by block, with what was lost.
 
     Raises:
-        UsageError: a log that cannot have any.
-        LogError: one that is there cannot be read.
+        UsageError: a log of a format that cannot have any.
+        LogError: a message that cannot be read.
     """
     if not isinstance(source, McapSource):
         raise UsageError(
-            f"{source.name} is no annotated log; write one with spatial-replay replay … -o FILE.mcap"
+            f"{source.name} is not an annotated log; write one with spatial-replay replay … -o FILE.mcap"
         )
     for payloads, faults in source.iter_payloads(ROBUSTNESS):
         try:
@@ -98,7 +98,7 @@ def _iter_series(source: Source) -> Iterator[tuple[list[RobustnessSeries], tuple
 
 
 def _columns(source: Source) -> Mapping[tuple[_Result, int], str]:
-    """The title of each node's column: its name, or its result's and its number; no two are alike."""
+    """Return the title of each node's column: its name, or its result's and its number; all differ."""
     nodes: dict[tuple[_Result, int], str | None] = {}
     faults: list[str] = []
     for series, lost in _iter_series(source):
@@ -133,7 +133,7 @@ def _columns(source: Source) -> Mapping[tuple[_Result, int], str]:
 
 def _iter_tables(
     source: Source, titles: Mapping[tuple[_Result, int], str], quantity: int, faults: list[str]
-) -> Iterator[Table]:
+) -> Iterator[TableRows]:
     column = {node: index for index, node in enumerate(titles)}
     for series, lost in _iter_series(source):
         faults += lost
@@ -146,11 +146,11 @@ def _iter_tables(
             rows = np.searchsorted(times_ns, each.times_ns)
             columns = [column[result, int(identifier)] for identifier in each.ids]
             numbers[rows[:, None], columns] = each.series[:, quantity].T
-        yield Table(times_ns, numbers)
+        yield TableRows(times_ns, numbers)
 
 
-Write: TypeAlias = Callable[[Table | None], None]
-"""Takes the next rows; None after the last."""
+Write: TypeAlias = Callable[[TableRows | None], None]
+"""Writes the next rows; None after the last."""
 
 
 def _csv_writer(stream: Any, titles: Sequence[str]) -> Write:
@@ -158,7 +158,7 @@ def _csv_writer(stream: Any, titles: Sequence[str]) -> Write:
     rows = csv.writer(text)
     rows.writerow(titles)
 
-    def write(table: Table | None) -> None:
+    def write(table: TableRows | None) -> None:
         if table is None:
             text.detach()
             return
@@ -179,7 +179,7 @@ def _parquet_writer(stream: Any, titles: Sequence[str]) -> Write:
     schema = pa.schema([(titles[0], pa.int64()), *((title, pa.float64()) for title in titles[1:])])
     writer = parquet.ParquetWriter(stream, schema)
 
-    def write(table: Table | None) -> None:
+    def write(table: TableRows | None) -> None:
         if table is None:
             writer.close()
             return

@@ -1,8 +1,12 @@
-"""Specifications evaluated over a log again and again, each time with other values for their constants."""
+"""A log in memory, evaluated again and again with other values for the constants of its specifications.
+
+`Tuning` holds the log, `EditedFiles` the specifications with some values, `Tuned` what they give.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import PurePath
@@ -14,18 +18,17 @@ from spatial_replay.annotate.curves import CurvedResult, encode_curves
 from spatial_replay.annotate.foxglove_layout import Extent, live_layout_attachment
 from spatial_replay.annotate.scene_update import SceneState
 from spatial_replay.annotate.specification import kept_files
-from spatial_replay.errors import UsageError
+from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.source import MemorySource, Source
-from spatial_replay.monitor.semantics import Semantics, checked_semantics
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
-from spatial_replay.monitor.witness.path import Evidence
-from spatial_replay.replay.engine import Replayed, ReplayedSpec, replayed_spec
-from spatial_replay.replay.selection import OwnMessages, Selection, Window, first_sample_ns
+from spatial_replay.replay.engine import Replayed, replayed_specs
+from spatial_replay.replay.own_messages import OwnMessages
+from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Selection, first_sample_ns
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.diagnostics import nearest_hint
-from spatial_replay.spec.format import format_duration
+from spatial_replay.spec.format import format_duration, format_specification
 from spatial_replay.spec.formula import Constant, Specification, iter_nodes
 from spatial_replay.trace.trace import Trace
 
@@ -33,46 +36,56 @@ MOST_NUMBERS: Final = 1 << 27
 """Numbers of nodes at samples, four for each, that an evaluation may have: 1 GiB of them."""
 
 
+@dataclass(frozen=True, slots=True)
+class EditedFiles:
+    """The specifications with some values for their constants.
+
+    Attributes:
+        files: as a log stores them.
+        constants: the values, by the names of `Tuning.constants`.
+    """
+
+    files: tuple[Specification, ...]
+    constants: Mapping[str, Constant]
+
+
 class Tuning:
     """A log in memory, with the specifications whose constants are changed.
 
-    What is measured between footprints is kept, so that a change measures only what it brings in.
+    Measurements between footprints are cached, so that a change computes only the new ones.
 
     Attributes:
+        name: the log's name.
+        options: how it is evaluated.
         constants: those of the specifications, as they are written, by the names to change them by.
-        trace: every sample that counts, those that are only looked back at included.
+        trace: every sample that is read; those before the window that are only looked back at, too.
         inside: those in the window.
         own: the messages of the log itself.
-        semantics: what the formulas mean.
-        faults, remarks: what was lost while reading, and what else the source says.
+        faults, remarks: what was lost while reading, and what else the source reports.
     """
 
     def __init__(
         self,
         source: Source,
         files: Sequence[Specification],
+        options: ReplayOptions = DEFAULT_OPTIONS,
         *,
-        window: Window | None = None,
-        each: Mapping[str, str] | None = None,
-        semantics: Semantics = "ltlf",
         advance: Callable[[int], None] = lambda samples: None,
     ) -> None:
         """Read the log.
 
         Args:
-            window, each, semantics: as for a replay.
-            advance: told how many more samples are read.
+            advance: called with the number of samples of each block that is read.
 
         Raises:
             LogError: no sample in the log, or it cannot be read.
-            UsageError: no sample in the window, an operator that the semantics lacks.
+            UsageError: no sample in the window, an option that cannot work.
             SpecificationError: names that the log never has.
         """
-        self.semantics = checked_semantics(semantics, files)
-        self._source, self._each = source, dict(each or {})
-        self._files = tuple(files)
-        selection = Selection(source, window or Window(), self._files)
-        self.window = selection.window
+        selection = Selection(source, tuple(files), options)
+        self.name, self.options = source.name, options
+        self._attachments = source.attachments
+        self._files, self._kept = tuple(files), kept_files(files)
         self.own = OwnMessages(selection)
         traces: list[Trace] = []
         remarks: list[str] = []
@@ -87,64 +100,49 @@ class Tuning:
         if not len(self.inside):
             raise selection.nothing_to_evaluate(self.faults)
         selection.check_names(self.trace.names, tuple(self.trace.signals))
-        self.first_ns = first_sample_ns(source) if self.window.start_ns else int(self.trace.times_ns[0])
+        self.first_ns = first_sample_ns(source) if options.window.start_ns else int(self.trace.times_ns[0])
         self._places = _places(self._files)
         self.constants: Mapping[str, Constant] = self._constants(self._files)
 
-    @property
-    def name(self) -> str:
-        """The log's name."""
-        return self._source.name
+    def edit(self, values: Mapping[str, float | str]) -> EditedFiles:
+        """Return the specifications with other values for some constants; a file is parsed if it changes.
 
-    def specifications(self, changed: Mapping[str, float | str]) -> list[Specification]:
-        """The specifications with other values for some constants, as `evaluate` takes them.
+        Args:
+            values: numbers and, as texts, durations ("2s"), by name; the others stay as they are written.
 
         Raises:
             UsageError: no such constant, a value of another kind.
-            SpecificationError: a specification that means nothing with these values.
+            SpecificationError: a specification that is invalid with these values.
         """
-        values = [dict[str, float | str]() for _ in self._files]
-        for name, value in changed.items():
-            file, own = self._place(name, value)
-            values[file][own] = value
-        return [_with_constants(file, own) for file, own in zip(self._files, values, strict=True)]
+        edits = [dict[str, float | str]() for _ in self._files]
+        for name, value in values.items():
+            index, own = self._place(name, value)
+            edits[index][own] = value
+        edited = [_edited(file, own) for file, own in zip(self._files, edits, strict=True)]
+        stored = [
+            kept if file is written else _stored(file, written, kept)
+            for file, written, kept in zip(edited, self._files, self._kept, strict=True)
+        ]
+        return EditedFiles(tuple(stored), self._constants(edited))
 
-    def evaluate(self, changed: Mapping[str, float | str] | None = None) -> Tuned:
-        """The specifications over all samples, with other values for some constants.
+    def evaluate(self, values: Mapping[str, float | str] | EditedFiles | None = None) -> Tuned:
+        """Evaluate the specifications over all samples, with other values for some constants.
 
         Args:
-            changed: numbers and, as texts, durations ("2s"), by name; the others stay as they are written.
+            values: as for `edit`, or what that returned.
 
         Raises:
-            UsageError: no such constant, a value of another kind, more numbers than are held at once.
-            SpecificationError: a specification that means nothing with these values.
+            UsageError: no such constant, a value of another kind, more numbers than fit into memory.
+            SpecificationError: a specification that is invalid with these values.
         """
-        files = self.specifications(changed or {})
-        held = Selection(MemorySource(self.trace, self.name), replace(self.window, every=1), files)
-        kept = kept_files(files)
-        instances = [held.instances(file, self._each) for file in kept]
-        evaluation = AnnotatedEvaluation(kept, instances, self.semantics, self._source.attachments)
+        edited = values if isinstance(values, EditedFiles) else self.edit(values or {})
+        # the samples in memory are every Nth already
+        options = replace(self.options, window=replace(self.options.window, every=1))
+        selection = Selection(MemorySource(self.trace, self.name), edited.files, options)
+        instances = [selection.instances(file) for file in edited.files]
+        evaluation = AnnotatedEvaluation(edited.files, instances, options.semantics, self._attachments)
         self._check_size(evaluation)
-        return Tuned(
-            self, tuple(kept), self._constants(files), evaluation, tuple(evaluation.extend(self.trace)), held
-        )
-
-    def replayed(self, results: Sequence[ReplayedSpec]) -> Replayed:
-        """Results as those of a replay; without a certificate, which nobody asks of what is only tried."""
-        times_ns = self.inside.times_ns
-        return Replayed(
-            log=self.name,
-            samples=len(self.inside),
-            first_ns=self.first_ns,
-            start_ns=int(times_ns[0]),
-            end_ns=int(times_ns[-1]),
-            faults=self.faults,
-            remarks=self.remarks,
-            unreadable=self.inside.unreadable_count,
-            results=tuple(results),
-            certificate=MappingProxyType({}),
-            semantics=self.semantics,
-        )
+        return Tuned(self, edited, selection, evaluation, tuple(evaluation.extend(self.trace)))
 
     def _constants(self, files: Sequence[Specification]) -> Mapping[str, Constant]:
         return MappingProxyType(
@@ -152,7 +150,7 @@ class Tuning:
         )
 
     def _place(self, name: str, value: object) -> tuple[int, str]:
-        """The file of a constant, and its name there, if a value is of its kind."""
+        """Return the file of a constant and its name there, if a value is of its kind."""
         if name not in self._places:
             known = tuple(self._places)
             hint = nearest_hint(name, known) or f"the constants are: {', '.join(known) or 'none'}"
@@ -178,45 +176,43 @@ class Tuning:
 
 @dataclass(frozen=True, eq=False)
 class Tuned:
-    """Every number that the specifications have with some values for their constants.
+    """An evaluation of the whole log with some values for the constants.
 
     Attributes:
-        files: the specifications with these values, as a log keeps them.
-        constants: the values, by the names of `Tuning.constants`.
-        evaluation: what was evaluated.
+        edited: the specifications with these values.
+        selection: the samples in memory.
+        evaluation: the evaluation, which has taken in all of them.
         stretches: for each of its trees, every sample.
     """
 
     tuning: Tuning
-    files: tuple[Specification, ...]
-    constants: Mapping[str, Constant]
+    edited: EditedFiles
+    selection: Selection
     evaluation: AnnotatedEvaluation
     stretches: tuple[SeriesBlock, ...]
-    selection: Selection
 
     @property
     def verdict(self) -> Verdict:
-        """The worst of the results'."""
+        """The worst verdict of the results."""
         return worst_verdict(stream.verdict for stream in self.evaluation.streams)
 
     @cached_property
     def replayed(self) -> Replayed:
-        """The results, to be shown and inquired into as those of a replay."""
-        return self.tuning.replayed(
-            [
-                replayed_spec(
-                    tree,
-                    stream,
-                    Evidence(stream.instance, self.files[tree.file].regions, self.selection.iter_traces),
-                    stretch,
-                    self.tuning.semantics,
-                    has_series=True,
-                    has_leaves=True,
-                )
-                for tree, stream, stretch in zip(
-                    self.evaluation.trees, self.evaluation.streams, self.stretches, strict=True
-                )
-            ]
+        """The results as those of a replay; without a certificate, since no log is written."""
+        tuning = self.tuning
+        times_ns = tuning.inside.times_ns
+        return Replayed(
+            log=tuning.name,
+            samples=len(tuning.inside),
+            first_ns=tuning.first_ns,
+            start_ns=int(times_ns[0]),
+            end_ns=int(times_ns[-1]),
+            faults=tuning.faults,
+            remarks=tuning.remarks,
+            unreadable=tuning.inside.unreadable_count,
+            results=replayed_specs(self.evaluation, self.edited.files, self.stretches, self.selection),
+            certificate=MappingProxyType({}),
+            semantics=tuning.options.semantics,
         )
 
     @cached_property
@@ -232,16 +228,16 @@ class Tuned:
 
     @cached_property
     def layout(self) -> Attachment:
-        """How to open a server of this log in a viewer."""
+        """The viewer layout for a server of this log."""
         topics = {each.topic for each in self.tuning.own.channels}
         return live_layout_attachment(self.evaluation.contents(Extent.of(self.tuning.inside), topics))
 
     def annotator(self, scene: SceneState | None = None) -> Annotator:
-        """Who writes the messages of these samples, from the first on; see `AnnotatedEvaluation`."""
+        """Return the annotator of these samples, before the first; see `AnnotatedEvaluation`."""
         return self.evaluation.annotator(scene)
 
     def part(self, begin: int, end: int) -> tuple[Trace, list[SeriesBlock]]:
-        """Samples `begin` to before `end` of those in the window, and what the evaluation says of them."""
+        """Return samples `begin` to before `end` of those in the window, with their evaluation."""
         trace = self.tuning.inside.slice(begin, end)
         if not len(trace):
             return trace, [stretch.between(0, 0) for stretch in self.stretches]
@@ -250,22 +246,24 @@ class Tuned:
 
 
 def constant_text(constant: Constant) -> str:
-    """A constant as a specification writes it: `70`, `2s`."""
+    """Write a constant as a specification does: `70`, `2s`."""
     if constant.duration_ns is not None:
         return format_duration(constant.duration_ns)
     return repr(constant.value).removesuffix(".0")
 
 
-def values_of(constants: Mapping[str, Constant]) -> dict[str, float | str]:
-    """Constants as `Tuning.evaluate` takes them."""
-    return {
-        name: each.value if each.duration_ns is None else constant_text(each)
-        for name, each in constants.items()
-    }
+def constant_value(constant: Constant) -> float | str:
+    """Return a constant as `Tuning.edit` takes it: a number or, as a text, a duration."""
+    return constant.value if constant.duration_ns is None else constant_text(constant)
+
+
+def constant_values(constants: Mapping[str, Constant]) -> dict[str, float | str]:
+    """Return constants as `Tuning.edit` takes them."""
+    return {name: constant_value(each) for name, each in constants.items()}
 
 
 def _places(files: Sequence[Specification]) -> dict[str, tuple[int, str]]:
-    """For each constant its file and its name there; where two files share a name, after their stems."""
+    """Return for each constant its file and its name there; names in two files follow their file's stem."""
     names = [name for file in files for name in file.constants]
     return {
         f"{PurePath(file.filename).stem}.{name}" if names.count(name) > 1 else name: (index, name)
@@ -274,7 +272,24 @@ def _places(files: Sequence[Specification]) -> dict[str, tuple[int, str]]:
     }
 
 
-def _with_constants(file: Specification, values: Mapping[str, float | str]) -> Specification:
-    if not values:
+def _edited(file: Specification, values: Mapping[str, float | str]) -> Specification:
+    if all(value == constant_value(file.constants[name]) for name, value in values.items()):
         return file
     return parse_specification(file.source, filename=file.filename, profile=file.profile, constants=values)
+
+
+def _stored(edited: Specification, written: Specification, kept: Specification) -> Specification:
+    """Return an edited specification as a log stores it: its text says the new values.
+
+    Messages refer to nodes by their place in the text, so the canonical text is parsed to get the places.
+
+    Args:
+        kept: the written specification as a log stores it.
+    """
+    if edited == written and kept.source == written.source:
+        return replace(edited, filename=kept.filename)
+    with suppress(SpecificationError):
+        read_back = parse_specification(format_specification(edited), filename=edited.filename)
+        if read_back == edited:
+            return replace(read_back, filename=kept.filename)
+    return replace(edited, filename=kept.filename)

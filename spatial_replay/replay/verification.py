@@ -1,4 +1,4 @@
-"""Certificates compared with what a log, or its source, gives now."""
+"""Certificates of logs, compared with those that a new evaluation gives."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import CERTIFICATE, METADATA
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.replay.annotated import load_files, run_replay
-from spatial_replay.replay.selection import Window
+from spatial_replay.replay.selection import ReplayOptions, Window
 from spatial_replay.spec.formula import Specification
 
 _HASHES: Mapping[str, str] = MappingProxyType(
@@ -24,18 +24,18 @@ _HASHES: Mapping[str, str] = MappingProxyType(
         "results_sha256": "other results",
     }
 )
-"""What it means that a hash of a certificate differs."""
+"""The meaning of a difference, for each hash of a certificate."""
 
 _WINDOW = ("start_ns", "end_ns", "every")
 
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """What a certificate says, and what it would say now.
+    """A certificate as recorded, and as computed now.
 
     Attributes:
         recorded: the log's certificate; empty where it has none.
-        computed: the one computed now.
+        computed: the one of the new evaluation.
         faults: what could not be read.
     """
 
@@ -45,7 +45,7 @@ class Verified:
 
     @property
     def differences(self) -> tuple[str, ...]:
-        """What differs, in words; none where all is as it was."""
+        """The differences in words; none if everything is equal."""
         if not self.recorded:
             return ("the log has no certificate: it was not written to its end",)
         return tuple(
@@ -61,11 +61,11 @@ def verify_certificate(
     """Evaluate a log, or its source, again with the log's own specifications and options.
 
     Args:
-        source: what the log was made of; None for the log itself.
-        advance: told how many more samples are done.
+        source: the log that it was made from; None evaluates the log itself.
+        advance: called with the number of samples of each block that is done.
 
     Raises:
-        UsageError, LogError, SpecificationError: what cannot be evaluated.
+        UsageError, LogError, SpecificationError: it cannot be evaluated.
     """
     metadata = dict(log.metadata())
     recorded, about = metadata.get(CERTIFICATE, {}), metadata.get(METADATA, {})
@@ -74,21 +74,23 @@ def verify_certificate(
     options = _options(about)
     if source is None and options.get("layer"):
         raise UsageError(
-            f"{log.name} holds what was derived and no samples; name what it was made of: --source SOURCE"
+            f"{log.name} is a layer without samples; give the log that it was made from: --source SOURCE"
         )
     replayed = run_replay(
         log if source is None else source,
         _files(log),
-        window=Window(**{name: options[name] for name in _WINDOW if name in options}),
-        each=options.get("each", {}),
-        semantics=_semantics(about),
+        ReplayOptions(
+            Window(**{name: options[name] for name in _WINDOW if name in options}),
+            options.get("each", {}),
+            _semantics(about),
+        ),
         advance=advance,
     )
     return Verified(dict(recorded), dict(replayed.certificate), replayed.faults)
 
 
 def _files(log: Source) -> list[Specification]:
-    """The specifications that a log was written with; none for a log without."""
+    """Return the specifications that a log was written with, if any."""
     try:
         return load_files((), log)
     except UsageError:
@@ -96,7 +98,7 @@ def _files(log: Source) -> list[Specification]:
 
 
 def _options(about: Mapping[str, str]) -> dict[str, Any]:
-    """How the log was replayed; nothing for a recording."""
+    """Return the options of the replay that wrote a log; none for a recording."""
     if about.get("written_by") != "replay":
         return {}
     try:

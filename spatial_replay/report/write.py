@@ -17,11 +17,9 @@ from spatial_replay.logs.output_file import replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import AUTOMATON, EVENTS, GRADIENT_MAP, PLAN_DECISION, SCENE
-from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.replay.annotated import check_parameters
-from spatial_replay.replay.document import explanation_of
+from spatial_replay.replay.document import explain_node
 from spatial_replay.replay.engine import Replay, Replayed
-from spatial_replay.replay.selection import Window
+from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions
 from spatial_replay.report.automaton_panel import StatePath, StatePathMaker
 from spatial_replay.report.contents import Report, ReportedResult, worst_results
 from spatial_replay.report.decision_panel import Plan, PlanMaker
@@ -105,10 +103,8 @@ def write_report(
     source: Source,
     files: Sequence[Specification],
     output: Path,
+    options: ReplayOptions = DEFAULT_OPTIONS,
     *,
-    window: Window | None = None,
-    each: Mapping[str, str] | None = None,
-    semantics: Semantics = "ltlf",
     inputs: Sequence[Path] = (),
     advance: Callable[[int], None] = lambda samples: None,
 ) -> Replayed:
@@ -117,8 +113,6 @@ def write_report(
     The page needs no other file and no network. Equal sources, specifications and options give an equal page.
 
     Args:
-        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
-        semantics: "ltlf", or "paper": Def. 16 of the paper to the letter.
         inputs: files that the output must not be.
         advance: told how many more samples are done.
 
@@ -128,16 +122,10 @@ def write_report(
         LogError: no sample in the log.
         OutputError: the output cannot be written.
     """
-    check_parameters(files, each or {})
-    replay = Replay(
-        source, files, window=window, each=each, semantics=semantics, keep_series=True, keep_leaves=True
-    )
+    replay = Replay(source, files, options, keep_series=True, keep_leaves=True)
     with replacing(output, inputs) as stream:
         collector = Collector()
-        for messages, samples in replay.iter_messages(annotate=True):
-            collector.add(messages)
-            advance(samples)
-        replayed = replay.result()
+        replayed = replay.run(collector.add, advance=advance)
         stream.write(page(_report(replay, replayed, collector)))
     return replayed
 
@@ -167,7 +155,7 @@ def _results(replay: Replay, replayed: Replayed, collector: Collector) -> Iterat
     for index, result in enumerate(replayed.results):
         tree, kept = replay.trees[index], replay.automata[index]
         unseen = np.empty((len(result.robustness), 4, 0))
-        why = explanation_of(result, first_ns=replayed.first_ns) if index in explained else None
+        why = explain_node(result, first_ns=replayed.first_ns) if index in explained else None
         yield ReportedResult(
             name=result.name,
             object=result.object,

@@ -23,7 +23,7 @@ from spatial_replay.logs.topics import CURVES_TOPIC, EVENT_LOG, EVENTS
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.replay.engine import ReplayedSpec
 from spatial_replay.replay.playback import Playback
-from spatial_replay.replay.tuning import Tuned, constant_text, values_of
+from spatial_replay.replay.tuning import Tuned, constant_text, constant_values
 from spatial_replay.serve.session import Session, State, Values, Wishes
 
 
@@ -116,7 +116,7 @@ def _changes(tuned: Tuned) -> str:
     written = tuned.tuning.constants
     changed = [
         f"{name} = {constant_text(constant)}"
-        for name, constant in tuned.constants.items()
+        for name, constant in tuned.edited.constants.items()
         if constant != written[name]
     ]
     more = ", …" if len(changed) > _MOST else ""
@@ -178,7 +178,7 @@ class Player:
             self._playback.tuned = before.tuning.evaluate(values)
         except SpatialReplayError as error:
             self._outlet.tell(Note(CONSTANTS, Level.ERROR, str(error)))
-            self._outlet.tell_values(self._session.take_back(values_of(before.constants)))
+            self._outlet.tell_values(self._session.take_back(constant_values(before.edited.constants)))
             return
         self._outlet.tell_state(self._session.state._replace(time_ns=time_ns, did_seek=True))
         self._outlet.tell(verdict_note(self._playback.tuned))

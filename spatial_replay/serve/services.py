@@ -20,8 +20,8 @@ from jsonschema.exceptions import best_match
 
 from spatial_replay.annotate.foxglove_layout import LAYOUT
 from spatial_replay.errors import UsageError
-from spatial_replay.replay.document import document, explanations
-from spatial_replay.replay.tuning import Tuned, values_of
+from spatial_replay.replay.document import document_from_replay, explain_results
+from spatial_replay.replay.tuning import Tuned, constant_values
 from spatial_replay.serve.session import OVER, Question, Session
 
 _MOST_BYTES: Final = 1 << 16
@@ -75,13 +75,13 @@ def _evaluate(tuned: Tuned, request: Mapping[str, Any]) -> Mapping[str, Any]:
     """What a replay with other constants says; what is shown stays as it is."""
     changed = request.get("constants", {})
     if changed:
-        tuned = tuned.tuning.evaluate({**values_of(tuned.constants), **changed})
+        tuned = tuned.tuning.evaluate({**constant_values(tuned.edited.constants), **changed})
     results = tuple(replace(result, times_ns=None, series=None) for result in tuned.replayed.results)
-    return document(replace(tuned.replayed, results=results))
+    return document_from_replay(replace(tuned.replayed, results=results))
 
 
 def _explain(tuned: Tuned, request: Mapping[str, Any]) -> Mapping[str, Any]:
-    found = explanations(tuned.replayed, node=request.get("node"), object=request.get("object"))
+    found = explain_results(tuned.replayed, node=request.get("node"), object=request.get("object"))
     return {"explanations": [each.document for each in found]}
 
 
@@ -184,7 +184,7 @@ def asset(tuned: Tuned, uri: str) -> bytes | None:
     if (kind, name) == (LAYOUT, ""):
         return tuned.layout.data
     if kind == "specification":
-        return {file.filename: file.source.encode() for file in tuned.files}.get(name)
+        return {file.filename: file.source.encode() for file in tuned.edited.files}.get(name)
     if kind == "automaton" and name.endswith(".dot"):
         kept = tuned.evaluation.automata_attachments("")
         return {each.name.rpartition("/")[2]: each.data for each in kept}.get(name)

@@ -20,7 +20,7 @@ from threading import Condition
 from typing import Any, Final, NamedTuple, TypeVar
 
 from spatial_replay.errors import UsageError
-from spatial_replay.replay.tuning import Tuned, Tuning, values_of
+from spatial_replay.replay.tuning import Tuned, Tuning, constant_values
 
 MOST_LATE_S: Final = 0.15
 """What passes from one turn to the next, at most; viewers take what is played in that time at once."""
@@ -210,7 +210,7 @@ class Session:
         self._tuning = tuning
         self._pace = Pace(clock)
         self._transport = Transport(start_ns, end_ns)
-        self._values = values_of(tuning.constants)
+        self._values = constant_values(tuning.constants)
         self._wishes = Wishes()
         self._questions: list[Question] = []
         self._wished = Condition()
@@ -266,7 +266,7 @@ class Session:
         """
         with self._wished:
             wished = {**self._values, **values}
-            self._tuning.specifications(wished)
+            self._tuning.edit(wished)
             self._values = self._wishes.values = wished
             self._wished.notify()
 

@@ -18,7 +18,7 @@ from spatial_replay.logs.schemas import AutomatonState_pb2
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
 from spatial_replay.recording import Recorder, Recording
-from spatial_replay.replay import run_replay
+from spatial_replay.replay import ReplayOptions, run_replay
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec.load import parse_specification
 from spatial_replay.trace.sample import Sample
@@ -202,6 +202,6 @@ def test_under_the_papers_semantics_there_is_none(tmp_path: Path) -> None:
     with Recorder(log) as recorder:
         for each in RUN:
             recorder.write(each)
-    run_replay(open_source(log), [SPEC], output=tmp_path / "out.mcap", semantics="paper")
+    run_replay(open_source(log), [SPEC], ReplayOptions(semantics="paper"), output=tmp_path / "out.mcap")
     assert "/spatial/automaton" not in content_of(tmp_path / "out.mcap").topics()
     assert about_automata(tmp_path / "out.mcap")["done"].startswith("none: ")

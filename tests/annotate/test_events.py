@@ -13,7 +13,7 @@ from mcap.records import Message
 
 import spatial_replay as sr
 from spatial_replay.logs.source import MemorySource
-from spatial_replay.replay import Window, run_replay
+from spatial_replay.replay import ReplayOptions, Window, run_replay
 
 STEP_NS = 10**8
 
@@ -45,7 +45,7 @@ def batteries(*charges: float | None) -> list[sr.Sample]:
 def written(tmp_path: Path, text: str, samples: list[sr.Sample], **options: object) -> Found:
     output = tmp_path / "annotated.mcap"
     files = [sr.parse_specification(text, filename="battery.spatial")]
-    run_replay(MemorySource.from_samples(samples), files, output=output, **options)
+    run_replay(MemorySource.from_samples(samples), files, ReplayOptions(**options), output=output)
     events, lines = (_messages(output, topic) for topic in ("/spatial/events", "/spatial/log"))
     found = []
     for event, line in zip(events, lines, strict=True):

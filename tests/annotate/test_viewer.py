@@ -14,7 +14,7 @@ from annotate.layouts import layout_of, panels, paths_of
 from annotate.message_paths import split, values
 from spatial_replay.annotate.foxglove_layout import Contents, layout_for_live
 from spatial_replay.logs.source import MemorySource
-from spatial_replay.replay import run_replay
+from spatial_replay.replay import ReplayOptions, run_replay
 from spatial_replay.sources.open_log import open_source
 
 TEXT = "spec near = F a closeto[2] b\nspec apart = G a farfrom[0] b"
@@ -27,7 +27,7 @@ def run(tmp_path: Path, text: str, **options: object) -> Path:
     ]
     output = tmp_path / "annotated.mcap"
     files = [sr.parse_specification(text)]
-    run_replay(MemorySource.from_samples(samples), files, output=output, **options)
+    run_replay(MemorySource.from_samples(samples), files, ReplayOptions(**options), output=output)
     return output
 
 

@@ -43,7 +43,7 @@ def test_the_quantity_can_be_chosen(folder: Path) -> None:
         ("none.mcap", "run.csv", 2, "none.mcap: no such file"),
         ("annotated.mcap", "run.txt", 2, "run.txt ends in neither .csv nor .parquet"),
         ("annotated.mcap", "none/run.csv", 2, "there is no folder none"),
-        ("tracks.csv", "run.csv", 2, "tracks.csv is no annotated log; write one with"),
+        ("tracks.csv", "run.csv", 2, "tracks.csv is not an annotated log; write one with"),
         ("recorded.mcap", "run.csv", 2, "recorded.mcap holds no /spatial/robustness; write it with"),
         ("annotated.mcap", "-", 2, "- is no file; name one"),
     ],

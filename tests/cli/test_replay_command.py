@@ -181,7 +181,7 @@ TEN_FAULTS = "\n".join(
         ((*REPLAY, "-o", "none/out.mcap"), "there is no folder none"),
         ((*REPLAY, "-o", "."), "is a folder"),
         ((*REPLAY, "--from", "soon"), "'soon' is not a time; write 12.5s"),
-        ((*REPLAY, "--from", "99s"), "run.jsonl has no sample in the window asked for; its samples are from"),
+        ((*REPLAY, "--from", "99s"), "run.jsonl has no sample in the requested window; its samples are from"),
         ((*REPLAY, "--from", "2s", "--to", "1000ms"), "the window --from 2s --to 1000ms is empty"),
         ((*REPLAY, "--to", "0s"), "the window --to 0s is empty"),
         ((*REPLAY, "-o", "-"), "- is no file; name one. `replay … --json -` writes to standard output"),

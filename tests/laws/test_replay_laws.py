@@ -16,7 +16,7 @@ from laws.strategies_monitor import NAMES, Recording, recordings, specifications
 from replay.runs import PiecewiseSource, content_of, record, run, write_tracks
 from spatial_replay.errors import SpecificationError
 from spatial_replay.recording import Recorder, record_source
-from spatial_replay.replay import Replayed, Window, load_files, run_replay
+from spatial_replay.replay import Replayed, ReplayOptions, Window, load_files, run_replay
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import parse_specification
@@ -46,12 +46,12 @@ def test_a_replay_of_a_replay_is_the_replay(replay: tuple[Trace, Specification])
     with TemporaryDirectory() as folder:
         first, second, third = (Path(folder, name) for name in ("run.mcap", "once.mcap", "twice.mcap"))
         record(trace, first)
-        once = run_replay(open_source(first), [spec], each=_choices(spec), output=second)
-        twice = run_replay(open_source(second), [spec], each=_choices(spec), output=third)
+        once = run_replay(open_source(first), [spec], ReplayOptions(each=_choices(spec)), output=second)
+        twice = run_replay(open_source(second), [spec], ReplayOptions(each=_choices(spec)), output=third)
         assert second.read_bytes() == third.read_bytes()
         assert once.certificate == twice.certificate
         own = load_files((), open_source(second))
-        run_replay(open_source(second), own, each=_choices(spec), output=third)
+        run_replay(open_source(second), own, ReplayOptions(each=_choices(spec)), output=third)
         assert second.read_bytes() == third.read_bytes()
 
 
@@ -67,7 +67,10 @@ def test_how_a_source_is_cut_changes_nothing(
         whole, pieces = Path(folder, "whole.mcap"), Path(folder, "pieces.mcap")
         results = [
             run_replay(
-                PiecewiseSource(trace, blocks), [spec], window=window, each=_choices(spec), output=output
+                PiecewiseSource(trace, blocks),
+                [spec],
+                ReplayOptions(window, _choices(spec)),
+                output=output,
             )
             for blocks, output in ((len(trace), whole), (size, pieces))
         ]

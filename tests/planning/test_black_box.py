@@ -23,9 +23,7 @@ from spatial_replay.planning.read import read_decisions
 from spatial_replay.planning.recompute import planner_of, redo_decisions
 from spatial_replay.planning.settings import Settings, settings_from_text, text_from_settings
 from spatial_replay.planning.workspace import Grid, Workspace
-from spatial_replay.replay import load_files, run_replay
-from spatial_replay.replay.selection import Window
-from spatial_replay.replay.verification import verify_certificate
+from spatial_replay.replay import ReplayOptions, Window, load_files, run_replay, verify_certificate
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec import load_specification
 
@@ -104,7 +102,7 @@ def test_a_wait_whose_end_is_not_told_shows(tmp_path):
 def cut(log, to, window):
     """Copy some samples of a log."""
     source = open_source(log)
-    run_replay(source, load_files((), source), output=to, window=window)
+    run_replay(source, load_files((), source), ReplayOptions(window), output=to)
 
 
 def test_what_is_left_of_a_run_is_enough_if_it_is_the_beginning(tmp_path):

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from replay.runs import SPECIFICATION, PiecewiseSource, run
-from spatial_replay.replay import document, run_replay
+from spatial_replay.replay import document_from_replay, run_replay
 from spatial_replay.spec.load import parse_specification
 
 
@@ -16,7 +16,7 @@ from spatial_replay.spec.load import parse_specification
 def found() -> dict[str, Any]:
     spec = parse_specification(SPECIFICATION)
     replayed = run_replay(PiecewiseSource(run(), 5), [spec], keep_series=True)
-    loaded: dict[str, Any] = json.loads(json.dumps(document(replayed), allow_nan=False))
+    loaded: dict[str, Any] = json.loads(json.dumps(document_from_replay(replayed), allow_nan=False))
     return loaded
 
 
@@ -61,4 +61,4 @@ def test_series_have_one_list_per_node(found: dict[str, Any]) -> None:
 
 def test_there_are_no_series_unless_asked_for() -> None:
     replayed = run_replay(PiecewiseSource(run(), 5), [parse_specification(SPECIFICATION)])
-    assert all("series" not in each for each in document(replayed)["specifications"])
+    assert all("series" not in each for each in document_from_replay(replayed)["specifications"])

@@ -36,9 +36,7 @@ from spatial_replay.logs.topics import (
     SPECIFICATION,
     protobuf_channel,
 )
-from spatial_replay.replay import Window, run_replay
-from spatial_replay.replay.playback import Playback
-from spatial_replay.replay.tuning import Tuning
+from spatial_replay.replay import Playback, ReplayOptions, Tuning, Window, run_replay
 from spatial_replay.sources.open_log import open_source
 
 ROOT = Path(__file__).parents[2]
@@ -58,7 +56,7 @@ def specification() -> sr.Specification:
 
 def playback(source: Source | None = None, window: Window | None = None) -> Playback:
     source = source or PiecewiseSource(run(COUNT), 7)
-    return Playback(Tuning(source, [specification()], window=window).evaluate())
+    return Playback(Tuning(source, [specification()], ReplayOptions(window or Window())).evaluate())
 
 
 def sent(messages: Messages) -> list[Sent]:
@@ -68,7 +66,7 @@ def sent(messages: Messages) -> list[Sent]:
 
 def annotated(source: Source, output: Path, window: Window | None = None) -> list[Sent]:
     """What a replay writes."""
-    run_replay(source, [specification()], output=output, window=window)
+    run_replay(source, [specification()], ReplayOptions(window or Window()), output=output)
     return [(topic, time_ns, data) for topic, time_ns, _, _, data in content_of(output).messages]
 
 

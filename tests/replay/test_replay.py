@@ -16,7 +16,7 @@ from replay.runs import PAST, SPECIFICATION, STEP_NS, PiecewiseSource, content_o
 from spatial_replay.errors import LogError, OutputError, SpecificationError, UsageError
 from spatial_replay.logs.messages import Block
 from spatial_replay.recording import record_source
-from spatial_replay.replay import Replayed, Window, load_files, run_replay
+from spatial_replay.replay import Replayed, ReplayOptions, Window, load_files, run_replay
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec.load import load_specification, parse_specification
 from spatial_replay.trace.trace import Trace
@@ -114,7 +114,9 @@ def _spans(replayed: Replayed) -> list[int]:
 
 
 def _replayed(text: str, window: Window) -> Replayed:
-    return run_replay(PiecewiseSource(run(), 3), [parse_specification(text)], window=window, keep_series=True)
+    return run_replay(
+        PiecewiseSource(run(), 3), [parse_specification(text)], ReplayOptions(window), keep_series=True
+    )
 
 
 def test_a_window_is_from_a_time_to_before_another() -> None:
@@ -152,16 +154,16 @@ def test_an_every_below_one_and_an_empty_window_are_refused() -> None:
 
 
 def test_a_window_without_samples_names_those_that_there_are() -> None:
-    with pytest.raises(UsageError, match=r"no sample in the window asked for.*from 0 to 2750000000 ns"):
+    with pytest.raises(UsageError, match=r"no sample in the requested window.*from 0 to 2750000000 ns"):
         _replayed(PAST, Window(10**12))
 
 
 def test_a_template_is_evaluated_for_each_object_chosen() -> None:
     spec = parse_specification("spec near(ego) = G (ego dist cube <= 9)")
     source = PiecewiseSource(run(), 4)
-    everyone = run_replay(source, [spec], each={"ego": "all"})
+    everyone = run_replay(source, [spec], ReplayOptions(each={"ego": "all"}))
     assert [(r.name, r.object) for r in everyone.results] == [("near", "cube"), ("near", "cup 物")]
-    dishes = run_replay(source, [spec], each={"ego": "class:DISH"})
+    dishes = run_replay(source, [spec], ReplayOptions(each={"ego": "class:DISH"}))
     assert [r.object for r in dishes.results] == ["cup 物"]
 
 
@@ -174,7 +176,7 @@ def test_the_objects_of_templates_take_one_pass() -> None:
             return super().iter_blocks(start_ns, end_ns)
 
     spec = parse_specification("spec near(a) = G (a dist cube <= 9)\nspec far(b) = F (b dist cube >= 1)")
-    run_replay(Counted(run(), 4), [spec], each={"a": "class:dish", "b": "class:block"})
+    run_replay(Counted(run(), 4), [spec], ReplayOptions(each={"a": "class:dish", "b": "class:block"}))
     assert len(passes) == 2
 
 
@@ -190,13 +192,13 @@ def test_the_objects_of_templates_take_one_pass() -> None:
 def test_objects_that_cannot_be_chosen_are_said(each: dict[str, str], said: str) -> None:
     spec = parse_specification("spec near(ego) = G (ego dist cube <= 9)")
     with pytest.raises(UsageError, match=said):
-        run_replay(PiecewiseSource(run(), 4), [spec], each=each)
+        run_replay(PiecewiseSource(run(), 4), [spec], ReplayOptions(each=each))
 
 
 def test_a_class_that_is_elsewhere_in_the_log_stands_for_nobody_here() -> None:
     spec = parse_specification("spec near(ego) = G (ego dist cube <= 9)")
     only_cube = Window(3 * STEP_NS, 4 * STEP_NS)
-    replayed = run_replay(PiecewiseSource(run(), 4), [spec], each={"ego": "class:dish"}, window=only_cube)
+    replayed = run_replay(PiecewiseSource(run(), 4), [spec], ReplayOptions(only_cube, {"ego": "class:dish"}))
     assert replayed.results == ()
 
 
@@ -212,7 +214,7 @@ def test_names_that_the_log_never_has_are_all_told_at_once() -> None:
 
 
 def test_a_name_need_not_be_in_the_window() -> None:
-    replayed = run_replay(PiecewiseSource(run(), 4), [SPEC], window=Window(3 * STEP_NS, 4 * STEP_NS))
+    replayed = run_replay(PiecewiseSource(run(), 4), [SPEC], ReplayOptions(Window(3 * STEP_NS, 4 * STEP_NS)))
     assert [str(r.verdict) for r in replayed.results] == ["violated", "unknown"]
 
 

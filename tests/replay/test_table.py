@@ -11,8 +11,7 @@ import pytest
 
 from replay.runs import SPECIFICATION, PiecewiseSource, record, run
 from spatial_replay.errors import UsageError
-from spatial_replay.replay import Replayed, run_replay
-from spatial_replay.replay.table import QUANTITIES, export_table
+from spatial_replay.replay import QUANTITIES, Replayed, ReplayOptions, export_table, run_replay
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec.load import parse_specification
 
@@ -22,7 +21,7 @@ def annotated(tmp_path: Path) -> tuple[Path, Replayed]:
     path = tmp_path / "annotated.mcap"
     spec = parse_specification(f"{SPECIFICATION}spec near(ego) = G (ego dist cube <= 9)\n")
     replayed = run_replay(
-        PiecewiseSource(run(), 5), [spec], each={"ego": "all"}, output=path, keep_series=True
+        PiecewiseSource(run(), 5), [spec], ReplayOptions(each={"ego": "all"}), output=path, keep_series=True
     )
     return path, replayed
 

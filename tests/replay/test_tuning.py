@@ -10,8 +10,15 @@ from hypothesis import strategies as st
 import spatial_replay as sr
 from replay.runs import PAST, STEP_NS, PiecewiseSource, run
 from spatial_replay.errors import LogError, SpecificationError, UsageError
-from spatial_replay.replay import Window
-from spatial_replay.replay.tuning import Tuned, Tuning, constant_text, values_of
+from spatial_replay.replay import (
+    ReplayOptions,
+    Tuned,
+    Tuning,
+    Window,
+    constant_text,
+    constant_values,
+    run_replay,
+)
 
 TEXT = """\
 const far = {far}
@@ -29,7 +36,9 @@ def specification(text: str = WRITTEN, name: str = "blocks.spatial") -> sr.Speci
 
 
 def tuning(*files: sr.Specification, size: int = 5, window: Window | None = None) -> Tuning:
-    return Tuning(PiecewiseSource(run(40), size), files or [specification()], window=window)
+    return Tuning(
+        PiecewiseSource(run(40), size), files or [specification()], ReplayOptions(window or Window())
+    )
 
 
 def numbers(tuned: Tuned) -> list[np.ndarray]:
@@ -70,8 +79,8 @@ def test_constants_are_told_as_they_are_written_and_as_they_are() -> None:
         "soon": "2s",
     }
     tuned = held.evaluate({"far": 1})
-    assert values_of(tuned.constants) == {"far": 1.0, "soon": "2s"}
-    assert values_of(held.constants) == {"far": 0.5, "soon": "2s"}
+    assert constant_values(tuned.edited.constants) == {"far": 1.0, "soon": "2s"}
+    assert constant_values(held.constants) == {"far": 0.5, "soon": "2s"}
 
 
 @pytest.mark.parametrize(
@@ -104,21 +113,22 @@ def test_a_name_that_two_files_share_is_called_after_the_file() -> None:
     held = tuning(specification(), specification(other, "wide.spatial"))
     assert list(held.constants) == ["blocks.far", "soon", "wide.far", "own"]
     tuned = held.evaluate({"wide.far": 0.75})
-    assert values_of(tuned.constants)["blocks.far"] == 0.5
-    assert values_of(tuned.constants)["wide.far"] == 0.75
+    assert constant_values(tuned.edited.constants)["blocks.far"] == 0.5
+    assert constant_values(tuned.edited.constants)["wide.far"] == 0.75
     with pytest.raises(UsageError, match=r"blocks\.far"):
         held.evaluate({"far": 1.0})
 
 
 @pytest.mark.parametrize("window", [Window(2 * STEP_NS), Window(0, 20 * STEP_NS), Window(STEP_NS, every=3)])
 def test_a_window_is_evaluated_as_a_replay_evaluates_it(window: Window) -> None:
-    held = Tuning(PiecewiseSource(run(40), 7), [specification(WRITTEN + PAST)], window=window)
-    replayed = sr.replay.Replay(
-        PiecewiseSource(run(40), 4), [specification(WRITTEN + PAST)], window=window, keep_series=True
+    held = Tuning(PiecewiseSource(run(40), 7), [specification(WRITTEN + PAST)], ReplayOptions(window))
+    replayed = run_replay(
+        PiecewiseSource(run(40), 4),
+        [specification(WRITTEN + PAST)],
+        ReplayOptions(window),
+        keep_series=True,
     )
-    for _ in replayed.iter_messages():
-        pass
-    expected = [result.series for result in replayed.result().results]
+    expected = [result.series for result in replayed.results]
     for own, other in zip(numbers(held.evaluate()), expected, strict=True):
         assert other is not None
         np.testing.assert_array_equal(own, other)
@@ -127,7 +137,7 @@ def test_a_window_is_evaluated_as_a_replay_evaluates_it(window: Window) -> None:
 def test_a_template_is_evaluated_for_its_objects() -> None:
     text = "const far = 0.5\nspec calm(ego) = G (ego dist cube >= far)\n"
     source = PiecewiseSource(run(12), 5)
-    held = Tuning(source, [specification(text)], each={"ego": "class:dish"})
+    held = Tuning(source, [specification(text)], ReplayOptions(each={"ego": "class:dish"}))
     assert [tree.object for tree in held.evaluate({"far": 0.0}).evaluation.trees] == ["cup 物"]
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import spatial_replay as sr
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.logs.source import MemorySource
-from spatial_replay.replay import load_files
+from spatial_replay.replay import ReplayOptions, load_files
 from spatial_replay.report.write import write_report
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.trace.trace import Trace
@@ -82,7 +82,7 @@ def report_of_samples(output: Path, samples: Iterable[sr.Sample], *texts: str, *
 def report_of_trace(output: Path, trace: Trace, *texts: str, **options: Any) -> Page:
     """The page of a trace and specifications."""
     files = [sr.parse_specification(text) for text in texts]
-    write_report(MemorySource(trace), files, output, **options)
+    write_report(MemorySource(trace), files, output, ReplayOptions(**options))
     return page_of(output)
 
 
@@ -116,5 +116,5 @@ def report_of_recording(output: Path, log: str, *specs: str, **options: Any) -> 
     """The page of a recording."""
     source = open_source(RECORDINGS / log)
     files = load_files([RECORDINGS / spec for spec in specs], source)
-    write_report(source, files, output, **options)
+    write_report(source, files, output, ReplayOptions(**options))
     return page_of(output)

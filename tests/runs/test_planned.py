@@ -9,8 +9,7 @@ import pytest
 import spatial_replay as sr
 from spatial_replay.planning.read import read_decisions
 from spatial_replay.planning.recompute import redo_decisions
-from spatial_replay.replay import load_files, run_replay
-from spatial_replay.replay.verification import verify_certificate
+from spatial_replay.replay import load_files, run_replay, verify_certificate
 from spatial_replay.runs.planned import PlannedRun, record_plan
 from spatial_replay.sources.open_log import open_source
 

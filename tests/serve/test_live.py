@@ -36,8 +36,7 @@ from spatial_replay.logs.topics import (
     SPECIFICATION,
     protobuf_channel,
 )
-from spatial_replay.replay import run_replay
-from spatial_replay.replay.tuning import Tuning
+from spatial_replay.replay import Tuning, run_replay
 from spatial_replay.serve.serving import Serving, serving
 from spatial_replay.sources.open_log import open_source
 

@@ -24,8 +24,7 @@ from spatial_replay.annotate.curves import CURVES_CHANNEL
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.topics import ROBUSTNESS
-from spatial_replay.replay.playback import Playback
-from spatial_replay.replay.tuning import Tuned, Tuning
+from spatial_replay.replay import Playback, Tuned, Tuning
 from spatial_replay.serve.player import MOST_A_SECOND, Level, Note, Player
 from spatial_replay.serve.services import MOST_OPEN, Questions
 from spatial_replay.serve.session import MOST_LATE_S, Session, State, Status

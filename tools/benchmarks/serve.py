@@ -19,7 +19,7 @@ from websockets.typing import Subprotocol
 import spatial_replay as sr
 from spatial_replay.logs.source import MemorySource
 from spatial_replay.logs.topics import CURVES_TOPIC, SCENE
-from spatial_replay.replay.tuning import Tuning
+from spatial_replay.replay import Tuning
 from spatial_replay.serve.serving import serving
 from spatial_replay.trace.trace import Trace
 
