@@ -21,13 +21,13 @@ from spatial_replay.text import counted
     type=click.Path(path_type=Path),
     help="Evaluate what the log was made of instead of the log itself.",
 )
-@click.option("--decisions", is_flag=True, help="Make the decisions of a planned run again, too.")
+@click.option("--decisions", is_flag=True, help="Recompute the decisions of a planned run, too.")
 @reading_options
 def verify(log: Path, source: Path | None, decisions: bool, reading: Reading) -> int:
     """Compute a log's certificate again, and compare it with the one in the log.
 
     The log is evaluated with its own specifications and options. With --decisions, every decision of a
-    planner is made again from the recorded samples, with all its maps, and compared bit for bit; with
+    planner is recomputed from the recorded samples, with all its maps, and compared bit for bit; with
     --source, those in the source. Exits with 0 if all is equal, else with 1.
 
     \b
@@ -37,7 +37,7 @@ def verify(log: Path, source: Path | None, decisions: bool, reading: Reading) ->
       spatial-replay verify push.mcap --decisions
     """
     # the numerical libraries load when there is work for them
-    from spatial_replay.planning.recompute import redo_decisions
+    from spatial_replay.planning.recompute import recompute_decisions
     from spatial_replay.replay.verification import verify_certificate
     from spatial_replay.sources.open_log import open_source
 
@@ -54,13 +54,13 @@ def verify(log: Path, source: Path | None, decisions: bool, reading: Reading) ->
     if decisions:
         planned = own if made_of is None else made_of
         with progress("samples") as advance:
-            redone = redo_decisions(planned, advance)
-        faults += redone.faults
-        differences += [f"{planned.name}: {each}" for each in redone.differences]
-        if not redone.differences:
+            recomputed = recompute_decisions(planned, advance)
+        faults += recomputed.faults
+        differences += [f"{planned.name}: {each}" for each in recomputed.differences]
+        if not recomputed.differences:
             click.echo(
-                f"{planned.name}: {counted(redone.decisions, 'decision')} made again on "
-                f"{counted(redone.maps, 'map')}, all as recorded"
+                f"{planned.name}: {counted(recomputed.decisions, 'decision')} recomputed on "
+                f"{counted(recomputed.maps, 'map')}, all as recorded"
             )
     for fault in dict.fromkeys(faults):
         say("warning", fault, colour="yellow")

@@ -1,16 +1,9 @@
-"""The planner's messages in a log: what it decided, on which maps, and how that went.
-
-Decisions, and what came of them, as messages.
-
-Gradient maps as messages that viewers draw, one for each way in which an object may be turned.
-
-The path of an object that is moved, as a message that viewers draw.
-"""
+"""The planner's messages in a log: decisions with their outcomes, gradient maps, paths to draw."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
@@ -21,11 +14,11 @@ from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from google.protobuf.message import Message
+from google.protobuf.message import DecodeError, Message
 
 from spatial_replay.annotate.scene_entities import FRAME, outlines_of
 from spatial_replay.annotate.scene_update import cell_colours
-from spatial_replay.errors import UsageError
+from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.logs.messages import Messages, merge, messages_of
@@ -55,43 +48,180 @@ from spatial_replay.planning.maps import GradientMap, centre_of, moved_object
 from spatial_replay.planning.planner import Planner
 from spatial_replay.trace.sample import Sample
 
+PLAN_METADATA: Final = "spatial_replay_plan"
+"""Name of the metadata record with the settings and the specification that decisions depend on."""
+
+_DECISIONS: Final = protobuf_channel(PLAN_DECISION, PlanDecision)
+_MAPS: Final = protobuf_channel(GRADIENT_MAP, GridMessage)
+_PATHS: Final = protobuf_channel(PLAN_PATH, SceneUpdate)
+_CHANNELS: Final = (_DECISIONS, _MAPS, _PATHS)
+
 CELL: Final = np.dtype([("robustness", "<f4"), ("colour", "u1", (4,))])
 """A map's cell: its robustness, NaN where it is blocked, and red, green, blue and alpha."""
 
 _COLOURS: Final = ("red", "green", "blue", "alpha")
 _DEPTH: Final = 0.1
-"""How far below the plane a map lies, by the size of its cells: regions are drawn in the plane."""
+"""Depth of a map below the plane, in cells, so that it does not hide the regions in the plane."""
+
+_KINDS: MappingProxyType[Kind, PlanDecision.Kind.ValueType] = MappingProxyType(
+    {
+        "execute": PlanDecision.KIND_EXECUTE,
+        "hold": PlanDecision.KIND_HOLD,
+        "wait": PlanDecision.KIND_WAIT,
+        "no path": PlanDecision.KIND_NO_PATH,
+    }
+)
+
+_PATH, _TRAVELLED = "plan/way", "plan/travelled"
+_PIXELS = 3.0
+"""Width of lines on the screen."""
+
+
+class BlackBox:
+    """A planner together with the messages of all its decisions.
+
+    Samples, decisions and outcomes have to go through it in the order in which they happen. Equal ones give
+    equal bytes, so that a log can be verified by recomputing it.
+    """
+
+    def __init__(self, planner: Planner) -> None:
+        """Begin before the first sample."""
+        self.planner = planner
+        self._written = dict.fromkeys(_CHANNELS, 0)
+        self._sample: Sample | None = None
+        self._step: Step | None = None
+        self._decision = PlanDecision()
+        self._tracked: TrackedObject | None = None
+        self._travelled: list[tuple[float, float]] = []
+
+    def observe(self, sample: Sample) -> None:
+        """Take the next sample.
+
+        Raises:
+            TraceError: its time is not after that of the last one.
+        """
+        self.planner.observe(sample)
+        self._sample = sample
+        tracked = self._object_moved()
+        if tracked is not None:
+            self._travelled.append(centre_of(tracked.footprint))
+
+    def decide(self) -> tuple[Step, Messages]:
+        """Return the planner's next step and its messages; none while the same wait goes on.
+
+        The outcome of a wait comes with the decision after it.
+
+        Raises:
+            UsageError: nothing was observed yet, or the last step was not concluded.
+        """
+        step = self.planner.next_step()
+        if step is self._step:
+            return step, self._messages(step.time_ns, [], [], [])
+        ended = self._ended_wait(step.time_ns)
+        self._step = step
+        self._tracked = self._object_moved()
+        self._travelled = [] if self._tracked is None else [centre_of(self._tracked.footprint)]
+        self._decision = decision_message(step, self.planner.automaton.name, self._written[_MAPS])
+        maps = [map_message(turned, step.time_ns) for turned in maps_of(step)]
+        path = path_message(step.target, self._tracked, step.time_ns)
+        return step, self._messages(step.time_ns, [*ended, self._decision], maps, [path])
+
+    def conclude(self, outcome: Outcome) -> Messages:
+        """Take the outcome of the last step, and return its messages.
+
+        Raises:
+            UsageError: no step is being executed.
+        """
+        self.planner.conclude(outcome)
+        if self._step is None or self._sample is None:
+            raise UsageError("no step is being executed; decide on one first")
+        step, end_ns = self._step, self._sample.time_ns
+        concluded = self._concluded(outcome, end_ns)
+        path = path_message(step.target, self._tracked, end_ns, self._travelled)
+        self._step = None
+        return self._messages(end_ns, [concluded], [], [path])
+
+    def _ended_wait(self, end_ns: int) -> list[PlanDecision]:
+        """Return the last decision with its outcome if it was a wait."""
+        if self._step is None or self._step.kind != "wait":
+            return []
+        return [self._concluded(wait_outcome(self._step, self.planner.states), end_ns)]
+
+    def _concluded(self, outcome: Outcome, end_ns: int) -> PlanDecision:
+        """Return the last decision with its outcome."""
+        message = outcome_message(outcome, end_ns, self.planner.states, self._travelled)
+        self._decision.outcome.CopyFrom(message)
+        return self._decision
+
+    def _object_moved(self) -> TrackedObject | None:
+        """Return the object that the last step moves, from the newest sample."""
+        if self._step is None or self._step.target is None or self._sample is None:
+            return None
+        tracked = self._sample.objects.get(self._step.target.name)
+        return tracked if isinstance(tracked, TrackedObject) else None
+
+    def _messages(self, time_ns: int, *of_channels: Sequence[Message]) -> Messages:
+        """Return messages of each channel, numbered on from those before."""
+        streams = []
+        for channel, messages in zip(_CHANNELS, of_channels, strict=True):
+            first = self._written[channel]
+            self._written[channel] += len(messages)
+            payloads = [message.SerializeToString(deterministic=True) for message in messages]
+            times_ns = np.full(len(payloads), time_ns, np.int64)
+            streams.append(messages_of(channel, times_ns, payloads, first))
+        return merge(streams)
+
+
+def decision_from_payload(payload: bytes) -> PlanDecision:
+    """Decode a message on the topic of decisions.
+
+    Raises:
+        LogError: it is damaged.
+    """
+    try:
+        return PlanDecision.FromString(payload)
+    except DecodeError as error:
+        raise LogError(f"a message on {PLAN_DECISION} cannot be read: {error}") from error
+
+
+def latest_decisions(decisions: Iterable[PlanDecision]) -> tuple[PlanDecision, ...]:
+    """Return decisions by number, of each the latest message.
+
+    A decision is written twice if it has an outcome; the second message repeats the first one.
+    """
+    by_number = {decision.number: decision for decision in decisions}
+    return tuple(by_number[number] for number in sorted(by_number))
 
 
 class TurnedMap(NamedTuple):
-    """A candidate's map with the object turned in one way, by its place among the map's turns."""
+    """A candidate's map for one orientation of the object, the index into the map's turns."""
 
     candidate: Candidate
     turn: int
 
 
 def maps_of(step: Step) -> list[TurnedMap]:
-    """Every map that a step rests on, edge after edge, in the order in which a log has them.
+    """Return all maps that a step depends on, by edge, in the order in which a log has them.
 
-    Viewers draw the last one: that of the object chosen, turned as it is to be.
+    The chosen object in its target orientation comes last, since a viewer shows the last message of a topic.
     """
     return [
         TurnedMap(candidate, turn)
         for edge in step.considered
         for candidate in sorted(edge.candidates, key=lambda each: each.is_chosen)
-        for turn in sorted(range(len(candidate.map.turns)), key=lambda turn: _is_meant(candidate, turn))
+        for turn in sorted(range(len(candidate.map.turns)), key=lambda turn: _is_aim(candidate, turn))
     ]
 
 
-def _is_meant(candidate: Candidate, turn: int) -> bool:
-    """Whether the object is to be turned in this way."""
+def _is_aim(candidate: Candidate, turn: int) -> bool:
+    """Return whether the target has this orientation."""
     return candidate.target is not None and candidate.target.turn == candidate.map.turns[turn]
 
 
 def map_message(turned: TurnedMap, time_ns: int) -> GridMessage:
-    """A map that lies under the scene, in its colours; those of blocked cells are clear."""
-    found = turned.candidate.map
-    grid, values = found.grid, found.values[turned.turn]
+    """Return a map as a message, drawn under the scene; blocked cells are transparent."""
+    gradient = turned.candidate.map
+    grid, values = gradient.grid, gradient.values[turned.turn]
     cells = np.empty(values.shape, CELL)
     cells["robustness"] = values
     cells["colour"] = cell_colours(values)
@@ -113,26 +243,16 @@ def map_message(turned: TurnedMap, time_ns: int) -> GridMessage:
     return message
 
 
-def map_digest(found: GradientMap) -> bytes:
-    """SHA-256 of a map's values: little-endian float64 by turn, row and column, NaN where blocked."""
-    return hashlib.sha256(np.ascontiguousarray(found.values, "<f8").tobytes()).digest()
-
-
-_KINDS: MappingProxyType[Kind, PlanDecision.Kind.ValueType] = MappingProxyType(
-    {
-        "execute": PlanDecision.KIND_EXECUTE,
-        "hold": PlanDecision.KIND_HOLD,
-        "wait": PlanDecision.KIND_WAIT,
-        "no path": PlanDecision.KIND_NO_PATH,
-    }
-)
+def map_digest(gradient: GradientMap) -> bytes:
+    """Return the SHA-256 of a map's values: little-endian float64 by turn, row and column, NaN if blocked."""
+    return hashlib.sha256(np.ascontiguousarray(gradient.values, "<f8").tobytes()).digest()
 
 
 def decision_message(step: Step, specification: str, first_map: int) -> PlanDecision:
-    """A decision, without an outcome.
+    """Return a decision as a message, without an outcome.
 
     Args:
-        first_map: how many maps the log has before those of this step.
+        first_map: the number of the step's first map in the log.
     """
     numbers = {turned: number for number, turned in enumerate(maps_of(step), first_map)}
     return PlanDecision(
@@ -154,7 +274,7 @@ def decision_message(step: Step, specification: str, first_map: int) -> PlanDeci
 def outcome_message(
     outcome: Outcome, end_ns: int, states: Sequence[int], travelled: Sequence[tuple[float, float]]
 ) -> PlanOutcome:
-    """How a step went, and where its object and the automaton were then."""
+    """Return the outcome of a step as a message, with the object's path and the automaton's states."""
     return PlanOutcome(
         end_ns=end_ns,
         succeeded=outcome.succeeded,
@@ -210,17 +330,16 @@ def _target(target: Target) -> PlanTarget:
     )
 
 
-_WAY, _TRAVELLED = "plan/way", "plan/travelled"
-_PIXELS = 3.0
-
-
 def path_message(
     target: Target | None,
     tracked: TrackedObject | None,
     time_ns: int,
     travelled: Sequence[tuple[float, float]] = (),
 ) -> SceneUpdate:
-    """The way to a target, its object's outline there, the way it has travelled; all gone without one."""
+    """Return the path to a target, the object's outline there and the path travelled, as a message.
+
+    Without a target, the message deletes what was drawn before.
+    """
     message = SceneUpdate()
     lines: dict[str, list[tuple[list[tuple[float, float]], bool, tuple[float, float, float]]]] = {}
     height = 0.0
@@ -228,10 +347,10 @@ def path_message(
         height = 0.0 if tracked.height is None else tracked.height[1]
         there = moved_object(tracked, target.x, target.y, target.turn)
         outlines = [(points, True, POSITIVE) for points in map(_points, outlines_of(there.footprint))]
-        lines[_WAY] = [(list(target.waypoints), False, POSITIVE), *outlines]
+        lines[_PATH] = [(list(target.waypoints), False, POSITIVE), *outlines]
         if travelled:
             lines[_TRAVELLED] = [(list(travelled), False, NEUTRAL)]
-    for identifier in (_WAY, _TRAVELLED):
+    for identifier in (_PATH, _TRAVELLED):
         if identifier not in lines:
             deletion = message.deletions.add(type=SceneEntityDeletion.MATCHING_ID, id=identifier)
             deletion.timestamp.FromNanoseconds(time_ns)
@@ -261,107 +380,3 @@ def _add_line(
 
 def _points(ring: Floats) -> list[tuple[float, float]]:
     return [(x, y) for x, y in ring.tolist()]
-
-
-PLAN_METADATA: Final = "spatial_replay_plan"
-"""The metadata record with what decisions depend on besides samples: settings, and which specification."""
-
-_DECISIONS: Final = protobuf_channel(PLAN_DECISION, PlanDecision)
-_MAPS: Final = protobuf_channel(GRADIENT_MAP, GridMessage)
-_PATHS: Final = protobuf_channel(PLAN_PATH, SceneUpdate)
-_CHANNELS: Final = (_DECISIONS, _MAPS, _PATHS)
-
-
-class BlackBox:
-    """A planner and a record of everything it decides.
-
-    Samples, `decide` and `conclude` go through it in the order in which they happen; equal ones give equal
-    bytes.
-    """
-
-    def __init__(self, planner: Planner) -> None:
-        """Begin before the first sample."""
-        self.planner = planner
-        self._written = dict.fromkeys(_CHANNELS, 0)
-        self._sample: Sample | None = None
-        self._step: Step | None = None
-        self._decision = PlanDecision()
-        self._tracked: TrackedObject | None = None
-        self._travelled: list[tuple[float, float]] = []
-
-    def observe(self, sample: Sample) -> None:
-        """Take in the next sample.
-
-        Raises:
-            TraceError: it does not come after the one before.
-        """
-        self.planner.observe(sample)
-        self._sample = sample
-        tracked = self._object_moved()
-        if tracked is not None:
-            self._travelled.append(centre_of(tracked.footprint))
-
-    def decide(self) -> tuple[Step, Messages]:
-        """The planner's next step, and the messages that tell of it; none while the same wait goes on.
-
-        What became of a wait is told when something else is decided.
-
-        Raises:
-            UsageError: nothing was observed yet, or the last step was not concluded.
-        """
-        step = self.planner.next_step()
-        if step is self._step:
-            return step, self._messages(step.time_ns, [], [], [])
-        waited = self._waited(step.time_ns)
-        self._step = step
-        self._tracked = self._object_moved()
-        self._travelled = [] if self._tracked is None else [centre_of(self._tracked.footprint)]
-        self._decision = decision_message(step, self.planner.automaton.name, self._written[_MAPS])
-        maps = [map_message(turned, step.time_ns) for turned in maps_of(step)]
-        path = path_message(step.target, self._tracked, step.time_ns)
-        return step, self._messages(step.time_ns, [*waited, self._decision], maps, [path])
-
-    def conclude(self, outcome: Outcome) -> Messages:
-        """Say how the last step went; the messages that tell of it.
-
-        Raises:
-            UsageError: no step is being executed.
-        """
-        self.planner.conclude(outcome)
-        if self._step is None or self._sample is None:
-            raise UsageError("no step is being executed; decide on one first")
-        step, end_ns = self._step, self._sample.time_ns
-        told = self._concluded(outcome, end_ns)
-        path = path_message(step.target, self._tracked, end_ns, self._travelled)
-        self._step = None
-        return self._messages(end_ns, [told], [], [path])
-
-    def _waited(self, end_ns: int) -> list[PlanDecision]:
-        """The last decision with its outcome, if it was to wait."""
-        if self._step is None or self._step.kind != "wait":
-            return []
-        return [self._concluded(wait_outcome(self._step, self.planner.states), end_ns)]
-
-    def _concluded(self, outcome: Outcome, end_ns: int) -> PlanDecision:
-        """The last decision with its outcome."""
-        told = outcome_message(outcome, end_ns, self.planner.states, self._travelled)
-        self._decision.outcome.CopyFrom(told)
-        return self._decision
-
-    def _object_moved(self) -> TrackedObject | None:
-        """The object that the last step moves, as it is now."""
-        if self._step is None or self._step.target is None or self._sample is None:
-            return None
-        tracked = self._sample.objects.get(self._step.target.name)
-        return tracked if isinstance(tracked, TrackedObject) else None
-
-    def _messages(self, time_ns: int, *of_channels: Sequence[Message]) -> Messages:
-        """Messages of each channel, as the log numbers them."""
-        streams = []
-        for channel, messages in zip(_CHANNELS, of_channels, strict=True):
-            first = self._written[channel]
-            self._written[channel] += len(messages)
-            payloads = [message.SerializeToString(deterministic=True) for message in messages]
-            times_ns = np.full(len(payloads), time_ns, np.int64)
-            streams.append(messages_of(channel, times_ns, payloads, first))
-        return merge(streams)

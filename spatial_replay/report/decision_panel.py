@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -12,6 +13,7 @@ from foxglove_schemas_protobuf.Grid_pb2 import Grid
 from google.protobuf.message import DecodeError
 
 from spatial_replay.annotate.sentences import number_text
+from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanCandidate,
@@ -20,6 +22,7 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanGuard,
     PlanTarget,
 )
+from spatial_replay.planning.decision_log import decision_from_payload, latest_decisions
 from spatial_replay.planning.decisions import Reason
 from spatial_replay.report.compact import Packing, singles
 
@@ -45,17 +48,13 @@ class PlanMaker:
     """Takes decisions and maps from messages as they come."""
 
     def __init__(self) -> None:
-        self._decisions: dict[int, PlanDecision] = {}
+        self._decisions: list[PlanDecision] = []
         self._maps: dict[int, Grid] = {}
 
     def add_decision(self, payload: bytes) -> None:
         """Take in a decision; one that cannot be read tells nothing."""
-        try:
-            decision = PlanDecision.FromString(payload)
-        except DecodeError:
-            return
-        # the one with the outcome comes later and says everything that the first one does
-        self._decisions[decision.number] = decision
+        with suppress(LogError):
+            self._decisions.append(decision_from_payload(payload))
 
     def add_map(self, number: int, payload: bytes) -> None:
         """Take in a gradient map; one that cannot be read is none."""
@@ -66,7 +65,7 @@ class PlanMaker:
 
     def plan(self) -> Plan:
         """What was taken so far."""
-        return Plan(tuple(self._decisions[number] for number in sorted(self._decisions)), dict(self._maps))
+        return Plan(latest_decisions(self._decisions), dict(self._maps))
 
 
 class _Owner(NamedTuple):

@@ -67,11 +67,11 @@ def test_a_log_that_was_cut_short_has_no_certificate(recorded: Path, tmp_path: P
     assert "no certificate" in said
 
 
-def test_decisions_are_made_again(tmp_path: Path) -> None:
+def test_decisions_are_recomputed(tmp_path: Path) -> None:
     record_plan_of(tmp_path / "run.mcap")
     code, said = call("verify", tmp_path / "run.mcap", "--decisions")
     assert code == 0
-    assert "3 decisions made again on 9 maps" in said
+    assert "3 decisions recomputed on 9 maps" in said
 
 
 def test_decisions_that_differ_are_named(tmp_path: Path) -> None:
@@ -88,7 +88,7 @@ def test_decisions_are_those_of_the_source(tmp_path: Path) -> None:
     for name in ("layer.mcap", "cut.mcap"):
         code, said = call("verify", tmp_path / name, "--decisions", "--source", tmp_path / "run.mcap")
         assert code == 0
-        assert "run.mcap: 3 decisions made again on 9 maps" in said
+        assert "run.mcap: 3 decisions recomputed on 9 maps" in said
     with pytest.raises(sr.UsageError, match="begins within the run"):
         call("verify", tmp_path / "cut.mcap", "--decisions")
 
@@ -140,7 +140,7 @@ def test_decisions_of_a_log_that_was_cut_short_are_told(tmp_path: Path) -> None:
     assert "step 0 at 0.000 s, state 0" in said
     code, said = call("verify", tmp_path / "cut.mcap", "--decisions")
     assert code == 1
-    assert "made again" in said
+    assert "recomputed on" in said
     assert "no certificate" in said
 
 

@@ -19,8 +19,8 @@ from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_PATH
 from spatial_replay.planning.decision_log import CELL
 from spatial_replay.planning.decisions import Reason
-from spatial_replay.planning.read import read_decisions
-from spatial_replay.planning.recompute import planner_of, redo_decisions
+from spatial_replay.planning.read import planner_of, read_decisions
+from spatial_replay.planning.recompute import recompute_decisions
 from spatial_replay.planning.settings import Settings, settings_from_text, text_from_settings
 from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.replay import ReplayOptions, Window, load_files, run_replay, verify_certificate
@@ -49,10 +49,10 @@ def test_decisions_are_told_with_their_outcomes(tmp_path):
 
 def test_decisions_made_again_are_the_same(tmp_path):
     steps = record_plan_of(tmp_path / "run.mcap", slips=1)
-    redone = redo_decisions(open_source(tmp_path / "run.mcap"))
-    assert redone.differences == ()
-    assert redone.decisions == len(steps)
-    assert redone.maps == sum(len(each.candidates) for step in steps for each in step.considered)
+    recomputed = recompute_decisions(open_source(tmp_path / "run.mcap"))
+    assert recomputed.differences == ()
+    assert recomputed.decisions == len(steps)
+    assert recomputed.maps == sum(len(each.candidates) for step in steps for each in step.considered)
 
 
 def test_equal_runs_give_equal_logs(tmp_path):
@@ -63,7 +63,7 @@ def test_equal_runs_give_equal_logs(tmp_path):
 
 def test_other_settings_make_other_decisions(tmp_path):
     record_plan_of(tmp_path / "run.mcap", told=replace(PUSH, margin=0.03))
-    (first, *_) = redo_decisions(open_source(tmp_path / "run.mcap")).differences
+    (first, *_) = recompute_decisions(open_source(tmp_path / "run.mcap")).differences
     assert "/plan/decision differs in" in first
     assert "of decision 0" in first
 
@@ -73,30 +73,30 @@ def test_a_sample_that_was_changed_shows(tmp_path):
         return sr.Sample(sample.time_ns, {**sample.objects, "red": block(0.5, -0.0500001, math.pi / 4)})
 
     record_plan_of(tmp_path / "run.mcap", seen_as=seen_as)
-    assert redo_decisions(open_source(tmp_path / "run.mcap")).differences
+    assert recompute_decisions(open_source(tmp_path / "run.mcap")).differences
 
 
 @pytest.mark.parametrize(
     ("most_told", "missing"),
     [
-        (0, "the log tells no decision"),
-        (1, "the log does not tell how decision 0 at 0.000 s went"),
-        (2, "the log tells nothing after decision 0 at 0.000 s"),
-        (3, "the log does not tell how decision 1 at 0.100 s went"),
-        (4, "the log tells nothing after decision 1 at 0.100 s"),
+        (0, "the log has no decision"),
+        (1, "the log has no outcome of decision 0 at 0.000 s"),
+        (2, "the log has no decision after decision 0 at 0.000 s"),
+        (3, "the log has no outcome of decision 1 at 0.100 s"),
+        (4, "the log has no decision after decision 1 at 0.100 s"),
     ],
 )
 def test_decisions_that_are_not_told_show(tmp_path, most_told, missing):
     record_plan_of(tmp_path / "run.mcap", most_told=most_told)
-    (difference,) = redo_decisions(open_source(tmp_path / "run.mcap")).differences
+    (difference,) = recompute_decisions(open_source(tmp_path / "run.mcap")).differences
     assert difference.startswith(missing)
 
 
 def test_a_wait_whose_end_is_not_told_shows(tmp_path):
     text = "F[30,900] (green rightof red)"
     record_plan_of(tmp_path / "run.mcap", f"use spatial_spec\nspec late = {text}", most_told=1)
-    (difference,) = redo_decisions(open_source(tmp_path / "run.mcap")).differences
-    assert difference.startswith("the log tells nothing after decision 0")
+    (difference,) = recompute_decisions(open_source(tmp_path / "run.mcap")).differences
+    assert difference.startswith("the log has no decision after decision 0")
 
 
 def cut(log, to, window):
@@ -109,14 +109,14 @@ def test_what_is_left_of_a_run_is_enough_if_it_is_the_beginning(tmp_path):
     record_plan_of(tmp_path / "run.mcap", slips=1)
     first, second, *_ = read_decisions(tmp_path / "run.mcap").decisions
     cut(tmp_path / "run.mcap", tmp_path / "begun.mcap", Window(end_ns=second.time_ns + 1))
-    redone = redo_decisions(open_source(tmp_path / "begun.mcap"))
-    assert redone.differences == ()
-    assert redone.decisions == second.number + 1
+    recomputed = recompute_decisions(open_source(tmp_path / "begun.mcap"))
+    assert recomputed.differences == ()
+    assert recomputed.decisions == second.number + 1
     cut(tmp_path / "run.mcap", tmp_path / "cut.mcap", Window(start_ns=first.time_ns + 1))
     cut(tmp_path / "cut.mcap", tmp_path / "copy.mcap", Window())
     for name in ("cut.mcap", "copy.mcap"):
         with pytest.raises(UsageError, match=f"{name} begins within the run"):
-            redo_decisions(open_source(tmp_path / name))
+            recompute_decisions(open_source(tmp_path / name))
 
 
 def test_a_replay_keeps_what_was_decided(tmp_path):
@@ -124,7 +124,7 @@ def test_a_replay_keeps_what_was_decided(tmp_path):
     (tmp_path / "edited.spatial").write_text("use spatial_spec\nF (red above blue)\n")
     edited = load_specification(tmp_path / "edited.spatial")
     run_replay(open_source(tmp_path / "run.mcap"), [edited], output=tmp_path / "annotated.mcap")
-    assert redo_decisions(open_source(tmp_path / "annotated.mcap")).differences == ()
+    assert recompute_decisions(open_source(tmp_path / "annotated.mcap")).differences == ()
 
 
 def test_certificates_count_what_was_decided(tmp_path):
@@ -253,7 +253,7 @@ def test_a_log_without_decisions_has_none_to_make_again(tmp_path):
     with sr.Recorder(tmp_path / "run.mcap") as recorder:
         recorder.write(sr.Sample(0, BLOCKS))
     with pytest.raises(UsageError, match="holds no decisions"):
-        redo_decisions(open_source(tmp_path / "run.mcap"))
+        recompute_decisions(open_source(tmp_path / "run.mcap"))
     with pytest.raises(UsageError, match="holds no decisions"):
         read_decisions(tmp_path / "run.mcap")
 

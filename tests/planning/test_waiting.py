@@ -14,7 +14,7 @@ from spatial_replay.planning import read_steps
 from spatial_replay.planning.maps import moved_object
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.read import read_decisions
-from spatial_replay.planning.recompute import redo_decisions
+from spatial_replay.planning.recompute import recompute_decisions
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.sources.open_log import open_source
@@ -113,7 +113,7 @@ def test_a_wait_is_told_once_with_its_outcome(tmp_path, text):
     assert wait.outcome.succeeded
     assert wait.outcome.reason == "the time has passed"
     assert wait.outcome.end_ns == steps[1].time_ns
-    redone = redo_decisions(open_source(log))
-    assert redone.differences == ()
-    assert redone.decisions == len(steps)
+    recomputed = recompute_decisions(open_source(log))
+    assert recomputed.differences == ()
+    assert recomputed.decisions == len(steps)
     assert [each.step.reason for each in read_steps(log)] == [each.reason for each in steps]

@@ -8,7 +8,7 @@ import pytest
 
 import spatial_replay as sr
 from spatial_replay.planning.read import read_decisions
-from spatial_replay.planning.recompute import redo_decisions
+from spatial_replay.planning.recompute import recompute_decisions
 from spatial_replay.replay import load_files, run_replay, verify_certificate
 from spatial_replay.runs.planned import PlannedRun, record_plan
 from spatial_replay.sources.open_log import open_source
@@ -41,9 +41,9 @@ def test_a_replay_says_that_it_is_satisfied(pushed: tuple[Path, PlannedRun]) -> 
 def test_decisions_and_certificate_are_confirmed(pushed: tuple[Path, PlannedRun]) -> None:
     source = open_source(pushed[0])
     assert verify_certificate(source).differences == ()
-    redone = redo_decisions(source)
-    assert redone.differences == ()
-    assert redone.decisions == len(read_decisions(pushed[0]).decisions)
+    recomputed = recompute_decisions(source)
+    assert recomputed.differences == ()
+    assert recomputed.decisions == len(read_decisions(pushed[0]).decisions)
 
 
 def test_what_cannot_be_done_ends_and_says_why(tmp_path: Path) -> None:
