@@ -153,7 +153,8 @@ def search(free: Flags, goals: Flags, box: Integers, start_row: int, start_colum
 
 @piece
 def _sign(value: int) -> int:
-    return (value > 0) - (value < 0)
+    # numpy refuses to subtract booleans, and the kernel also runs uncompiled
+    return int(value > 0) - int(value < 0)
 
 
 @piece

@@ -140,7 +140,7 @@ def test_decisions_of_a_log_that_was_cut_short_are_told(tmp_path: Path) -> None:
     assert "step 0 at 0.000 s, state 0" in said
     code, said = call("verify", tmp_path / "cut.mcap", "--decisions")
     assert code == 1
-    assert "recomputed on" in said
+    assert "recomputed" in said
     assert "no certificate" in said
 
 
