@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -9,6 +11,7 @@ from importlib.resources import files
 from types import MappingProxyType
 from typing import Any
 
+import lark
 from lark import Lark, Token
 from lark.exceptions import UnexpectedToken
 from lark.lexer import Lexer
@@ -22,6 +25,8 @@ from spatial_replay.spec.tokens import BINARY_TYPES, KEYWORDS, STATEMENT_TYPES, 
 FORMULA_NAME = "spec"
 """The name of the specification in a text that is only a formula."""
 
+TABLES_FILE = "grammar_tables.json"
+"""Written by `tools/make_grammar`."""
 _OPENING = frozenset({"LPAR", "LSQB"})
 _STATEMENT_WORDS = tuple(word for word, kind in KEYWORDS.items() if kind in STATEMENT_TYPES)
 
@@ -139,13 +144,44 @@ class _Tokens(Lexer):
 
 @cache
 def grammar() -> Lark:
-    """The compiled grammar; a conflict in it would be an error here."""
-    text = files("spatial_replay.spec").joinpath("grammar.lark").read_text(encoding="utf-8")
+    """Return the parser of statements and formulas; a conflict in the grammar would be an error here.
+
+    Working out the parser's tables takes longer than reading a specification, so they are kept in a file beside
+    the grammar. It is used if it was made from this grammar by the same version of the library.
+    """
+    text = _resource("grammar.lark")
+    tables: Any = json.loads(_resource(TABLES_FILE), object_hook=_with_numbers)
+    if tables["made_from"] == made_from(text):
+        data = tables["data"]
+        data["options"] |= {"lexer": _Tokens}
+        data["parser"]["lexer_conf"]["lexer_type"] = _Tokens
+        load: Any = Lark._load_from_dict
+        loaded: Lark = load(data, tables["memo"], transformer=TreeBuilder())
+        return loaded
+    return built_grammar(text)
+
+
+def built_grammar(text: str) -> Lark:
+    """Return the parser of a grammar, its tables worked out."""
     builder: Any = TreeBuilder()
     return Lark(
         text, parser="lalr", lexer=_Tokens, start=["statement", "formula"], strict=True,
         maybe_placeholders=True, transformer=builder,
     )  # fmt: skip
+
+
+def made_from(grammar_text: str) -> str:
+    """Return what tables depend on: the library's version and a digest of the grammar."""
+    return f"lark {lark.__version__}, grammar {hashlib.sha256(grammar_text.encode()).hexdigest()}"
+
+
+def _resource(name: str) -> str:
+    return files("spatial_replay.spec").joinpath(name).read_text(encoding="utf-8")
+
+
+def _with_numbers(table: dict[str, Any]) -> dict[Any, Any]:
+    """Return a table whose keys are numbers where JSON made texts of them."""
+    return {int(key) if key.isdecimal() else key: value for key, value in table.items()}
 
 
 def _parse_group(group: TokenGroup, relations: Collection[str], faults: Faults) -> Statement | None:
