@@ -146,8 +146,8 @@ class _Tokens(Lexer):
 def grammar() -> Lark:
     """Return the parser of statements and formulas; a conflict in the grammar would be an error here.
 
-    Working out the parser's tables takes longer than reading a specification, so they are kept in a file beside
-    the grammar. It is used if it was made from this grammar by the same version of the library.
+    Working out the parser's tables takes longer than reading a specification, so they are kept in a file
+    beside the grammar. It is used if it was made from this grammar by the same version of the library.
     """
     text = _resource("grammar.lark")
     tables: Any = json.loads(_resource(TABLES_FILE), object_hook=_with_numbers)

@@ -14,24 +14,25 @@ ROOT = Path(__file__).resolve().parents[2]
 TEXTS = [
     *(path.read_text(encoding="utf-8") for path in sorted((ROOT / "recordings").glob("*.spatial"))),
     'const near = 70\nspec a(ego) = G[0s, 2.5s] (ego closeto[near] "the cup" -> not P[0, 3] ego in $x)',
-    'use spatial_spec\ngroup g = class "x" except a, b\nspec s = forall x, y in g: (x dist y >= 1) W (a ovlp b)',
+    'use spatial_spec\ngroup g = class "x" except a, b\n'
+    "spec s = forall x, y in g: (x dist y >= 1) W (a ovlp b)",
     "F (a ovlp",
     "spec = G",
 ]
 
 
+def resource(name):
+    return files("spatial_replay.spec").joinpath(name).read_text(encoding="utf-8")
+
+
 @pytest.fixture
 def built():
-    return parser.built_grammar(
-        files("spatial_replay.spec").joinpath("grammar.lark").read_text(encoding="utf-8")
-    )
+    return parser.built_grammar(resource("grammar.lark"))
 
 
 def test_they_belong_to_the_grammar_and_the_library():
-    text = files("spatial_replay.spec").joinpath("grammar.lark").read_text(encoding="utf-8")
-    assert (
-        f'"{parser.made_from(text)}"' in files("spatial_replay.spec").joinpath(parser.TABLES_FILE).read_text()
-    )
+    text = resource("grammar.lark")
+    assert f'"{parser.made_from(text)}"' in resource(parser.TABLES_FILE)
 
 
 @pytest.mark.parametrize("text", TEXTS)
