@@ -1,45 +1,64 @@
-"""Messages to samples."""
+"""Assemble samples: the messages of one log in, traces out.
+
+A message runs through these stages:
+
+    assemble       raw messages of all topics → `PendingMessages` of each topic, transforms in a `FrameTree`
+    topic_reader   pending messages of one topic → `TopicColumns`: signals and detections
+    extract        decoded messages → `DetectionChunk`: lists of values, read by bound field paths
+    detections     chunks → `Detections`: poses and solids in columns
+    timeline       detections → observations in the fixed frame, and `Events` over time
+    tracker        events and signals of all topics → `Trace` at the times of samples
+
+Messages wait in the first stage until none that is earlier can arrive.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import compress, repeat
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from spatial_replay.bags.columns import Message, MessageColumns
 from spatial_replay.bags.topic import Decoder
-from spatial_replay.errors import LogError
+from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.read_options import FaultList, OnTimeJump
 from spatial_replay.mapping.names import Codes
 from spatial_replay.mapping.reading_plan import DISORDER_NS, ReadingPlan
 from spatial_replay.mapping.topic_reader import MISFITS, TopicReader
-from spatial_replay.mapping.tracker import Instants, Remarks, Tracker
+from spatial_replay.mapping.tracker import Remarks, Tracker
 from spatial_replay.mapping.transforms import HISTORY_NS, FrameTree
 from spatial_replay.trace.sample import FOREVER, LATEST_NS
 from spatial_replay.trace.trace import Trace
 
 _FIRST_STEP: Final = 256
 _LONGEST_STEP: Final = 8_192
-"""After how many messages samples come out: soon at first, for those who want to see the first one only."""
+"""Messages between two traces: few at first, so that the first sample comes out early."""
 
 _STEP_BYTES: Final = 2**23
-"""After how many bytes of messages they come out in any case."""
+"""Bytes of messages between two traces, if that is fewer messages."""
+
+_MOST_STEPS = 100_000
+"""Samples between two messages; more are not a pause, but a clock that jumped."""
+
+_MOST_AT_ONCE = 1_000_000
+"""Samples between the messages of one step: all are in memory at once."""
 
 
 class Assembler:
-    """Makes samples of the messages of one log, as they come.
+    """Assembles the samples of one log from its messages.
 
-    Feed it many messages at once (thousands): it works on columns. The same messages make the same samples
-    however they are handed over.
+    Add thousands of messages at once, because it works on columns. The samples do not depend on how the
+    messages are divided.
 
     Args:
-        name: of the log, for what is told.
-        decoder: how the messages of a topic are decoded.
-        start_ns, end_ns: only samples from `start_ns` up to, not including, `end_ns` come out; messages
-            before and after may be fed, and count for them.
+        name: of the log, for errors and remarks.
+        decoder: returns the decoder of a topic.
+        start_ns, end_ns: only samples from `start_ns` up to, not including, `end_ns` come out. Messages
+            before and after the window may be added, and count.
         on_time_jump: whether a log whose time jumps back by more than a second is refused, or ends there.
     """
 
@@ -56,17 +75,17 @@ class Assembler:
     ) -> None:
         self._plan = plan
         self._name = name
-        self._start_ns, self._end_ns = start_ns or 0, FOREVER if end_ns is None else end_ns
+        self._window_ns = start_ns or 0, FOREVER if end_ns is None else end_ns
         self._on_time_jump = on_time_jump
         self._faults = FaultList()
         for topic, reason in plan.lost:
-            # what is unreadable names its topic itself
+            # some reasons start with the topic already
             what = reason.removeprefix(f"topic {topic!r}: ")
             self._faults.add(f"{name}: {topic}: its transforms cannot be decoded: {what}")
         self._remarks = Remarks(name, plan.mapping)
         self._tree = FrameTree()
         names, classes = Codes(), Codes()
-        self._channels = {
+        self._readers = {
             topic.name: TopicReader(
                 topic,
                 decoder,
@@ -74,15 +93,23 @@ class Assembler:
                 classes,
                 mapping_name=plan.mapping.name,
                 needs_frame=plan.mapping.fixed_frame is not None,
-                fault=self._add_fault,
+                report=self._add_fault,
             )
             for topic in plan.planned
         }
-        self._codes = _Others({name: number for number, name in enumerate(self._channels)})
-        self._scene = Tracker(
-            plan, self._channels, names, classes, self._tree, self._remarks, self._add_fault, concave
+        self._number_of_topic = {topic: number for number, topic in enumerate(self._readers)}
+        self._tracker = Tracker(
+            plan,
+            self._readers,
+            names,
+            classes,
+            self._tree,
+            self._remarks,
+            window_ns=self._window_ns,
+            concave=concave,
+            report=self._add_fault,
         )
-        self._instants = Instants(plan, name, self._start_ns)
+        self._sample_times = _SampleTimes(plan, name, self._window_ns[0])
         self._newest_ns = -1
         self._latest_ns = self._settled_ns = -1
         self._count = self._bytes = 0
@@ -91,11 +118,11 @@ class Assembler:
 
     @property
     def is_finished(self) -> bool:
-        """Whether no further message can change anything: after a jump that splits, or past the end."""
-        return self._has_split or self._settled_ns >= self._end_ns - 1
+        """Whether no further message counts: after a jump that splits the log, or past the window."""
+        return self._has_split or self._settled_ns >= self._window_ns[1] - 1
 
     def add(self, messages: Sequence[Message] | MessageColumns) -> Trace:
-        """Take messages in the order of the log; the samples that are final now, maybe none.
+        """Add messages in the order of the log; return the samples that are final now.
 
         Raises:
             LogError: time jumps back by more than a second, and `on_time_jump` is "error".
@@ -109,7 +136,7 @@ class Assembler:
             read = int(ends[begin - 1]) if begin else 0
             by_size = int(np.searchsorted(ends, read + _STEP_BYTES - self._bytes)) + 1
             stop = min(begin + self._step - self._count, by_size, len(columns))
-            self._accept(columns.slice(begin, stop))
+            self._add_step(columns.slice(begin, stop))
             self._count += stop - begin
             self._bytes += int(ends[stop - 1]) - read
             begin = stop
@@ -120,68 +147,69 @@ class Assembler:
         return traces[0] if len(traces) == 1 else Trace.concatenate(traces)
 
     def finish(self) -> Trace:
-        """The samples that are left when the log has ended.
+        """End the log; return the remaining samples.
 
         Raises:
             UsageError: the mapping fits no message of a topic.
         """
         trace = self._settle(max(self._newest_ns, self._latest_ns))
-        for channel in self._channels.values():
-            channel.finish()
+        for reader in self._readers.values():
+            reader.finish()
         self._settled_ns = LATEST_NS
         return trace
 
     def take_faults(self) -> tuple[str, ...]:
-        """What was lost since the last call, each with its place."""
+        """Return what was lost since the last call, each with its place."""
         return self._faults.take(last=self._settled_ns == LATEST_NS)
 
     def move_faults(self, other: FaultList) -> None:
-        """Hand over what `take_faults` would give, with the count of what is no longer told one by one."""
+        """Move what `take_faults` would return to another list, with the count of faults beyond its limit."""
         self._faults.move_to(other)
 
     def take_remarks(self) -> tuple[str, ...]:
-        """What is not as one would wish, without a loss: counts of stale objects, missing transforms.
-
-        They are complete when `finish` has been called, and come then.
-        """
+        """Return counts of stale objects and missing transforms; none before `finish`, when they are
+        complete."""
         return self._remarks.take() if self._settled_ns == LATEST_NS else ()
 
-    def _accept(self, arrived: MessageColumns) -> None:
-        """Put transforms into the tree, and the other messages where they wait."""
-        code = np.fromiter(map(self._codes.__getitem__, arrived.topics), np.int64, len(arrived))
-        taken: list[_Timed] = []
-        for number, channel in enumerate(self._channels.values()):
-            places = np.flatnonzero(code == number)
+    def _add_step(self, arrived: MessageColumns) -> None:
+        """Distribute messages: transforms to the frame tree, all others to the readers of their topics."""
+        numbers = map(self._number_of_topic.get, arrived.topics, repeat(-1))
+        number_of_message = np.fromiter(numbers, np.int64, len(arrived))
+        stamped: list[_Stamped] = []
+        for number, reader in enumerate(self._readers.values()):
+            places = np.flatnonzero(number_of_message == number)
             if len(places):
-                taken.append(self._timed(channel, places, arrived))
-        end = self._jump(taken, arrived)
-        for timed in taken:
-            self._put(timed.before(end), arrived)
+                stamped.append(self._stamp(reader, places, arrived))
+        end = self._advance_time(stamped, arrived)
+        for each in stamped:
+            self._put(each.before(end), arrived)
 
-    def _timed(self, channel: TopicReader, places: Integers, arrived: MessageColumns) -> _Timed:
-        """The messages of one topic with their times on its clock; decoded, where that is needed."""
+    def _stamp(self, reader: TopicReader, places: Integers, arrived: MessageColumns) -> _Stamped:
+        """Return the messages of one topic with their times on its clock, decoded if the clock needs that."""
         contents: list[Any] = [arrived.payloads[place] for place in places.tolist()]
-        clock = channel.planned.clock
-        if channel.keeps_decoded:
-            contents, kept = channel.decoded(contents, arrived.log_time_ns[places].tolist())
-            places = places[kept]
-        if clock == "header":
-            times, kept = channel.stamps(arrived.log_time_ns[places].tolist(), contents)
-            return _Timed(channel, places[kept], np.array(times, np.int64), [contents[i] for i in kept])
-        times_ns = arrived.log_time_ns if clock == "log" else arrived.publish_time_ns
-        return _Timed(channel, places, times_ns[places], contents)
+        clock = reader.planned.clock
+        times_ns = (arrived.publish_time_ns if clock == "publish" else arrived.log_time_ns)[places]
+        if reader.decodes_on_arrival:
+            good = np.ones(len(places), np.bool_)
+            log_times_ns = arrived.log_time_ns[places].tolist()
+            contents = reader.decode(contents, log_times_ns, good)
+            if clock == "header":
+                times_ns = reader.stamps(contents, log_times_ns, good)
+            contents = list(compress(contents, good.tolist()))
+            places, times_ns = places[good], times_ns[good]
+        return _Stamped(reader, places, times_ns, contents)
 
-    def _jump(self, taken: list[_Timed], arrived: MessageColumns) -> int:
-        """Take note of how far the log has come; where it ends: at a jump back that splits, or not at all.
+    def _advance_time(self, stamped: list[_Stamped], arrived: MessageColumns) -> int:
+        """Update how far the log has come; return the number of messages before a jump that splits it.
 
         Raises:
-            LogError: there is a jump back, and it does not split.
+            LogError: time jumps back, and jumps do not split the log.
         """
-        moving = [timed for timed in taken if timed.channel.is_moving]
+        moving = [each for each in stamped if each.reader.advances_time]
         if not moving:
             return len(arrived)
-        places = np.concatenate([timed.places for timed in moving])
-        times_ns = np.concatenate([timed.times_ns for timed in moving])
+        places = np.concatenate([each.places for each in moving])
+        times_ns = np.concatenate([each.times_ns for each in moving])
         order = np.argsort(places, kind="stable")
         places, times_ns = places[order], times_ns[order]
         newest = np.maximum.accumulate(np.concatenate([[self._newest_ns], times_ns]))
@@ -206,29 +234,34 @@ class Assembler:
         self._remarks.add(f"{where}: the log is taken to end there; cut it to evaluate what comes after")
         return place
 
-    def _put(self, timed: _Timed, arrived: MessageColumns) -> None:
-        channel, planned = timed.channel, timed.channel.planned
-        log_times_ns = arrived.log_time_ns[timed.places]
-        if channel.transforms is not None:
-            for time_ns, log_ns, content in zip(
-                timed.times_ns.tolist(), log_times_ns.tolist(), timed.contents, strict=True
+    def _put(self, stamped: _Stamped, arrived: MessageColumns) -> None:
+        reader = stamped.reader
+        log_times_ns = arrived.log_time_ns[stamped.places]
+        if reader.transforms is not None:
+            is_static = reader.planned.is_static
+            for time_ns, log_time_ns, message in zip(
+                stamped.times_ns.tolist(), log_times_ns.tolist(), stamped.contents, strict=True
             ):
                 try:
-                    channel.transforms.add(self._tree, content, time_ns, is_static=planned.is_static)
+                    reader.transforms.add(self._tree, message, time_ns, is_static=is_static)
                 except MISFITS as error:
-                    self._add_fault(channel.name, log_ns, f"its transforms cannot be read: {error}")
-        if planned.mapping is not None or channel.name == self._plan.sampled_topic:
-            # what is stamped before what is settled came too late for that, and counts from now on
-            times_ns = np.maximum(timed.times_ns, self._settled_ns + 1)
+                    self._add_fault(reader.name, log_time_ns, f"its transforms cannot be read: {error}")
+        if reader.is_mapped or reader.name == self._plan.sampled_topic:
+            # samples up to here are out already: a late message counts from now on
+            times_ns = np.maximum(stamped.times_ns, self._settled_ns + 1)
             self._latest_ns = max(self._latest_ns, int(times_ns.max(initial=-1)))
-            channel.pending.add(times_ns, arrived.sequence[timed.places], log_times_ns, timed.contents)
+            reader.pending.add(times_ns, arrived.sequence[stamped.places], log_times_ns, stamped.contents)
 
     def _settle(self, upto_ns: int) -> Trace:
-        """The samples up to a time, all of whose messages are there."""
+        """Return the samples up to a time before which no further message is expected."""
         if upto_ns <= self._settled_ns:
             return Trace.from_samples(())
+        start_ns, end_ns = self._window_ns
+        # logs contain NaN and infinity; they make objects unknown, without warnings
         with np.errstate(all="ignore"):
-            trace = self._scene.settle(upto_ns, self._instants, self._start_ns, self._end_ns)
+            times_ns = self._sample_times.upto(self._tracker.advance(upto_ns), upto_ns)
+            trace = self._tracker.trace(times_ns[(times_ns >= start_ns) & (times_ns < end_ns)])
+            self._tracker.forget(upto_ns)
         self._settled_ns = upto_ns
         self._tree.forget_before(upto_ns - HISTORY_NS)
         return trace
@@ -247,22 +280,76 @@ def _columns(messages: Sequence[Message]) -> MessageColumns:
     return MessageColumns(topics, log, publish, sequence, payloads, np.arange(len(messages)))
 
 
-class _Timed(NamedTuple):
-    """Messages of one topic: where they stand among all that came, their times, what they hold."""
+class _Stamped(NamedTuple):
+    """Messages of one topic: their places among all that arrived, their times and contents."""
 
-    channel: TopicReader
+    reader: TopicReader
     places: Integers
     times_ns: Integers
     contents: list[Any]
 
-    def before(self, place: int) -> _Timed:
-        """Those that stand before a place."""
+    def before(self, place: int) -> _Stamped:
+        """Return the messages before a place."""
         count = int(np.searchsorted(self.places, place))
-        return _Timed(self.channel, self.places[:count], self.times_ns[:count], self.contents[:count])
+        return _Stamped(self.reader, self.places[:count], self.times_ns[:count], self.contents[:count])
 
 
-class _Others(dict[str, int]):
-    """Numbers of topics; those of any other topic are left out."""
+class _SampleTimes:
+    """Decides when samples are taken: at messages, or at multiples of a step.
 
-    def __missing__(self, topic: str) -> int:
-        return -1
+    Args:
+        start_ns: the start of the window; multiples of a step are counted from there.
+    """
+
+    def __init__(self, plan: ReadingPlan, name: str, start_ns: int) -> None:
+        self._name = name
+        self._mapping_name = plan.mapping.name
+        self._step_ns = plan.mapping.sampling.step_ns
+        self._start_ns = start_ns
+        self._from_ns: int | None = None
+        self._last_ns = -1
+
+    def upto(self, times_ns: Integers, upto_ns: int) -> Integers:
+        """Return the distinct times of the next samples.
+
+        Args:
+            times_ns: of the new messages: those of the sampled topic or, for multiples of a step, those of
+                all topics with objects or signals.
+            upto_ns: how far the log is known.
+
+        Raises:
+            LogError: a gap in the log holds far too many samples.
+            UsageError: the step is far too short for the rate of the messages.
+        """
+        if self._step_ns is None:
+            times = np.unique(times_ns)
+            times = times[times > self._last_ns]
+        else:
+            times = self._multiples(times_ns, upto_ns, self._step_ns)
+        if len(times):
+            self._last_ns = int(times[-1])
+        return times
+
+    def _multiples(self, times_ns: Integers, upto_ns: int, step_ns: int) -> Integers:
+        if self._from_ns is None and len(times_ns):
+            self._from_ns = max(int(times_ns.min()), self._start_ns)
+        if self._from_ns is None or upto_ns < self._from_ns:
+            return np.empty(0, np.int64)
+        begin_ns = max(self._from_ns, self._last_ns + 1)
+        # multiples of the step since the epoch, so that samples do not depend on the window
+        first, stop = -(-begin_ns // step_ns), upto_ns // step_ns + 1
+        marks = np.unique(np.concatenate([[begin_ns, upto_ns], times_ns[times_ns > begin_ns]]))
+        gaps = np.diff(marks)
+        if len(gaps) and int(gaps.max()) // step_ns > _MOST_STEPS:
+            at = int(np.argmax(gaps))
+            raise LogError(
+                f"{self._name}: time jumps forward from {marks[at]} ns to {marks[at + 1]} ns, more than"
+                f" {_MOST_STEPS} samples without a message; take another clock or a longer step"
+            )
+        if stop - first > _MOST_AT_ONCE:
+            raise UsageError(
+                f"{self._mapping_name}: sample.every: a sample each {step_ns} ns makes {stop - first} of them"
+                f" up to {upto_ns} ns, where at most {_MOST_AT_ONCE} fit between messages that are read"
+                " together; give a longer step"
+            )
+        return np.arange(first, max(first, stop), dtype=np.int64) * step_ns

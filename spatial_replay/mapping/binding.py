@@ -1,10 +1,17 @@
-"""A reading bound to the first object that was seen: paths that lead somewhere, compiled."""
+"""Bind a layout to the first object of a topic: field paths in, compiled getters out.
+
+A layout names alternatives; the first object decides which of them its topic has, and for times, whether they
+are two fields or a number.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import TypeVar
+
+import numpy as np
 
 from spatial_replay.mapping.field_paths import (
     FieldError,
@@ -12,7 +19,6 @@ from spatial_replay.mapping.field_paths import (
     Get,
     Style,
     below,
-    check,
     field_names,
     getter,
     is_list,
@@ -25,25 +31,38 @@ from spatial_replay.mapping.field_paths import (
 )
 from spatial_replay.mapping.message_types import MessageLayout
 from spatial_replay.mapping.model import Measure, Stamp
-from spatial_replay.mapping.stamps import TimeGetter, bind_time
+from spatial_replay.trace.sample import LATEST_NS
 
 _Option = TypeVar("_Option")
-_Found = TypeVar("_Found")
+_Resolved = TypeVar("_Resolved")
+
+_SECOND_NS = 10**9
+_TIME_FIELDS = (
+    ("sec", "nanosec"),
+    ("sec", "nsec"),
+    ("secs", "nsecs"),
+    ("seconds", "nanos"),
+    ("sec", "nanos"),
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Binding:
-    """Where the columns of objects come from; a column is the place in the tuple that `numbers` gives.
+    """Getters for the columns of objects.
+
+    A column is an index into the tuple that `numbers` returns. All numbers of an object are read with one
+    call, because that is several times faster than a call for each.
 
     Attributes:
-        numbers: every number that is read from an object, at once.
-        position: columns of x, y and maybe z; () where a polygon says it all.
+        numbers: reads every number of an object; None if there are none.
+        position: columns of x, y and maybe z; () for polygons and solids, which have their own coordinates.
         orientation: columns of x, y, z, w; () for none.
         yaw: a column, or None.
-        sizes: columns of a box, where the message has its sizes.
-        shape_sizes, height: of the mapping, a number or a column each.
+        sizes: columns of length, width and maybe height, if the message has them.
+        shape_sizes, height: from the mapping, each a number (float) or a column (int).
         uncertainty: a number, a column, or None.
-        frame: how a frame's name is read, from the message or from the object; None for the fixed frame.
+        frame: reads the frame's name, and whether from the message instead of the object; None for the fixed
+            frame.
     """
 
     style: Style
@@ -63,8 +82,42 @@ class Binding:
     lifetime: TimeGetter | None
 
 
+@dataclass(frozen=True, slots=True)
+class TimeGetter:
+    """Reads a time: two fields, or one number of `unit_ns`."""
+
+    path: FieldPath
+    get: Get
+    parts: tuple[str, str] | None
+    unit_ns: int
+
+    def nanoseconds(self, values: Sequence[object]) -> list[int]:
+        """Return the times in the messages or objects that `path` starts from.
+
+        Raises:
+            FieldError: one lies outside the times of a log.
+            TypeError, ValueError, OverflowError: one is not a time.
+        """
+        read = map(self.get, values)
+        if self.parts is None:
+            unit = self.unit_ns
+            return [self._checked(v * unit if type(v) is int else round(float(v) * unit)) for v in read]
+        pairs = np.fromiter(chain.from_iterable(read), np.int64, 2 * len(values))
+        seconds, rest = pairs[::2], pairs[1::2]
+        # before the product, which would overflow
+        if len(seconds) and max(np.abs(seconds).max(), np.abs(rest).max()) >= LATEST_NS // _SECOND_NS:
+            raise FieldError(f"{self.path.text}: the time lies outside those of a log")
+        times: list[int] = (seconds * _SECOND_NS + rest).tolist()
+        return times
+
+    def _checked(self, time_ns: int) -> int:
+        if abs(time_ns) > LATEST_NS:
+            raise FieldError(f"{self.path.text}: the time lies outside those of a log")
+        return time_ns
+
+
 class _Columns:
-    """Paths of numbers, each once."""
+    """Distinct paths of numbers, each with a column."""
 
     def __init__(self, example: object) -> None:
         self.example = example
@@ -83,7 +136,7 @@ class _Columns:
         return len(self.paths) - 1
 
     def point(self, path: FieldPath, names: str) -> tuple[int, ...]:
-        """The columns of a point's coordinates, as far as it has them: at least two."""
+        """Return the columns of a point's coordinates, at least two."""
         value = walk(path, self.example)
         known = field_names(value)
         if all(name in known for name in names[:2]):
@@ -94,39 +147,40 @@ class _Columns:
         raise FieldError(f"{path.text}: {type_name(value)} has no {' and '.join(names[:2])}{fields}")
 
     def measure(self, measure: Measure) -> float | int:
-        """A column (an int), or the number (a float) itself."""
+        """Return a column (int) for a path, or the number itself (float)."""
         return self.add(FieldPath.of(measure)) if isinstance(measure, str) else float(measure)
 
 
-def bind(reading: MessageLayout, example: object, message: object, *, needs_frame: bool) -> Binding:
-    """
+def bind(layout: MessageLayout, example: object, message: object, *, needs_frame: bool) -> Binding:
+    """Bind a layout to the fields that an object has.
+
     Args:
-        example: the first object, found in `message`.
+        example: the first object; it stands in `message`.
 
     Raises:
-        FieldError: a path leads nowhere; the text names the fields that are there.
+        FieldError: a path leads nowhere; the message lists the existing fields.
     """
     style = style_of(example)
     columns = _Columns(example)
     position: tuple[int, ...] = ()
     orientation: tuple[int, ...] = ()
     yaw: int | None = None
-    if not reading.solids:
-        orientation = _orientation(reading, columns)
-        yaw = None if orientation else _yaw(reading, columns)
-        position = () if reading.polygon and reading.is_generic else _position(reading, columns)
-    uncertainty, covariance = _uncertainty(reading, columns, style)
-    sizes = (
-        _first(reading.sizes, lambda paths: tuple(columns.add(FieldPath.of(path)) for path in paths)) or ()
-    )
-    shape_sizes = tuple(map(columns.measure, reading.shape.sizes)) if reading.shape else ()
-    height = tuple(map(columns.measure, reading.height)) if reading.height else ()
-    polygon = _polygon(reading, example, style)
-    class_paths = [FieldPath.of(path) for path in reading.class_field]
+    if not layout.solids:
+        orientation = _orientation(layout, columns)
+        if not orientation:
+            yaw = _first(layout.yaw, lambda path: columns.add(FieldPath.of(path)))
+        position = () if layout.polygon and layout.is_generic else _position(layout, columns)
+    uncertainty, covariance = _uncertainty(layout, columns, style)
+    sizes = _first(layout.sizes, lambda paths: tuple(columns.add(FieldPath.of(path)) for path in paths)) or ()
+    shape_sizes = tuple(map(columns.measure, layout.shape.sizes)) if layout.shape else ()
+    height = tuple(map(columns.measure, layout.height)) if layout.height else ()
+    polygon = _polygon(layout, example, style)
+    class_paths = [FieldPath.of(path) for path in layout.class_field]
     if len(class_paths) == 1:
-        check(class_paths[0], example)
+        # alternatives may all be missing, a single path of the mapping must not
+        walk(class_paths[0], example)
     lifetime = None
-    if reading.stays:
+    if layout.stays:
         lifetime = bind_time((Stamp("lifetime"),), example, message)
     paths = columns.paths
     return Binding(
@@ -143,48 +197,44 @@ def bind(reading: MessageLayout, example: object, message: object, *, needs_fram
         polygon=polygon,
         covariance=covariance,
         class_gets=tuple(getter(path, style) for path in class_paths),
-        frame=_frame(reading, example, message, needs_frame),
+        frame=_frame(layout, example, message, needs_frame),
         lifetime=lifetime,
     )
 
 
-def _position(reading: MessageLayout, columns: _Columns) -> tuple[int, ...]:
+def _position(layout: MessageLayout, columns: _Columns) -> tuple[int, ...]:
     def columns_of(paths: tuple[str, ...]) -> tuple[int, ...]:
         if len(paths) == 1:
             return columns.point(FieldPath.of(paths[0]), "xyz")
         return tuple(columns.add(FieldPath.of(path)) for path in paths)
 
-    if not reading.position:
+    if not layout.position:
         return ()
-    found = _first(reading.position, columns_of)
-    if found is None:
+    position = _first(layout.position, columns_of)
+    if position is None:
         fields = ", ".join(field_names(columns.example)[:20])
         raise FieldError(
             f"no field of {type_name(columns.example)} looks like a position; name one with `position`"
             + (f"; its fields are {fields}" if fields else "")
         )
-    return found
+    return position
 
 
-def _orientation(reading: MessageLayout, columns: _Columns) -> tuple[int, ...]:
+def _orientation(layout: MessageLayout, columns: _Columns) -> tuple[int, ...]:
     def columns_of(path: str) -> tuple[int, ...]:
-        found = columns.point(FieldPath.of(path), "xyzw")
-        if len(found) != 4:
-            raise FieldError(f"{path}: it is no quaternion; give the path of one with x, y, z, w")
-        return found
+        quaternion = columns.point(FieldPath.of(path), "xyzw")
+        if len(quaternion) != 4:
+            raise FieldError(f"{path}: it is not a quaternion; give the path of one with x, y, z, w")
+        return quaternion
 
-    return _first(reading.orientation, columns_of) or ()
-
-
-def _yaw(reading: MessageLayout, columns: _Columns) -> int | None:
-    return _first(reading.yaw, lambda path: columns.add(FieldPath.of(path)))
+    return _first(layout.orientation, columns_of) or ()
 
 
-def _first(alternatives: Sequence[_Option], resolve: Callable[[_Option], _Found]) -> _Found | None:
-    """What the first alternative that is there resolves to; a single one must be there.
+def _first(alternatives: Sequence[_Option], resolve: Callable[[_Option], _Resolved]) -> _Resolved | None:
+    """Resolve the first alternative that exists; a single one must exist.
 
     Raises:
-        FieldError: the only alternative leads nowhere.
+        FieldError: the only alternative does not exist.
     """
     for option in alternatives:
         try:
@@ -195,10 +245,10 @@ def _first(alternatives: Sequence[_Option], resolve: Callable[[_Option], _Found]
     return None
 
 
-def _polygon(reading: MessageLayout, example: object, style: Style) -> Get | None:
-    if not reading.polygon:
+def _polygon(layout: MessageLayout, example: object, style: Style) -> Get | None:
+    if not layout.polygon:
         return None
-    path = FieldPath.of(reading.polygon[0])
+    path = FieldPath.of(layout.polygon[0])
     value = walk(path, example)
     if not is_list(value):
         raise FieldError(f"{path.text}: {type_name(value)} where a list of corners belongs")
@@ -206,32 +256,58 @@ def _polygon(reading: MessageLayout, example: object, style: Style) -> Get | Non
 
 
 def _uncertainty(
-    reading: MessageLayout, columns: _Columns, style: Style
+    layout: MessageLayout, columns: _Columns, style: Style
 ) -> tuple[float | int | None, Get | None]:
-    wanted = reading.uncertainty
+    wanted = layout.uncertainty
     if wanted is None:
         return None, None
     if not wanted.is_covariance:
         return columns.measure(wanted.measure), None
-    path = FieldPath.of(str(wanted.measure) or reading.covariance or "covariance")
+    path = FieldPath.of(str(wanted.measure) or layout.covariance or "covariance")
     value = walk(path, columns.example)
     if not is_list(value) or len(value) not in (4, 9, 36):
         raise FieldError(
-            f"{path.text}: {type_name(value)} is no covariance; give the path of 4, 9 or 36 numbers"
+            f"{path.text}: {type_name(value)} is not a covariance; give the path of 4, 9 or 36 numbers"
         )
     return None, getter(path, style)
 
 
 def _frame(
-    reading: MessageLayout, example: object, message: object, needs_frame: bool
+    layout: MessageLayout, example: object, message: object, needs_frame: bool
 ) -> tuple[Get, bool] | None:
-    for text in reading.frame:
+    for text in layout.frame:
         path = FieldPath.of(text)
         root = message if path.from_message else example
-        if (len(reading.frame) > 1 or not needs_frame) and not leads_somewhere(path, root):
+        if (len(layout.frame) > 1 or not needs_frame) and not leads_somewhere(path, root):
             continue
         value = walk(path, root)
         if not isinstance(value, str):
             raise FieldError(f"{path.text}: {type_name(value)} where a frame's name belongs")
         return getter(path, style_of(root)), path.from_message
+    return None
+
+
+def bind_time(stamps: Sequence[Stamp], example: object, message: object) -> TimeGetter | None:
+    """Bind the first stamp that exists; None if none does.
+
+    Raises:
+        FieldError: the only stamp does not exist, or a stamp is not a time.
+    """
+    for stamp in stamps:
+        path = FieldPath.of(stamp.field)
+        root = message if path.from_message else example
+        if len(stamps) > 1 and not leads_somewhere(path, root):
+            continue
+        value = walk(path, root)
+        style = style_of(root)
+        names = field_names(value)
+        for parts in _TIME_FIELDS:
+            if all(part in names for part in parts):
+                pair = tuple_getter([below(path, part) for part in parts], style)
+                return TimeGetter(path, pair, parts, 1)
+        if is_number(value):
+            return TimeGetter(path, getter(path, style), None, stamp.unit_ns)
+        raise FieldError(
+            f"{path.text}: {type_name(value)} is not a time; give the path of a stamp or a number"
+        )
     return None

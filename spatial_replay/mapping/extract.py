@@ -1,23 +1,23 @@
-"""Decoded messages of one topic to columns: objects, their poses and bodies, who left."""
+"""Extract the objects of one topic: decoded messages in, chunks of detections out."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import chain, compress
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from spatial_replay.mapping.binding import Binding, bind
+from spatial_replay.geometry.arrays import Booleans, Integers
+from spatial_replay.mapping.binding import Binding, TimeGetter, bind, bind_time
 from spatial_replay.mapping.detections import (
     EVERY_OBJECT,
     DetectionChunk,
     Detections,
-    bodies_of,
     covariances,
     detections_from_chunks,
-    points_of,
-    rows_of,
+    points_from_lists,
+    rows_from_tuples,
 )
 from spatial_replay.mapping.field_paths import (
     FieldPath,
@@ -32,224 +32,221 @@ from spatial_replay.mapping.footprints import (
     MARKER_ADD,
     MARKER_DELETE,
     MARKER_DELETE_ALL,
-    reader_of,
+    lenient_getter,
+    solids_of_entity,
+    solids_of_marker,
+    solids_of_perceived_object,
 )
 from spatial_replay.mapping.message_types import MessageLayout
+from spatial_replay.mapping.model import TopicMapping
 from spatial_replay.mapping.names import Codes, Namer, class_codes
-from spatial_replay.mapping.stamps import TimeGetter, bind_time
+
+_SOLIDS_OF = {
+    "marker": solids_of_marker,
+    "scene": solids_of_entity,
+    "primitive": solids_of_perceived_object,
+}
+
+
+class _Objects(NamedTuple):
+    """Objects in columns: their decoded values, the index of each one's message, the code of its name."""
+
+    values: list[Any]
+    message: list[int]
+    name: list[int]
+
+    def where(self, keep: list[bool]) -> _Objects:
+        return self if all(keep) else _Objects(*(list(compress(column, keep)) for column in self))
 
 
 class Extractor:
     """Reads the objects of one topic.
 
+    The field paths of the layout are bound to the first object; all others are read with the bound paths.
+
     Args:
         names, classes: codes that all topics share.
-        needs_frame: whether frames matter: whether there is a fixed one.
+        needs_frame: whether there is a fixed frame, so that frames matter.
     """
 
     def __init__(
         self,
-        reading: MessageLayout,
-        topic: str,
+        layout: MessageLayout,
+        mapping: TopicMapping,
         names: Codes,
         classes: Codes,
         *,
-        only: Sequence[str] = (),
-        without: Sequence[str] = (),
-        needs_frame: bool = False,
+        needs_frame: bool,
     ) -> None:
-        self.reading = reading
-        self._names, self._classes = names, classes
-        self._namer = Namer(NameTemplate.of(reading.name), topic, names, only, without)
+        self.noted_frames: set[str] = set()
+        self._layout = layout
+        self._classes = classes
+        self._namer = Namer(NameTemplate.of(layout.name), mapping.topic, names, mapping.only, mapping.without)
         self._needs_frame = needs_frame
-        self._path = FieldPath.of(reading.objects) if reading.objects else None
+        self._path = FieldPath.of(layout.objects) if layout.objects else None
         self._list: Get | None = None
         self._binding: Binding | None = None
         self._time: TimeGetter | None = None
-        self._has_time = False
-        self.noted_frames: set[str] = set()
+        self._is_time_bound = False
 
     @property
     def is_bound(self) -> bool:
-        """Whether an object has been seen, so that every path is known to lead somewhere."""
+        """Whether an object was read, so that every path is known to lead somewhere."""
         return self._binding is not None
 
     @property
     def is_timed(self) -> bool:
-        """Whether it is known how stamps are read."""
+        """Whether stamps were found."""
         return self._time is not None
 
     @property
     def lacks_stamp(self) -> bool:
-        """Whether a message was seen, and there was no stamp where there could be one."""
-        return self._has_time and self._time is None
+        """Whether a message was read that has no stamp where there could be one."""
+        return self._is_time_bound and self._time is None
 
-    def message_times(self, messages: Sequence[object]) -> list[int | None]:
-        """The stamp of each message: its own, or that of its first object; None where it has none.
-
-        Raises:
-            FieldError: there is no stamp where the reading says.
-        """
-        times: list[int | None] = []
-        for message in messages:
-            first = next(iter(self._elements(message)), None)
-            own = first if first is not None else message
-            if not self._has_time:
-                if first is None:
-                    times.append(None)
-                    continue
-                self._bind_time(own, message)
-            if self._time is None:
-                times.append(None)
-            elif self._time.path.from_message:
-                times.append(self._time.nanoseconds([message])[0])
-            else:
-                times.append(None if first is None else self._time.nanoseconds([first])[0])
-        return times
-
-    def harvest(self, messages: Sequence[object], first: int) -> DetectionChunk:
-        """What some messages tell of objects; `first` is the number of the first of them.
+    def stamp(self, message: object) -> int | None:
+        """Return the stamp of a message, or that of its first object; None if it has none.
 
         Raises:
-            FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError: a message that is
-                not as the others; the first says what is wrong.
+            FieldError: there is no stamp where the layout says.
         """
-        objects, index, places = self._objects(messages)
-        gone: list[tuple[int, int]] = []
-        if self.reading.solids == "scene":
-            gone = self._deleted_entities(messages)
-        names = self._namer.codes(objects, places, style_of(messages[0]) if messages else "attributes")
-        if self.reading.solids == "marker":
-            objects, index, names, gone = self._without_deleted(objects, index, names)
-        if self._namer.is_filtering():
-            texts = list(self._names)
-            keep = [self._namer.wants(code, texts[code]) for code in names]
-            objects, index, names = _kept(keep, objects, index, names)
-        part = DetectionChunk(gone=[(number + first, name) for number, name in gone])
-        if not objects:
-            return part
-        if self._binding is None:
-            message = messages[index[0]]
-            self._binding = bind(self.reading, objects[0], message, needs_frame=self._needs_frame)
-            self._bind_time(objects[0], message)
-        self._fill(part, self._binding, messages, objects, index, names)
-        part.message = [number + first for number in part.message] if first else part.message
-        return part
+        first = next(iter(self._elements(message)), None)
+        if first is not None:
+            self._bind_time(first, message)
+        if self._time is None:
+            return None
+        source = message if self._time.path.from_message else first
+        return None if source is None else self._time.nanoseconds([source])[0]
+
+    def read(self, messages: Sequence[object], places: Integers) -> DetectionChunk:
+        """Extract the objects of some messages.
+
+        Args:
+            places: (N,) the place of each message in its batch.
+
+        Raises:
+            FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError: a message differs
+                from the others; FieldError says how.
+        """
+        values, index, order = self._flatten(messages)
+        style = style_of(messages[0]) if messages else "attributes"
+        deleted: list[tuple[int, int]] = []
+        if self._layout.solids == "scene":
+            deleted = self._deleted_entities(messages)
+        objects = _Objects(values, index, self._namer.codes(values, order, style))
+        if self._layout.solids == "marker":
+            objects, deleted = _split_deleted_markers(objects)
+        if self._namer.is_filtering:
+            objects = objects.where(self._namer.wanted(objects.name))
+        chunk = DetectionChunk(places, deleted)
+        if objects.values:
+            if self._binding is None:
+                example, message = objects.values[0], messages[objects.message[0]]
+                self._binding = bind(self._layout, example, message, needs_frame=self._needs_frame)
+                self._bind_time(example, message)
+            self._fill(chunk, self._binding, messages, objects)
+        return chunk
+
+    def detections(self, chunks: Sequence[DetectionChunk], good: Booleans) -> Detections:
+        """Join the chunks of a batch; see `detections_from_chunks`."""
+        return detections_from_chunks(self._layout, self._binding, chunks, good)
 
     def _fill(
-        self,
-        part: DetectionChunk,
-        binding: Binding,
-        messages: Sequence[object],
-        objects: list[Any],
-        index: list[int],
-        names: list[int],
+        self, chunk: DetectionChunk, binding: Binding, messages: Sequence[object], objects: _Objects
     ) -> None:
-        if self.reading.solids:
-            bodies = bodies_of(self.reading, binding, objects)
-            count = len(objects)
-            keep = [bool(each) for each in bodies]
-            objects, index, names = _kept(keep, objects, index, names)
-            part.bodies = [each for each in bodies if each]
-            part.skipped = count - len(objects)
+        if self._layout.solids:
+            get, solids_of = lenient_getter(binding.style), _SOLIDS_OF[self._layout.solids]
+            solids = [solids_of(each, get) for each in objects.values]
+            chunk.solids = [each for each in solids if each]
+            chunk.skipped = len(solids) - len(chunk.solids)
+            objects = objects.where([bool(each) for each in solids])
         elif binding.polygon is not None:
-            part.corner_counts, part.corners = points_of([binding.polygon(each) for each in objects])
+            corners = [binding.polygon(each) for each in objects.values]
+            chunk.corner_counts, chunk.corners = points_from_lists(corners)
+        values = objects.values
         if binding.numbers is not None:
-            found = map(binding.numbers, objects)
-            part.numbers = rows_of(found, len(objects), binding.width, binding.style)
-        part.covariance = covariances(self.reading, binding, objects)
-        part.class_code = class_codes(self.reading, binding, objects, self._classes)
-        part.frames = self._frames(messages, objects, index)
-        part.stamps = self._stamps(messages, objects, index)
+            rows = map(binding.numbers, values)
+            chunk.numbers = rows_from_tuples(rows, len(values), binding.width, binding.style)
+        chunk.covariance = covariances(self._layout, binding, values)
+        chunk.class_code = class_codes(self._layout, binding, values, self._classes)
+        chunk.frames = self._frames(binding, messages, objects)
+        chunk.stamps = self._stamps(messages, objects)
         if binding.lifetime is not None:
-            part.lifetimes = binding.lifetime.nanoseconds(objects)
-        part.message, part.name = index, names
+            chunk.lifetimes = binding.lifetime.nanoseconds(values)
+        chunk.message, chunk.name = objects.message, objects.name
 
-    def seen(self, parts: Sequence[DetectionChunk]) -> Detections:
-        """The parts of consecutive messages as columns."""
-        return detections_from_chunks(self.reading, self._binding, parts)
-
-    def _objects(self, messages: Sequence[object]) -> tuple[list[Any], list[int], list[int]]:
-        """All objects, the message of each, and its place in that."""
+    def _flatten(self, messages: Sequence[object]) -> tuple[list[Any], list[int], list[int]]:
+        """Return all objects, the index of each one's message, and its index in that message."""
         if self._path is None:
             return list(messages), list(range(len(messages))), [0] * len(messages)
         if self._list is None and messages:
-            # the first message is taken step by step, so that a wrong path is told well
+            # step by step once, because the errors of the fast getter name no fields
             list(iter_elements(self._path, messages[0]))
             self._list = list_getter(self._path, style_of(messages[0])) or self._elements
         lists = list(map(self._list, messages)) if self._list is not None else []
         counts = [len(each) for each in lists]
         index = np.repeat(np.arange(len(counts)), counts).tolist()
-        places = list(chain.from_iterable(map(range, counts)))
-        return list(chain.from_iterable(lists)), index, places
+        return list(chain.from_iterable(lists)), index, list(chain.from_iterable(map(range, counts)))
 
     def _elements(self, message: object) -> list[object]:
         return [message] if self._path is None else list(iter_elements(self._path, message))
 
     def _deleted_entities(self, messages: Sequence[object]) -> list[tuple[int, int]]:
-        gone: list[tuple[int, int]] = []
+        """Return (message, name) of each deletion in a foxglove.SceneUpdate."""
+        deleted: list[tuple[int, int]] = []
         for number, message in enumerate(messages):
-            read = reader_of(style_of(message))
-            for deletion in read(message, "deletions") or ():
-                if read(deletion, "type") == DELETE_ALL_ENTITIES:
-                    gone.append((number, EVERY_OBJECT))
+            get = lenient_getter(style_of(message))
+            for deletion in get(message, "deletions") or ():
+                if get(deletion, "type") == DELETE_ALL_ENTITIES:
+                    deleted.append((number, EVERY_OBJECT))
                 else:
                     (code,) = self._namer.codes([deletion], [0], style_of(deletion))
-                    gone.append((number, code))
-        return gone
-
-    def _without_deleted(
-        self, objects: list[Any], index: list[int], names: list[int]
-    ) -> tuple[list[Any], list[int], list[int], list[tuple[int, int]]]:
-        """The markers that are shown, and those that are deleted."""
-        gone: list[tuple[int, int]] = []
-        if not objects:
-            return objects, index, names, gone
-        read = reader_of(style_of(objects[0]))
-        actions = [read(each, "action") for each in objects]
-        if any(actions):
-            for action, number, name in zip(actions, index, names, strict=True):
-                if action == MARKER_DELETE_ALL:
-                    gone.append((number, EVERY_OBJECT))
-                elif action == MARKER_DELETE:
-                    gone.append((number, name))
-            keep = [action == MARKER_ADD or not action for action in actions]
-            objects, index, names = _kept(keep, objects, index, names)
-        return objects, index, names, gone
+                    deleted.append((number, code))
+        return deleted
 
     def _bind_time(self, example: object, message: object) -> None:
-        if not self._has_time:
-            self._time = bind_time(self.reading.stamp, example, message) if self.reading.stamp else None
-            self._has_time = True
+        if not self._is_time_bound:
+            self._time = bind_time(self._layout.stamp, example, message)
+            self._is_time_bound = True
 
-    def _frames(self, messages: Sequence[object], objects: list[Any], index: list[int]) -> list[str] | None:
-        """The frame of each object; None where all are taken to be in the fixed frame."""
-        if self.reading.frame_name is not None:
-            return [self.reading.frame_name] * len(objects) if self._needs_frame else None
-        if self._binding is None or self._binding.frame is None or not objects:
+    def _frames(self, binding: Binding, messages: Sequence[object], objects: _Objects) -> list[str] | None:
+        """Return the frame of each object; None if all are in the fixed frame."""
+        if self._layout.frame_name is not None:
+            return [self._layout.frame_name] * len(objects.values) if self._needs_frame else None
+        if binding.frame is None or not objects.values:
             return None
-        get, from_message = self._binding.frame
+        get, from_message = binding.frame
         if not self._needs_frame:
-            # one of many, to be able to say that they differ
-            self.noted_frames.add(str(get(messages[index[0]] if from_message else objects[0])))
+            # one of many, enough to remark that topics are in different frames
+            example = messages[objects.message[0]] if from_message else objects.values[0]
+            self.noted_frames.add(str(get(example)))
             return None
         if from_message:
             of_message = [str(get(message)).removeprefix("/") for message in messages]
-            return [of_message[number] for number in index]
-        return [str(get(each)).removeprefix("/") for each in objects]
+            return [of_message[index] for index in objects.message]
+        return [str(get(each)).removeprefix("/") for each in objects.values]
 
-    def _stamps(self, messages: Sequence[object], objects: list[Any], index: list[int]) -> list[int] | None:
+    def _stamps(self, messages: Sequence[object], objects: _Objects) -> list[int] | None:
         if self._time is None or not self._needs_frame:
             return None
         if self._time.path.from_message:
             of_message = self._time.nanoseconds(messages)
-            return [of_message[number] for number in index]
-        return self._time.nanoseconds(objects)
+            return [of_message[index] for index in objects.message]
+        return self._time.nanoseconds(objects.values)
 
 
-def _kept(
-    keep: list[bool], objects: list[Any], index: list[int], names: list[int]
-) -> tuple[list[Any], list[int], list[int]]:
-    if all(keep):
-        return objects, index, names
-    return list(compress(objects, keep)), list(compress(index, keep)), list(compress(names, keep))
+def _split_deleted_markers(objects: _Objects) -> tuple[_Objects, list[tuple[int, int]]]:
+    """Return the markers that are shown, and (message, name) of those that are deleted."""
+    deleted: list[tuple[int, int]] = []
+    if not objects.values:
+        return objects, deleted
+    get = lenient_getter(style_of(objects.values[0]))
+    actions = [get(each, "action") for each in objects.values]
+    if not any(actions):
+        return objects, deleted
+    for action, message, name in zip(actions, objects.message, objects.name, strict=True):
+        if action == MARKER_DELETE_ALL:
+            deleted.append((message, EVERY_OBJECT))
+        elif action == MARKER_DELETE:
+            deleted.append((message, name))
+    return objects.where([action == MARKER_ADD or not action for action in actions]), deleted

@@ -1,14 +1,12 @@
-"""Field paths: where in a message something stands, such as `poses[*].position.x`.
+"""Field paths such as `poses[*].position.x`, and name templates such as `tag{id}` that contain them.
 
-    path  =  ["$."] step { step }          "$." begins at the message where the path else begins at an object
-    step  =  name | "." name | "[" number "]" | "[*]"
+    path      =  ["$."] step { step }      "$." starts at the message, not at the object in it
+    step      =  name | "." name | "[" number "]" | "[*]"
+    template  =  { text | "{" path { "|" path } "}" }
 
-A path is read into steps and compiled to nested calls; nothing in it is ever evaluated, and only fields that
-a message declares can be reached.
-
-The fields of decoded messages, whatever decoded them: ROS, protobuf or JSON.
-
-Names by template: `tag{id}`, `{ns|topic}_{id}`.
+Messages may be decoded ROS, protobuf or JSON. `walk` follows a path step by step and explains errors;
+`getter` compiles it to nested calls. A path comes from a file, so nothing in it is evaluated: it reaches only
+fields that the message declares.
 """
 
 from __future__ import annotations
@@ -26,12 +24,12 @@ Style: TypeAlias = Literal["attributes", "keys"]
 
 
 def style_of(value: object) -> Style:
-    """How the fields of a message are reached: JSON objects by key, all others by attribute."""
+    """Return how to access the fields of a message: by key for JSON objects, else by attribute."""
     return "keys" if isinstance(value, dict) else "attributes"
 
 
 def field_names(value: object) -> tuple[str, ...]:
-    """The names of the fields of a message or a part of it; none for numbers, texts and lists."""
+    """Return the names of the fields of a message or a part of it; none for numbers, texts and lists."""
     if isinstance(value, dict):
         return tuple(name for name in value if isinstance(name, str))
     descriptor = getattr(value, "DESCRIPTOR", None)
@@ -43,13 +41,13 @@ def field_names(value: object) -> tuple[str, ...]:
 
 
 def get_field(value: Any, name: str) -> object:
-    """The value of a field that `field_names` lists."""
-    found: object = value[name] if isinstance(value, dict) else getattr(value, name)
-    return found
+    """Return the value of a field that `field_names` lists."""
+    field: object = value[name] if isinstance(value, dict) else getattr(value, name)
+    return field
 
 
 def type_name(value: object) -> str:
-    """What a message or a part of it is called."""
+    """Describe the type of a message or a part of it."""
     if isinstance(value, dict):
         return "the JSON object"
     descriptor = getattr(value, "DESCRIPTOR", None)
@@ -71,18 +69,18 @@ Get: TypeAlias = Callable[[Any], Any]
 
 EACH: Final = "*"
 PATTERN: Final = r"(\$\.)?[A-Za-z_][\w-]*(\.[A-Za-z_][\w-]*|\[(\d{1,9}|\*)\])*"
-"""What a path looks like, as a regular expression."""
+"""A path, as a regular expression."""
 
 _STEP = re.compile(r"\.?([A-Za-z_][\w-]*)|\[(\d{1,9}|\*)\]", re.ASCII)
 _PATH = re.compile(PATTERN, re.ASCII)
 
 
 class FieldError(Exception):
-    """A path that leads nowhere in a message; its text names the fields that are there."""
+    """A path that leads nowhere in a message; the text lists the existing fields."""
 
 
 class ContentError(FieldError):
-    """A field that is there, but holds what cannot be used."""
+    """A field that exists, but has an unusable value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,9 +96,9 @@ class FieldPath:
     """A field path.
 
     Attributes:
-        text: as it was written.
+        text: as written.
         steps: names, indices, and `Each`.
-        from_message: whether it begins at the message, wherever it is used.
+        from_message: whether it starts at the message, not at the object.
     """
 
     text: str
@@ -109,40 +107,27 @@ class FieldPath:
 
     @classmethod
     def of(cls, text: str) -> FieldPath:
-        """
+        """Parse a path.
+
         Raises:
-            UsageError: the text is no path.
+            UsageError: the text is not a path.
         """
         if not _PATH.fullmatch(text):
             raise UsageError(
-                f"{text[:80]!r} is no field path; write names with dots: pose.position.x, tags[0].id"
+                f"{text[:80]!r} is not a field path; write names with dots: pose.position.x, tags[0].id"
             )
         steps: list[Step] = []
-        for found in _STEP.finditer(text.removeprefix("$.")):
-            name, index = found.groups()
+        for match in _STEP.finditer(text.removeprefix("$.")):
+            name, index = match.groups()
             steps.append(name if name else Each() if index == EACH else int(index))
         return cls(text, tuple(steps), text.startswith("$."))
 
-    @property
-    def count_of_lists(self) -> int:
-        """How many `[*]` the path has."""
-        return sum(isinstance(step, Each) for step in self.steps)
-
-
-def check(path: FieldPath, value: object) -> None:
-    """That a path without `[*]` leads somewhere from a value.
-
-    Raises:
-        FieldError: it does not; the text says where it ends and which fields are there.
-    """
-    walk(path, value)
-
 
 def walk(path: FieldPath, value: object) -> object:
-    """What stands at a path without `[*]`, found step by step.
+    """Return the value at a path without `[*]`.
 
     Raises:
-        FieldError: as `check`.
+        FieldError: the path leads nowhere; the text says where it ends and which fields exist there.
     """
     for step in path.steps:
         if isinstance(step, str):
@@ -153,7 +138,7 @@ def walk(path: FieldPath, value: object) -> object:
 
 
 def leads_somewhere(path: FieldPath, value: object) -> bool:
-    """Whether a path without `[*]` leads somewhere from a value."""
+    """Return whether a path without `[*]` leads somewhere from a value."""
     try:
         walk(path, value)
     except FieldError:
@@ -176,14 +161,14 @@ def _named(path: FieldPath, value: object, name: str) -> object:
 
 def _numbered(path: FieldPath, value: object, index: int) -> object:
     if not is_list(value):
-        raise FieldError(f"{path.text}: [{index}] follows {type_name(value)}, which is no list")
+        raise FieldError(f"{path.text}: [{index}] follows {type_name(value)}, which is not a list")
     if index >= len(value):
         raise FieldError(f"{path.text}: there are only {len(value)} elements where [{index}] is asked for")
     return value[index]
 
 
 def is_list(value: object) -> TypeGuard[Sequence[object]]:
-    """Whether a field's value is a list of any kind: of ROS (arrays too), protobuf or JSON."""
+    """Return whether a value is a list of ROS (or a NumPy array), protobuf or JSON."""
     return (
         hasattr(value, "__len__")
         and hasattr(value, "__getitem__")
@@ -191,10 +176,10 @@ def is_list(value: object) -> TypeGuard[Sequence[object]]:
     )
 
 
-def getter(path: FieldPath, style: Literal["attributes", "keys"]) -> Get:
-    """A function from a value to what stands at a path without `[*]`.
+def getter(path: FieldPath, style: Style) -> Get:
+    """Compile a path without `[*]` to a function from a message to the value at the path.
 
-    It is fast and its errors (AttributeError, LookupError, TypeError) say little: `check` says it well.
+    The function is fast, but its errors (AttributeError, LookupError, TypeError) say little; `walk` explains.
     """
     if style == "attributes" and all(isinstance(step, str) for step in path.steps):
         return attrgetter(".".join(str(step) for step in path.steps)) if path.steps else _itself
@@ -212,10 +197,8 @@ def getter(path: FieldPath, style: Literal["attributes", "keys"]) -> Get:
     return follow
 
 
-def tuple_getter(
-    paths: Sequence[FieldPath], style: Literal["attributes", "keys"]
-) -> Callable[[Any], tuple[Any, ...]]:
-    """A function from a value to what stands at each of one or more paths."""
+def tuple_getter(paths: Sequence[FieldPath], style: Style) -> Callable[[Any], tuple[Any, ...]]:
+    """Compile one or more paths to a function from a message to the tuple of their values."""
     plain = all(isinstance(step, str) for path in paths for step in path.steps)
     if style == "attributes" and plain and len(paths) > 1:
         return attrgetter(*(".".join(str(step) for step in path.steps) for path in paths))
@@ -227,7 +210,7 @@ def tuple_getter(
 
 
 def iter_elements(path: FieldPath, message: object) -> Iterator[object]:
-    """Every element that a path with `[*]` stands for, in order; of one without, what stands there.
+    """Iterate over the elements at a path with `[*]`, in order; over the one value at a path without.
 
     Raises:
         FieldError: the path leads nowhere.
@@ -241,20 +224,20 @@ def iter_elements(path: FieldPath, message: object) -> Iterator[object]:
         else:
             for value in values:
                 if not is_list(value):
-                    raise FieldError(f"{path.text}: [*] follows {type_name(value)}, which is no list")
+                    raise FieldError(f"{path.text}: [*] follows {type_name(value)}, which is not a list")
             values = [element for value in values for element in value]  # type: ignore[attr-defined]
     return iter(values)
 
 
-def list_getter(path: FieldPath, style: Literal["attributes", "keys"]) -> Get | None:
-    """A fast function to the list that a path ends with, for the common `a.b[*]`; None for any other form."""
+def list_getter(path: FieldPath, style: Style) -> Get | None:
+    """Compile the common form `a.b[*]` to a function that returns the list; None for other forms."""
     *before, last = path.steps
     if isinstance(last, Each) and not any(isinstance(step, Each) for step in before):
         return getter(FieldPath(path.text, tuple(before)), style)
     return None
 
 
-def _step(step: Step, style: Literal["attributes", "keys"]) -> Get:
+def _step(step: Step, style: Style) -> Get:
     if isinstance(step, str):
         return attrgetter(step) if style == "attributes" else itemgetter(step)
     if isinstance(step, int):
@@ -267,13 +250,13 @@ def _itself(value: Any) -> Any:
 
 
 def below(path: FieldPath, step: str | int) -> FieldPath:
-    """A path with one more step."""
+    """Return the path with one more step."""
     text = f"{path.text}[{step}]" if isinstance(step, int) else f"{path.text}.{step}"
     return FieldPath(text, (*path.steps, step), path.from_message)
 
 
 def is_number(value: object) -> bool:
-    """Whether a field holds a number, or nothing where JSON may have one."""
+    """Return whether a field holds a number, or null, which JSON writes for a missing number."""
     if isinstance(value, str | bytes) or value is None or field_names(value):
         return value is None
     try:
@@ -288,7 +271,7 @@ TOPIC = "topic"
 
 _ALTERNATIVES = rf"{PATTERN}(\|{PATTERN})*"
 TEMPLATE_PATTERN = rf"([^{{}}]|\{{{_ALTERNATIVES}\}})+"
-"""What a template looks like, as a regular expression."""
+"""A template, as a regular expression."""
 
 _PART = re.compile(r"\{([^{}]*)\}|([^{}]+)", re.ASCII)
 _TEMPLATE = re.compile(TEMPLATE_PATTERN, re.ASCII)
@@ -299,11 +282,11 @@ _DROPPED_ENDS = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class NameTemplate:
-    """Literal text and fields in turn.
+    """A template for the names of objects: literal text and fields in turn.
 
     Attributes:
-        parts: a text, or the fields of which the first that is there and not empty is taken; the word `index`
-            stands for an object's place in its list, `topic` for its topic, where no field is called so.
+        parts: texts, and tuples of alternative fields: the first that exists and is not empty counts. Unless
+            a field has that name, `index` is the object's index in its list and `topic` its topic.
     """
 
     text: str
@@ -311,17 +294,18 @@ class NameTemplate:
 
     @classmethod
     def of(cls, text: str) -> NameTemplate:
-        """
+        """Parse a template.
+
         Raises:
-            UsageError: the text is no template.
+            UsageError: the text is not a template.
         """
         if not _TEMPLATE.fullmatch(text):
             raise UsageError(
-                f"{text[:80]!r} is no name; write text with fields in braces: tag{{id}}, {{ns}}_{{id}}"
+                f"{text[:80]!r} is not a name; write text with fields in braces: tag{{id}}, {{ns}}_{{id}}"
             )
         parts: list[str | tuple[FieldPath, ...]] = []
-        for found in _PART.finditer(text):
-            fields, literal = found.groups()
+        for match in _PART.finditer(text):
+            fields, literal = match.groups()
             parts.append(
                 literal if fields is None else tuple(FieldPath.of(each) for each in fields.split("|"))
             )
@@ -329,12 +313,12 @@ class NameTemplate:
 
     @property
     def is_constant(self) -> bool:
-        """Whether every object gets the same name."""
+        """Whether all objects get the same name."""
         return all(isinstance(part, str) for part in self.parts)
 
 
 def name_from_topic(topic: str) -> str:
-    """What an object is called after its topic: `/turtle1/pose` → turtle1, `/pose` → pose."""
+    """Return the name of an object after its topic: `/turtle1/pose` → turtle1, `/pose` → pose."""
     words = [word for word in topic.split("/") if word]
     if len(words) > 1 and words[-1].lower() in _DROPPED_ENDS:
         words.pop()

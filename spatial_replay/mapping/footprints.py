@@ -1,6 +1,6 @@
-"""Bodies in space to footprints: projected along z, with the interval of heights that they take up.
+"""Footprints of solids: solids in space in, their projections along z and intervals of heights out.
 
-The bodies that messages made for drawing and for perception consist of.
+The first half works on arrays; the second reads the solids in messages for visualization and perception.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from spatial_replay.mapping.field_paths import Style
 from spatial_replay.mapping.transforms import is_upright
 
 BOX, DISC, CYLINDER, SPHERE, POLYGON, HULL = range(6)
-"""Kinds of bodies. What their three sizes mean: of a box, length, width, height (NaN: flat); of a disc, its
-diameter; of a cylinder, diameters along x and y, height; of a sphere, diameters along x, y and z. A polygon
-has corners in order, a hull points in any order. Cylinders that are tilted or not round, and spheres that
-are not round, count as the box around them."""
+"""Kinds of solids, with the meaning of their three sizes: box: length, width, height (NaN if flat); disc:
+diameter; cylinder: diameters along x and y, height; sphere: diameters along x, y and z. A polygon has corners
+in order, a hull points in any order. Cylinders that are tilted or not round, and spheres that are not round,
+count as their bounding boxes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Solids:
-    """P bodies that make up R objects.
+    """P solids that make up R objects.
 
     Attributes:
-        owner: (P,) int64, increasing: the object that a body belongs to.
+        owner: (P,) int64, increasing: the object that a solid belongs to.
         kind: (P,) int8.
-        position: (P, 3), rotation: (P, 3, 3): frame_from_body.
+        position: (P, 3), rotation: (P, 3, 3): frame_from_solid.
         size: (P, 3).
-        point_start: (P + 1,) int64 into `points` (V, 3), which are in the body's frame.
+        point_start: (P + 1,) int64 into `points` (V, 3), which are in the solid's frame.
     """
 
     owner: Integers
@@ -48,7 +48,7 @@ class Solids:
 
 
 def footprints_from_solids(solids: Solids, count: int) -> FootprintBatch:
-    """The footprints (R,) of objects; one height is missing where any body of an object has none.
+    """Return the footprints (R,) of objects; an object has no height if one of its solids has none.
 
     Args:
         count: R.
@@ -91,7 +91,7 @@ _IS_ROUND = np.array([False, True, True, True, False, False])
 
 
 def _with_boxes(solids: Solids) -> Solids:
-    """The solids, with boxes for the cylinders and spheres that count as the box around them."""
+    """Replace the cylinders and spheres that count as their bounding boxes."""
     kind, size = solids.kind, solids.size
     doubtful = np.flatnonzero((kind == CYLINDER) | (kind == SPHERE))
     if not len(doubtful):
@@ -106,13 +106,13 @@ def _with_boxes(solids: Solids) -> Solids:
 
 
 def _fill(vertices: Floats, start: Integers, pieces: Integers, corners: Floats) -> None:
-    """Put corners (K, C, 2) of some pieces where they belong."""
+    """Write the corners (K, C, 2) of some solids to their places in `vertices`."""
     counts = np.full(len(pieces), corners.shape[1])
     vertices[flat_index(start[pieces], counts)] = corners.reshape(-1, 2)
 
 
 def _rectangles(solids: Solids, size: Floats, pieces: Integers) -> Floats:
-    """(K, 4, 2) corners of boxes seen from above that are flat or stand upright."""
+    """Return the corners (K, 4, 2), seen from above, of boxes that are flat or upright."""
     along = solids.rotation[pieces, :2, 0] * (size[pieces, 0, None] / 2)
     across = solids.rotation[pieces, :2, 1] * (size[pieces, 1, None] / 2)
     centre = solids.position[pieces, :2]
@@ -126,10 +126,11 @@ def _rectangles(solids: Solids, size: Floats, pieces: Integers) -> Floats:
 
 
 def _hexagons(solids: Solids, size: Floats, pieces: Integers) -> Floats:
-    """(K, 6, 2) outlines of tilted boxes: the sum of their three half axes, each taken both ways.
+    """Return the outlines (K, 6, 2) of tilted boxes, seen from above.
 
-    With the axes turned into the upper half plane and ordered by angle, the outline runs from the lowest
-    corner along each of them in turn, and back.
+    The projection of a box is the Minkowski sum of its three projected axes. With the axes turned into the
+    upper half plane and ordered by angle, the outline runs from the lowest corner along each of them, and
+    back.
     """
     axes = np.swapaxes(solids.rotation[pieces, :2, :] * (size[pieces, None, :] / 2), 1, 2)
     down = (axes[..., 1] < 0) | ((axes[..., 1] == 0) & (axes[..., 0] < 0))
@@ -155,7 +156,7 @@ def _fill_polygons(vertices: Floats, start: Integers, solids: Solids, pieces: In
 
 
 def _ring(solids: Solids, piece: int) -> Floats:
-    """The convex hull, seen from above, of a body's points; the points as they are if some are not finite."""
+    """Return the convex hull, seen from above, of a solid's points; one NaN if some are not finite."""
     points = solids.points[solids.point_start[piece] : solids.point_start[piece + 1]]
     placed = points @ solids.rotation[piece].T + solids.position[piece]
     if not np.isfinite(placed).all():
@@ -165,13 +166,14 @@ def _ring(solids: Solids, piece: int) -> Floats:
 
 
 def _heights(solids: Solids, size: Floats, count: int) -> tuple[Floats, Floats]:
-    """(R,) bottom and top, NaN where some body of an object is flat."""
+    """Return the bottom and the top (R,) of objects; NaN if one of their solids is flat."""
     has_height = (
         (solids.kind != DISC) & (solids.kind != POLYGON) & ~((solids.kind == BOX) & np.isnan(size[:, 2]))
     )
     if not has_height.any():
         return np.full(count, np.nan), np.full(count, np.nan)
     up = solids.rotation[:, 2, :]
+    # half the extent along z of a box in any orientation
     half = np.einsum("ij,ij->i", np.abs(up), np.nan_to_num(size)) / 2
     half = np.where(solids.kind == SPHERE, size[:, 0] / 2, half)
     half = np.where(has_height, half, np.nan)
@@ -183,14 +185,14 @@ def _heights(solids: Solids, size: Floats, count: int) -> tuple[Floats, Floats]:
     if len(lowest) == count:
         return lowest, highest
     bottom, top = np.full(count, np.inf), np.full(count, -np.inf)
-    # NaN wins over every number
+    # NaN prevails: one solid without a height leaves the object without
     np.minimum.at(bottom, solids.owner, lowest)
     np.maximum.at(top, solids.owner, highest)
     return bottom, top
 
 
 Numbers: TypeAlias = tuple[float, ...]
-Read: TypeAlias = Callable[[Any, str], Any]
+GetField: TypeAlias = Callable[[Any, str], Any]
 
 MARKER_ADD, MARKER_DELETE, MARKER_DELETE_ALL = 0, 2, 3
 DELETE_ALL_ENTITIES = 1
@@ -199,7 +201,7 @@ _NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 
 
 class Solid(NamedTuple):
-    """One body in the frame of its message; see `Solids` for what its numbers mean."""
+    """One solid in the frame of its message; its numbers mean the same as in `Solids`."""
 
     kind: int
     position: Numbers
@@ -208,22 +210,22 @@ class Solid(NamedTuple):
     points: Sequence[Numbers] = ()
 
 
-def reader_of(style: Style) -> Read:
-    """How a field is read that may be missing from a JSON object."""
+def lenient_getter(style: Style) -> GetField:
+    """Return a function to read a field; in JSON objects, where fields may be missing, it returns None."""
     return getattr if style == "attributes" else lambda value, name: value.get(name)
 
 
-def solids_of_marker(marker: Any, read: Read) -> list[Solid]:
-    """The bodies of a visualization_msgs/Marker; none of markers that are no bodies: arrows, lines, texts."""
-    kind = read(marker, "type")
-    pose, scale = read(marker, "pose"), _vector(read(marker, "scale"), read)
-    position, quaternion = _pose(pose, read)
+def solids_of_marker(marker: Any, get: GetField) -> list[Solid]:
+    """Return the solids of a visualization_msgs/Marker; none for arrows, lines and texts."""
+    kind = get(marker, "type")
+    pose, scale = get(marker, "pose"), _vector(get(marker, "scale"), get)
+    position, quaternion = _pose(pose, get)
     single = {1: BOX, 2: SPHERE, 3: CYLINDER}.get(kind)
     if single is not None:
         return [Solid(single, position, quaternion, scale)]
-    points = [_vector(point, read) for point in read(marker, "points") or ()]
+    points = [_vector(point, get) for point in get(marker, "points") or ()]
     if kind in (6, 7):
-        # each at a point in the marker's own frame: a hull of one point stands for the shift
+        # elements of a list marker; the point, in the marker's frame, is added when solids are put in columns
         listed = BOX if kind == 6 else SPHERE
         return [Solid(listed, position, quaternion, scale, (point,)) for point in points]
     if kind == 11 and len(points) >= 3:
@@ -235,57 +237,57 @@ def solids_of_marker(marker: Any, read: Read) -> list[Solid]:
     return []
 
 
-def solids_of_entity(entity: Any, read: Read) -> list[Solid]:
-    """The bodies of a foxglove.SceneEntity; its lines, arrows, texts and models are none."""
-    bodies: list[Solid] = []
+def solids_of_entity(entity: Any, get: GetField) -> list[Solid]:
+    """Return the solids of a foxglove.SceneEntity; its lines, arrows, texts and models are left out."""
+    solids: list[Solid] = []
     for name, kind in (("cubes", BOX), ("spheres", SPHERE), ("cylinders", CYLINDER)):
-        for primitive in read(entity, name) or ():
-            size = _vector(read(primitive, "size"), read)
+        for primitive in get(entity, name) or ():
+            size = _vector(get(primitive, "size"), get)
             if kind == CYLINDER:
-                scale = max(_or_one(read(primitive, "bottom_scale")), _or_one(read(primitive, "top_scale")))
+                scale = max(_or_one(get(primitive, "bottom_scale")), _or_one(get(primitive, "top_scale")))
                 size = (size[0] * scale, size[1] * scale, size[2])
-            bodies.append(Solid(kind, *_pose(read(primitive, "pose"), read), size))
-    for primitive in read(entity, "triangles") or ():
-        points = [_vector(point, read) for point in read(primitive, "points") or ()]
-        order = list(read(primitive, "indices") or range(len(points)))
+            solids.append(Solid(kind, *_pose(get(primitive, "pose"), get), size))
+    for primitive in get(entity, "triangles") or ():
+        points = [_vector(point, get) for point in get(primitive, "points") or ()]
+        order = list(get(primitive, "indices") or range(len(points)))
         corners = [points[i] for i in order if i < len(points)]
-        pose = _pose(read(primitive, "pose"), read)
-        bodies += [Solid(HULL, *pose, (nan,) * 3, corners[i : i + 3]) for i in range(0, len(corners) - 2, 3)]
-    return bodies
+        pose = _pose(get(primitive, "pose"), get)
+        solids += [Solid(HULL, *pose, (nan,) * 3, corners[i : i + 3]) for i in range(0, len(corners) - 2, 3)]
+    return solids
 
 
-def solids_of_perceived_object(thing: Any, read: Read) -> list[Solid]:
-    """The body of a derived_object_msgs/Object: its solid, else its polygon, else the point where it is."""
-    pose = _pose(read(thing, "pose"), read)
-    solid = read(thing, "shape")
-    kind = read(solid, "type")
-    sizes = [float(size) for size in read(solid, "dimensions")]
+def solids_of_perceived_object(thing: Any, get: GetField) -> list[Solid]:
+    """Return the solid of a derived_object_msgs/Object: its shape, else its polygon, else its position."""
+    pose = _pose(get(thing, "pose"), get)
+    shape = get(thing, "shape")
+    kind = get(shape, "type")
+    sizes = [float(size) for size in get(shape, "dimensions")]
     if kind == 1 and len(sizes) >= 3:
         return [Solid(BOX, *pose, tuple(sizes[:3]))]
     if kind == 2 and sizes:
         return [Solid(SPHERE, *pose, (2 * sizes[0],) * 3)]
     if kind in (3, 4) and len(sizes) >= 2:
         return [Solid(CYLINDER, *pose, (2 * sizes[1], 2 * sizes[1], sizes[0]))]
-    corners = [_vector(point, read) for point in read(read(thing, "polygon"), "points") or ()]
+    corners = [_vector(point, get) for point in get(get(thing, "polygon"), "points") or ()]
     if len(corners) >= 3:
         return [Solid(POLYGON, (0.0, 0.0, pose[0][2]), _NO_ROTATION, (nan,) * 3, corners)]
     return [Solid(SPHERE, *pose, (0.0,) * 3)]
 
 
-def _pose(pose: Any, read: Read) -> tuple[Numbers, Numbers]:
+def _pose(pose: Any, get: GetField) -> tuple[Numbers, Numbers]:
     if pose is None:
         return (0.0,) * 3, _NO_ROTATION
-    quaternion = read(pose, "orientation")
-    turned = _NO_ROTATION if quaternion is None else _coordinates(quaternion, "xyzw", read)
-    return _vector(read(pose, "position"), read), turned
+    quaternion = get(pose, "orientation")
+    turned = _NO_ROTATION if quaternion is None else _coordinates(quaternion, "xyzw", get)
+    return _vector(get(pose, "position"), get), turned
 
 
-def _vector(vector: Any, read: Read) -> Numbers:
-    return (0.0,) * 3 if vector is None else _coordinates(vector, "xyz", read)
+def _vector(vector: Any, get: GetField) -> Numbers:
+    return (0.0,) * 3 if vector is None else _coordinates(vector, "xyz", get)
 
 
-def _coordinates(value: Any, names: Iterable[str], read: Read) -> Numbers:
-    return tuple([float(read(value, name) or 0.0) for name in names])
+def _coordinates(value: Any, names: Iterable[str], get: GetField) -> Numbers:
+    return tuple([float(get(value, name) or 0.0) for name in names])
 
 
 def _or_one(value: Any) -> float:

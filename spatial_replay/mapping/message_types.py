@@ -1,4 +1,7 @@
-"""How objects are read from messages: the built-in types, and any other by its fields."""
+"""Where the fields of objects are in messages: the built-in types, and any other type by common field names.
+
+Input is the name of a message type and the entry of its topic in the mapping; output is a `MessageLayout`.
+"""
 
 from __future__ import annotations
 
@@ -11,25 +14,26 @@ from typing import Literal, TypeAlias
 from spatial_replay.mapping.model import ClassMapping, Measure, ShapeMapping, Stamp, TopicMapping, Uncertainty
 
 Alternatives: TypeAlias = tuple[str, ...]
-"""Field paths of which the first that leads somewhere is taken."""
+"""Field paths; the first that leads somewhere counts."""
 
 _NO_CLASSES: Table[str, str | None] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
 class MessageLayout:
-    """Where in the messages of a topic objects stand, as far as it is known before the first one is seen.
+    """Where the fields of objects are in the messages of a topic, before the first one has been read.
 
     Attributes:
         objects: path of the list of objects; "" for a message that is one object.
-        complete: whether a message lists every object there is.
-        stays: whether an object stays until it is deleted, however long nothing is said of it.
-        name: template.
-        position: each the path of a point, or the paths of its coordinates.
-        sizes: each the paths of length, width and maybe height of a box.
-        solids: whether the parts of an object come from a message of a kind of its own.
-        frame, stamp: from the object, or with `$.` from the message.
+        complete: whether a message lists all objects that exist.
+        stays: whether an object stays valid until it is deleted.
+        name: a name template.
+        position: alternatives, each the path of a point or the paths of its coordinates.
         angle_scale: radians in one unit of `yaw`.
+        sizes: alternatives, each the paths of length, width and maybe height of a box.
+        frame, stamp: in the object, or with `$.` in the message.
+        solids: the kind of message that lists the solids of an object; "" for objects with a single shape.
+        is_generic: whether the fields are guesses for an unknown type.
     """
 
     objects: str = ""
@@ -224,32 +228,32 @@ GENERIC = MessageLayout(
     ),
     is_generic=True,
 )
-"""How an unknown type is read: by the names that fields of poses usually have."""
+"""The layout of an unknown type: the names that fields of poses usually have."""
 
 
 def short_type(name: str) -> str:
-    """`pkg/Name` of a type as ROS 1, ROS 2, protobuf or Foxglove's JSON schemas write it."""
+    """Return `pkg/Name` for a type as written by ROS 1, ROS 2, protobuf or Foxglove's JSON schemas."""
     words = re.split(r"[/.]|::", name)
     short = f"{words[0]}/{words[-1]}" if len(words) > 1 else name
     return re.sub(r"^(ros_)?foxglove_msgs/", "foxglove/", short)
 
 
 def layout_of_topic(topic_type: str, mapping: TopicMapping) -> MessageLayout:
-    """How a topic is read: as its type is, but for what its mapping says."""
-    kept = BUILT_IN.get(short_type(mapping.type or topic_type), GENERIC)
+    """Return the layout of a topic: that of its type, changed by what its mapping says."""
+    layout = BUILT_IN.get(short_type(mapping.type or topic_type), GENERIC)
     is_list = mapping.objects is not None
-    if is_list and mapping.objects != kept.objects:
-        # the type's own list is not what is wanted, so neither are its fields
-        kept = GENERIC
+    if is_list and mapping.objects != layout.objects:
+        # another list than that of the type holds other objects, with fields of their own
+        layout = GENERIC
     changes: dict[str, object] = {}
     if is_list:
         changes["objects"] = mapping.objects
-        changes["complete"] = kept.complete or kept.is_generic
+        changes["complete"] = layout.complete or layout.is_generic
     if mapping.complete is not None:
         changes["complete"] = mapping.complete
     if mapping.name is not None:
         changes["name"] = mapping.name
-    elif is_list and kept.is_generic:
+    elif is_list and layout.is_generic:
         changes["name"] = "{topic}_{id|index}"
     changes |= _pose_changes(mapping) | _shape_changes(mapping) | _class_changes(mapping.class_name)
     if mapping.frame is not None or mapping.frame_field is not None:
@@ -261,7 +265,7 @@ def layout_of_topic(topic_type: str, mapping: TopicMapping) -> MessageLayout:
         changes["stamp"] = (mapping.stamp,)
     if mapping.uncertainty is not None:
         changes["uncertainty"] = mapping.uncertainty
-    return replace(kept, **changes)  # type: ignore[arg-type]
+    return replace(layout, **changes)  # type: ignore[arg-type]
 
 
 def _pose_changes(mapping: TopicMapping) -> dict[str, object]:

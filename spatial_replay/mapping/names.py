@@ -1,8 +1,11 @@
-"""Names and classes of objects, as numbers."""
+"""Names and classes of objects: decoded objects in, integer codes out.
+
+Codes are dense integers, so that everything behind the decoding works on arrays.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -13,6 +16,7 @@ from spatial_replay.mapping.field_paths import (
     ContentError,
     FieldError,
     FieldPath,
+    Get,
     NameTemplate,
     Style,
     field_names,
@@ -23,38 +27,48 @@ from spatial_replay.mapping.field_paths import (
 )
 from spatial_replay.mapping.message_types import MessageLayout
 
-Get = Callable[[Any], Any]
+_LONGEST_NAME = 500
 
 
 class Codes(dict[Any, int]):
-    """A number for each value, counted as they come."""
+    """Codes of values, numbered in the order of their first use; `by_code` lists the values."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.by_code: list[Any] = []
 
     def __missing__(self, value: Any) -> int:
-        code = self[value] = len(self)
+        code = self[value] = len(self.by_code)
+        self.by_code.append(value)
         return code
 
 
 class Namer:
-    """Objects' names from a template, as codes that several namers share."""
+    """Names objects by a template, with codes that several namers share.
+
+    Args:
+        only, without: patterns of names to keep and to leave out.
+    """
 
     def __init__(
         self, template: NameTemplate, topic: str, codes: Codes, only: Sequence[str], without: Sequence[str]
     ) -> None:
+        self.is_filtering = bool(only or without)
         self._template = template
         self._topic = name_from_topic(topic)
         self._codes = codes
         self._only, self._without = tuple(only), tuple(without)
-        self._wanted: dict[int, bool] = {}
-        self._by_values: dict[Any, int] = {}
+        self._is_wanted: dict[int, bool] = {}
+        self._code_by_value: dict[Any, int] = {}
         self._get: Get | None = None
-        self._has_places_only = False
-        self._is_planned = False
+        self._is_by_index = False
+        self._is_prepared = False
 
-    def codes(self, objects: Sequence[object], places: Sequence[int], style: Style) -> list[int]:
-        """The code of each object's name.
+    def codes(self, objects: Sequence[object], indices: Sequence[int], style: Style) -> list[int]:
+        """Return the code of each object's name.
 
         Args:
-            places: where each object stands in its list.
+            indices: the index of each object in its list.
 
         Raises:
             FieldError: a field of the template is missing, or the name is empty or too long.
@@ -62,66 +76,59 @@ class Namer:
         if self._template.is_constant or self._template.text == "{topic}":
             name = "".join(str(part) for part in self._template.parts) if self._template.is_constant else ""
             return [self._codes[_checked(name or self._topic)]] * len(objects)
-        if objects and not self._is_planned:
-            # the first one is taken step by step, so that a wrong path is told well
-            self._name(objects[0], places[0])
-            self._plan(objects[0], style)
+        if objects and not self._is_prepared:
+            # step by step once, because the errors of the fast getter name no fields
+            self._name(objects[0], indices[0])
+            self._prepare(objects[0], style)
+        known = self._code_by_value
+        if self._is_by_index:
+            for index, each in zip(indices, objects, strict=True):
+                if index not in known:
+                    known[index] = self._codes[self._name(each, index)]
+            return [known[index] for index in indices]
         get = self._get
-        known = self._by_values
-        if self._has_places_only:
-            for place, thing in zip(places, objects, strict=True):
-                if place not in known:
-                    known[place] = self._codes[self._name(thing, place)]
-            return [known[place] for place in places]
-        if get is None or not objects:
-            return [self._codes[self._name(each, place)] for each, place in zip(objects, places, strict=True)]
-        # most names depend on one field alone
-        found = []
+        if get is None:
+            return [self._codes[self._name(each, i)] for each, i in zip(objects, indices, strict=True)]
+        codes = []
         for each in objects:
             value = get(each)
             code = known.get(value)
             if code is None:
                 code = known[value] = self._codes[self._name(each, 0)]
-            found.append(code)
-        return found
+            codes.append(code)
+        return codes
 
-    def is_filtering(self) -> bool:
-        return bool(self._only or self._without)
+    def wanted(self, codes: Sequence[int]) -> list[bool]:
+        """Return whether to keep the objects with these codes of names."""
+        for code in set(codes).difference(self._is_wanted):
+            name = self._codes.by_code[code]
+            is_named = not self._only or any(fnmatchcase(name, pattern) for pattern in self._only)
+            is_excluded = any(fnmatchcase(name, pattern) for pattern in self._without)
+            self._is_wanted[code] = is_named and not is_excluded
+        return [self._is_wanted[code] for code in codes]
 
-    def wants(self, code: int, name: str) -> bool:
-        """Whether an object of this name is to be kept."""
-        found = self._wanted.get(code)
-        if found is None:
-            kept = not self._only or any(fnmatchcase(name, pattern) for pattern in self._only)
-            found = kept and not any(fnmatchcase(name, pattern) for pattern in self._without)
-            self._wanted[code] = found
-        return found
-
-    def _plan(self, example: object, style: Style) -> None:
-        """Find out how the one field is read that names depend on, where it is as simple as that."""
-        self._is_planned = True
+    def _prepare(self, example: object, style: Style) -> None:
+        """Find a fast way: most templates have one field, so that a name is known by its value."""
+        self._is_prepared = True
         fields = [part for part in self._template.parts if not isinstance(part, str)]
         given = {INDEX, TOPIC}.difference(field_names(example))
         if all(alternatives[0].text in given for alternatives in fields):
-            self._has_places_only = True
-            return
-        if len(fields) == 1 and len(fields[0]) == 1:
+            self._is_by_index = True
+        elif len(fields) == 1 and len(fields[0]) == 1:
             (path,) = fields[0]
-            if path.text in (INDEX, TOPIC) and path.text not in field_names(example):
-                return
             if not path.from_message and isinstance(walk(path, example), str | int | float):
                 self._get = getter(path, style)
 
-    def _name(self, thing: object, place: int) -> str:
+    def _name(self, thing: object, index: int) -> str:
         words = [
-            part if isinstance(part, str) else self._word(part, thing, place) for part in self._template.parts
+            part if isinstance(part, str) else self._word(part, thing, index) for part in self._template.parts
         ]
         return _checked("".join(words))
 
-    def _word(self, alternatives: tuple[FieldPath, ...], thing: object, place: int) -> str:
+    def _word(self, alternatives: tuple[FieldPath, ...], thing: object, index: int) -> str:
         for path in alternatives:
             if path.text in (INDEX, TOPIC) and path.text not in field_names(thing):
-                return str(place) if path.text == INDEX else self._topic
+                return str(index) if path.text == INDEX else self._topic
             try:
                 word = _text(walk(path, thing), path)
             except FieldError:
@@ -136,20 +143,20 @@ class Namer:
 
 
 def class_codes(
-    reading: MessageLayout, binding: Binding, objects: Sequence[object], codes: Codes
+    layout: MessageLayout, binding: Binding, objects: Sequence[object], codes: Codes
 ) -> list[int]:
-    """The code of each object's class."""
+    """Return the code of each object's class."""
     if not binding.class_gets:
-        return [codes[reading.class_name]] * len(objects)
+        return [codes[layout.class_name]] * len(objects)
     known: dict[Any, int] = {}
-    found = []
+    result = []
     for each in objects:
         value = _first_value(binding.class_gets, each)
         code = known.get(value)
         if code is None:
-            code = known[value] = codes[_class_name(reading, value)]
-        found.append(code)
-    return found
+            code = known[value] = codes[_class_name(layout, value)]
+        result.append(code)
+    return result
 
 
 def _first_value(gets: Sequence[Get], thing: object) -> Any:
@@ -158,19 +165,19 @@ def _first_value(gets: Sequence[Get], thing: object) -> Any:
             value = get(thing)
         except (AttributeError, LookupError, TypeError):
             continue
-        # what cannot be a key cannot be a class
+        # lists and messages cannot be keys of a dictionary
         return value if isinstance(value, str | int | float | bool) else str(value)
     return None
 
 
-def _class_name(reading: MessageLayout, value: object) -> str | None:
+def _class_name(layout: MessageLayout, value: object) -> str | None:
     if value is None or value == "":
         return None
-    # halves of surrogate pairs, which JSON can spell, cannot be written
+    # JSON can spell lone surrogates, which UTF-8 cannot write
     text = str(value).encode("utf-8", "replace").decode()
-    if text in reading.class_table:
-        return reading.class_table[text]
-    return reading.class_other if reading.class_has_other else text
+    if text in layout.class_table:
+        return layout.class_table[text]
+    return layout.class_other if layout.class_has_other else text
 
 
 def _text(value: object, path: FieldPath) -> str:
@@ -184,9 +191,6 @@ def _text(value: object, path: FieldPath) -> str:
         # such as osi3.Identifier
         return str(getattr(value, "value", ""))
     raise FieldError(f"{path.text}: {type_name(value)} where a text or a number belongs")
-
-
-_LONGEST_NAME = 500
 
 
 def _checked(name: str) -> str:

@@ -1,4 +1,4 @@
-"""A mapping compared with the topics of a log: what has to be read, and how."""
+"""Plan what to read of a log: a mapping and the log's topics in, the topics to read and their layouts out."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from spatial_replay.mapping.transforms import HISTORY_NS
 from spatial_replay.text import nearest_hint
 
 DISORDER_NS = 10**9
-"""How far messages may be out of order."""
+"""How far messages may be out of order; it is also how long samples wait for late messages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,18 +27,18 @@ class PlannedTopic:
     """How one topic is read.
 
     Attributes:
-        mapping: of the topic; None where it is read for transforms or times only.
-        reading: how its objects are read; None for none.
-        max_age_ns: how long what it says stays valid.
+        mapping: its entry; None for topics that are read for transforms or times only.
+        layout: where its objects are; None for a topic without objects.
+        max_age_ns: how long an observation or a signal stays valid.
         is_transforms: whether its transforms place frames; `is_static`: at all times.
-        is_lasting: whether a message counts however long ago it came.
+        is_lasting: whether a message counts however old it is.
         is_latched: whether it may have been sent long before it was recorded.
     """
 
     name: str
     clock: Clock
     mapping: TopicMapping | None
-    reading: MessageLayout | None
+    layout: MessageLayout | None
     max_age_ns: int
     is_transforms: bool
     is_static: bool
@@ -48,16 +48,16 @@ class PlannedTopic:
 
 @dataclass(frozen=True, slots=True)
 class ReadingPlan:
-    """A mapping that fits a log.
+    """What to read of a log for a mapping that fits it.
 
     Attributes:
-        topics: every topic to read: those mapped, and those with transforms where frames are needed.
-        by_log_time: whether times of samples are log times; if not, which messages make the samples of a
-            window is only known when they have been decoded.
+        topics: every topic to read: those mapped, and those with transforms if frames are needed.
+        by_log_time: whether the times of samples are log times. If not, the messages of a window are known
+            only when all have been decoded.
         margin_ns: how far beyond the end of a window messages still count.
-        planned: how each topic is read, as in `topics`.
+        planned: how each topic is read, in the order of `topics`.
         lost: topics with transforms that cannot be decoded, with the reason.
-        sampled_topic: the topic whose messages are sampled; None for samples at each multiple of a step.
+        sampled_topic: the topic whose messages are sampled; None for samples at multiples of a step.
     """
 
     mapping: LogMapping
@@ -70,9 +70,10 @@ class ReadingPlan:
 
     @classmethod
     def of(cls, mapping: LogMapping, topics: Sequence[Topic]) -> ReadingPlan:
-        """
+        """Compare a mapping with the topics of a log.
+
         Raises:
-            UsageError: the mapping does not fit the topics; all faults are listed.
+            UsageError: the mapping does not fit the topics; all errors are listed.
         """
         known = {topic.name: topic for topic in topics}
         faults = _faults(mapping, known)
@@ -106,27 +107,29 @@ class ReadingPlan:
         )
 
     def lookback_ns(self, topic: str) -> int | None:
-        """How long before a window messages of a topic count; None for all of them, such as static ones."""
-        found = next(each for each in self.planned if each.name == topic)
+        """Return how long before a window messages of a topic count; None for all, as of static
+        transforms."""
+        planned = next(each for each in self.planned if each.name == topic)
         ages = [
             each.max_age_ns
             for each in self.planned
-            if each.reading is not None and not each.is_lasting and not each.is_transforms
+            if each.layout is not None and not each.is_lasting and not each.is_transforms
         ]
-        own = found.max_age_ns if found.mapping is not None else 0
-        if found.is_transforms and not found.is_static:
+        own = planned.max_age_ns if planned.mapping is not None else 0
+        if planned.is_transforms and not planned.is_static:
+            # an observation of the window may be that old, and is placed by a transform of its time
             own = max(own, HISTORY_NS + max(ages, default=0))
-            if any(each.is_lasting and each.reading is not None for each in self.planned):
+            if any(each.is_lasting and each.layout is not None for each in self.planned):
                 return None
-        return None if found.is_lasting or own >= FOREVER_NS else own + DISORDER_NS
+        return None if planned.is_lasting or own >= FOREVER_NS else own + DISORDER_NS
 
 
 def _faults(mapping: LogMapping, known: dict[str, Topic]) -> list[str]:
     faults: list[str] = []
-    asked = [entry.topic for entry in mapping.topics]
+    named = [entry.topic for entry in mapping.topics]
     sampled = mapping.sampling.topic
-    for name in [*asked, *([sampled] if sampled is not None and sampled not in asked else [])]:
-        where = f"topics.{name}" if name in asked else "sample.topic"
+    for name in [*named, *([sampled] if sampled is not None and sampled not in named else [])]:
+        where = f"topics.{name}" if name in named else "sample.topic"
         if name not in known:
             listed = ", ".join(sorted(known)[:20]) or "none"
             hint = nearest_hint(name, known) or f"its topics are {listed}"
@@ -136,12 +139,12 @@ def _faults(mapping: LogMapping, known: dict[str, Topic]) -> list[str]:
     for entry in mapping.topics:
         if entry.type is not None and short_type(entry.type) not in BUILT_IN:
             hint = nearest_hint(short_type(entry.type), BUILT_IN) or f"known are {', '.join(BUILT_IN)}"
-            faults.append(f"topics.{entry.topic}.type: {entry.type!r} is no type that is known; {hint}")
+            faults.append(f"topics.{entry.topic}.type: {entry.type!r} is not a known type; {hint}")
     return faults
 
 
 def _first(mapping: LogMapping) -> str:
-    """The topic that is sampled if nothing is said: the first with objects, else the first."""
+    """Return the topic that is sampled by default: the first with objects, else the first."""
     return next((entry.topic for entry in mapping.topics if entry.reads_objects), mapping.topics[0].topic)
 
 
@@ -150,18 +153,18 @@ def _planned(
 ) -> PlannedTopic:
     is_transforms = needs_frames and short_type(topic.type) in TRANSFORM_TYPES
     is_static = is_transforms and (topic.latched or topic.name.rsplit("/", 1)[-1] == "tf_static")
-    reading = layout_of_topic(topic.type, entry) if entry is not None and entry.reads_objects else None
-    stays = topic.latched or (reading is not None and reading.stays)
+    layout = layout_of_topic(topic.type, entry) if entry is not None and entry.reads_objects else None
+    stays = topic.latched or (layout is not None and layout.stays)
     default = FOREVER_NS if stays else mapping.max_age_ns or DEFAULT_MAX_AGE_NS
     max_age_ns = (entry.max_age_ns if entry is not None else None) or default
     return PlannedTopic(
         name=topic.name,
         clock=(entry.clock if entry is not None else None) or mapping.clock,
         mapping=entry,
-        reading=reading,
+        layout=layout,
         max_age_ns=max_age_ns,
         is_transforms=is_transforms,
         is_static=is_static,
         is_latched=topic.latched,
-        is_lasting=is_static or (reading is not None and max_age_ns >= FOREVER_NS),
+        is_lasting=is_static or (layout is not None and max_age_ns >= FOREVER_NS),
     )

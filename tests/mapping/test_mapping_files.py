@@ -123,7 +123,7 @@ shapes:
         ("topics: {}", "topics"),
         ("topics: {'': {}}", "a name is empty"),
         ("? [a, b]\n: c", "a key is a list or a mapping"),
-        ("topics: {/a: {name: '{a b}'}}", "is no name"),
+        ("topics: {/a: {name: '{a b}'}}", "is not a name"),
         ("x" * 300_000, "larger than 256 KiB"),
         ("a: 1\n---\nb: 2", "this is no YAML"),
     ],
@@ -159,7 +159,7 @@ def test_topics_that_the_log_does_not_have() -> None:
     assert str(caught.value).splitlines() == [
         "m.yaml: topics./pse: the log has no topic '/pse'; did you mean '/pose'?",
         "m.yaml: sample.topic: the log has no topic '/tick'; its topics are /other, /pose",
-        *[line for line in str(caught.value).splitlines() if "'foo/Bar' is no type that is known" in line],
+        *[line for line in str(caught.value).splitlines() if "'foo/Bar' is not a known type" in line],
     ]
 
 
@@ -178,16 +178,16 @@ def test_topics_that_cannot_be_decoded() -> None:
         ),
         ("position: header.stamp", "has no x and y; its fields are sec, nanosec"),
         ("yaw: pose", "geometry_msgs/msg/Pose where a number belongs"),
-        ("orientation: pose.position", "has no x and y|no quaternion"),
+        ("orientation: pose.position", "has no x and y|not a quaternion"),
         ("polygon: pose", "where a list of corners belongs"),
         ("objects: 'poses[*]'", "has no field 'poses'"),
-        ("objects: 'header[*]'", r"\[\*\] follows std_msgs/msg/Header, which is no list"),
+        ("objects: 'header[*]'", r"\[\*\] follows std_msgs/msg/Header, which is not a list"),
         ("name: 'x{id}'", "has no field 'id'"),
         ("class: {field: kind}", "has no field 'kind'"),
         ("shape: {disc: size}", "has no field 'size'"),
-        ("uncertainty: {covariance: pose}", "is no covariance"),
+        ("uncertainty: {covariance: pose}", "is not a covariance"),
         ("name: p, signals: {speed: speed}", "has no field 'speed'"),
-        ("name: p, signals: {speed: header.frame_id}", "its value is no number"),
+        ("name: p, signals: {speed: header.frame_id}", "its value is not a number"),
         ("yaw: $.header.stamp.sec", "give a field of the object"),
     ],
 )

@@ -65,7 +65,7 @@ def test_every_element_of_lists_in_lists() -> None:
         (pose_stamped(0, 0), "header.frame_id.x", "a text has no field 'x'"),
         (scene(), "entitys", "foxglove.SceneUpdate has no field 'entitys'; did you mean 'entities'"),
         (scene(), "entities[7]", r"there are only 2 elements where \[7\] is asked for"),
-        (scene(), "entities[0].id[0]", "follows a text, which is no list"),
+        (scene(), "entities[0].id[0]", "follows a text, which is not a list"),
         ({"a": 1}, "b", "the JSON object has no field 'b'; its fields are a"),
         ({"a": None}, "a.b", "nothing has no field 'b'"),
         # what every object has in Python is no field
@@ -83,7 +83,7 @@ def test_a_path_that_leads_nowhere_says_what_is_there(message: Any, text: str, w
     "text", ["", "a..b", ".a", "a.", "a[", "a[-1]", "a[x]", "1a", "a b", "a()", "$a", "a.$.b"]
 )
 def test_what_is_no_path(text: str) -> None:
-    with pytest.raises(UsageError, match="is no field path"):
+    with pytest.raises(UsageError, match="is not a field path"):
         FieldPath.of(text)
 
 
@@ -128,7 +128,7 @@ def test_names_that_are_none(template: str, thing: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("text", ["{", "}", "a{b", "{}", "{a b}", "{a|}", ""])
 def test_what_is_no_template(text: str) -> None:
-    with pytest.raises(UsageError, match="is no name"):
+    with pytest.raises(UsageError, match="is not a name"):
         NameTemplate.of(text)
 
 

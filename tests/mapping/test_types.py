@@ -129,7 +129,7 @@ def test_markers_are_boxes_discs_and_unions() -> None:
     assert cubes.footprint == Footprint.union(
         [Footprint.box(0.0, 1.5, 2.0, 2.5), Footprint.box(10.0, 1.5, 12.0, 2.5)]
     )
-    assert "1 thing was left out" in made.remarks[0]
+    assert "1 object was left out" in made.remarks[0]
 
 
 def test_markers_stay_until_they_are_deleted_or_their_time_is_up() -> None:
