@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mapping.feeding import SECOND, Feed, header, make, pose_stamped, ros
-from spatial_replay.bags import MessageColumns
+from spatial_replay.bags.columns import MessageColumns
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import parse_mapping
