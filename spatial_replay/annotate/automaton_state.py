@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.annotate.specification import ReportedTree
-from spatial_replay.automata.automaton import FALSE, TRUE, UNKNOWN, Automaton, Table
+from spatial_replay.automata.automaton import FALSE, TRUE, UNKNOWN, Automaton, TransitionTable
 from spatial_replay.automata.compile import automaton, stored_text
 from spatial_replay.automata.dot_hoa import size_words
 from spatial_replay.errors import NoAutomatonError
@@ -67,7 +67,7 @@ class AutomatonRun:
         self._name, self._object = name, object
         self._automaton = automaton
         self._order = order
-        self._table = Table.of(automaton)
+        self._table = TransitionTable.of(automaton)
         numbers = {id(node): number for number, _, node in iter_nodes(formula)}
         self.propositions = tuple(numbers[id(each.formula)] for each in automaton.propositions)
         self._possible = np.zeros(len(automaton.states), np.bool_)

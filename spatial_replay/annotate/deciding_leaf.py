@@ -22,6 +22,7 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Atom, Boolean, Formula, Quantified, iter_nodes
+from spatial_replay.spec.walks import operand_signs
 
 
 class LeavesBelow(NamedTuple):
@@ -65,7 +66,7 @@ def leaves_below(formula: Formula, leaves: Sequence[Formula]) -> list[LeavesBelo
         if isinstance(node, Atom | Quantified):
             found[identifier] = {(numbers[_key(node)], 1): None}
         for place, operand in enumerate(operands[identifier]):
-            for sign in signs_of(node, place):
+            for sign in operand_signs(node, place):
                 found[identifier].update(dict.fromkeys((leaf, own * sign) for leaf, own in found[operand]))
     return [_columns(list(each)) for each in found]
 
@@ -91,18 +92,6 @@ def attained(below: LeavesBelow, ends: tuple[Floats, Floats], number: float, *, 
 def _columns(entries: Sequence[tuple[int, int]]) -> LeavesBelow:
     pairs = np.array(entries, np.int64).reshape(-1, 2)
     return LeavesBelow(pairs[:, 0], pairs[:, 1].astype(np.float64))
-
-
-def signs_of(node: Formula, operand: int) -> tuple[int, ...]:
-    """In which signs an operand's number can become that of the node."""
-    match node:
-        case Boolean(operator="not"):
-            return (-1,)
-        case Boolean(operator="->") if operand == 0:
-            return (-1,)
-        case Boolean(operator="xor" | "<->"):
-            return (1, -1)
-    return (1,)
 
 
 def _key(leaf: Formula) -> tuple[object, ...]:
@@ -171,7 +160,7 @@ class Parts:
             lows, highs = low_and_high(len(leaves), wide=wide)
             return attained(self._below[node], (leaves[lows], leaves[highs]), number, low=low)
         for place, operand in enumerate(self._operands[node]):
-            for sign in signs_of(formula, place):
+            for sign in operand_signs(formula, place):
                 is_low = low == (sign > 0)
                 if sign * _end(ends, operand, is_low) == number:
                     found = self.attained(operand, ends, low=is_low, wide=wide)

@@ -38,7 +38,7 @@ from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import Formula, Specification, TrackedName, iter_nodes
+from spatial_replay.spec.formula import Formula, Specification, iter_nodes
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.walks import substitute
 
@@ -152,7 +152,7 @@ class EventTeller:
         self._watched = _watched(tree, below, file)
         self._nodes = np.array([each.node for each in self._watched], np.int64)
         self._parts = Parts(tree.formula, below, self._nodes.tolist())
-        self._bindings = {variable: TrackedName(name) for variable, name in instance.bindings.items()}
+        self._bindings = instance.bindings
         self._relations = RELATION_NAMES | file.relations
         self._standings = Standings.begin(len(self._watched))
         self._carried: dict[tuple[int, int], Attained | None] = {}

@@ -18,9 +18,7 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.spec.formula import (
     ANY_CLASS,
     Atom,
-    Boolean,
     Earlier,
-    Enlarged,
     Formula,
     Group,
     Quantified,
@@ -32,6 +30,7 @@ from spatial_replay.spec.formula import (
     iter_nodes,
     operands_of,
 )
+from spatial_replay.spec.walks import base_of, operand_signs
 
 
 class OpenGroup(NamedTuple):
@@ -187,16 +186,9 @@ def worst_robustness(
 
 
 def _sign(parent: Formula, operand: int) -> float:
-    """How an operand's sign follows from that of the formula it stands in; 0 where neither does."""
-    match parent:
-        case Boolean(operator="not"):
-            return -1.0
-        case Boolean(operator="->"):
-            return -1.0 if operand == 0 else 1.0
-        case Boolean(operator="xor" | "<->"):
-            return 0.0
-        case _:
-            return 1.0
+    """Return how an operand's sign follows from that of the formula it stands in; 0 where neither does."""
+    signs = operand_signs(parent, operand)
+    return float(signs[0]) if len(signs) == 1 else 0.0
 
 
 def _concern(
@@ -244,9 +236,8 @@ def _with_bindings(formula: Formula) -> Iterator[tuple[Formula, _Bindings]]:
 
 def _referred(term: Term, bindings: _Bindings) -> TrackedName | RegionName | Variable | Group:
     """What a term is about, whenever and however far around."""
-    while isinstance(term, (Earlier, Enlarged)):
-        term = term.term
-    return bindings.get(term.name, term) if isinstance(term, Variable) else term
+    base = base_of(term)
+    return bindings.get(base.name, base) if isinstance(base, Variable) else base
 
 
 def _excluded(group: Group, object: str | None) -> frozenset[str]:

@@ -18,16 +18,13 @@ from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.spec.formula import (
     Atom,
-    Earlier,
-    Enlarged,
     Formula,
     Outline,
     Protrusion,
     SignedDistance,
     Term,
-    TrackedName,
 )
-from spatial_replay.spec.walks import iter_expressions, substitute
+from spatial_replay.spec.walks import iter_expressions, looks_back, substitute
 from spatial_replay.trace.trace import Trace
 
 
@@ -94,8 +91,7 @@ class Pointers(NamedTuple):
 def pointing_of(instance: Instance, concerns: Sequence[Concern], regions: Mapping[str, Outline]) -> Pointing:
     """How to point at what an instance finds violated."""
     below = leaves_below(instance.formula, instance.program.leaves)
-    names = {variable: TrackedName(name) for variable, name in instance.bindings.items()}
-    pairs = tuple(_pair(substitute(leaf, names)) for leaf in instance.program.leaves)
+    pairs = tuple(_pair(substitute(leaf, instance.bindings)) for leaf in instance.program.leaves)
     return Pointing(pairs, tuple(below[concern.node] for concern in concerns), regions)
 
 
@@ -179,7 +175,7 @@ def _pair(leaf: Formula) -> Pair | None:
     if not isinstance(leaf, Atom):
         return None
     for pair in _pairs(leaf):
-        if not any(map(_looks_back, (pair.first, pair.second))):
+        if not any(map(looks_back, (pair.first, pair.second))):
             return pair
     return None
 
@@ -193,9 +189,3 @@ def _pairs(atom: Atom) -> Iterator[Pair]:
                 yield Pair(part.inner, part.outer, True)
     if len(atom.terms) > 1:
         yield Pair(atom.terms[0], atom.terms[1], False)
-
-
-def _looks_back(term: Term) -> bool:
-    while isinstance(term, Enlarged):
-        term = term.term
-    return isinstance(term, Earlier)

@@ -292,7 +292,7 @@ StateSet: TypeAlias = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class TransitionTable:
     """The moves of an automaton for the kernels.
 
     Attributes:
@@ -304,7 +304,7 @@ class Table:
     decisions: Integers
 
     @classmethod
-    def of(cls, automaton: Automaton) -> Table:
+    def of(cls, automaton: Automaton) -> TransitionTable:
         """The table of an automaton."""
         decisions = np.array(automaton.decisions, np.int64).reshape(-1, 3)
         return cls(np.array(automaton.entries, np.int64), decisions)

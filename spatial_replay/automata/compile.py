@@ -17,7 +17,7 @@ from spatial_replay.automata.mona import compiled_by_mona
 from spatial_replay.automata.progression import progressed
 from spatial_replay.automata.propositions import Propositions
 from spatial_replay.errors import NoAutomatonError, UsageError
-from spatial_replay.spec.diagnostics import Source, nearest_hint
+from spatial_replay.spec.diagnostics import SourceText, nearest_hint
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import NamedSpec, Specification
 from spatial_replay.spec.load import require_specification
@@ -143,7 +143,7 @@ def automaton(
     if compiler is not None and compiler not in get_args(Compiler):
         raise UsageError(f"no compiler {compiler!r}; there are 'own' and 'mona'")
     spec = chosen_spec(specification, name)
-    source = Source.of(specification.source, specification.filename) if specification.source else None
+    source = SourceText.of(specification.source, specification.filename) if specification.source else None
     propositions = Propositions(spec.formula)
     skeleton = Skeleton(spec.formula, propositions, source)
     compilers = get_args(Compiler) if compiler is None else (compiler,)

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 
 from spatial_replay.automata.propositions import Propositions
 from spatial_replay.errors import NoAutomatonError
-from spatial_replay.spec.diagnostics import Source
+from spatial_replay.spec.diagnostics import SourceText
 from spatial_replay.spec.format import format_bound
 from spatial_replay.spec.formula import (
     PAST_OPERATORS,
@@ -27,7 +27,7 @@ from spatial_replay.spec.formula import (
 )
 
 
-def refuse_operators(formula: Formula, source: Source | None) -> None:
+def refuse_operators(formula: Formula, source: SourceText | None) -> None:
     """That no operator looks back or counts seconds.
 
     Raises:
@@ -46,7 +46,7 @@ def refuse_operators(formula: Formula, source: Source | None) -> None:
         raise NoAutomatonError("\n".join(told), "; ".join(reasons))
 
 
-def no_automaton(spec: NamedSpec, source: Source | None, reason: str) -> NoAutomatonError:
+def no_automaton(spec: NamedSpec, source: SourceText | None, reason: str) -> NoAutomatonError:
     """The error for a spec that no compiler is up to; its widest window is blamed, or else all of it."""
     place = max(_temporal(spec.formula), key=_width, default=spec.formula)
     if not _width(place):
@@ -56,7 +56,9 @@ def no_automaton(spec: NamedSpec, source: Source | None, reason: str) -> NoAutom
     return obstacle(source, place, message, hint)
 
 
-def obstacle(source: Source | None, node: Formula | None, message: str, remedy: str = "") -> NoAutomatonError:
+def obstacle(
+    source: SourceText | None, node: Formula | None, message: str, remedy: str = ""
+) -> NoAutomatonError:
     """The error for what stands at a node; where the source is known, with its place."""
     hint = f"it is evaluated all the same{'; ' if remedy else ''}{remedy}"
     if source is None or node is None:
@@ -125,7 +127,9 @@ class Skeleton:
             whether it is an until, from which the longer one follows, or a release, which follows from that.
     """
 
-    def __init__(self, formula: Formula, propositions: Propositions, source: Source | None = None) -> None:
+    def __init__(
+        self, formula: Formula, propositions: Propositions, source: SourceText | None = None
+    ) -> None:
         """Unroll a formula.
 
         Args:

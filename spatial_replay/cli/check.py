@@ -23,8 +23,9 @@ from spatial_replay.cli.progress import progress
 from spatial_replay.errors import NoAutomatonError, SpecificationError, UsageError
 from spatial_replay.logs.output_file import refuse_inputs, replacing
 from spatial_replay.spec import check_names, load_specification
+from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import format_formula, iter_branches, label_of
-from spatial_replay.spec.formula import Diagnostic, Formula, NamedSpec, Specification, iter_nodes, operator_of
+from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operator_of
 
 
 def iter_tree_lines(formula: Formula) -> Iterator[str]:

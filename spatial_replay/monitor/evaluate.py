@@ -23,9 +23,9 @@ from spatial_replay.monitor.verdict import Verdict, final_verdict, worst_verdict
 from spatial_replay.monitor.witness.path import Evidence
 from spatial_replay.monitor.witness.witness import Witness, find_witness
 from spatial_replay.spec.checks import check_names
-from spatial_replay.spec.diagnostics import nearest_hint
+from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
 from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import Diagnostic, Formula, Specification, iter_nodes, operator_of
+from spatial_replay.spec.formula import Formula, Specification, iter_nodes, operator_of
 from spatial_replay.spec.load import require_specification
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace, window_of

@@ -10,7 +10,7 @@ import numpy as np
 from spatial_replay.errors import UsageError
 from spatial_replay.monitor.atoms.terms import Bindings
 from spatial_replay.monitor.online.program import Program, compile_formula
-from spatial_replay.spec.formula import Formula, NamedSpec, Specification
+from spatial_replay.spec.formula import Formula, NamedSpec, Specification, TrackedName
 from spatial_replay.trace.trace import ABSENT, Trace, window_of
 
 
@@ -91,7 +91,7 @@ def find_instances(
             instances.append(Instance(spec.name, None, spec.formula, program, {}, start_ns, end_ns))
             continue
         for name, (first_ns, last_ns) in sorted(chosen[spec.parameter].items()):
-            bindings = {spec.parameter: name}
+            bindings = {spec.parameter: TrackedName(name)}
             instances.append(
                 Instance(spec.name, name, spec.formula, program, bindings, first_ns, last_ns + 1)
             )

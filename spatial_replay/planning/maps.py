@@ -33,8 +33,6 @@ from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import (
     Atom,
-    Earlier,
-    Enlarged,
     Formula,
     Group,
     Outline,
@@ -43,7 +41,7 @@ from spatial_replay.spec.formula import (
     Term,
     TrackedName,
 )
-from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, terms_of
+from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, looks_back, terms_of
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
@@ -162,17 +160,11 @@ def refuse_delays(propositions: Sequence[Formula]) -> None:
         for each in iter_formulas(proposition):
             terms = list(terms_of(each.expression)) if isinstance(each, Atom) else []
             terms += [each.group] if isinstance(each, Quantified) else []
-            if any(map(_looks_back, terms)):
+            if any(map(looks_back, terms)):
                 raise UsageError(
                     f"{format_formula(each)} looks at earlier samples, so there is no map of it; plan "
                     "without it, and evaluate it with replay"
                 )
-
-
-def _looks_back(term: Term) -> bool:
-    while isinstance(term, Enlarged):
-        term = term.term
-    return isinstance(term, Earlier)
 
 
 def refuse_unknown(names: Sequence[str], sample: Sample, propositions: Sequence[Formula]) -> None:

@@ -16,7 +16,8 @@ from spatial_replay.logs.source import Source, read_blocks, reading_options
 from spatial_replay.recording.interruption import leaving, uninterrupted
 from spatial_replay.recording.recording import Recording, refuse_templates
 from spatial_replay.spec import check_names
-from spatial_replay.spec.formula import Diagnostic, Specification
+from spatial_replay.spec.diagnostics import Diagnostic
+from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.trace import Trace
 
 

@@ -18,7 +18,8 @@ from spatial_replay.monitor.instances import Choice, Instance, find_instances
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
 from spatial_replay.monitor.stream import look_back
 from spatial_replay.spec import check_names
-from spatial_replay.spec.formula import Diagnostic, Specification
+from spatial_replay.spec.diagnostics import Diagnostic
+from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace, window_of
 

@@ -13,12 +13,11 @@ from types import MappingProxyType
 from lark import Token
 
 from spatial_replay.errors import UsageError
-from spatial_replay.spec.diagnostics import Faults, Source, nearest_hint
+from spatial_replay.spec.diagnostics import Diagnostic, Faults, SourceText, nearest_hint
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
     PAST_OPERATORS,
     Atom,
-    Diagnostic,
     Formula,
     Group,
     NamedSpec,
@@ -47,7 +46,7 @@ class _Level:
     binary: Token | None = None
 
 
-def reach_warnings(tokens: Sequence[Token], source: Source, published: bool) -> Iterator[Diagnostic]:
+def reach_warnings(tokens: Sequence[Token], source: SourceText, published: bool) -> Iterator[Diagnostic]:
     """Operators that, without brackets, reach further or elsewhere than a reader may think.
 
     Args:
@@ -80,13 +79,13 @@ def reach_warnings(tokens: Sequence[Token], source: Source, published: bool) -> 
             level.binary = token
 
 
-def _reach(prefix: Token, operator: Token, source: Source) -> Diagnostic:
+def _reach(prefix: Token, operator: Token, source: SourceText) -> Diagnostic:
     message = f"{prefix.value!r} reaches over {operator.value!r} up to the closing bracket"
     hint = f"write ({prefix.value} ...) {operator.value} ... or {prefix.value} (... {operator.value} ...)"
     return source.diagnostic("warning", span_of(prefix), message, hint)
 
 
-def _regrouped(level: _Level, operator: Token, source: Source) -> Iterator[Diagnostic]:
+def _regrouped(level: _Level, operator: Token, source: SourceText) -> Iterator[Diagnostic]:
     if level.negation is not None:
         message = f"the published grammar takes 'not' over {operator.value!r} as well; here it ends before it"
         yield source.diagnostic("warning", span_of(level.negation), message, "write the brackets you mean")
@@ -103,7 +102,7 @@ def _differs(first: Token, second: Token) -> bool:
     return _TIGHTNESS[first.type] > _TIGHTNESS[second.type]
 
 
-def past_warnings(specs: Sequence[NamedSpec], source: Source) -> Iterator[Diagnostic]:
+def past_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterator[Diagnostic]:
     """Past operators outside any future one: at the first sample, where there is no past, they stay."""
     warned: set[Span] = set()
     for spec in specs:
@@ -122,7 +121,7 @@ def past_warnings(specs: Sequence[NamedSpec], source: Source) -> Iterator[Diagno
             stack.extend(operands_of(node))
 
 
-def unused_warnings(names: Namespace, source: Source) -> Iterator[Diagnostic]:
+def unused_warnings(names: Namespace, source: SourceText) -> Iterator[Diagnostic]:
     """Definitions that nothing refers to; a spec is a result by itself."""
     for name, statement in names.definitions.items():
         if isinstance(statement, (SpecStatement, BrokenStatement)) or name in names.used:
@@ -179,7 +178,7 @@ def check_names(
         warning for each object of the log that a definition of the same name hides.
     """
     objects, numeric = tuple(known), tuple(signals)
-    source = Source.of(specification.source, specification.filename)
+    source = SourceText.of(specification.source, specification.filename)
     places, defined = _places(specification, source)
     missing = [("object", name, objects) for name in object_names(specification) if name not in objects]
     missing += [("signal", name, numeric) for name in signal_names(specification) if name not in numeric]
@@ -209,7 +208,7 @@ def _listing(kind: str, names: tuple[str, ...]) -> str:
     return f"its {kind}s are {listed}" + (", ..." if len(names) > _LISTED else "")
 
 
-def _places(specification: Specification, source: Source) -> tuple[dict[str, Span], dict[str, Span]]:
+def _places(specification: Specification, source: SourceText) -> tuple[dict[str, Span], dict[str, Span]]:
     """Where each name first occurs in the source, and where each definition stands."""
     relations = RELATION_NAMES | specification.relations
     tokens = tokenize(specification.source, relations, Faults(source))

@@ -1,4 +1,4 @@
-"""Where faults of a text are collected, each with its place, so that they can all be told at once."""
+"""Faults of a specification's text: each with its place, collected so that all are reported together."""
 
 from __future__ import annotations
 
@@ -10,17 +10,55 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from spatial_replay.errors import SpecificationError
-from spatial_replay.spec.formula import Diagnostic, Span
+from spatial_replay.spec.formula import Span
 
 MAX_FAULTS = 100
-"""Faults told at once; beyond, only their number."""
+"""Faults reported together; beyond, only their number."""
 
 _MAX_SUGGESTION_EFFORT = 10_000
+"""Names compared for hints in one text; a text with a fault in every line would compare millions."""
 _LINE_END = re.compile(r"\r\n|\r|\n")
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class Diagnostic:
+    """An error or a warning about a specification, with its place.
+
+    Attributes:
+        severity: "error" or "warning".
+        line, column: counted from 1; the column in characters.
+        source_line: the line itself.
+        width: how many characters the caret underlines, at least 1.
+        hint: what to write instead, or "".
+    """
+
+    severity: Literal["error", "warning"]
+    message: str
+    filename: str
+    line: int
+    column: int
+    source_line: str
+    width: int = 1
+    hint: str = ""
+
+    def __str__(self) -> str:
+        first = max(0, self.column - _SHOWN_BEFORE) if len(self.source_line) > _SHOWN else 0
+        piece = self.source_line[first : first + _SHOWN]
+        shown = "".join(character if character.isprintable() else " " for character in piece)
+        offset = self.column - 1 - first
+        caret = " " * offset + "^" * max(1, min(self.width, _SHOWN - offset))
+        head = f"{self.filename}:{self.line}:{self.column}: {self.severity}: {self.message}"
+        tail = f"\n  {self.hint}" if self.hint else ""
+        return f"{head}\n  {shown}\n  {caret}{tail}"
+
+
+_SHOWN = 200
+"""Characters of a line that a message shows; of a longer one, those around the fault."""
+_SHOWN_BEFORE = 100
+
+
+@dataclass(frozen=True, slots=True)
+class SourceText:
     """A text and the name of its file; turns offsets into lines and columns."""
 
     text: str
@@ -28,18 +66,18 @@ class Source:
     line_starts: tuple[int, ...]
 
     @classmethod
-    def of(cls, text: str, filename: str) -> Source:
-        """The source of a text, with its lines found."""
+    def of(cls, text: str, filename: str) -> SourceText:
+        """Index the lines of a text."""
         return cls(text, filename, (0, *(found.end() for found in _LINE_END.finditer(text))))
 
     def line_of(self, offset: int) -> int:
-        """The line, counted from 1, that an offset lies in."""
+        """Return the line, counted from 1, that an offset lies in."""
         return bisect_right(self.line_starts, offset)
 
     def diagnostic(
         self, severity: Literal["error", "warning"], span: Span, message: str, hint: str = ""
     ) -> Diagnostic:
-        """A fault or a remark about a span, which is marked up to the end of its first line."""
+        """Return an error or a warning about a span, which is marked up to the end of its first line."""
         line = self.line_of(span.start)
         start = self.line_starts[line - 1]
         end = self.line_starts[line] if line < len(self.line_starts) else len(self.text)
@@ -51,34 +89,34 @@ class Source:
 
 @dataclass(slots=True)
 class Faults:
-    """The faults found so far in one source: at most one for each place, and a bounded number."""
+    """The faults found so far in one text: at most one for each place, and a bounded number."""
 
-    source: Source
+    source: SourceText
     found: dict[Span, Diagnostic] = field(default_factory=dict)
-    untold: int = 0
+    unreported: int = 0
     effort: int = 0
 
     @property
     def is_full(self) -> bool:
-        """Whether further faults are only counted, so that nothing need be found out about them."""
+        """Whether further faults are only counted, so that no hint need be worked out for them."""
         return len(self.found) >= MAX_FAULTS
 
     @property
     def count(self) -> int:
-        """All faults, told or not."""
-        return len(self.found) + self.untold
+        """All faults, reported or only counted."""
+        return len(self.found) + self.unreported
 
     def add(self, span: Span, message: str, hint: str = "") -> None:
-        """Take in a fault, unless its place has one already; when full, only count it."""
+        """Add a fault, unless its place has one already; when full, only count it."""
         if span in self.found:
             return
         if self.is_full:
-            self.untold += 1
+            self.unreported += 1
             return
         self.found[span] = self.source.diagnostic("error", span, _cropped(message), _cropped(hint))
 
     def nearest(self, name: str, known: Iterable[str]) -> str:
-        """The hint that names the known name most like one that is unknown, or ""."""
+        """Return a hint with the known name most like one that is unknown, or ""."""
         if self.is_full or self.effort > _MAX_SUGGESTION_EFFORT:
             return ""
         candidates = tuple(known)
@@ -86,16 +124,17 @@ class Faults:
         return nearest_hint(name, candidates)
 
     def raise_if_any(self) -> None:
-        """
+        """Raise the error of all faults, in the order of the text.
+
         Raises:
-            SpecificationError: with every fault, in the order of the text.
+            SpecificationError: there is a fault.
         """
         if not self.found:
             return
         diagnoses = sorted(self.found.values(), key=lambda fault: (fault.line, fault.column))
-        if self.untold:
+        if self.unreported:
             end = Span(len(self.source.text), len(self.source.text))
-            remark = f"{self.untold} further faults are not shown"
+            remark = f"{self.unreported} further faults are not shown"
             diagnoses.append(self.source.diagnostic("error", end, remark, "mend these first"))
         raise SpecificationError(diagnoses)
 
@@ -105,7 +144,7 @@ _LONGEST_COMPARED = 64
 
 
 def _cropped(message: str) -> str:
-    """A message of a length to be read, even about a name of pages."""
+    """Shorten the middle of a long message, such as one about a name of several pages."""
     if len(message) <= _LONGEST_MESSAGE:
         return message
     half = _LONGEST_MESSAGE // 2
@@ -113,7 +152,7 @@ def _cropped(message: str) -> str:
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str | None:
-    """The known name most like `name`, if one is like it at all."""
+    """Return the known name most like `name`, if one is like it at all."""
     if len(name) > _LONGEST_COMPARED:
         return None
     comparable = [candidate for candidate in known if len(candidate) <= _LONGEST_COMPARED]
@@ -122,6 +161,6 @@ def nearest_name(name: str, known: Iterable[str]) -> str | None:
 
 
 def nearest_hint(name: str, known: Iterable[str]) -> str:
-    """The hint that names the known name most like `name`, or ""."""
+    """Return a hint with the known name most like `name`, or ""."""
     match = nearest_name(name, known)
     return f"did you mean {match!r}?" if match is not None else ""

@@ -1,4 +1,4 @@
-"""What a specification says: terms, expressions, formulas, as frozen values.
+"""Terms, expressions, formulas and specifications, as frozen values.
 
 Three layers, each built of the one before:
 
@@ -8,17 +8,18 @@ Three layers, each built of the one before:
   projections, and their sums, minima and maxima. Every spatial relation is such an expression
   (see `relations`), positive where the relation holds;
 - a *formula* combines atoms (an expression, as it was written) by Boolean and temporal operators.
-
-Nothing here computes: walks over these values live with what they compute.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from spatial_replay.lazy import Displayed
+
+if TYPE_CHECKING:
+    from spatial_replay.spec.diagnostics import Diagnostic
 
 Axis: TypeAlias = Literal["x", "y", "z"]
 Side: TypeAlias = Literal["min", "max"]
@@ -214,7 +215,7 @@ Expression: TypeAlias = Number | Measurement | Signal | Sum | Negative | Minimum
 
 
 def as_expression(value: object) -> Expression:
-    """The expression that a number or an expression stands for.
+    """Return a number as an expression, and an expression as it is.
 
     Raises:
         TypeError: for anything else.
@@ -227,12 +228,12 @@ def as_expression(value: object) -> Expression:
 
 
 def minimum(*operands: Expression | float) -> Minimum:
-    """The least of some expressions."""
+    """Return the least of some expressions."""
     return Minimum(tuple(as_expression(operand) for operand in operands))
 
 
 def maximum(*operands: Expression | float) -> Maximum:
-    """The greatest of some expressions."""
+    """Return the greatest of some expressions."""
     return Maximum(tuple(as_expression(operand) for operand in operands))
 
 
@@ -241,7 +242,7 @@ def maximum(*operands: Expression | float) -> Maximum:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """Where something stands in a source text: characters `start` up to, not including, `end`."""
+    """A place in a source text: characters `start` up to, not including, `end`."""
 
     start: int
     end: int
@@ -262,8 +263,7 @@ class Bound:
     unit: Literal["samples", "ns"]
 
 
-def _unspanned() -> Span:
-    return Span(0, 0)
+_NO_SPAN = Span(0, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,7 +272,7 @@ class Truth:
 
     value: bool
     name: str | None = None
-    span: Span = field(default_factory=_unspanned, compare=False)
+    span: Span = field(default=_NO_SPAN, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,7 +291,7 @@ class Atom:
     relation: str
     expression: Expression
     name: str | None = None
-    span: Span = field(default_factory=_unspanned, compare=False)
+    span: Span = field(default=_NO_SPAN, compare=False)
     terms: tuple[Term, ...] = ()
     parameters: tuple[float | str, ...] = ()
 
@@ -304,18 +304,17 @@ BooleanOperator: TypeAlias = Literal["not", "and", "or", "xor", "->", "<->", "sp
 class Boolean:
     """A Boolean operator: `not` and `spec` have one operand; `and` and `or` two or more; the rest two.
 
-    Attributes:
-        expansion: the formula that defines it; None for `not`, `and` and `or` (see `expand`).
+    Its `expansion` is the formula that defines it; None for `not`, `and` and `or` (see `expand`).
     """
 
     operator: BooleanOperator
     operands: tuple[Formula, ...]
     name: str | None = None
-    span: Span = field(default_factory=_unspanned, compare=False)
+    span: Span = field(default=_NO_SPAN, compare=False)
     expansion: Formula | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "expansion", _boolean_expansion(self.operator, self.operands))
+        object.__setattr__(self, "expansion", _expansion(self.operator, self.operands))
 
 
 TemporalOperator: TypeAlias = Literal["X", "WX", "F", "G", "U", "R", "W", "Y", "O", "H", "S"]
@@ -327,19 +326,18 @@ PAST_OPERATORS: frozenset[str] = frozenset({"Y", "O", "H", "S"})
 class Temporal:
     """A temporal operator: U, R, W and S have two operands, the others one; X, WX and Y have no bound.
 
-    Attributes:
-        expansion: the formula that defines R, W and WX; None for the others (see `expand`).
+    Its `expansion` is the formula that defines R, W and WX; None for the others (see `expand`).
     """
 
     operator: TemporalOperator
     operands: tuple[Formula, ...]
     bound: Bound | None = None
     name: str | None = None
-    span: Span = field(default_factory=_unspanned, compare=False)
+    span: Span = field(default=_NO_SPAN, compare=False)
     expansion: Formula | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "expansion", _temporal_expansion(self.operator, self.operands, self.bound))
+        object.__setattr__(self, "expansion", _expansion(self.operator, self.operands, self.bound))
 
 
 @dataclass(frozen=True, slots=True)
@@ -358,7 +356,7 @@ class Quantified:
     group: Group | Earlier
     body: Formula
     name: str | None = None
-    span: Span = field(default_factory=_unspanned, compare=False)
+    span: Span = field(default=_NO_SPAN, compare=False)
 
 
 Formula: TypeAlias = Truth | Atom | Boolean | Temporal | Quantified
@@ -375,34 +373,28 @@ def expand(formula: Formula) -> Formula:
     return formula
 
 
-def _boolean_expansion(operator: BooleanOperator, operands: tuple[Formula, ...]) -> Formula | None:
-    first, *rest = operands
+def _expansion(operator: str, operands: tuple[Formula, ...], bound: Bound | None = None) -> Formula | None:
+    first, last = operands[0], operands[-1]
     match operator:
         case "spec":
             return first
         case "->":
-            return _or(_not(first), rest[0])
+            return Boolean("or", (_not(first), last))
         case "xor":
-            return _or(_and(first, _not(rest[0])), _and(_not(first), rest[0]))
+            one, other = Boolean("and", (first, _not(last))), Boolean("and", (_not(first), last))
+            return Boolean("or", (one, other))
         case "<->":
-            return _and(_or(_not(first), rest[0]), _or(_not(rest[0]), first))
-    return None
-
-
-def _temporal_expansion(
-    operator: TemporalOperator, operands: tuple[Formula, ...], bound: Bound | None
-) -> Formula | None:
-    first, last = operands[0], operands[-1]
-    match operator:
+            one, other = Boolean("or", (_not(first), last)), Boolean("or", (_not(last), first))
+            return Boolean("and", (one, other))
         case "WX":
             return _not(Temporal("X", (_not(first),)))
         case "R":
             return _not(Temporal("U", (_not(first), _not(last)), bound))
         case "W" if bound is None:
             # not "U or G": that would count as two unbounded operators, each doubling the online state
-            return Temporal("R", (last, _or(first, last)))
+            return Temporal("R", (last, Boolean("or", (first, last))))
         case "W":
-            return _or(Temporal("U", operands, bound), Temporal("G", (first,), bound))
+            return Boolean("or", (Temporal("U", operands, bound), Temporal("G", (first,), bound)))
     return None
 
 
@@ -410,23 +402,15 @@ def _not(operand: Formula) -> Boolean:
     return Boolean("not", (operand,))
 
 
-def _and(*operands: Formula) -> Boolean:
-    return Boolean("and", operands)
-
-
-def _or(*operands: Formula) -> Boolean:
-    return Boolean("or", operands)
-
-
 def operands_of(formula: Formula) -> tuple[Formula, ...]:
-    """The formulas directly below a node of the tree; a quantifier over an open group has none."""
+    """Return the formulas directly below a node of the tree; a quantifier over an open group has none."""
     if isinstance(formula, (Boolean, Temporal)):
         return formula.operands
     return ()
 
 
 def operator_of(formula: Formula) -> str:
-    """The operator shown for a node: "and", "F", "forall"; an atom's relation; "true" or "false"."""
+    """Return the operator shown for a node: "and", "F", "forall", an atom's relation, "true", "false"."""
     match formula:
         case Boolean() | Temporal():
             return formula.operator
@@ -439,7 +423,7 @@ def operator_of(formula: Formula) -> str:
 
 
 def iter_nodes(formula: Formula) -> Iterator[tuple[int, int | None, Formula]]:
-    """The tree's nodes as (id, parent's id, node), from the root, 0, in the order of the text."""
+    """Yield the tree's nodes as (id, parent's id, node), from the root, 0, in the order of the text."""
     stack: list[tuple[int | None, Formula]] = [(None, formula)]
     identifier = 0
     while stack:
@@ -485,7 +469,7 @@ class NamedSpec:
     formula: Formula
     parameter: str | None = None
     is_result: bool = True
-    span: Span = field(default_factory=_unspanned, compare=False)
+    span: Span = field(default=_NO_SPAN, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -505,8 +489,7 @@ class Constant:
 class Specification(Displayed):
     """All specs of one text, parsed: macros, constants and named quantifiers expanded.
 
-    Two specifications are equal when they mean the same: the source text, its file name, its constants and
-    the warnings do not count.
+    Equality is of meaning: the source text, its file name, constants and warnings do not count.
 
     Attributes:
         specs: every `spec`, in the order of the text.
@@ -517,7 +500,7 @@ class Specification(Displayed):
         constants: by name; formulas have their values already.
         source: the text it was parsed from, without a byte order mark; spans are offsets into it.
         filename: base name of the file it came from, or "<text>".
-        warnings: what `check` remarks on.
+        warnings: what `check` warns of.
     """
 
     specs: tuple[NamedSpec, ...]
@@ -534,40 +517,3 @@ class Specification(Displayed):
     def results(self) -> tuple[NamedSpec, ...]:
         """The specs that no other spec uses: what an evaluation reports on."""
         return tuple(spec for spec in self.specs if spec.is_result)
-
-
-@dataclass(frozen=True, slots=True)
-class Diagnostic:
-    """A fault or a remark about a specification, with the place it is about.
-
-    Attributes:
-        severity: "error" or "warning".
-        line, column: counted from 1; the column in characters.
-        source_line: the line itself.
-        width: how many characters the caret underlines, at least 1.
-        hint: what to write instead, or "".
-    """
-
-    severity: Literal["error", "warning"]
-    message: str
-    filename: str
-    line: int
-    column: int
-    source_line: str
-    width: int = 1
-    hint: str = ""
-
-    def __str__(self) -> str:
-        first = max(0, self.column - _SHOWN_BEFORE) if len(self.source_line) > _SHOWN else 0
-        piece = self.source_line[first : first + _SHOWN]
-        shown = "".join(character if character.isprintable() else " " for character in piece)
-        offset = self.column - 1 - first
-        caret = " " * offset + "^" * max(1, min(self.width, _SHOWN - offset))
-        head = f"{self.filename}:{self.line}:{self.column}: {self.severity}: {self.message}"
-        tail = f"\n  {self.hint}" if self.hint else ""
-        return f"{head}\n  {shown}\n  {caret}{tail}"
-
-
-_SHOWN = 200
-"""Characters of a line that a message shows; of a longer one, those around the fault."""
-_SHOWN_BEFORE = 100

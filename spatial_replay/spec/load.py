@@ -13,9 +13,9 @@ from lark import Token
 from spatial_replay.errors import MissingFileError, SpecificationError, UsageError
 from spatial_replay.spec.atoms import parameters_of
 from spatial_replay.spec.checks import past_warnings, reach_warnings, unused_warnings
-from spatial_replay.spec.diagnostics import Faults, Source, nearest_hint
+from spatial_replay.spec.diagnostics import Diagnostic, Faults, SourceText, nearest_hint
 from spatial_replay.spec.elaborate import Elaborator, TooLargeError
-from spatial_replay.spec.formula import Constant, Diagnostic, Expression, Span, Specification
+from spatial_replay.spec.formula import Constant, Expression, Span, Specification
 from spatial_replay.spec.parser import parse_statements
 from spatial_replay.spec.relations import DEFAULT_PROFILE, PROFILES, RELATION_NAMES, Relation
 from spatial_replay.spec.resolve import Namespace
@@ -58,7 +58,7 @@ def parse_specification(
     if profile is not None and profile not in PROFILES:
         raise UsageError(f"unknown profile {profile!r}; the profiles are {', '.join(PROFILES)}")
     text = text.removeprefix("\ufeff")
-    faults = Faults(Source.of(text, filename))
+    faults = Faults(SourceText.of(text, filename))
     names = RELATION_NAMES | given.keys()
     tokens = _tokens(text, names, faults)
     statements = parse_statements(tokens, names, faults)
@@ -122,7 +122,7 @@ def load_specification(
         text = content.decode("utf-8")
     except UnicodeDecodeError as error:
         before = content[: error.start].decode("utf-8")
-        source = Source.of(before + "\ufffd", path.name)
+        source = SourceText.of(before + "\ufffd", path.name)
         message = f"byte 0x{content[error.start]:02x} is no UTF-8 text"
         hint = "save the file as UTF-8"
         place = Span(len(before), len(before) + 1)

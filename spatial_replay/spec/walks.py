@@ -1,9 +1,10 @@
-"""Walks over terms and expressions: which names they hold, and others put in their place."""
+"""Walks over terms, expressions and formulas: what they hold, and other things put in its place."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from spatial_replay.spec.format import format_relation
@@ -17,6 +18,7 @@ from spatial_replay.spec.formula import (
     Formula,
     Group,
     Maximum,
+    Measurement,
     Minimum,
     Misalignment,
     Negative,
@@ -33,19 +35,33 @@ from spatial_replay.spec.formula import (
     TrackedName,
     Truth,
     Variable,
+    operands_of,
+    operator_of,
 )
 from spatial_replay.spec.relations import RELATION_NAMES
 
 
 def base_of(term: Term) -> TrackedName | Variable | RegionName | Group:
-    """What a term names, without delays and enlargements."""
+    """Return what a term names, without delays and enlargements."""
     while isinstance(term, (Earlier, Enlarged)):
         term = term.term
     return term
 
 
+def without_enlargement(term: Term) -> TrackedName | Variable | RegionName | Group | Earlier:
+    """Return a term as it is before it is enlarged; a delay stays."""
+    while isinstance(term, Enlarged):
+        term = term.term
+    return term
+
+
+def looks_back(term: Term) -> bool:
+    """Return whether a term is that of an earlier sample."""
+    return isinstance(without_enlargement(term), Earlier)
+
+
 def iter_expressions(expression: Expression) -> Iterator[Expression]:
-    """An expression and all within it."""
+    """Yield an expression and all within it."""
     stack = [expression]
     while stack:
         current = stack.pop()
@@ -59,22 +75,26 @@ def iter_expressions(expression: Expression) -> Iterator[Expression]:
                 stack += reversed(current.operands)
 
 
+def measured_terms(measurement: Measurement) -> tuple[Term, ...]:
+    """Return the one or two terms that a measurement is of."""
+    match measurement:
+        case SignedDistance() | Misalignment():
+            return measurement.first, measurement.second
+        case Protrusion():
+            return measurement.inner, measurement.outer
+        case Projection() | CentroidProjection():
+            return (measurement.term,)
+
+
 def terms_of(expression: Expression) -> Iterator[Term]:
-    """The terms that an expression measures."""
+    """Yield the terms that an expression measures."""
     for current in iter_expressions(expression):
-        match current:
-            case SignedDistance() | Misalignment():
-                yield current.first
-                yield current.second
-            case Protrusion():
-                yield current.inner
-                yield current.outer
-            case Projection() | CentroidProjection():
-                yield current.term
+        if isinstance(current, Measurement):
+            yield from measured_terms(current)
 
 
 def iter_formulas(formula: Formula) -> Iterator[Formula]:
-    """A formula and all within it, the bodies of quantifiers included, in the order of the text."""
+    """Yield a formula and all within it, the bodies of quantifiers included, in the order of the text."""
     stack = [formula]
     while stack:
         current = stack.pop()
@@ -86,22 +106,47 @@ def iter_formulas(formula: Formula) -> Iterator[Formula]:
                 stack.append(current.body)
 
 
+def iter_terms(formulas: Iterable[Formula]) -> Iterator[Term]:
+    """Yield the terms that atoms measure and the groups of open quantifiers, in the order of the text."""
+    for formula in formulas:
+        for each in iter_formulas(formula):
+            if isinstance(each, Atom):
+                yield from terms_of(each.expression)
+            elif isinstance(each, Quantified):
+                yield each.group
+
+
 def other_names(formula: Formula) -> frozenset[str]:
-    """Names in a formula of objects, regions, groups and specs: all but variables."""
-    found: set[str] = set()
-    for each in iter_formulas(formula):
-        if each.name is not None:
-            found.add(each.name)
-        terms: list[Term] = list(terms_of(each.expression)) if isinstance(each, Atom) else []
-        if isinstance(each, Quantified):
-            terms.append(each.group)
-        for base in map(base_of, terms):
-            if isinstance(base, (TrackedName, RegionName)):
-                found.add(base.name)
-            elif isinstance(base, Group):
-                found.add(base.name)
-                found.update(member.name for member in base.excluded if isinstance(member, TrackedName))
-    return frozenset(found)
+    """Return the names in a formula of objects, regions, groups and specs: all but variables."""
+    names = {each.name for each in iter_formulas(formula) if each.name is not None}
+    for base in map(base_of, iter_terms([formula])):
+        if isinstance(base, (TrackedName, RegionName, Group)):
+            names.add(base.name)
+        if isinstance(base, Group):
+            names.update(member.name for member in base.excluded if isinstance(member, TrackedName))
+    return frozenset(names)
+
+
+def operand_signs(formula: Formula, operand: int) -> tuple[int, ...]:
+    """Return in which signs the robustness of an operand can become that of its node: 1, -1 or both.
+
+    Args:
+        operand: its place among the operands.
+    """
+    if not isinstance(formula, Boolean):
+        return (1,)
+    # stand-ins, because equal operands may be one object and still are two places in the text
+    stand_ins = tuple(Truth(True) for _ in formula.operands)
+    node = Boolean(formula.operator, stand_ins)
+    signs: set[int] = set()
+    stack: list[tuple[Formula, int]] = [(node.expansion or node, 1)]
+    while stack:
+        current, sign = stack.pop()
+        if current is stand_ins[operand]:
+            signs.add(sign)
+        below = -sign if operator_of(current) == "not" else sign
+        stack.extend((each, below) for each in operands_of(current))
+    return tuple(sorted(signs, reverse=True))
 
 
 # -------------------------------------------------------------------------------------- substitution
@@ -110,18 +155,19 @@ Names = Mapping[str, TrackedName | Variable]
 
 
 def substitute(formula: Formula, names: Names, relations: frozenset[str] = RELATION_NAMES) -> Formula:
-    """A formula with other objects in place of some of its variables."""
+    """Return a formula with other objects in place of some of its variables."""
     if not names:
         return formula
     match formula:
         case Truth():
             return formula
         case Atom():
+            expression = map_leaves(formula.expression, partial(_substituted, names=names))
             terms = tuple(substitute_term(term, names) for term in formula.terms)
             text = formula.text
             if terms:
                 text = format_relation(formula.relation, terms, formula.parameters, relations)
-            return replace(formula, text=text, terms=terms, expression=_expression(formula.expression, names))
+            return replace(formula, text=text, terms=terms, expression=expression)
         case Quantified():
             group: Any = substitute_term(formula.group, names)
             inner = {old: new for old, new in names.items() if old not in formula.variables}
@@ -132,12 +178,12 @@ def substitute(formula: Formula, names: Names, relations: frozenset[str] = RELAT
 
 
 def substitute_term(term: Term, names: Names) -> Term:
+    """Return a term with other objects in place of some of its variables."""
     match term:
         case Variable():
             return names.get(term.name, term)
         case Group():
-            excluded = tuple(_object(each, names) for each in term.excluded)
-            return replace(term, excluded=excluded)
+            return replace(term, excluded=tuple(_object(each, names) for each in term.excluded))
         case Earlier():
             then: Any = substitute_term(term.term, names)
             return replace(term, term=then)
@@ -151,23 +197,39 @@ def _object(term: TrackedName | Variable, names: Names) -> TrackedName | Variabl
     return names.get(term.name, term) if isinstance(term, Variable) else term
 
 
-def _expression(expression: Expression, names: Names) -> Expression:
-    match expression:
-        case Number() | Signal():
-            return expression
-        case SignedDistance() | Misalignment():
-            first, second = (substitute_term(term, names) for term in (expression.first, expression.second))
-            return replace(expression, first=first, second=second)
+def map_terms(measurement: Measurement, change: Callable[[Term], Term]) -> Measurement:
+    """Return a measurement of other terms."""
+    match measurement:
+        case SignedDistance():
+            return SignedDistance(change(measurement.first), change(measurement.second))
+        case Misalignment():
+            return Misalignment(change(measurement.first), change(measurement.second))
         case Protrusion():
-            inner, outer = (substitute_term(term, names) for term in (expression.inner, expression.outer))
-            return Protrusion(inner, outer)
-        case Projection() | CentroidProjection():
-            return replace(expression, term=substitute_term(expression.term, names))
+            return Protrusion(change(measurement.inner), change(measurement.outer))
+        case Projection():
+            return Projection(change(measurement.term), measurement.axis, measurement.side)
+        case CentroidProjection():
+            return CentroidProjection(change(measurement.term), measurement.axis, measurement.side)
+
+
+def map_leaves(
+    expression: Expression, change: Callable[[Number | Signal | Measurement], Expression]
+) -> Expression:
+    """Return an expression with its numbers, signals and measurements replaced."""
+    match expression:
         case Sum():
-            return Sum(_expression(expression.first, names), _expression(expression.second, names))
+            return Sum(map_leaves(expression.first, change), map_leaves(expression.second, change))
         case Negative():
-            return Negative(_expression(expression.operand, names))
+            return Negative(map_leaves(expression.operand, change))
         case Minimum():
-            return Minimum(tuple([_expression(operand, names) for operand in expression.operands]))
+            return Minimum(tuple([map_leaves(each, change) for each in expression.operands]))
         case Maximum():
-            return Maximum(tuple([_expression(operand, names) for operand in expression.operands]))
+            return Maximum(tuple([map_leaves(each, change) for each in expression.operands]))
+        case _:
+            return change(expression)
+
+
+def _substituted(leaf: Number | Signal | Measurement, names: Names) -> Expression:
+    if isinstance(leaf, Number | Signal):
+        return leaf
+    return map_terms(leaf, lambda term: substitute_term(term, names))

@@ -18,7 +18,7 @@ from spatial_replay.cli.application import (
     gravest,
     message_of,
 )
-from spatial_replay.spec.formula import Diagnostic
+from spatial_replay.spec.diagnostics import Diagnostic
 
 FAULT = Diagnostic("error", "unknown relation 'ovlap'", "a.spatial", 1, 3, "a ovlap b", 5)
 ORDER = (130, 70, 2, 3, 1, 4, 0)

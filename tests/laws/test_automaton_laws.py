@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from laws.reference import Prefix
 from laws.strategies_automaton import compiled, formulas_and_symbols, formulas_with_automata
 from laws.strategies_monitor import leaf_runs
-from spatial_replay.automata.automaton import Automaton, Table
+from spatial_replay.automata.automaton import Automaton, TransitionTable
 from spatial_replay.automata.compile import automaton, automaton_from, stored_text
 from spatial_replay.spec.formula import NamedSpec, Specification
 
@@ -63,13 +63,13 @@ def test_many_samples_at_once_are_as_one_by_one(given_symbols):
     values = values.reshape(len(symbols), len(machine.propositions)).T.copy()
     begin = np.zeros(len(machine.states), np.bool_)
     begin[machine.initial] = True
-    sets = Table.of(machine).state_sets(begin, values)
+    sets = TransitionTable.of(machine).state_sets(begin, values)
     possible = frozenset({machine.initial})
     for t, symbol in enumerate(symbols):
         possible = machine.step_set(possible, symbol)
         assert set(np.flatnonzero(sets[t]).tolist()) == possible
     if not (values < 0).any():
-        states = Table.of(machine).states(machine.initial, values)
+        states = TransitionTable.of(machine).states(machine.initial, values)
         assert [{state} for state in states.tolist()] == [set(np.flatnonzero(row)) for row in sets]
 
 

@@ -11,18 +11,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import permutations
 from math import inf, perm
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from spatial_replay.compiled import long_kernel
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Flags, Floats, Integers
-from spatial_replay.monitor.atoms.terms import Bindings, bind, bind_group
+from spatial_replay.monitor.atoms.terms import Bindings
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
-    CentroidProjection,
     Earlier,
     Expression,
     Formula,
@@ -30,20 +29,18 @@ from spatial_replay.spec.formula import (
     Maximum,
     Measurement,
     Minimum,
-    Misalignment,
     Negative,
     Number,
-    Projection,
-    Protrusion,
     Quantified,
     Signal,
-    SignedDistance,
     Sum,
     Temporal,
+    TrackedName,
     Truth,
     operands_of,
     operator_of,
 )
+from spatial_replay.spec.walks import map_terms, substitute_term
 
 # instructions: operation, a, b, c
 CONSTANT, MEASURED, SIGNAL = 0, 1, 2  # number a of its kind
@@ -214,7 +211,7 @@ class LeafCode:
                 for other in others:
                     row = self._row(op, row, other)
                 return row
-        measurement = _bound(expression, bindings)
+        measurement = map_terms(expression, lambda term: substitute_term(term, bindings))
         return self._row(MEASURED, self.measurements.setdefault(measurement, len(self.measurements)))
 
     def _joined(self, formula: Formula, rows: Mapping[int, int]) -> int:
@@ -234,7 +231,7 @@ class LeafCode:
 
     def _quantified(self, formula: Quantified, bindings: Bindings) -> int:
         is_forall = formula.quantifier == "forall"
-        group = bind_group(formula.group, bindings)
+        group: Any = substitute_term(formula.group, bindings)
         names = self._groups.candidates(group)
         self._check_bindings(formula, len(names))
         op = AND_MEMBER if is_forall else OR_MEMBER
@@ -242,7 +239,8 @@ class LeafCode:
         if self._groups.may_be_unknown(group):
             result = self._row(op, result, result, self._member(group, ()))
         for chosen in permutations(range(len(names)), len(formula.variables)):
-            inner = {**bindings, **{v: names[n] for v, n in zip(formula.variables, chosen, strict=True)}}
+            members = [TrackedName(names[n]) for n in chosen]
+            inner = {**bindings, **dict(zip(formula.variables, members, strict=True))}
             body = self._add(formula.body, inner)
             result = self._row(op, result, body, self._member(group, chosen))
         return result
@@ -258,19 +256,3 @@ class LeafCode:
                 f"formula to {self._bindings} bindings; {MAX_BINDINGS} is the limit: use a smaller group or "
                 "fewer variables"
             )
-
-
-def _bound(measurement: Measurement, bindings: Bindings) -> Measurement:
-    if not bindings:
-        return measurement
-    match measurement:
-        case SignedDistance():
-            return SignedDistance(bind(measurement.first, bindings), bind(measurement.second, bindings))
-        case Misalignment():
-            return Misalignment(bind(measurement.first, bindings), bind(measurement.second, bindings))
-        case Protrusion():
-            return Protrusion(bind(measurement.inner, bindings), bind(measurement.outer, bindings))
-        case Projection():
-            return Projection(bind(measurement.term, bindings), measurement.axis, measurement.side)
-        case CentroidProjection():
-            return CentroidProjection(bind(measurement.term, bindings), measurement.axis, measurement.side)

@@ -37,22 +37,19 @@ from spatial_replay.monitor.atoms.live_rows import (
     RecentSamples,
     iter_delays,
 )
-from spatial_replay.monitor.atoms.measurements import measured_terms, quantity_of
+from spatial_replay.monitor.atoms.measurements import quantity_of
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.spec.formula import (
     ANY_CLASS,
-    Atom,
     Enlarged,
-    Formula,
     Group,
     Misalignment,
     Outline,
-    Quantified,
     RegionName,
     Term,
     TrackedName,
 )
-from spatial_replay.spec.walks import base_of, iter_formulas, terms_of
+from spatial_replay.spec.walks import base_of, iter_terms, measured_terms
 from spatial_replay.trace.sample import Sample
 
 
@@ -220,7 +217,7 @@ class SampleLeaves:
 
     def __init__(self, leaves: Sequence[Leaves], regions: Mapping[str, Outline]) -> None:
         formulas = list(chain.from_iterable(leaves))
-        bases = [base_of(term) for term in _terms(formulas)]
+        bases = [base_of(term) for term in iter_terms(formulas)]
         open_classes = {base.class_name or "" for base in bases if isinstance(base, Group) and base.is_open}
         regions_named = {base.name for base in bases if isinstance(base, RegionName)}
         classes = sorted({name.casefold() for name in open_classes if name != ANY_CLASS})
@@ -319,16 +316,6 @@ def _room(count: int) -> int:
     """For how many a plan for so many is made: 1, 2, 3, 4, 6, 8, 12, 16, …, so that there are few plans."""
     power = 1 << (count - 1).bit_length()
     return count if count < 4 else power * 3 // 4 if count <= power * 3 // 4 else power
-
-
-def _terms(formulas: Sequence[Formula]) -> list[Term]:
-    terms: list[Term] = []
-    for formula in chain.from_iterable(map(iter_formulas, formulas)):
-        if isinstance(formula, Atom):
-            terms += terms_of(formula.expression)
-        elif isinstance(formula, Quantified):
-            terms.append(formula.group)
-    return terms
 
 
 def _names(bases: Sequence[Term]) -> frozenset[str]:

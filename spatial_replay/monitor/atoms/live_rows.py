@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from typing import NamedTuple, TypeAlias
 
 from spatial_replay.monitor.atoms.instructions import Membership
@@ -18,7 +17,6 @@ from spatial_replay.spec.formula import (
     ANY_CLASS,
     Atom,
     Earlier,
-    Enlarged,
     Formula,
     Group,
     Outline,
@@ -26,7 +24,7 @@ from spatial_replay.spec.formula import (
     RegionName,
     Term,
 )
-from spatial_replay.spec.walks import iter_formulas, terms_of
+from spatial_replay.spec.walks import iter_terms, without_enlargement
 from spatial_replay.trace.sample import Sample
 
 
@@ -46,13 +44,9 @@ NO_DELAY = Delay(0, None)
 
 def iter_delays(formulas: Iterable[Formula]) -> Iterator[Delay]:
     """How far each term in some formulas looks back, for those that do."""
-    for formula in chain.from_iterable(map(iter_formulas, formulas)):
-        terms = terms_of(formula.expression) if isinstance(formula, Atom) else ()
-        for term in chain(terms, (formula.group,) if isinstance(formula, Quantified) else ()):
-            while isinstance(term, Enlarged):
-                term = term.term
-            if isinstance(term, Earlier):
-                yield Delay.of(term)
+    for term in map(without_enlargement, iter_terms(formulas)):
+        if isinstance(term, Earlier):
+            yield Delay.of(term)
 
 
 class RecentSamples:
@@ -142,8 +136,7 @@ class PlanRows:
 
     def of_term(self, term: Term) -> list[Row]:
         """The rows that a term is the union of."""
-        while isinstance(term, Enlarged):
-            term = term.term
+        term = without_enlargement(term)
         sample = self._sample_of(term)
         base = term.term if isinstance(term, Earlier) else term
         if isinstance(base, RegionName):
@@ -158,8 +151,7 @@ class PlanRows:
 
     def required(self, term: Term) -> list[int]:
         """The rows without which a term is unknown as a whole: that of its sample among them."""
-        while isinstance(term, Enlarged):
-            term = term.term
+        term = without_enlargement(term)
         base = term.term if isinstance(term, Earlier) else term
         sample = [self._sample_of(term)] if isinstance(term, Earlier) else []
         if isinstance(base, RegionName) or (isinstance(base, Group) and base.members is None):

@@ -6,7 +6,6 @@ Numbers that leaves are computed from: measured once per trace, kept for the nex
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -16,7 +15,6 @@ from spatial_replay.monitor.atoms.instructions import LeafCode, Membership, run_
 from spatial_replay.monitor.atoms.terms import Bindings, TraceScene
 from spatial_replay.spec.formula import (
     CentroidProjection,
-    Earlier,
     Enlarged,
     Formula,
     Measurement,
@@ -27,6 +25,7 @@ from spatial_replay.spec.formula import (
     SignedDistance,
     Term,
 )
+from spatial_replay.spec.walks import base_of, map_terms, measured_terms
 
 
 def measured(scene: TraceScene, measurements: Sequence[Measurement]) -> tuple[Floats, Floats]:
@@ -84,17 +83,6 @@ def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Flo
     return result
 
 
-def measured_terms(measurement: Measurement) -> tuple[Term, ...]:
-    """The one or two terms that a measurement is of."""
-    match measurement:
-        case SignedDistance() | Misalignment():
-            return measurement.first, measurement.second
-        case Protrusion():
-            return measurement.inner, measurement.outer
-        case Projection() | CentroidProjection():
-            return (measurement.term,)
-
-
 def quantity_of(measurement: Measurement) -> Quantity:
     match measurement:
         case SignedDistance():
@@ -116,25 +104,14 @@ def _key(scene: TraceScene, measurement: Measurement) -> Hashable:
     )
     if not shapes:
         return scene.skip, measurement
-    nameless: Measurement
-    match measurement:
-        case SignedDistance():
-            nameless = replace(
-                measurement, first=_unnamed(measurement.first), second=_unnamed(measurement.second)
-            )
-        case Protrusion():
-            nameless = replace(
-                measurement, inner=_unnamed(measurement.inner), outer=_unnamed(measurement.outer)
-            )
-        case _:
-            return scene.skip, measurement, shapes
-    return scene.skip, nameless, shapes
+    if isinstance(measurement, Misalignment | Projection | CentroidProjection):
+        return scene.skip, measurement, shapes
+    return scene.skip, map_terms(measurement, _unnamed), shapes
 
 
 def _region(term: Term) -> str | None:
-    while isinstance(term, (Enlarged, Earlier)):
-        term = term.term
-    return term.name if isinstance(term, RegionName) else None
+    base = base_of(term)
+    return base.name if isinstance(base, RegionName) else None
 
 
 def _unnamed(term: Term) -> Term:

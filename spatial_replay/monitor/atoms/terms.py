@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
 
@@ -26,8 +26,8 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.trace.trace import ABSENT, Trace
 
-Bindings = Mapping[str, str]
-"""Names of the objects that variables stand for."""
+Bindings = Mapping[str, TrackedName]
+"""The objects that variables stand for."""
 
 
 @dataclass(frozen=True)
@@ -201,38 +201,6 @@ def footprint_from_outline(outline: Outline) -> Footprint:
         (x, y), *_ = outline.vertices
         return Footprint.disc(x, y, outline.radius)
     return Footprint.polygon(outline.vertices)
-
-
-def bind_group(group: Group | Earlier, bindings: Bindings) -> Group | Earlier:
-    """An open group with the variables that it leaves out replaced by the objects they stand for."""
-    if isinstance(group, Earlier):
-        return replace(group, term=_bind_base(group.term, bindings))
-    return replace(group, excluded=tuple(_bind_variable(each, bindings) for each in group.excluded))
-
-
-def bind(term: Term, bindings: Bindings) -> Term:
-    """A term with its variables replaced by the objects they stand for."""
-    match term:
-        case Enlarged():
-            return Enlarged(bind(term.term, bindings), term.radius)
-        case Earlier():
-            return replace(term, term=_bind_base(term.term, bindings))
-        case _:
-            return _bind_base(term, bindings)
-
-
-def _bind_base(term: _Base, bindings: Bindings) -> _Base:
-    match term:
-        case Variable():
-            return _bind_variable(term, bindings)
-        case Group():
-            return replace(term, excluded=tuple(_bind_variable(each, bindings) for each in term.excluded))
-        case _:
-            return term
-
-
-def _bind_variable(term: TrackedName | Variable, bindings: Bindings) -> TrackedName | Variable:
-    return TrackedName(bindings[term.name]) if isinstance(term, Variable) and term.name in bindings else term
 
 
 def open_group(term: Group | Earlier) -> Group:

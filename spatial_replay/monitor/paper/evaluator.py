@@ -28,7 +28,7 @@ from spatial_replay.monitor.paper.kernel import PaperMemory, step_paper
 from spatial_replay.monitor.paper.scans import OPERATORS, PaperTable, paper_table
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, final_verdict
-from spatial_replay.spec.diagnostics import Source
+from spatial_replay.spec.diagnostics import SourceText
 from spatial_replay.spec.formula import (
     Atom,
     Formula,
@@ -235,7 +235,7 @@ def check_operators(specification: Specification) -> None:
     for spec in specification.results:
         for _, _, node in iter_nodes(spec.formula):
             if isinstance(node, Temporal) and node.operator not in OPERATORS:
-                source = Source.of(specification.source, specification.filename)
+                source = SourceText.of(specification.source, specification.filename)
                 fault = source.diagnostic("error", node.span, f"the paper's semantics has no {node.operator}")
                 raise UsageError(
                     f"{fault.filename}:{fault.line}:{fault.column}: {fault.message}, as {spec.name} has; "

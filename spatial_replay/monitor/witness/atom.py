@@ -14,7 +14,7 @@ import numpy as np
 
 from spatial_replay.geometry.contact import Contact, contact, enlarged, protrusion_contact
 from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.monitor.atoms.measurements import leaf_values, measured, measured_terms, quantity_of
+from spatial_replay.monitor.atoms.measurements import leaf_values, measured, quantity_of
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.witness.path import End, Extremum, Interval, SignedOperand, chosen, extremum_of
@@ -43,7 +43,14 @@ from spatial_replay.spec.formula import (
     Term,
     TrackedName,
 )
-from spatial_replay.spec.walks import base_of, iter_expressions, substitute, terms_of
+from spatial_replay.spec.walks import (
+    base_of,
+    iter_expressions,
+    measured_terms,
+    substitute,
+    terms_of,
+    without_enlargement,
+)
 from spatial_replay.trace.trace import ABSENT
 
 
@@ -81,8 +88,7 @@ def _reasons_of_term(scene: TraceScene, part: Expression, term: Term) -> Iterato
 
 def _missing(scene: TraceScene, term: Term) -> Iterator[str]:
     """What of a term is not there."""
-    while isinstance(term, Enlarged):
-        term = term.term
+    term = without_enlargement(term)
     if isinstance(term, Earlier) and _is_before_the_first(scene, term):
         yield f"{format_term(term)} looks back to before the first sample"
         return
@@ -296,19 +302,13 @@ def _singles(scene: TraceScene, term: Term) -> list[Term]:
     if not isinstance(base, Group):
         return [term]
     if base.members is None:
-        group = _without_enlargement(term)
+        group: Any = without_enlargement(term)
         names, members, _ = scene.members(group)
         present = [name for name, is_member in zip(names, members[0].tolist(), strict=True) if is_member]
     else:
         left_out = {each.name for each in base.excluded}
         present = [name for name in base.members if name not in left_out]
     return [_of_member(term, name) for name in present] or [term]
-
-
-def _without_enlargement(term: Term) -> Any:
-    while isinstance(term, Enlarged):
-        term = term.term
-    return term
 
 
 def _of_member(term: Term, name: str) -> Term:

@@ -31,7 +31,6 @@ from spatial_replay.spec.formula import (
     Formula,
     Outline,
     Temporal,
-    TrackedName,
     Truth,
     iter_nodes,
     operands_of,
@@ -328,9 +327,7 @@ class Evidence:
 
     def bound(self, formula: Formula) -> Formula:
         """A formula of the instance, with the object that it is about in place of its variable."""
-        return substitute(
-            formula, {variable: TrackedName(name) for variable, name in self.instance.bindings.items()}
-        )
+        return substitute(formula, self.instance.bindings)
 
     def scene(self, time_ns: int) -> TraceScene:
         """The one sample of that time, with those before it that it may look back at.

@@ -23,13 +23,12 @@ from spatial_replay.monitor.witness.path import End, Evidence
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
-    CentroidProjection,
     Enlarged,
     Expression,
     Formula,
     Maximum,
+    Measurement,
     Minimum,
-    Misalignment,
     Negative,
     Number,
     Projection,
@@ -42,7 +41,7 @@ from spatial_replay.spec.formula import (
     Term,
     Truth,
 )
-from spatial_replay.spec.walks import iter_formulas
+from spatial_replay.spec.walks import iter_formulas, map_leaves, map_terms
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,26 +156,16 @@ def _replaced(expression: Expression, kind: str, old: float, new: float) -> Expr
         is_meant = kind == "radius" and old_term.radius == old
         return Enlarged(term(old_term.term), new if is_meant else old_term.radius)
 
-    match expression:
-        case Number():
-            return Number(new) if kind == "number" and expression.value == old else expression
-        case Sum():
-            first = _replaced(expression.first, kind, old, new)
-            return Sum(first, _replaced(expression.second, kind, old, new))
-        case Negative():
-            return Negative(_replaced(expression.operand, kind, old, new))
-        case Minimum():
-            return Minimum(tuple([_replaced(each, kind, old, new) for each in expression.operands]))
-        case Maximum():
-            return Maximum(tuple([_replaced(each, kind, old, new) for each in expression.operands]))
-        case SignedDistance():
-            return SignedDistance(term(expression.first), term(expression.second))
-        case Protrusion():
-            return Protrusion(term(expression.inner), term(expression.outer))
-        case Projection():
-            return replace(expression, term=term(expression.term))
-        case Signal() | Misalignment() | CentroidProjection():
-            return expression
+    def leaf(part: Number | Signal | Measurement) -> Expression:
+        match part:
+            case Number():
+                return Number(new) if kind == "number" and part.value == old else part
+            case SignedDistance() | Protrusion() | Projection():
+                return map_terms(part, term)
+        # these take no radius: turning and centroids are the same for an enlarged term
+        return part
+
+    return map_leaves(expression, leaf)
 
 
 _FAR = 1e300
