@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import cached_property
 from operator import itemgetter
 from pathlib import Path
 from types import MappingProxyType
@@ -62,9 +64,9 @@ class McapSource:
 
         Only chunks that reach into the window are read, if the log has an index.
         """
-        faults = FaultList()
+        directory, faults = self._index[0], deepcopy(self._index[1])
         with self.path.open("rb") as stream:
-            walk = ChunkWalk(stream, read_directory(stream, faults, self.name), faults, self.name)
+            walk = ChunkWalk(stream, directory, faults, self.name)
             window = (0 if start_ns is None else start_ns, AFTER_ALL_NS if end_ns is None else end_ns)
             decoder = _BlockDecoder(self, walk, faults)
             for messages in _blocks(walk, window, _is_copied):
@@ -82,24 +84,37 @@ class McapSource:
 
     def iter_payloads(self, topic: str) -> Iterator[tuple[list[bytes], tuple[str, ...]]]:
         """The messages of one topic as they are, in order, in lists of bounded size; and what was lost."""
-        faults = FaultList()
+        directory, faults = self._index[0], deepcopy(self._index[1])
         with self.path.open("rb") as stream:
-            walk = ChunkWalk(stream, read_directory(stream, faults, self.name), faults, self.name)
+            walk = ChunkWalk(stream, directory, faults, self.name)
             for messages in _blocks(walk, (0, AFTER_ALL_NS), topic.__eq__):
                 yield [payload for *_, payload in messages], faults.take()
             yield [], faults.take(last=True)
 
     def attachments(self) -> tuple[Attachment, ...]:
-        """The files kept in the log, those that can be read."""
-        with self.path.open("rb") as stream:
-            directory = read_directory(stream, FaultList(), self.name)
-            return tuple(iter_attachments(stream, directory, FaultList(), self.name))
+        """See `Source.attachments`; those that are damaged are left out."""
+        return self._beside[0]
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
-        """The metadata records, those that can be read, with their names."""
+        """See `Source.metadata`; records that are damaged are left out."""
+        return self._beside[1]
+
+    @cached_property
+    def _index(self) -> tuple[Directory, FaultList]:
+        """The directory, and the faults in it.
+
+        Finding it in a log that has lost its summary takes a scan of the whole file, so it is done only once.
+        """
+        faults = FaultList()
         with self.path.open("rb") as stream:
-            directory = read_directory(stream, FaultList(), self.name)
-            return tuple(iter_metadata(stream, directory, FaultList(), self.name))
+            return read_directory(stream, faults, self.name), faults
+
+    @cached_property
+    def _beside(self) -> tuple[tuple[Attachment, ...], tuple[tuple[str, Mapping[str, str]], ...]]:
+        directory, _ = self._index
+        with self.path.open("rb") as stream:
+            attachments = tuple(iter_attachments(stream, directory, FaultList(), self.name))
+            return attachments, tuple(iter_metadata(stream, directory, FaultList(), self.name))
 
     def _without_objects(self, walk: ChunkWalk, fault: str | None) -> LogError | UsageError:
         topics = sorted({channel.topic for channel in walk.channels.values()})
