@@ -71,9 +71,9 @@ def serve(
 
 def _serve(tuned: Tuned, host: str, port: int, play: bool) -> None:
     # the numerical libraries load when there is work for them
-    from spatial_replay.serve.serving import serving
+    from spatial_replay.serve import open_server
 
-    with serving(tuned, host=host, port=port, play=play) as server:
+    with open_server(tuned, host=host, port=port, play=play) as server:
         print_verdicts(tuned.replayed, None)
         if not _is_loopback(host):
             say("warning", f"anyone who reaches {server.address} can read this log", colour="yellow")

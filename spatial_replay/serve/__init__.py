@@ -1,1 +1,26 @@
-"""The live server: viewers connect to a replay, move in time, and change the specification's constants."""
+"""Serve: a log played to viewers over WebSocket, with the constants of its specifications as parameters.
+
+`serving` starts and ends it all. Viewers' requests arrive in `server` on threads of its library and wait in
+`session`; `player` does them on a thread of its own, at the speed of `pace`; `services` answers questions.
+
+Names are loaded when they are first used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+from spatial_replay.lazy import loaded_when_used
+
+if TYPE_CHECKING:
+    from spatial_replay.serve.serving import Serving, open_server
+
+__all__ = ["Serving", "open_server"]
+
+_HOMES: Mapping[str, str] = MappingProxyType(
+    {"Serving": "spatial_replay.serve.serving", "open_server": "spatial_replay.serve.serving"}
+)
+
+__getattr__, __dir__ = loaded_when_used(globals(), _HOMES)

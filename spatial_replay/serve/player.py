@@ -1,16 +1,9 @@
-"""Does what viewers want: plays, seeks, evaluates again, and sends what comes of it.
-
-How much of a fast playback viewers are sent.
-
-Where a session tells viewers what it has to say.
-
-What an evaluation comes to, in a line.
-"""
+"""The thread that does what viewers request: it plays, seeks and evaluates again, and sends the messages."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from enum import Enum, auto
 from typing import Final, NamedTuple, Protocol
 
@@ -23,12 +16,14 @@ from spatial_replay.logs.topics import CURVES_TOPIC, EVENT_LOG, EVENTS
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.replay.engine import ReplayedSpec
 from spatial_replay.replay.playback import Playback
-from spatial_replay.replay.tuning import Tuned, constant_text, constant_values
-from spatial_replay.serve.session import Session, State, Values, Wishes
+from spatial_replay.replay.tuning import EditedFiles, Tuned, constant_text, constant_values
+from spatial_replay.serve.pace import PlaybackState
+from spatial_replay.serve.requests import PendingRequests, Values
+from spatial_replay.serve.session import Session
 
 
 class Level(Enum):
-    """How much a note matters."""
+    """The severity of a note."""
 
     INFO = auto()
     WARNING = auto()
@@ -36,49 +31,48 @@ class Level(Enum):
 
 
 class Note(NamedTuple):
-    """A sentence that viewers show beside the data; it takes the place of one about the same."""
+    """A status message of viewers; it replaces an earlier one about the same subject."""
 
     about: str
     level: Level
     text: str
 
 
-class Outlet(Protocol):
-    """All viewers together. Nothing here waits for a viewer, nor fails because of one."""
+class Viewers(Protocol):
+    """All viewers together. No method waits for a viewer, or fails because of one."""
 
     def wants(self, topic: str) -> bool:
-        """Whether anybody has subscribed to a topic."""
+        """Say whether a viewer has subscribed to a topic."""
 
     def publish(self, messages: Messages) -> None:
-        """Send messages to whoever has subscribed to their topics."""
+        """Send messages to the viewers that have subscribed to their topics."""
 
-    def tell_state(self, state: State) -> None:
-        """Say what the playback does, where that is not the answer to a viewer."""
+    def send_state(self, state: PlaybackState) -> None:
+        """Send the state of the playback, if it is not the reply to a viewer."""
 
-    def tell_time(self, time_ns: int) -> None:
-        """Say at which time of the log the playback is."""
+    def send_time(self, time_ns: int) -> None:
+        """Send the present time of the log."""
 
-    def tell_values(self, values: Mapping[str, float | str]) -> None:
-        """Say what the constants are, where that is not the answer to a viewer."""
+    def send_values(self, values: Values) -> None:
+        """Send the constants, if they are not the reply to a viewer."""
 
-    def tell(self, note: Note) -> None:
-        """Show a note."""
-
-
-_EACH_COUNTS: Final = (EVENTS, EVENT_LOG)
-"""Topics of which no message is left out."""
+    def send_note(self, note: Note) -> None:
+        """Send a note."""
 
 
-def thinned(messages: Messages, most: int) -> Messages:
-    """Of the messages of each topic those of at most so many times, spread over all and with the last.
+_NEVER_THINNED: Final = (EVENTS, EVENT_LOG)
 
-    One time more than that is by chance, in a stretch cut out of many, and makes no difference.
+
+def thin(messages: Messages, most: int) -> Messages:
+    """Return of each topic the messages of at most `most` times, evenly spread and with the last.
+
+    One more time than that is left as it is: a turn of the playback has one more by chance.
     """
     kept = np.ones(len(messages), np.bool_)
     for number, channel in messages.channels.items():
         own = messages.channel == number
         times_ns, which = np.unique(messages.log_time_ns[own], return_inverse=True)
-        if len(times_ns) > most + 1 and channel.topic not in _EACH_COUNTS:
+        if len(times_ns) > most + 1 and channel.topic not in _NEVER_THINNED:
             chosen = np.zeros(len(times_ns), np.bool_)
             chosen[np.linspace(len(times_ns) - 1, 0, most, endpoint=False).astype(np.int64)] = True
             kept[own] = chosen[which]
@@ -88,17 +82,17 @@ def thinned(messages: Messages, most: int) -> Messages:
 VERDICT = "verdict"
 CONSTANTS = "constants"
 LOG = "log"
-"""What notes are about."""
+"""The subjects of notes."""
 
 _MOST = 5
-"""Results, and constants, that a line names."""
+"""The most results, and constants, that a note names."""
 
 
 def verdict_note(tuned: Tuned) -> Note:
-    """The verdict of each result, the worst first, and the constants that are not as they are written."""
+    """Say the verdict of each result, the worst first, and which constants differ from the text."""
     order = (Verdict.VIOLATED, Verdict.UNKNOWN, Verdict.SATISFIED)
     results = sorted(tuned.replayed.results, key=lambda result: order.index(result.verdict))
-    text = "; ".join(map(_result, results[:_MOST])) or "no object was there for a template to stand for"
+    text = "; ".join(map(_result, results[:_MOST])) or "the template matched no objects"
     if len(results) > _MOST:
         text += f"; and {len(results) - _MOST} more, none worse"
     level = Level.INFO if tuned.verdict is Verdict.SATISFIED else Level.WARNING
@@ -124,102 +118,100 @@ def _changes(tuned: Tuned) -> str:
 
 
 PERIOD_S: Final = 1 / 30
-"""From one stretch that is sent to the next."""
+"""The time between two turns."""
 
 MOST_A_SECOND: Final = 600
-"""Samples that are sent, so that a fast playback is no more than viewers take."""
+"""The most samples sent in a second, since viewers can take no more."""
 
 _CURVES_EVERY: Final = 60
-"""Stretches after which the curves are sent again: some viewers forget them while they open their panels."""
+"""Turns after which the curves are sent again: some viewers drop them while they open their panels."""
 
 _MOST_SAMPLES: Final = 4_096
-"""Samples that are worked on at once: what is slower than it should be still answers."""
+"""The most samples of one turn, so that a slow log does not block other requests."""
 
 
 class Player:
-    """All the work of a session; on one thread, so that nothing has to wait for anything else."""
+    """All the work of a session, on one thread: a playback needs no locks."""
 
-    def __init__(self, playback: Playback, session: Session, outlet: Outlet) -> None:
+    def __init__(self, playback: Playback, session: Session, viewers: Viewers) -> None:
         self._playback = playback
         self._session = session
-        self._outlet = outlet
-        self._stretches = 0
+        self._viewers = viewers
+        self._turns = 0
 
     def run(self) -> None:
-        """Do what viewers want until the session is stopped."""
+        """Do what is requested until the session is stopped."""
         try:
-            while not (wishes := self._session.next_wishes(PERIOD_S)).stop:
+            while not (requests := self._session.next_requests(PERIOD_S)).stop:
                 try:
-                    self._fulfil(wishes)
+                    self._do(requests)
                     self._play_on()
                 except SpatialReplayError as error:
-                    self._outlet.tell(Note(LOG, Level.ERROR, str(error)))
-                    self._outlet.tell_state(self._session.pause())
+                    self._viewers.send_note(Note(LOG, Level.ERROR, str(error)))
+                    self._viewers.send_state(self._session.pause())
         finally:
             self._session.end()
 
-    def _fulfil(self, wishes: Wishes) -> None:
-        time_ns = self._playback.time_ns if wishes.sought_ns is None else wishes.sought_ns
-        if wishes.values is not None:
-            self._evaluate(wishes.values, time_ns)
-        if wishes.values is not None or wishes.sought_ns is not None:
+    def _do(self, requests: PendingRequests) -> None:
+        time_ns = self._playback.time_ns if requests.seek_ns is None else requests.seek_ns
+        if requests.edited is not None:
+            self._evaluate(requests.edited, time_ns)
+        if requests.edited is not None or requests.seek_ns is not None:
             self._seek(time_ns)
-        if wishes.topics:
-            self._show(wishes.topics)
-        self._session.answer(self._playback.tuned)
+        if requests.topics:
+            self._resend(requests.topics)
+        self._session.provide_evaluation(self._playback.tuned)
 
-    def _evaluate(self, values: Values, time_ns: int) -> None:
-        """Evaluate the whole log with other constants; what was shown before is out of date.
-
-        Where that cannot be done, the old values come back.
-        """
+    def _evaluate(self, edited: EditedFiles, time_ns: int) -> None:
+        """Evaluate the whole log with other constants; after an error, restore the former values."""
         before = self._playback.tuned
         try:
-            self._playback.tuned = before.tuning.evaluate(values)
+            self._playback.tuned = before.tuning.evaluate(edited)
         except SpatialReplayError as error:
-            self._outlet.tell(Note(CONSTANTS, Level.ERROR, str(error)))
-            self._outlet.tell_values(self._session.take_back(constant_values(before.edited.constants)))
+            self._viewers.send_note(Note(CONSTANTS, Level.ERROR, str(error)))
+            self._viewers.send_values(self._session.restore_values(constant_values(before.edited.constants)))
             return
-        self._outlet.tell_state(self._session.state._replace(time_ns=time_ns, did_seek=True))
-        self._outlet.tell(verdict_note(self._playback.tuned))
+        # viewers drop what they show of the log when the playback jumps, even to the same time
+        self._viewers.send_state(self._session.state._replace(time_ns=time_ns, did_seek=True))
+        self._viewers.send_note(verdict_note(self._playback.tuned))
 
     def _seek(self, time_ns: int) -> None:
-        """Show what stands at a time, and go on from there."""
-        self._show_curves(time_ns)
-        self._outlet.publish(self._playback.seek(time_ns))
-        self._outlet.tell_time(time_ns)
-        self._session.go_on_from(time_ns)
+        """Send what is shown at a time, and go on from there."""
+        self._send_curves(time_ns)
+        self._viewers.publish(self._playback.seek(time_ns))
+        self._viewers.send_time(time_ns)
+        self._session.continue_from(time_ns)
 
-    def _show(self, topics: Collection[str]) -> None:
-        """Send again what stands on some topics."""
+    def _resend(self, topics: Collection[str]) -> None:
+        """Send again what is shown of some topics."""
         time_ns = self._playback.time_ns
         if CURVES_TOPIC in topics:
-            self._show_curves(time_ns)
-            self._outlet.tell(verdict_note(self._playback.tuned))
-        self._outlet.publish(_on_topics(self._playback.seek(time_ns), topics))
-        self._outlet.tell_state(self._session.state)
-        self._outlet.tell_time(time_ns)
+            self._send_curves(time_ns)
+            self._viewers.send_note(verdict_note(self._playback.tuned))
+        self._viewers.publish(_on_topics(self._playback.seek(time_ns), topics))
+        self._viewers.send_state(self._session.state)
+        self._viewers.send_time(time_ns)
 
-    def _show_curves(self, time_ns: int) -> None:
-        """Show what is known of the whole log; viewers forget it whenever they go to another time."""
-        if self._outlet.wants(CURVES_TOPIC):
+    def _send_curves(self, time_ns: int) -> None:
+        """Send the curves of the whole log; viewers drop them whenever they go to another time."""
+        if self._viewers.wants(CURVES_TOPIC):
             curves = [self._playback.tuned.curves]
-            self._outlet.publish(messages_of(CURVES_CHANNEL, np.array([time_ns]), curves, 0))
+            self._viewers.publish(messages_of(CURVES_CHANNEL, np.array([time_ns]), curves, 0))
 
     def _play_on(self) -> None:
-        """Send what has come since the last stretch, if it plays."""
-        passage = self._session.play_up_to(self._playback.reach_ns(_MOST_SAMPLES))
-        if passage is None:
+        """Send what has come since the last turn, if it plays."""
+        span = self._session.play_up_to(self._playback.reach_ns(_MOST_SAMPLES))
+        if span is None:
             return
-        time_ns = passage.time_ns
-        most = max(1, math.ceil(MOST_A_SECOND * passage.lasted_s))
-        self._outlet.publish(thinned(self._playback.advance_to(time_ns), most))
-        self._outlet.tell_time(time_ns)
-        self._stretches += 1
-        if self._stretches % _CURVES_EVERY == 0:
-            self._show_curves(time_ns)
+        time_ns = span.time_ns
+        most = max(1, math.ceil(MOST_A_SECOND * span.elapsed_s))
+        self._viewers.publish(thin(self._playback.advance_to(time_ns), most))
+        self._viewers.send_time(time_ns)
+        self._turns += 1
+        if self._turns % _CURVES_EVERY == 0:
+            self._send_curves(time_ns)
         if time_ns == self._playback.end_ns:
-            self._outlet.tell_state(self._session.pause())
+            self._viewers.send_state(self._session.pause())
 
 
 def _on_topics(messages: Messages, topics: Collection[str]) -> Messages:

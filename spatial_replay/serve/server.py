@@ -1,4 +1,4 @@
-"""The connection to viewers: the only module that knows the library behind it."""
+"""The WebSocket server: the only module that knows the Foxglove SDK."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import ipaddress
 import json
 import logging
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future
-from functools import partial
 from reprlib import repr as shortened
 from threading import Thread
 from types import MappingProxyType
@@ -20,19 +19,21 @@ from foxglove import websocket as protocol
 
 from spatial_replay.errors import SpatialReplayError, UsageError
 from spatial_replay.logs.messages import Channel, Messages, Schema
+from spatial_replay.serve.pace import PlaybackState, Status
 from spatial_replay.serve.player import CONSTANTS, Level, Note
-from spatial_replay.serve.services import SERVICES, Questions, answer, asset
-from spatial_replay.serve.session import Session, State, Status
+from spatial_replay.serve.requests import Questions, Values
+from spatial_replay.serve.services import SERVICES, answer, asset
+from spatial_replay.serve.session import Session
 
-# what viewers send wrongly is told to them; nobody else has to read it
+# viewers get their errors in replies; the SDK would print them on standard error, too
 logging.getLogger("foxglove").addHandler(logging.NullHandler())
 
 _LONGEST_TEXT: Final = 64
 _LONGEST_NOTE: Final = 2_000
-"""Characters of a duration, and of a note."""
+"""The most characters of a duration, and of a note."""
 
-_FAREWELL_S: Final = 1.0
-"""How long the library, which waits for every viewer, may take to stop."""
+_STOP_S: Final = 1.0
+"""How long the SDK, which waits for every viewer, may take to stop."""
 
 _STATUS: Final = MappingProxyType(
     {
@@ -57,9 +58,9 @@ _CAPABILITIES: Final = (
 
 
 class LiveServer:
-    """A session that viewers connect to over WebSocket; an `Outlet`.
+    """A session that viewers connect to over WebSocket; see `Viewers`.
 
-    A viewer that does not take what it is sent loses the oldest of it, and is let go when it takes nothing.
+    A viewer that reads too slowly loses the oldest messages; one that reads nothing is disconnected.
     """
 
     def __init__(
@@ -68,8 +69,8 @@ class LiveServer:
         """Listen.
 
         Args:
-            questions: answers those of viewers.
-            channels: all that there can be messages of.
+            questions: those of viewers to the services.
+            channels: all channels that may have messages.
             port: 0 for any that is free.
 
         Raises:
@@ -77,7 +78,7 @@ class LiveServer:
         """
         self._session, self._questions = session, questions
         self._context = foxglove.Context()
-        self._channels = self._sent(channels)
+        self._channels = self._advertised(channels)
         self._host = f"[{host}]" if _is_v6(host) else host
         self._started: Future[protocol.WebSocketServer] = Future()
         try:
@@ -93,23 +94,23 @@ class LiveServer:
 
     @property
     def address(self) -> str:
-        """What to connect to."""
+        """The address that viewers connect to."""
         return f"ws://{self._host}:{self._server.port}"
 
     def stop(self) -> None:
-        """Let all viewers go; one that takes nothing is not waited for longer than a moment."""
+        """Disconnect all viewers; one that does not respond is waited for only briefly."""
         stopping = Thread(target=self._server.stop, daemon=True)
         stopping.start()
-        stopping.join(_FAREWELL_S)
+        stopping.join(_STOP_S)
         for channel in self._channels.values():
             channel.close()
 
     def wants(self, topic: str) -> bool:
-        """See `Outlet.wants`."""
+        """See `Viewers.wants`."""
         return any(sent.has_sinks() for channel, sent in self._channels.items() if channel.topic == topic)
 
     def publish(self, messages: Messages) -> None:
-        """See `Outlet.publish`."""
+        """See `Viewers.publish`."""
         wanted = {
             number: sent
             for number, channel in messages.channels.items()
@@ -120,29 +121,29 @@ class LiveServer:
             if number in wanted:
                 wanted[number].log(payload, log_time=time_ns)
 
-    def tell_state(self, state: State) -> None:
-        """See `Outlet.tell_state`."""
+    def send_state(self, state: PlaybackState) -> None:
+        """See `Viewers.send_state`."""
         self._server.broadcast_playback_state(_playback_state(state, None))
 
-    def tell_time(self, time_ns: int) -> None:
-        """See `Outlet.tell_time`."""
+    def send_time(self, time_ns: int) -> None:
+        """See `Viewers.send_time`."""
         self._server.broadcast_time(time_ns)
 
-    def tell_values(self, values: Mapping[str, float | str]) -> None:
-        """See `Outlet.tell_values`."""
+    def send_values(self, values: Values) -> None:
+        """See `Viewers.send_values`."""
         self._server.publish_parameter_values(_parameters(values))
 
-    def tell(self, note: Note) -> None:
-        """See `Outlet.tell`."""
+    def send_note(self, note: Note) -> None:
+        """See `Viewers.send_note`."""
         self._server.publish_status(note.text[:_LONGEST_NOTE], _LEVELS[note.level], note.about)
 
-    def withdraw(self, about: str) -> None:
-        """Show the note about something no longer."""
+    def remove_note(self, about: str) -> None:
+        """Remove the note about a subject."""
         self._server.remove_status([about])
 
     @property
     def _server(self) -> protocol.WebSocketServer:
-        """The server; a fast viewer asks for something before it is known here."""
+        """The server; a fast viewer may send a request before the SDK has returned it."""
         return self._started.result()
 
     def _start(self, port: int) -> protocol.WebSocketServer:
@@ -153,23 +154,23 @@ class LiveServer:
             capabilities=list(_CAPABILITIES),
             server_listener=_Listener(self._session, self),
             services=[self._service(name) for name in SERVICES],
-            asset_handler=lambda uri: self._session.ask(partial(asset, uri=uri)),
+            asset_handler=lambda uri: asset(self._session.wait_for_evaluation(), uri),
             context=self._context,
             playback_time_range=self._session.span_ns,
         )
 
-    def _sent(self, channels: Sequence[Channel]) -> dict[Channel, foxglove.Channel]:
-        """What is offered to viewers: what can be read without a schema of its own, or has one."""
+    def _advertised(self, channels: Sequence[Channel]) -> dict[Channel, foxglove.Channel]:
+        """Return the channels that viewers can decode: those with a schema, and JSON."""
         sent: dict[tuple[str, str, Schema | None], foxglove.Channel] = {}
-        found: dict[Channel, foxglove.Channel] = {}
+        advertised: dict[Channel, foxglove.Channel] = {}
         for channel in channels:
             if channel.schema is not None or channel.encoding == "json":
-                # channels that only differ in who publishes on them are one to a viewer
+                # channels that differ only in their publisher are one to a viewer
                 alike = channel.topic, channel.encoding, channel.schema
                 if alike not in sent:
                     sent[alike] = self._channel(channel)
-                found[channel] = sent[alike]
-        return found
+                advertised[channel] = sent[alike]
+        return advertised
 
     def _channel(self, channel: Channel) -> foxglove.Channel:
         schema = channel.schema
@@ -192,8 +193,8 @@ class LiveServer:
             for schema in (described.request, described.response)
         )
 
-        def handle(asked: ServiceRequest) -> bytes:
-            return self._questions.ask(lambda tuned: answer(name, tuned, asked.payload))
+        def handle(request: ServiceRequest) -> bytes:
+            return self._questions.ask(lambda tuned: answer(name, tuned, request.payload))
 
         return Service(
             name, schema=foxglove.ServiceSchema(name, request=request, response=response), handler=handle
@@ -201,14 +202,14 @@ class LiveServer:
 
 
 class _Listener(protocol.ServerListener):
-    """Hands on what viewers ask for; called on threads of the library."""
+    """Pass on the requests of viewers; called on threads of the SDK."""
 
     def __init__(self, session: Session, server: LiveServer) -> None:
         self._session = session
         self._server = server
 
     def on_subscribe(self, client: protocol.Client, channel: protocol.ChannelView) -> None:
-        self._session.show_again(channel.topic)
+        self._session.resend(channel.topic)
 
     def on_get_parameters(
         self, client: protocol.Client, param_names: list[str], request_id: str | None = None
@@ -219,35 +220,35 @@ class _Listener(protocol.ServerListener):
     def on_set_parameters(
         self, client: protocol.Client, parameters: list[Parameter], request_id: str | None = None
     ) -> list[Parameter]:
-        self._server.withdraw(CONSTANTS)
+        self._server.remove_note(CONSTANTS)
         try:
-            self._session.change({each.name: _value(each) for each in parameters})
+            self._session.set_constants({each.name: _value(each) for each in parameters})
         except SpatialReplayError as error:
-            self._server.tell(Note(CONSTANTS, Level.ERROR, str(error)))
+            self._server.send_note(Note(CONSTANTS, Level.ERROR, str(error)))
         return _parameters(self._session.values)
 
     def on_playback_control_request(
         self, playback_control_request: protocol.PlaybackControlRequest
     ) -> protocol.PlaybackState:
-        asked = playback_control_request
+        request = playback_control_request
         state = self._session.control(
-            is_playing=asked.playback_command == protocol.PlaybackCommand.Play,
-            speed=asked.playback_speed,
-            seek_ns=asked.seek_time,
+            is_playing=request.playback_command == protocol.PlaybackCommand.Play,
+            speed=request.playback_speed,
+            seek_ns=request.seek_time,
         )
-        return _playback_state(state, asked.request_id)
+        return _playback_state(state, request.request_id)
 
 
-def _playback_state(state: State, request: str | None) -> protocol.PlaybackState:
+def _playback_state(state: PlaybackState, request: str | None) -> protocol.PlaybackState:
     return protocol.PlaybackState(_STATUS[state.status], state.time_ns, state.speed, state.did_seek, request)
 
 
-def _parameters(values: Mapping[str, float | str]) -> list[Parameter]:
+def _parameters(values: Values) -> list[Parameter]:
     return [Parameter(name, value=value) for name, value in values.items()]
 
 
 def _value(parameter: Parameter) -> float | str:
-    """What a constant is to be.
+    """Return the value that a viewer sets.
 
     Raises:
         UsageError: neither a number nor a short text.
@@ -269,7 +270,7 @@ def _is_v6(host: str) -> bool:
 
 
 def _is_own(host: str) -> bool:
-    """Whether something can listen at an address, at a port that is free."""
+    """Say whether an address belongs to this machine: a server could listen there, at some port."""
     try:
         family, kind, number, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, number) as probe:

@@ -1,7 +1,4 @@
-"""A live server from its start to its end.
-
-Work that the end of the process does not wait for.
-"""
+"""A live server from its start to its end."""
 
 from __future__ import annotations
 
@@ -16,59 +13,44 @@ from spatial_replay.errors import UsageError
 from spatial_replay.replay.playback import Playback
 from spatial_replay.replay.tuning import Tuned
 from spatial_replay.serve.player import Player
-from spatial_replay.serve.services import Questions
+from spatial_replay.serve.requests import Questions
 from spatial_replay.serve.session import Session
-
-
-def in_background(work: Callable[[], None], name: str) -> Future[None]:
-    """Do something on a thread of its own; whoever waits for it is told how it ended."""
-    ended: Future[None] = Future()
-
-    def run() -> None:
-        try:
-            work()
-        except BaseException as error:
-            ended.set_exception(error)
-        else:
-            ended.set_result(None)
-
-    Thread(target=run, name=name, daemon=True).start()
-    return ended
-
 
 LOOPBACK = "127.0.0.1"
 PORT = 8765
-"""Where viewers look for a server unless told otherwise."""
+"""The port that viewers connect to by default."""
 
-_FAREWELL_S = 0.25
-"""How long an evaluation that is at work is waited for in the end."""
+_STOP_S = 0.25
+"""How long a running evaluation is waited for at the end."""
 
 
 @dataclass(frozen=True)
 class Serving:
-    """A server at work.
+    """A running server.
 
     Attributes:
-        address: what viewers connect to: ws://127.0.0.1:8765.
+        address: the address that viewers connect to: ws://127.0.0.1:8765.
     """
 
     address: str
     _loop: Future[None]
 
     def wait(self) -> None:
-        """Wait until it ends, which it does only when something fails, and raise that."""
+        """Wait until the server ends, which happens only through an error, and raise that."""
         self._loop.result()
 
 
 @contextmanager
-def serving(tuned: Tuned, *, host: str = LOOPBACK, port: int = PORT, play: bool = False) -> Iterator[Serving]:
-    """Let viewers look at a log, and change the constants of its specifications, for a while.
+def open_server(
+    tuned: Tuned, *, host: str = LOOPBACK, port: int = PORT, play: bool = False
+) -> Iterator[Serving]:
+    """Serve a log to viewers, which play it and change the constants of its specifications.
 
     Args:
-        tuned: what is shown at first, with the constants as they are written.
-        host: the address to listen at; anyone who reaches it can read the log.
+        tuned: the evaluation to show first, with the constants as they are written.
+        host: the address to listen at; anyone who can connect can read the log.
         port: 0 for any that is free.
-        play: play from the start, rather than wait there for a viewer to do so.
+        play: play at once; otherwise wait at the start for a viewer to do so.
 
     Raises:
         UsageError: nothing can listen there, or the library for it is not installed.
@@ -83,10 +65,10 @@ def serving(tuned: Tuned, *, host: str = LOOPBACK, port: int = PORT, play: bool 
     playback = Playback(tuned)
     playback.seek(playback.start_ns)
     session = Session(tuned.tuning, playback.start_ns, playback.end_ns)
-    questions = Questions(session)
+    questions = Questions(session.wait_for_evaluation)
     server = LiveServer(session, questions, (*playback.channels, CURVES_CHANNEL), host, port)
-    loop = in_background(Player(playback, session, server).run, "player")
-    answering = in_background(questions.run, "questions")
+    loop = _in_background(Player(playback, session, server).run, "player")
+    answering = _in_background(questions.run, "questions")
     try:
         if play:
             session.control(is_playing=True, speed=1.0)
@@ -94,5 +76,21 @@ def serving(tuned: Tuned, *, host: str = LOOPBACK, port: int = PORT, play: bool 
     finally:
         session.stop()
         questions.stop()
-        wait([loop, answering], _FAREWELL_S)
+        wait([loop, answering], _STOP_S)
         server.stop()
+
+
+def _in_background(work: Callable[[], None], name: str) -> Future[None]:
+    """Do work on a daemon thread, which the end of the process does not wait for."""
+    ended: Future[None] = Future()
+
+    def run() -> None:
+        try:
+            work()
+        except BaseException as error:
+            ended.set_exception(error)
+        else:
+            ended.set_result(None)
+
+    Thread(target=run, name=name, daemon=True).start()
+    return ended

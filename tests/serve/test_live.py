@@ -1,4 +1,4 @@
-"""A log live in viewers, over real connections."""
+"""A log served to viewers, over real connections."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from spatial_replay.logs.topics import (
     protobuf_channel,
 )
 from spatial_replay.replay import Tuning, run_replay
-from spatial_replay.serve.serving import Serving, serving
+from spatial_replay.serve import Serving, open_server
 from spatial_replay.sources.open_log import open_source
 
 TEXT = """\
@@ -59,7 +59,7 @@ def specification() -> sr.Specification:
 @contextmanager
 def served(count: int = COUNT) -> Iterator[Serving]:
     tuning = Tuning(PiecewiseSource(run(count), 7), [specification()])
-    with serving(tuning.evaluate(), port=0) as server:
+    with open_server(tuning.evaluate(), port=0) as server:
         yield server
 
 
@@ -85,7 +85,7 @@ def value(message: Message) -> tuple[str, float]:
     return robustness.specification, robustness.nodes[0].value
 
 
-def test_it_says_what_it_has(server: Serving) -> None:
+def test_a_server_lists_its_capabilities_and_topics(server: Serving) -> None:
     async def looking(own: Viewer) -> None:
         assert own.info["name"] == "spatial-replay: run"
         assert {"parameters", "playbackControl", "services", "time", "assets"} <= {*own.info["capabilities"]}
@@ -95,7 +95,7 @@ def test_it_says_what_it_has(server: Serving) -> None:
     watch(server, looking)
 
 
-def test_whoever_subscribes_sees_the_first_sample_and_the_curves_of_all(server: Serving) -> None:
+def test_a_new_subscriber_gets_the_first_sample_and_the_curves_of_the_whole_log(server: Serving) -> None:
     async def looking(own: Viewer) -> None:
         await own.subscribe()
         found = await own.until(lambda each: isinstance(each, Message) and each.topic == SCENE)
@@ -122,7 +122,7 @@ def test_whoever_subscribes_sees_the_first_sample_and_the_curves_of_all(server: 
     watch(server, counting)
 
 
-def test_played_from_the_start_it_is_the_annotated_log(server: Serving, tmp_path: Path) -> None:
+def test_a_log_played_from_the_start_is_the_annotated_log(server: Serving, tmp_path: Path) -> None:
     output = tmp_path / "annotated.mcap"
     run_replay(PiecewiseSource(run(COUNT), 7), [specification()], output=output)
     expected = [(topic, time_ns, data) for topic, time_ns, _, _, data in content_of(output).messages]
@@ -139,7 +139,7 @@ def test_played_from_the_start_it_is_the_annotated_log(server: Serving, tmp_path
     watch(server, looking)
 
 
-def test_play_pause_seek_and_speed_are_answered(server: Serving) -> None:
+def test_play_pause_seek_and_speed_get_a_reply(server: Serving) -> None:
     async def looking(own: Viewer) -> None:
         await own.subscribe([ROBUSTNESS])
         sought = await own.control(seek_ns=3 * STEP_NS + 1, request="seek")
@@ -160,7 +160,7 @@ def test_play_pause_seek_and_speed_are_answered(server: Serving) -> None:
 @pytest.mark.parametrize(
     ("speed", "becomes"), [(float("nan"), 1.0), (0.0, 1.0), (-2.0, 1.0), (float("inf"), 1.0), (1e9, 100.0)]
 )
-def test_speeds_that_cannot_be_are_bounded(server: Serving, speed: float, becomes: float) -> None:
+def test_impossible_speeds_are_bounded(server: Serving, speed: float, becomes: float) -> None:
     async def looking(own: Viewer) -> None:
         assert (await own.control(speed=speed)).speed == becomes
         assert (await own.control(speed=1.0, seek_ns=2**63, request="far")).time_ns == END_NS
@@ -168,7 +168,7 @@ def test_speeds_that_cannot_be_are_bounded(server: Serving, speed: float, become
     watch(server, looking)
 
 
-def test_the_time_is_told_while_it_plays(server: Serving) -> None:
+def test_viewers_get_the_time_while_it_plays(server: Serving) -> None:
     async def looking(own: Viewer) -> None:
         await own.control(play=True, speed=FAST)
         times = [await own.next_of(int) for _ in range(2)]
@@ -177,7 +177,7 @@ def test_the_time_is_told_while_it_plays(server: Serving) -> None:
     watch(server, looking)
 
 
-def test_a_constant_changes_verdict_curves_and_all_that_is_shown(server: Serving) -> None:
+def test_a_changed_constant_changes_the_verdict_the_curves_and_the_messages(server: Serving) -> None:
     async def looking(own: Viewer) -> None:
         assert await own.constants() == {"far": 0.5, "soon": "10s"}
         await own.subscribe([CURVES_TOPIC, ROBUSTNESS, SPECIFICATION])
@@ -200,7 +200,7 @@ def test_a_constant_changes_verdict_curves_and_all_that_is_shown(server: Serving
     watch(server, looking)
 
 
-def test_after_a_change_viewers_are_told_that_what_they_show_is_out_of_date(server: Serving) -> None:
+def test_a_changed_constant_makes_viewers_drop_what_they_show(server: Serving) -> None:
     async def looking(own: Viewer) -> None:
         await own.control(seek_ns=STEP_NS)
         await own.set(soon="1s")
@@ -225,9 +225,7 @@ def test_after_a_change_viewers_are_told_that_what_they_show_is_out_of_date(serv
         ({"far": 1.0, "soon": "x"}, "soon"),
     ],
 )
-def test_values_that_make_no_sense_change_nothing(
-    server: Serving, values: dict[str, object], reason: str
-) -> None:
+def test_invalid_values_change_nothing(server: Serving, values: dict[str, object], reason: str) -> None:
     async def looking(own: Viewer) -> None:
         await own.send(
             op="setParameters",
@@ -240,10 +238,10 @@ def test_values_that_make_no_sense_change_nothing(
     watch(server, looking)
 
 
-def test_a_change_that_fails_later_brings_the_old_values_back() -> None:
+def test_a_change_that_fails_in_evaluation_restores_the_former_values() -> None:
     text = "const wide = 1\nregion goal = box(0, 0, wide, 1)\nspec reach = F (cube ovlp goal)\n"
     tuning = Tuning(PiecewiseSource(run(5), 7), [sr.parse_specification(text)])
-    with serving(tuning.evaluate(), port=0) as server:
+    with open_server(tuning.evaluate(), port=0) as server:
 
         async def looking(own: Viewer) -> None:
             await own.send(op="subscribeParameterUpdates", parameterNames=["wide"])
@@ -257,7 +255,7 @@ def test_a_change_that_fails_later_brings_the_old_values_back() -> None:
         watch(server, looking)
 
 
-def test_of_many_changes_the_last_one_counts(server: Serving) -> None:
+def test_the_last_of_many_changes_counts(server: Serving) -> None:
     async def looking(own: Viewer) -> None:
         for number in range(50):
             await own.send(op="setParameters", parameters=[{"name": "far", "value": number / 10}])
@@ -267,7 +265,7 @@ def test_of_many_changes_the_last_one_counts(server: Serving) -> None:
     watch(server, looking)
 
 
-def test_viewers_share_one_place_and_one_set_of_constants(server: Serving) -> None:
+def test_viewers_share_one_time_and_one_set_of_constants(server: Serving) -> None:
     async def session() -> None:
         async with viewer(server.address) as first, viewer(server.address) as second:
             await second.send(op="subscribeParameterUpdates", parameterNames=["far"])
@@ -276,8 +274,8 @@ def test_viewers_share_one_place_and_one_set_of_constants(server: Serving) -> No
             await first.control(seek_ns=STEP_NS, request="mine")
             assert (await second.next_of(State, lambda each: each.did_seek)).time_ns == STEP_NS
             await first.set(far=3.0)
-            told = await second.next_of(dict, lambda each: each["op"] == "parameterValues")
-            assert told["parameters"] == [{"name": "far", "type": "float64", "value": 3.0}]
+            update = await second.next_of(dict, lambda each: each["op"] == "parameterValues")
+            assert update["parameters"] == [{"name": "far", "type": "float64", "value": 3.0}]
             await second.note("verdict", "(far = 3)")
             await second.message(CURVES_TOPIC)
 
@@ -301,7 +299,7 @@ NONSENSE = [
 ]
 
 
-def test_nonsense_and_sudden_ends_disturb_nobody(server: Serving) -> None:
+def test_malformed_requests_and_lost_connections_disturb_no_other_viewer(server: Serving) -> None:
     async def session() -> None:
         async with viewer(server.address) as sane:
             await sane.subscribe([ROBUSTNESS])
@@ -322,7 +320,7 @@ def test_nonsense_and_sudden_ends_disturb_nobody(server: Serving) -> None:
     asyncio.run(session())
 
 
-def test_a_viewer_that_takes_nothing_holds_nobody_up_nor_the_end() -> None:
+def test_a_viewer_that_reads_nothing_delays_neither_others_nor_the_end() -> None:
     async def session() -> None:
         with served(600) as server:
             async with viewer(server.address) as sane:
@@ -356,8 +354,8 @@ def test_services_answer_in_json(server: Serving) -> None:
 @pytest.mark.parametrize(
     ("service", "raw", "said"),
     [
-        ("evaluate", b"{", "no JSON"),
-        ("evaluate", b"[" * 60_000, "no JSON"),
+        ("evaluate", b"{", "not JSON"),
+        ("evaluate", b"[" * 60_000, "not JSON"),
         ("evaluate", b"[]", "not of type 'object'"),
         ("evaluate", b'{"constant": {}}', "'constant' was unexpected"),
         ("evaluate", b'{"constants": {"fat": 1}}', "did you mean 'far'"),
@@ -367,9 +365,7 @@ def test_services_answer_in_json(server: Serving) -> None:
         ("explain", b'{"object": "nobody"}', "nobody"),
     ],
 )
-def test_services_say_what_is_wrong_with_a_request(
-    server: Serving, service: str, raw: bytes, said: str
-) -> None:
+def test_services_name_the_error_in_a_request(server: Serving, service: str, raw: bytes, said: str) -> None:
     async def looking(own: Viewer) -> None:
         with pytest.raises(ValueError, match=said):
             await own.call(service, None, raw=raw)
@@ -377,7 +373,7 @@ def test_services_say_what_is_wrong_with_a_request(
     watch(server, looking)
 
 
-def test_files_can_be_fetched_by_known_names_only(server: Serving) -> None:
+def test_only_known_files_can_be_fetched(server: Serving) -> None:
     async def looking(own: Viewer) -> None:
         layout = json.loads((await own.fetch("spatial-replay://layout.json")).data)
         assert "Parameters!constants" in layout["configById"]
@@ -391,7 +387,7 @@ def test_files_can_be_fetched_by_known_names_only(server: Serving) -> None:
     watch(server, looking)
 
 
-def test_what_others_wrote_is_played_if_viewers_can_read_it(tmp_path: Path) -> None:
+def test_messages_of_other_programs_are_played_if_viewers_can_decode_them(tmp_path: Path) -> None:
     schema = Schema("any.Thing", "ros1msg", b"int32 number")
     first, second = (Channel("/tf", "ros1", schema, {"by": name}) for name in ("arm", "base"))
     notes, secret = Channel("/notes", "json", None), Channel("/secret", "ros1", None)
@@ -403,7 +399,7 @@ def test_what_others_wrote_is_played_if_viewers_can_read_it(tmp_path: Path) -> N
             for channel in (first, second, notes, secret):
                 writer.write(channel, index * STEP_NS, b"12")
     tuning = Tuning(open_source(log), [specification()])
-    with serving(tuning.evaluate(), port=0) as server:
+    with open_server(tuning.evaluate(), port=0) as server:
 
         async def looking(own: Viewer) -> None:
             assert {"/tf", "/notes"} <= {*own.channels}
@@ -419,9 +415,9 @@ def test_what_others_wrote_is_played_if_viewers_can_read_it(tmp_path: Path) -> N
         watch(server, looking)
 
 
-def test_a_log_that_cannot_be_read_any_more_is_told(tmp_path: Path) -> None:
+def test_a_log_that_can_no_longer_be_read_is_reported(tmp_path: Path) -> None:
     log = record(run(COUNT), tmp_path / "run.mcap")
-    with serving(Tuning(open_source(log), [specification()]).evaluate(), port=0) as server:
+    with open_server(Tuning(open_source(log), [specification()]).evaluate(), port=0) as server:
         log.unlink()
 
         async def looking(own: Viewer) -> None:
@@ -434,19 +430,19 @@ def test_a_log_that_cannot_be_read_any_more_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("host", ["8.8.8.8", "no.such.host.invalid", "a..b", "::2", ""])
-def test_an_address_of_others_is_told(host: str) -> None:
+def test_an_address_of_another_machine_is_an_error(host: str) -> None:
     tuning = Tuning(PiecewiseSource(run(3), 7), [specification()])
     expected = f"cannot listen at {host or 'no address'}: .*; choose an address of this machine with --host"
-    with pytest.raises(UsageError, match=expected), serving(tuning.evaluate(), host=host, port=0):
+    with pytest.raises(UsageError, match=expected), open_server(tuning.evaluate(), host=host, port=0):
         pass
 
 
-def test_a_port_that_is_taken_is_told(server: Serving) -> None:
+def test_a_port_in_use_is_an_error(server: Serving) -> None:
     port = int(server.address.rpartition(":")[2])
     tuning = Tuning(PiecewiseSource(run(3), 7), [specification()])
     with (
         pytest.raises(UsageError, match=f"port {port}: .*; choose another"),
-        serving(tuning.evaluate(), port=port),
+        open_server(tuning.evaluate(), port=port),
     ):
         pass
 
@@ -467,7 +463,7 @@ def test_long_logs_have_thinned_curves() -> None:
         watch(server, looking)
 
 
-def test_viewers_are_let_go_when_it_ends() -> None:
+def test_viewers_are_disconnected_at_the_end() -> None:
     async def session() -> None:
         with served() as server:
             connection = await connect(server.address, subprotocols=[PROTOCOL])

@@ -1,4 +1,4 @@
-"""What a player sends by a clock that the test turns."""
+"""What a player sends, by a clock that the test sets."""
 
 from __future__ import annotations
 
@@ -25,9 +25,10 @@ from spatial_replay.errors import UsageError
 from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.topics import ROBUSTNESS
 from spatial_replay.replay import Playback, Tuned, Tuning
+from spatial_replay.serve.pace import MOST_LATE_S, PlaybackState, Status
 from spatial_replay.serve.player import MOST_A_SECOND, Level, Note, Player
-from spatial_replay.serve.services import MOST_OPEN, Questions
-from spatial_replay.serve.session import MOST_LATE_S, Session, State, Status
+from spatial_replay.serve.requests import MOST_OPEN, Questions
+from spatial_replay.serve.session import Session
 
 PATIENCE_S = 10.0
 MOST_SAMPLES = math.ceil(MOST_A_SECOND * MOST_LATE_S)
@@ -35,10 +36,10 @@ TEXT = 'const far = 0.5\nspec apart = F (cube dist "cup 物" >= far)\n'
 
 
 @dataclass
-class Kept:
-    """An outlet that keeps what it is told, in order."""
+class RecordingViewers:
+    """Viewers that record what they are sent, in order."""
 
-    told: SimpleQueue[Messages | State | Note | Mapping[str, float | str] | int] = field(
+    sent: SimpleQueue[Messages | PlaybackState | Note | Mapping[str, float | str] | int] = field(
         default_factory=SimpleQueue
     )
 
@@ -46,27 +47,27 @@ class Kept:
         return True
 
     def publish(self, messages: Messages) -> None:
-        self.told.put(messages)
+        self.sent.put(messages)
 
-    def tell_state(self, state: State) -> None:
-        self.told.put(state)
+    def send_state(self, state: PlaybackState) -> None:
+        self.sent.put(state)
 
-    def tell_time(self, time_ns: int) -> None:
-        self.told.put(time_ns)
+    def send_time(self, time_ns: int) -> None:
+        self.sent.put(time_ns)
 
-    def tell_values(self, values: Mapping[str, float | str]) -> None:
-        self.told.put(values)
+    def send_values(self, values: Mapping[str, float | str]) -> None:
+        self.sent.put(values)
 
-    def tell(self, note: Note) -> None:
-        self.told.put(note)
+    def send_note(self, note: Note) -> None:
+        self.sent.put(note)
 
     def until(self, is_wanted: Callable[[object], bool]) -> list[object]:
-        """All that is told up to the first that is wanted."""
-        found: list[object] = []
+        """Return all that is sent up to the first that is wanted."""
+        received: list[object] = []
         deadline = time.monotonic() + PATIENCE_S
-        while not found or not is_wanted(found[-1]):
-            found.append(self.told.get(timeout=max(0.0, deadline - time.monotonic())))
-        return found
+        while not received or not is_wanted(received[-1]):
+            received.append(self.sent.get(timeout=max(0.0, deadline - time.monotonic())))
+        return received
 
 
 @dataclass
@@ -83,52 +84,53 @@ def tuning_of(count: int, step_ns: int = STEP_NS) -> Tuning:
 
 
 @contextmanager
-def playing(tuning: Tuning, clock: Clock) -> Iterator[tuple[Session, Kept]]:
+def playing(tuning: Tuning, clock: Clock) -> Iterator[tuple[Session, RecordingViewers]]:
     playback = Playback(tuning.evaluate())
     playback.seek(0)
     session = Session(tuning, playback.start_ns, playback.end_ns, clock=clock)
-    outlet = Kept()
+    viewers = RecordingViewers()
     with ThreadPoolExecutor(1) as thread:
-        running = thread.submit(Player(playback, session, outlet).run)
+        running = thread.submit(Player(playback, session, viewers).run)
         try:
-            yield session, outlet
+            yield session, viewers
         finally:
             session.stop()
             running.result(PATIENCE_S)
 
 
-def robustness_times(told: list[object]) -> list[int]:
+def robustness_times(sent: list[object]) -> list[int]:
     return [
         time_ns
-        for each in told
+        for each in sent
         if isinstance(each, Messages)
         for time_ns, number in zip(each.log_time_ns.tolist(), each.channel.tolist(), strict=True)
         if each.channels[number].topic == ROBUSTNESS
     ]
 
 
-def is_over(told: object) -> bool:
-    return isinstance(told, State) and told.status is Status.ENDED
+def is_over(sent: object) -> bool:
+    return isinstance(sent, PlaybackState) and sent.status is Status.ENDED
 
 
 def play_to_the_end(session: Session, clock: Clock, waits: list[float]) -> None:
-    """Turn the clock, each time the player has had a turn, until the log is over."""
+    """Move the clock after each turn of the player, until the log is over."""
     for wait_s in itertools.cycle(waits):
         clock.now += wait_s
-        state = session.ask(lambda tuned: session.state)
+        session.wait_for_evaluation()
+        state = session.state
         if state.status is Status.ENDED:
             return
 
 
-def test_what_passes_by_the_clock_is_sent_once_and_in_order() -> None:
+def test_samples_are_sent_once_and_in_order() -> None:
     clock = Clock()
-    with playing(tuning_of(30), clock) as (session, outlet):
+    with playing(tuning_of(30), clock) as (session, viewers):
         session.control(is_playing=True, speed=4.0)
         sent = []
         for step in range(1, 5):
             clock.now = step * 0.125
-            session.show_again("/nothing")  # wakes the player
-            sent += outlet.until(lambda told, now=clock.now: told == round(4.0 * now * 1e9))
+            session.resend("/nothing")  # wakes the player
+            sent += viewers.until(lambda sent, now=clock.now: sent == round(4.0 * now * 1e9))
         assert sorted(set(robustness_times(sent))) == [index * STEP_NS for index in range(1, 9)]
 
 
@@ -145,95 +147,86 @@ RATES = [
 @pytest.mark.parametrize(("step_ns", "speed"), RATES)
 @settings(max_examples=10, deadline=None)
 @given(waits=st.lists(st.floats(0.001, 5.0), min_size=1, max_size=6))
-def test_no_sample_is_lost_however_late_a_turn_comes(
-    step_ns: float, speed: float, waits: list[float]
-) -> None:
+def test_late_turns_lose_no_sample(step_ns: float, speed: float, waits: list[float]) -> None:
     clock, step_ns = Clock(), math.ceil(step_ns)
-    with playing(tuning_of(300, step_ns), clock) as (session, outlet):
+    with playing(tuning_of(300, step_ns), clock) as (session, viewers):
         session.control(is_playing=True, speed=speed)
         play_to_the_end(session, clock, [*waits, 0.2])
-        counts = Counter(robustness_times(outlet.until(is_over)))
+        counts = Counter(robustness_times(viewers.until(is_over)))
         assert counts == {index * step_ns: 1 for index in range(1, 300)}
 
 
-def test_what_plays_faster_is_thinned_to_what_viewers_take() -> None:
+def test_a_fast_playback_is_thinned_to_what_viewers_can_take() -> None:
     clock, step_ns = Clock(), 1_000_000
-    with playing(tuning_of(2_000, step_ns), clock) as (session, outlet):
+    with playing(tuning_of(2_000, step_ns), clock) as (session, viewers):
         session.control(is_playing=True, speed=4.0)
         play_to_the_end(session, clock, [0.03125])
-        sent = robustness_times(outlet.until(is_over))
+        sent = robustness_times(viewers.until(is_over))
         assert 0.5 * MOST_A_SECOND <= len(sent) <= 0.55 * MOST_A_SECOND
         assert sent[-1] == 1_999 * step_ns
         assert max(np.diff(sent)) <= 8 * step_ns
 
 
-def test_a_playback_that_is_late_falls_behind() -> None:
+def test_a_late_playback_falls_behind_the_clock() -> None:
     clock = Clock()
-    with playing(tuning_of(6_000), clock) as (session, outlet):
+    with playing(tuning_of(6_000), clock) as (session, viewers):
         session.control(is_playing=True, speed=100.0)
         clock.now = 1e6
         assert session.state.time_ns == round(100.0 * MOST_LATE_S * 1e9)
-        found = outlet.until(lambda told: isinstance(told, int) and told > 0)
-        assert len(robustness_times(found)) <= MOST_SAMPLES
-        assert session.state.time_ns == found[-1]
+        sent = viewers.until(lambda each: isinstance(each, int) and each > 0)
+        assert len(robustness_times(sent)) <= MOST_SAMPLES
+        assert session.state.time_ns == sent[-1]
 
 
-def test_curves_are_sent_again_while_it_plays() -> None:
-    with playing(tuning_of(40), Clock()) as (session, outlet):
+def test_curves_are_sent_again_while_a_log_plays() -> None:
+    with playing(tuning_of(40), Clock()) as (session, viewers):
         session.control(is_playing=True, speed=1.0)
-        told = outlet.until(
-            lambda told: isinstance(told, Messages) and CURVES_CHANNEL in told.channels.values()
+        sent = viewers.until(
+            lambda each: isinstance(each, Messages) and CURVES_CHANNEL in each.channels.values()
         )
-        assert not any(isinstance(each, State) for each in told)
+        assert not any(isinstance(each, PlaybackState) for each in sent)
 
 
-def test_nobody_is_answered_after_the_end() -> None:
+def test_requests_after_the_end_are_refused() -> None:
     with playing(tuning_of(5), Clock()) as (session, _):
-        assert session.ask(lambda tuned: tuned.verdict) == "satisfied"
+        assert session.wait_for_evaluation().verdict == "satisfied"
     with pytest.raises(UsageError, match="stopping"):
-        session.ask(lambda tuned: tuned.verdict)
+        session.wait_for_evaluation()
 
 
-def test_an_error_in_an_answer_is_that_of_who_asked() -> None:
-    with playing(tuning_of(5), Clock()) as (session, _):
-        with pytest.raises(ZeroDivisionError):
-            session.ask(lambda tuned: 1 // 0)
-        assert session.ask(lambda tuned: 1) == 1
-
-
-def test_a_change_while_it_plays_loses_no_sample() -> None:
+def test_a_change_during_playback_loses_no_sample() -> None:
     clock = Clock()
-    with playing(tuning_of(40), clock) as (session, outlet):
+    with playing(tuning_of(40), clock) as (session, viewers):
         session.control(is_playing=True, speed=20.0, seek_ns=0)
-        sent = outlet.until(lambda told: told == 0)
+        sent = viewers.until(lambda sent: sent == 0)
         clock.now = 0.1
-        sent += outlet.until(lambda told: told == 2_000_000_000)
-        session.change({"far": 1.0})
-        session.ask(lambda tuned: None)  # it is done by then
+        sent += viewers.until(lambda sent: sent == 2_000_000_000)
+        session.set_constants({"far": 1.0})
+        session.wait_for_evaluation()
         clock.now = 0.2
-        sent += outlet.until(lambda told: told == 4_000_000_000 or is_over(told))
+        sent += viewers.until(lambda sent: sent == 4_000_000_000 or is_over(sent))
         counts = Counter(robustness_times(sent))
         assert set(counts) == {index * STEP_NS for index in range(17)}
 
 
-def test_a_change_that_cannot_be_evaluated_brings_the_old_values_back() -> None:
+def test_a_change_that_cannot_be_evaluated_restores_the_former_values() -> None:
     text = "const wide = 1\nregion goal = box(0, 0, wide, 1)\nspec reach = F (cube ovlp goal)\n"
     tuning = Tuning(PiecewiseSource(run(5), 5), [sr.parse_specification(text, filename="blocks.spatial")])
-    with playing(tuning, Clock()) as (session, outlet):
-        session.change({"wide": 1e300})
-        *_, note, values = outlet.until(lambda told: isinstance(told, Mapping))
+    with playing(tuning, Clock()) as (session, viewers):
+        session.set_constants({"wide": 1e300})
+        *_, note, values = viewers.until(lambda sent: isinstance(sent, Mapping))
         assert isinstance(note, Note)
         assert (note.about, note.level) == ("constants", Level.ERROR)
         assert "1e+300" in note.text
         assert values == session.values == {"wide": 1}
-        session.change({"wide": 2})
-        told = outlet.until(lambda told: isinstance(told, Note))
-        assert "(wide = 2)" in told[-1].text
+        session.set_constants({"wide": 2})
+        sent = viewers.until(lambda each: isinstance(each, Note))
+        assert "(wide = 2)" in sent[-1].text
 
 
 @contextmanager
 def answering(session: Session) -> Iterator[Questions]:
-    questions = Questions(session)
+    questions = Questions(session.wait_for_evaluation)
     with ThreadPoolExecutor(1) as thread:
         running = thread.submit(questions.run)
         try:
@@ -243,7 +236,14 @@ def answering(session: Session) -> Iterator[Questions]:
             running.result(PATIENCE_S)
 
 
-def test_a_long_question_holds_up_nobody_who_looks() -> None:
+def test_an_error_in_an_answer_is_raised_where_it_was_asked() -> None:
+    with playing(tuning_of(5), Clock()) as (session, _), answering(session) as questions:
+        with pytest.raises(ZeroDivisionError):
+            questions.ask(lambda tuned: 1 // 0)
+        assert questions.ask(lambda tuned: 1) == 1
+
+
+def test_a_long_question_does_not_hold_up_the_playback() -> None:
     clock, is_asked, may_answer = Clock(), Event(), Event()
 
     def long_work(tuned: Tuned) -> str:
@@ -252,7 +252,7 @@ def test_a_long_question_holds_up_nobody_who_looks() -> None:
         return str(tuned.verdict)
 
     with (
-        playing(tuning_of(30), clock) as (session, outlet),
+        playing(tuning_of(30), clock) as (session, viewers),
         answering(session) as questions,
         ThreadPoolExecutor(MOST_OPEN) as asking,
     ):
@@ -260,12 +260,12 @@ def test_a_long_question_holds_up_nobody_who_looks() -> None:
         assert is_asked.wait(PATIENCE_S)
         session.control(is_playing=True, speed=100.0)
         play_to_the_end(session, clock, [0.1])
-        assert max(robustness_times(outlet.until(is_over))) == 29 * STEP_NS
+        assert max(robustness_times(viewers.until(is_over))) == 29 * STEP_NS
         may_answer.set()
         assert [each.result(PATIENCE_S) for each in asked] == ["satisfied"] * MOST_OPEN
 
 
-def test_the_end_leaves_no_question_open() -> None:
+def test_open_questions_are_refused_at_the_end() -> None:
     is_asked, may_end = Event(), Event()
 
     def long_work(tuned: Tuned) -> bool:
@@ -286,7 +286,7 @@ def test_the_end_leaves_no_question_open() -> None:
         may_end.set()
 
 
-def test_only_so_many_questions_can_be_open() -> None:
+def test_the_number_of_open_questions_is_limited() -> None:
     may_answer = Event()
     with (
         playing(tuning_of(5), Clock()) as (session, _),

@@ -1,4 +1,4 @@
-"""How much of a fast playback viewers are sent."""
+"""How a fast playback is thinned to what viewers can take."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from spatial_replay.logs.messages import Channel, Messages
 from spatial_replay.logs.topics import EVENTS, ROBUSTNESS, SCENE
-from spatial_replay.serve.player import thinned
+from spatial_replay.serve.player import thin
 
 CHANNELS = {
     number: Channel(topic, "protobuf", None) for number, topic in enumerate((EVENTS, ROBUSTNESS, SCENE))
@@ -37,9 +37,9 @@ TIMES = st.lists(st.tuples(st.integers(0, 60), st.sampled_from([0, 1, 1, 2]))).m
 
 
 @given(TIMES, st.integers(1, 20))
-def test_each_topic_has_so_many_times_and_its_last_one(times: list[tuple[int, int]], most: int) -> None:
+def test_each_topic_keeps_at_most_so_many_times_and_its_last(times: list[tuple[int, int]], most: int) -> None:
     whole = messages(times)
-    sent = kept(thinned(whole, most))
+    sent = kept(thin(whole, most))
     assert [each for each in kept(whole) if each in sent] == sent
     for number, channel in CHANNELS.items():
         before = [time_ns for time_ns, own in times if own == number]
@@ -51,6 +51,6 @@ def test_each_topic_has_so_many_times_and_its_last_one(times: list[tuple[int, in
         assert all(Counter(after)[time_ns] == Counter(before)[time_ns] for time_ns in after)
 
 
-def test_times_are_spread_evenly() -> None:
-    sent = thinned(messages([(time_ns, 1) for time_ns in range(100)]), 5)
+def test_the_times_that_stay_are_spread_evenly() -> None:
+    sent = thin(messages([(time_ns, 1) for time_ns in range(100)]), 5)
     assert set(np.diff(sent.log_time_ns).tolist()) <= {19, 20}

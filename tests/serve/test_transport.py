@@ -1,4 +1,4 @@
-"""Where a playback is, by the clock."""
+"""The time of a playback, by a clock."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spatial_replay.serve.session import FASTEST, SLOWEST, Status, Transport
+from spatial_replay.serve.pace import FASTEST, SLOWEST, Status, Transport
 
 START_NS, END_NS = 5_000_000_000, 65_000_000_000
 SECOND_NS = 1_000_000_000
 
 
-def test_it_begins_paused_at_the_start() -> None:
+def test_a_playback_begins_paused_at_the_start() -> None:
     transport = Transport(START_NS, END_NS)
     assert transport.state(100.0) == (Status.PAUSED, START_NS, 1.0, False)
     assert transport.time_ns(200.0) == START_NS
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 2.0), st.sampled_from([0.5, 1.0, 3.0])), max_size=8))
-def test_it_plays_what_has_passed_at_each_speed(parts: list[tuple[float, float]]) -> None:
+def test_a_playback_moves_by_the_clock_times_the_speed(parts: list[tuple[float, float]]) -> None:
     transport = Transport(START_NS, END_NS)
     now = 100.0
     transport.play(now)
@@ -33,7 +33,7 @@ def test_it_plays_what_has_passed_at_each_speed(parts: list[tuple[float, float]]
 
 
 @given(st.lists(st.floats(0.0, 30.0), min_size=1, max_size=8))
-def test_it_never_goes_back_nor_beyond_the_end(waits: list[float]) -> None:
+def test_a_playback_never_goes_back_or_beyond_the_end(waits: list[float]) -> None:
     transport = Transport(START_NS, END_NS)
     transport.play(0.0)
     places = [transport.time_ns(now) for now in accumulate(waits)]
@@ -41,7 +41,7 @@ def test_it_never_goes_back_nor_beyond_the_end(waits: list[float]) -> None:
     assert places[-1] <= END_NS
 
 
-def test_a_pause_is_no_time() -> None:
+def test_no_time_passes_during_a_pause() -> None:
     transport = Transport(START_NS, END_NS)
     transport.play(0.0)
     transport.pause(2.0)
@@ -49,7 +49,7 @@ def test_a_pause_is_no_time() -> None:
     assert transport.time_ns(51.0) == START_NS + 3 * SECOND_NS
 
 
-def test_it_has_ended_when_it_is_paused_at_the_end() -> None:
+def test_a_playback_paused_at_the_end_has_ended() -> None:
     transport = Transport(START_NS, END_NS)
     transport.play(0.0)
     assert transport.state(1000.0).status is Status.PLAYING

@@ -20,7 +20,7 @@ import spatial_replay as sr
 from spatial_replay.logs.source import MemorySource
 from spatial_replay.logs.topics import CURVES_TOPIC, SCENE
 from spatial_replay.replay import Tuning
-from spatial_replay.serve.serving import serving
+from spatial_replay.serve import open_server
 from spatial_replay.trace.trace import Trace
 
 SAMPLES = 100_000
@@ -107,7 +107,7 @@ def viewing(trace: Trace, text: str) -> Iterator[Viewer]:
     """A viewer of a log and a specification with the constant `near`."""
     tuning = Tuning(MemorySource(trace), [sr.parse_specification(f"const near = 70\n{text}")])
     with (
-        serving(tuning.evaluate(), port=0) as server,
+        open_server(tuning.evaluate(), port=0) as server,
         connect(server.address, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None) as connection,
     ):
         yield Viewer(connection)
