@@ -1,6 +1,6 @@
-"""Log → trace → formula → numbers → log: spatio-temporal robustness of recorded runs.
+"""Spatio-temporal robustness of recorded runs: log → trace → formula → robustness → log.
 
-Names are loaded when they are first used, so that importing the package loads no numerical library.
+Names are imported when they are first used, so that importing the package loads no numerical library.
 """
 
 from __future__ import annotations

@@ -1,16 +1,16 @@
 """The errors that spatial-replay raises, in one tree.
 
     SpatialReplayError
-    ├── UsageError              a call or an option that cannot work
-    │   ├── MissingFileError    a named file is not there
-    │   └── NoAutomatonError    a formula that has no automaton, or too large a one
-    ├── SpecificationError      a specification with faults, all of them listed
-    ├── GeometryError           coordinates that make no footprint
-    ├── TraceError              samples that make no trace
+    ├── UsageError              an invalid call or combination of options
+    │   ├── MissingFileError    a file does not exist or cannot be opened
+    │   └── NoAutomatonError    a formula without an automaton, or with too large a one
+    ├── SpecificationError      an invalid specification, with all its errors
+    ├── GeometryError           invalid footprint coordinates
+    ├── TraceError              samples that do not form a trace
     ├── LogError                a log that is damaged or breaks its format
-    └── OutputError             the machine could not write what was asked for
+    └── OutputError             an output could not be written
 
-Every message names the value that is wrong, the place where it stands and what to do about it.
+Every message names the wrong value, its place and the remedy.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from typing import Protocol, Self
 
 
 class SpatialReplayError(Exception):
-    """Any error of this package; catch it to catch them all."""
+    """The base class of all errors of this package."""
 
 
 class UsageError(SpatialReplayError):
-    """A call, an option or a combination of them that cannot work."""
+    """An invalid call, option or combination of options."""
 
 
 class MissingFileError(UsageError):
-    """A file that was named does not exist or cannot be opened."""
+    """A file that does not exist or cannot be opened."""
 
     @classmethod
     def of(cls, path: str | PathLike[str], error: OSError | ValueError) -> Self:
-        """The error for a file that could not be opened or read."""
+        """Return the error for a file that could not be opened or read."""
         if isinstance(error, FileNotFoundError | NotADirectoryError):
             reason = "no such file"
         else:
@@ -45,7 +45,7 @@ class NoAutomatonError(UsageError):
     """A formula that has no automaton, or one that is too large.
 
     Attributes:
-        reason: why not, without place and remedy.
+        reason: the cause alone, without place and remedy.
     """
 
     def __init__(self, message: str, reason: str | None = None) -> None:
@@ -54,7 +54,7 @@ class NoAutomatonError(UsageError):
 
 
 class Diagnosis(Protocol):
-    """One fault in a specification; str() gives its text with line, column and caret."""
+    """One error in a specification; str() gives its text with line, column and caret."""
 
     @property
     def message(self) -> str: ...
@@ -67,10 +67,10 @@ class Diagnosis(Protocol):
 
 
 class SpecificationError(SpatialReplayError):
-    """A specification with faults.
+    """An invalid specification.
 
     Attributes:
-        diagnoses: every fault found, in the order of the text.
+        diagnoses: all its errors, in the order of the text.
     """
 
     def __init__(self, diagnoses: Sequence[Diagnosis]) -> None:
@@ -79,11 +79,11 @@ class SpecificationError(SpatialReplayError):
 
 
 class GeometryError(SpatialReplayError, ValueError):
-    """Coordinates, radii or heights that make no footprint."""
+    """Coordinates, radii or heights that do not form a footprint."""
 
 
 class TraceError(SpatialReplayError, ValueError):
-    """Samples that make no trace: times that do not increase, a name that appears twice."""
+    """Samples that do not form a trace: times that do not increase, a name that appears twice."""
 
 
 class LogError(SpatialReplayError):
@@ -91,4 +91,4 @@ class LogError(SpatialReplayError):
 
 
 class OutputError(SpatialReplayError):
-    """An output could not be written: no space, no permission."""
+    """An output that could not be written: no space, no permission."""

@@ -1,4 +1,4 @@
-"""What is loaded when it is first used: names of a package, pictures of a value."""
+"""Lazy imports: names of a package, and how values are displayed in notebooks."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 def loaded_when_used(
     package: dict[str, Any], homes: Mapping[str, str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """The `__getattr__` and `__dir__` of a package (PEP 562).
+    """Return the `__getattr__` and `__dir__` of a package (PEP 562).
 
     Args:
-        package: its `globals()`; what was loaded is kept there.
-        homes: for each name the module that defines it.
+        package: its `globals()`, where loaded names are stored.
+        homes: for each name, the module that defines it.
     """
 
     def load(name: str) -> Any:
@@ -30,16 +30,15 @@ def loaded_when_used(
 
 
 class Displayed:
-    """A value that `spatial_replay.notebook` knows how to show.
+    """A value that `spatial_replay.notebook` can display.
 
-    The pictures stand above the values in the order of imports, so they are looked up by name when a
-    notebook asks for them.
+    That package imports the values, so values cannot import it; it is loaded by name when a notebook asks.
     """
 
     __slots__ = ()
 
     def plot(self, *args: Any, **options: Any) -> Any:
-        """Draw it with matplotlib; see `spatial_replay.notebook.plot` for the options of each type."""
+        """Draw this value with matplotlib; `spatial_replay.notebook.plot` has the options of each type."""
         return _notebook().plot(self, *args, **options)
 
     def _repr_html_(self) -> str:

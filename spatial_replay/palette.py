@@ -1,6 +1,6 @@
 """The colours of robustness: blue where it is positive, vermillion where it is negative, grey where unknown.
 
-Blue and vermillion are told apart with every common colour blindness, and so are their mixtures with grey.
+Blue and vermillion, and their mixtures with grey, are distinguishable with every common colour blindness.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ LABEL: Final = (0.95, 0.95, 0.95)
 """Red, green and blue from 0 to 1."""
 
 CURVES: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c8c8c")
-"""Colours of curves beside each other, also told apart with every common colour blindness (Okabe and Ito)."""
+"""Colours of curves in one plot, distinguishable with every common colour blindness (Okabe and Ito)."""
 
 _LIGHTER: Final = 0.4
 
 
 def hexadecimal(colour: tuple[float, float, float]) -> str:
-    """A colour as texts name it: "#0072b2"."""
+    """Return a colour as hexadecimal text: "#0072b2"."""
     return "#" + "".join(f"{round(255.0 * share):02x}" for share in colour)
 
 
 def light(colour: tuple[float, float, float]) -> tuple[float, float, float]:
-    """A colour for what dark text stands on: less than a third of it in white."""
+    """Return a background colour for dark text: less than a third of the colour, in white."""
     red, green, blue = (0.7 + 0.3 * share for share in colour)
     return red, green, blue
 
 
 def lighter(colour: str) -> str:
-    """A colour as texts name it, mixed with white: one that stays a colour where viewers darken it."""
+    """Return a hexadecimal colour mixed with white, so that it stays visible in viewers that darken it."""
     shares = (int(colour[begin : begin + 2], 16) / 255.0 for begin in (1, 3, 5))
     red, green, blue = (share + _LIGHTER * (1.0 - share) for share in shares)
     return hexadecimal((red, green, blue))

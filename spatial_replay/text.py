@@ -1,7 +1,4 @@
-"""Numbers and texts of others as people read them.
-
-Which known name somebody may have meant.
-"""
+"""Text for people: counts, numbers in JSON, printable text, suggestions for misspelt names."""
 
 from __future__ import annotations
 
@@ -11,16 +8,19 @@ from collections.abc import Iterable
 from typing import Final
 
 _LONGEST: Final = 300
-"""Characters after which a text is cut."""
+"""Characters of a printable text."""
+_LONGEST_NAME: Final = 100
+_MOST_NAMES: Final = 2_000
+"""Bounds of the comparison, which takes quadratic time: names come from logs and may be hostile."""
 
 
 def counted(count: int, noun: str) -> str:
-    """A number of things: "1 sample", "1,579 samples"."""
+    """Return a count with its noun: "1 sample", "1,579 samples"."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def json_number(number: float) -> float | str | None:
-    """A number as JSON can hold it: infinite ones are the strings "inf" and "-inf", NaN is null."""
+    """Return a number as valid JSON: infinities become the strings "inf" and "-inf", NaN becomes null."""
     if math.isnan(number):
         return None
     if math.isinf(number):
@@ -29,17 +29,13 @@ def json_number(number: float) -> float | str | None:
 
 
 def printable(text: str, longest: int = _LONGEST) -> str:
-    """A text without what a page or a figure would not show as it stands, cut after so many characters."""
+    """Return a text with blanks in place of unprintable characters, cut to a length."""
     shown = "".join(character if character.isprintable() else " " for character in text)
     return shown if len(shown) <= longest else shown[: longest - 1] + "…"
 
 
-_LONGEST_NAME = 100
-_MOST_NAMES = 2_000
-
-
 def nearest_hint(name: str, known: Iterable[str]) -> str:
-    """The hint that names the known name most like `name`, or ""."""
+    """Return "did you mean …?" with the known name closest to `name`, or ""."""
     if len(name) > _LONGEST_NAME:
         return ""
     candidates = [candidate for candidate in known if len(candidate) <= _LONGEST_NAME][:_MOST_NAMES]

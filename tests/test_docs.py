@@ -60,7 +60,7 @@ LINES = [(page.name, line) for page in PAGES for line in command_lines(page.read
 
 
 @pytest.mark.parametrize(("page", "line"), LINES)
-def test_command_lines_of_the_documentation_parse(page: str, line: str) -> None:
+def test_command_lines_in_the_documentation_parse(page: str, line: str) -> None:
     parse(line)
 
 
@@ -74,12 +74,12 @@ LINKS = [
 
 
 @pytest.mark.parametrize(("page", "target"), LINKS)
-def test_links_lead_somewhere(page: str, target: str) -> None:
+def test_links_point_to_existing_files(page: str, target: str) -> None:
     path, _, _ = target.partition("#")
     assert not path or (ROOT / page).parent.joinpath(path).exists()
 
 
-def test_links_are_found() -> None:
+def test_the_links_of_the_readme_are_collected() -> None:
     assert ("README.md", "docs/language.md") in LINKS
 
 
@@ -101,7 +101,7 @@ def test_help_has_an_example_that_parses(name: str) -> None:
             parse(line)
 
 
-def test_a_line_that_the_program_would_refuse_does_not_parse() -> None:
+def test_a_line_that_the_program_refuses_does_not_parse() -> None:
     with pytest.raises(click.UsageError):
         parse("spatial-replay check a.spatial --no-such-option")
     with pytest.raises(click.UsageError):

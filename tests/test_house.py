@@ -33,12 +33,12 @@ def test_the_package_under_test_is_the_installed_one() -> None:
 
 
 @pytest.mark.parametrize("name", spatial_replay.__all__)
-def test_every_public_name_is_there(name: str) -> None:
+def test_every_public_name_can_be_imported(name: str) -> None:
     assert getattr(spatial_replay, name) is not None
     assert name in dir(spatial_replay)
 
 
-def test_other_names_are_not_there() -> None:
+def test_other_names_raise_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="no attribute 'replay_everything'"):
         _ = spatial_replay.replay_everything
 
@@ -53,11 +53,11 @@ def test_importing_the_package_loads_nothing_but_itself() -> None:
     assert (done.returncode, done.stderr) == (0, b"")
 
 
-def test_the_package_says_that_it_is_typed() -> None:
+def test_the_package_is_marked_as_typed() -> None:
     assert (files(spatial_replay) / "py.typed").is_file()
 
 
-def test_dependencies_are_those_that_are_imported() -> None:
+def test_declared_dependencies_match_the_imports() -> None:
     project = tomllib.loads(PROJECT.read_text())["project"]
     required = {name_of(requirement) for requirement in project["dependencies"]}
     optional = {name_of(requirement) for requirement in chain(*project["optional-dependencies"].values())}

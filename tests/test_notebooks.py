@@ -78,7 +78,7 @@ def text_of(output):
 
 
 @pytest.mark.parametrize("name", EXPECTED)
-def test_a_tutorial_runs_and_shows_what_it_tells_of(name):
+def test_a_tutorial_runs_and_shows_what_its_text_says(name):
     shown = outputs(name)
     assert not [output for output in shown if output.get("name") == "stderr"]
     said = "\n".join(map(text_of, shown))
@@ -96,7 +96,7 @@ def test_every_tutorial_is_run():
 
 
 @pytest.mark.parametrize("name", EXPECTED)
-def test_a_tutorial_is_kept_without_outputs(name):
+def test_a_tutorial_is_committed_without_outputs(name):
     notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
     nbformat.validate(notebook)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
@@ -105,7 +105,7 @@ def test_a_tutorial_is_kept_without_outputs(name):
 
 
 @pytest.mark.parametrize("name", EXPECTED)
-def test_links_of_a_tutorial_lead_somewhere(name):
+def test_links_of_a_tutorial_point_to_existing_files(name):
     text = (NOTEBOOKS / f"{name}.ipynb").read_text("utf-8")
     for target in re.findall(r"\]\(([^):]+)\)", text):
         assert (NOTEBOOKS / target).exists()

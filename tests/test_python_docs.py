@@ -13,7 +13,7 @@ EXAMPLES = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "python.md").re
 
 
 @pytest.mark.usefixtures("figures")
-def test_the_examples_run_and_say_what_the_text_says(
+def test_the_examples_run_and_print_what_the_text_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("table.jsonl", "table.spatial"):

@@ -9,11 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from spatial_replay.cli.application import run as run_in_process
-from spatial_replay.monitor.evaluate import evaluate
-from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.sources.open_log import read_trace
-from spatial_replay.spec.load import load_specification
+from spatial_replay import Verdict, evaluate, load_specification, read_trace
+from spatial_replay.cli import run as run_in_process
 
 ROOT = Path(__file__).resolve().parent.parent
 RECORDINGS = ROOT / "recordings"
@@ -41,7 +38,7 @@ def test_every_result_is_as_expected(name):
 
 
 @pytest.mark.parametrize(("name", "log"), [("table", "table.jsonl"), ("push", "push.mcap")])
-def test_the_edit_turns_the_verdict(name, log):
+def test_the_edited_specification_flips_the_verdict(name, log):
     trace = read_trace(RECORDINGS / log)
     original = evaluate(load_specification(RECORDINGS / f"{name}.spatial"), trace)
     edited = evaluate(load_specification(RECORDINGS / f"{name}_edited.spatial"), trace)
@@ -54,17 +51,17 @@ def test_an_object_comes_into_view_late():
     assert "milk" in read_trace(RECORDINGS / "table.jsonl").names
 
 
-def test_the_planned_push_tells_its_decisions(capsys):
+def test_the_decisions_of_the_planned_push_are_printed(capsys):
     log = str(RECORDINGS / "push.mcap")
     assert run_in_process(["info", log, "--decisions"]) == 0
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     # all at once is given up; then two pushes
-    assert "3 decisions for 'push', 2 motions, 1 edge given up" in told
-    assert told.index("push red at") < told.index("push green at")
-    assert "    green (map 0): rejected, nowhere would it hold" in told
+    assert "3 decisions for 'push', 2 motions, 1 edge given up" in printed
+    assert printed.index("push red at") < printed.index("push green at")
+    assert "    green (map 0): rejected, nowhere would it hold" in printed
 
 
-def test_the_script_makes_the_files_that_are_there():
+def test_the_script_reproduces_the_committed_files():
     command = [sys.executable, str(ROOT / "tools" / "make_recordings"), "--check"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (result.returncode, result.stdout + result.stderr) == (0, "")

@@ -16,7 +16,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from annotate.layouts import layout_of, panels, paths_of
 from annotate.message_paths import newest, values
-from spatial_replay.cli.application import run as run_in_process
+from spatial_replay.cli import run as run_in_process
 
 RECORDINGS = Path(__file__).resolve().parent.parent / "recordings"
 LOGS = sorted([*RECORDINGS.glob("*.mcap"), *RECORDINGS.glob("*.jsonl")])
@@ -38,8 +38,8 @@ WIDTHS = {
 }
 
 
-class Told(NamedTuple):
-    """A message of a log."""
+class LogMessage(NamedTuple):
+    """A decoded message of a log."""
 
     topic: str
     schema: str
@@ -51,12 +51,12 @@ class Log(NamedTuple):
     """A log that a viewer opens, and its messages."""
 
     path: Path
-    messages: tuple[Told, ...]
+    messages: tuple[LogMessage, ...]
 
-    def of(self, schema: str) -> list[Told]:
+    def of(self, schema: str) -> list[LogMessage]:
         return [each for each in self.messages if each.schema == schema]
 
-    def on(self, topic: str) -> list[Told]:
+    def on(self, topic: str) -> list[LogMessage]:
         return [each for each in self.messages if each.topic == topic]
 
 
@@ -78,7 +78,7 @@ def log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         messages = tuple(
-            Told(channel.topic, schema.name, message.log_time, decoded)
+            LogMessage(channel.topic, schema.name, message.log_time, decoded)
             for schema, channel, message, decoded in reader.iter_decoded_messages()
             if schema is not None
         )
@@ -114,21 +114,21 @@ def points(entity: Any) -> np.ndarray:
     return np.array(corners)
 
 
-def test_the_layout_finds_all_that_it_shows(log):
+def test_every_message_path_of_the_layout_has_values(log):
     layout = layout_of(log.path)
     assert panels(layout["layout"]) == set(layout["configById"])
     for path in paths_of(layout["configById"]):
         assert values(log.path, path), path
 
 
-def test_panels_of_one_message_find_theirs_in_the_newest(log):
+def test_panels_of_one_message_show_the_newest_one(log):
     for identifier, config in layout_of(log.path)["configById"].items():
         if identifier.startswith(("Table!", "RawMessages!")):
             # they show one value, so that a path to each item of a list shows the first one only
             assert len(newest(log.path, config["topicPath"])) == 1, config
 
 
-def test_everything_is_in_the_frame_that_is_shown_or_in_one_that_has_a_transform(log):
+def test_every_frame_is_the_displayed_one_or_has_a_transform(log):
     fixed = layout_of(log.path)["configById"]["3D!scene"]["followTf"]
     transforms = [each.message for each in log.of("foxglove.FrameTransform")]
     known = {
@@ -141,7 +141,7 @@ def test_everything_is_in_the_frame_that_is_shown_or_in_one_that_has_a_transform
     assert named <= known
 
 
-def test_the_cells_of_every_grid_fit_its_sizes(log):
+def test_the_cells_of_every_grid_match_its_strides(log):
     for _, _, _, grid in log.of("foxglove.Grid"):
         ends = {field.name: (field.offset, field.offset + WIDTHS[field.type]) for field in grid.fields}
         assert "robustness" in ends
@@ -154,7 +154,7 @@ def test_the_cells_of_every_grid_fit_its_sizes(log):
         assert grid.cell_size.y > 0
 
 
-def test_blocked_cells_are_clear_and_others_show_their_sign(log):
+def test_blocked_cells_are_transparent_and_others_coloured_by_sign(log):
     for _, _, _, grid in log.of("foxglove.Grid"):
         cell = np.dtype(
             {
@@ -175,13 +175,13 @@ def test_scenes_are_at_most_60_hz_and_robustness_has_every_sample(log):
         times = np.array([each.time_ns for each in log.on(topic)])
         assert (np.searchsorted(times, times + SECOND_NS) - np.arange(len(times))).max() <= 60
     samples = [each.time_ns for each in log.on("/spatial/objects")]
-    told: dict[tuple[str, str], list[int]] = {}
+    reported: dict[tuple[str, str], list[int]] = {}
     for each in log.on("/spatial/robustness"):
-        told.setdefault((each.message.specification, each.message.object), []).append(each.time_ns)
-    assert all(times == samples for times in told.values())
+        reported.setdefault((each.message.specification, each.message.object), []).append(each.time_ns)
+    assert all(times == samples for times in reported.values())
 
 
-def test_a_viewer_shows_the_objects_that_are_seen_and_no_other(log):
+def test_a_viewer_shows_exactly_the_observed_objects(log):
     seen = {
         each.time_ns: {f"object/{tracked.name}" for tracked in each.message.objects}
         for each in log.on("/spatial/objects")
@@ -199,7 +199,7 @@ def test_a_viewer_shows_the_objects_that_are_seen_and_no_other(log):
         assert drawn == set(identifiers)
 
 
-def test_the_camera_has_every_object_in_the_picture(log):
+def test_the_camera_shows_every_object(log):
     camera = layout_of(log.path)["configById"]["3D!scene"]["cameraState"]
     corners = np.concatenate(
         [

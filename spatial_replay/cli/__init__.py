@@ -1,7 +1,10 @@
-"""The command line: one file per command; each parses, calls one function, and shows the result."""
+"""The command line: one file per command; each parses, calls one function, and prints the result.
+
+Commands import the numerical libraries inside their functions, so that `--help` answers at once.
+"""
 
 from __future__ import annotations
 
-from spatial_replay.cli.application import main
+from spatial_replay.cli.application import main, run
 
-__all__ = ["main"]
+__all__ = ["main", "run"]

@@ -1,10 +1,11 @@
-"""`spatial-replay completion`: commands and options at the press of a key."""
+"""`spatial-replay completion`: shell completion of commands and options."""
 
 from __future__ import annotations
 
 import click
 from click.shell_completion import get_completion_class
 
+from spatial_replay.cli.application import COMPLETION_VARIABLE, PROGRAM
 from spatial_replay.errors import UsageError
 
 
@@ -12,14 +13,13 @@ from spatial_replay.errors import UsageError
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 @click.pass_context
 def completion(context: click.Context, shell: str) -> None:
-    """Print the script that completes commands in a shell.
+    """Print a shell completion script.
 
     \b
-    Example, for the current shell (write it to ~/.bashrc for all):
+    Example, for the current shell (add it to ~/.bashrc to keep it):
       eval "$(spatial-replay completion bash)"
     """
     kind = get_completion_class(shell)
     if kind is None:
-        raise UsageError(f"no completion for {shell!r}; there is bash, zsh and fish")
-    root = context.find_root()
-    click.echo(kind(root.command, {}, "spatial-replay", "_SPATIAL_REPLAY_COMPLETE").source())
+        raise UsageError(f"no completion for {shell!r}; choose bash, zsh or fish")
+    click.echo(kind(context.find_root().command, {}, PROGRAM, COMPLETION_VARIABLE).source())

@@ -1,4 +1,4 @@
-"""`spatial-replay explain`: what decided a verdict, and what would flip it?"""
+"""`spatial-replay explain`: what decided a verdict, and what would flip it."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import click
 
-from spatial_replay.cli.application import exit_code_from_verdicts, say
+from spatial_replay.cli.application import exit_code_from_verdicts, warn
 from spatial_replay.cli.options import (
-    Request,
-    Task,
+    EvaluationArguments,
+    EvaluationInputs,
     evaluation_options,
-    prepared,
-    read_for,
-    report_reading,
+    naming_option,
+    open_inputs,
     text_from_duration_ns,
     time_point_from_text,
+    warn_of_damage,
 )
 from spatial_replay.cli.progress import progress
 from spatial_replay.errors import UsageError
@@ -24,62 +24,62 @@ from spatial_replay.errors import UsageError
 
 @click.command()
 @evaluation_options
-@click.option("--node", metavar="NAME", help="Explain a named spec, wherever it stands.  [default: results]")
-@click.option("--object", "object_name", metavar="NAME", help="Of a template, explain this object's result.")
-@click.option("--at", metavar="T", help="Explain what was so at this time, on the samples up to it.")
+@click.option("--node", metavar="NAME", help="Named spec to explain.  [default: all results]")
+@click.option("--object", "object_name", metavar="NAME", help="Template: explain the result of this object.")
+@click.option("--at", metavar="T", help="Explain the verdict at time T, on the samples up to it.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 def explain(
-    request: Request, node: str | None, object_name: str | None, at: str | None, as_json: bool
+    request: EvaluationArguments, node: str | None, object_name: str | None, at: str | None, as_json: bool
 ) -> int:
-    """Say in plain sentences why a verdict is what it is.
+    """Explain a verdict in plain sentences.
 
-    Which sample, which objects and which relation decided it, by how much, since when, and which change of
-    which number would flip it; of an unknown verdict, what was not known.
+    For each result: which sample, objects and relation decided it, by how much and since when, and which
+    change of a constant would flip it; for an unknown verdict, what was not known.
 
     T is 12.5s or 1500ms after the first sample, integer nanoseconds, or 2026-01-31T12:00:00Z. Exits with the
-    code of the verdicts explained, as `replay` does.
+    code of the explained verdicts, as `replay` does.
 
     \b
     Examples:
       spatial-replay explain run.mcap --spec blocks.spatial
       spatial-replay explain run.mcap --spec blocks.spatial --node reach --at 12.3s
     """
-    # the numerical libraries load when there is work for them
+    # imported here so that --help stays fast
     from spatial_replay.replay import ReplayOptions, explain_results, has_samples_from, run_replay
 
     if at is not None and request.end is not None:
-        raise UsageError("--at and --to both say where the samples end; give one of them")
-    task = _until(prepared(request), at)
+        raise UsageError("--at and --to both set the last sample; give only one")
+    inputs = _until(open_inputs(request), at)
     with progress("samples") as advance:
         replayed = run_replay(
-            task.source,
-            task.files,
-            ReplayOptions(task.window, task.each),
+            inputs.source,
+            inputs.files,
+            ReplayOptions(inputs.window, inputs.each),
             keep_series=True,
             keep_leaves=True,
             advance=advance,
         )
-    report_reading(replayed)
-    goes_on = at is not None and has_samples_from(task.source, task.window.end_ns)
-    if at is not None and not goes_on and replayed.end_ns < task.window.end_ns - 1:
+    warn_of_damage(replayed)
+    goes_on = at is not None and has_samples_from(inputs.source, inputs.window.end_ns)
+    if at is not None and not goes_on and replayed.end_ns < inputs.window.end_ns - 1:
         last = text_from_duration_ns(replayed.end_ns - replayed.first_ns)
-        say("warning", f"--at {at} lies after the last sample, at {last}", colour="yellow")
-    found = explain_results(replayed, node=node, object=object_name, goes_on=goes_on)
+        warn(f"--at {at} is after the last sample, at {last}")
+    results = explain_results(replayed, node=node, object=object_name, goes_on=goes_on)
     if as_json:
-        click.echo(json.dumps([each.document for each in found], indent=2, ensure_ascii=False))
+        click.echo(json.dumps([each.document for each in results], indent=2, ensure_ascii=False))
     else:
-        click.echo("\n\n".join("\n".join(each.sentences) for each in found))
-    return exit_code_from_verdicts((each.verdict for each in found), bool(replayed.faults))
+        click.echo("\n\n".join("\n".join(each.sentences) for each in results))
+    return exit_code_from_verdicts((each.verdict for each in results), bool(replayed.faults))
 
 
-def _until(task: Task, at: str | None) -> Task:
-    """The same over the samples up to a time, that included."""
+def _until(inputs: EvaluationInputs, at: str | None) -> EvaluationInputs:
+    """Return the same inputs with a window that ends with the samples at a time."""
     from spatial_replay.replay import first_sample_ns
 
     if at is None:
-        return task
-    with read_for("--at"):
-        at_ns = time_point_from_text(at).absolute_ns(first_sample_ns(task.source))
-    if at_ns < task.window.start_ns:
-        raise UsageError(f"--at {at} lies before --from; no sample is left")
-    return replace(task, window=replace(task.window, end_ns=at_ns + 1))
+        return inputs
+    with naming_option("--at"):
+        at_ns = time_point_from_text(at).absolute_ns(first_sample_ns(inputs.source))
+    if at_ns < inputs.window.start_ns:
+        raise UsageError(f"--at {at} is before --from; no sample is left")
+    return replace(inputs, window=replace(inputs.window, end_ns=at_ns + 1))

@@ -1,4 +1,4 @@
-"""`spatial-replay export`: an annotated log's numbers as a table."""
+"""`spatial-replay export`: the robustness in an annotated log as a table."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spatial_replay.cli.application import ExitCode, say
+from spatial_replay.cli.application import ExitCode, warn
 from spatial_replay.cli.options import output_option
 from spatial_replay.cli.progress import progress
 from spatial_replay.text import counted
@@ -18,25 +18,25 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("annotated", type=click.Path(path_type=Path))
-@output_option("FILE.csv or FILE.parquet.", required=True)
+@output_option("Output: FILE.csv or FILE.parquet.", required=True)
 @click.option(
     "--quantity",
     type=click.Choice(["value", "now", "lower", "upper"]),
     default="value",
     show_default=True,
-    help="Which number of each node.",
+    help="Which number of each node to export.",
 )
 def export(annotated: Path, output: Path, quantity: Quantity) -> int:
-    """Write the robustness in an annotated log as a table: one row per sample, one column per node.
+    """Export the robustness in an annotated log as a table: one row per sample, one column per node.
 
-    A column is named after its node, or SPEC#ID for a node without a name that no other column has. An
-    empty cell is a number that is not determined.
+    A column is named after its node, or SPEC#ID if the node has no unique name. Empty cells are numbers that
+    are not determined.
 
     \b
     Example:
       spatial-replay export annotated.mcap -o run.csv
     """
-    # the numerical libraries load when there is work for them
+    # imported here so that --help stays fast
     from spatial_replay.replay.table import export_table
     from spatial_replay.sources.open_log import open_source
 
@@ -49,7 +49,6 @@ def export(annotated: Path, output: Path, quantity: Quantity) -> int:
             inputs=(annotated,),
             advance=advance,
         )
-    for fault in faults:
-        say("warning", fault, colour="yellow")
+    warn(*faults)
     click.echo(f"wrote {output}: {counted(rows, 'row')}, {counted(columns, 'node')}")
     return ExitCode.DAMAGED if faults else ExitCode.SATISFIED

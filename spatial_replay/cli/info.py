@@ -1,4 +1,4 @@
-"""`spatial-replay info`: what is in this log?"""
+"""`spatial-replay info`: what a log contains."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spatial_replay.cli.application import ExitCode, say
-from spatial_replay.cli.options import Reading, reading_options
+from spatial_replay.cli.application import ExitCode, warn
+from spatial_replay.cli.options import ReadArguments, reading_options
 from spatial_replay.cli.output import decision_lines, decision_rows
 from spatial_replay.cli.progress import progress
 from spatial_replay.errors import UsageError
@@ -26,24 +26,25 @@ if TYPE_CHECKING:
     from spatial_replay.sources.overview import Overview, Survey
 
 _EPOCH_LIKELY_NS = 10**18
-"""Clocks beyond this count from 1970 (2001 or later); others count from the start of something."""
+"""Later times are taken to count from 1970 (2001 or later), earlier ones from the start of the run."""
 
 
 @click.command()
 @click.argument("log", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
-@click.option("--suggest-mapping", is_flag=True, help="Print a mapping file to start from instead (YAML).")
-@click.option("--decisions", is_flag=True, help="Tell what was decided in a planned run instead, and why.")
-@click.option("--layout", is_flag=True, help="Print the log's layout, to import in a viewer, instead.")
+@click.option("--suggest-mapping", is_flag=True, help="Print a first mapping file (YAML) instead.")
+@click.option("--decisions", is_flag=True, help="Print the decisions of a planned run instead.")
+@click.option("--layout", is_flag=True, help="Print the layout to import in a viewer instead.")
 @reading_options
 def info(
-    log: Path, as_json: bool, suggest_mapping: bool, decisions: bool, layout: bool, reading: Reading
+    log: Path, as_json: bool, suggest_mapping: bool, decisions: bool, layout: bool, reading: ReadArguments
 ) -> int:
-    """Say what a log holds: samples, objects, signals, topics, attachments.
+    """Show what a log contains: samples, objects, signals, topics, attachments.
 
-    Of a log of messages by others it says what could be read as objects; with a mapping, which objects are.
+    For an external log, lists the topics that could map to objects; with a mapping, the mapped objects.
 
-    The whole log is read. Exits with 0, or with 3 if it is damaged; what is wrong goes to standard error.
+    Reads the whole log. Exits with 0, or with 3 if the log is damaged; the damage is reported on standard
+    error.
 
     \b
     Examples:
@@ -55,17 +56,17 @@ def info(
     """
     if layout:
         if as_json or suggest_mapping or decisions:
-            raise UsageError("--layout prints a layout and nothing else; leave the other options out")
+            raise UsageError("--layout prints only the layout; remove the other options")
         return _print_layout(log)
     if decisions:
-        return _decisions(log, as_json)
-    # the numerical libraries load when there is work for them
+        return _print_decisions(log, as_json)
+    # imported here so that --help stays fast
     from spatial_replay.sources.open_log import open_source
     from spatial_replay.sources.overview import messages_in, overview_of, overview_of_survey, survey
 
     reader = messages_in(log)
     if suggest_mapping:
-        return _suggest(log, reader, as_json)
+        return _print_mapping(log, reader, as_json)
     surveyed = None
     if reader is not None:
         with progress("messages") as advance:
@@ -76,8 +77,7 @@ def info(
         with progress("samples") as advance:
             overview = overview_of(open_source(log, **reading), advance)
     faults = tuple(dict.fromkeys((*overview.faults, *(surveyed.faults if surveyed else ()))))
-    for warning in dict.fromkeys((*faults, *(surveyed.remarks if surveyed else ()), *overview.remarks)):
-        say("warning", warning, colour="yellow")
+    warn(*dict.fromkeys((*faults, *(surveyed.remarks if surveyed else ()), *overview.remarks)))
     if as_json:
         click.echo(json.dumps(_document(overview, surveyed, faults), indent=2, ensure_ascii=False))
     else:
@@ -86,25 +86,24 @@ def info(
     return ExitCode.DAMAGED if faults else ExitCode.SATISFIED
 
 
-def _decisions(log: Path, as_json: bool) -> int:
-    """Print what was decided in a planned run."""
+def _print_decisions(log: Path, as_json: bool) -> int:
+    """Print the decisions of a planned run."""
     from spatial_replay.planning.read import read_decisions
 
-    told = read_decisions(log)
-    for warning in told.faults:
-        say("warning", warning, colour="yellow")
+    recorded = read_decisions(log)
+    warn(*recorded.faults)
     if as_json:
-        rows = decision_rows(told.decisions)
-        document = {"name": log.name, "damaged": bool(told.faults), "decisions": rows}
+        rows = decision_rows(recorded.decisions)
+        document = {"name": log.name, "damaged": bool(recorded.faults), "decisions": rows}
         click.echo(json.dumps(document, indent=2, ensure_ascii=False))
     else:
-        for line in decision_lines(log, told.decisions, shutil.get_terminal_size((100, 24)).columns):
+        for line in decision_lines(log, recorded.decisions, shutil.get_terminal_size((100, 24)).columns):
             click.echo(line)
-    return ExitCode.DAMAGED if told.faults else ExitCode.SATISFIED
+    return ExitCode.DAMAGED if recorded.faults else ExitCode.SATISFIED
 
 
 def _print_layout(log: Path) -> int:
-    """Print the layout that is kept in a log."""
+    """Print the layout stored in a log."""
     from spatial_replay.annotate.foxglove_layout import LAYOUT
     from spatial_replay.sources.open_log import open_source
 
@@ -114,24 +113,23 @@ def _print_layout(log: Path) -> int:
             click.echo(attachment.data.decode("utf-8", "replace"))
             return ExitCode.SATISFIED
     raise UsageError(
-        f"{source.name} holds no layout; write it with spatial-replay record or replay … -o FILE.mcap"
+        f"{source.name} has no layout; logs written by spatial-replay record or replay -o have one"
     )
 
 
-def _suggest(log: Path, reader: MessageReader | None, as_json: bool) -> int:
-    """Print a mapping file for a log of messages."""
+def _print_mapping(log: Path, reader: MessageReader | None, as_json: bool) -> int:
+    """Print a first version of a mapping file for an external log."""
     from spatial_replay.sources.open_log import open_source
     from spatial_replay.sources.overview import survey
 
     if as_json:
-        raise UsageError("--suggest-mapping prints YAML; leave --json out")
+        raise UsageError("--suggest-mapping prints YAML; remove --json")
     if reader is None:
         source = open_source(log)
-        raise UsageError(f"{source.name} needs no mapping: it names its objects itself")
+        raise UsageError(f"{source.name} needs no mapping: it names its objects")
     with progress("messages") as advance:
         surveyed = survey(reader, advance, whole=False)
-    for warning in (*surveyed.faults, *surveyed.remarks):
-        say("warning", warning, colour="yellow")
+    warn(*surveyed.faults, *surveyed.remarks)
     click.echo(surveyed.mapping, nl=False)
     return ExitCode.DAMAGED if surveyed.faults else ExitCode.SATISFIED
 
@@ -221,9 +219,9 @@ def _survey_lines(survey: Survey, *, mapped: bool) -> Iterator[str]:
         )
     objects = [(f"{each.topic.name}:", each.entry) for each in survey.topics if each.entry]
     if objects and not mapped:
-        yield "could be read as objects"
+        yield "could map to objects"
         yield from _table(objects)
-        yield f"a mapping to start from: spatial-replay info {shlex.quote(survey.name)} --suggest-mapping"
+        yield f"to write a first mapping: spatial-replay info {shlex.quote(survey.name)} --suggest-mapping"
 
 
 def _container_lines(container: LogSummary, *, topics: bool) -> Iterator[str]:
@@ -252,7 +250,7 @@ def _unreadable(count: int) -> str:
 
 
 def _table(rows: Iterable[tuple[str, ...]]) -> Iterator[str]:
-    """Rows as lines, their columns aligned."""
+    """Yield rows as lines with aligned columns."""
     cells = list(rows)
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     for row in cells:

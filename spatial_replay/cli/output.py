@@ -1,7 +1,4 @@
-"""What a replay found, for people and for machines.
-
-The decisions of a planned run, in words.
-"""
+"""Results as text and as JSON: verdicts of a replay, decisions of a planned run."""
 
 from __future__ import annotations
 
@@ -28,7 +25,7 @@ _COLOURS = {"satisfied": "blue", "violated": "red", "unknown": "yellow"}
 
 
 def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | None = None) -> None:
-    """One line for each result, worst news easy to see, on standard output; another one for a window."""
+    """Print one line for each result, and another one for a sliding window."""
     seconds = (replayed.end_ns - replayed.start_ns) / 1e9
     damaged = ", damaged: verdicts are over what could be read" if replayed.faults else ""
     click.echo(f"{replayed.log}: {counted(replayed.samples, 'sample')} over {seconds:.3f} s{damaged}")
@@ -42,7 +39,7 @@ def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | Non
         if window_ns is not None:
             click.echo(f"  {'':<{width}}  {_over_window(result, replayed.first_ns, window_ns)}")
     if not replayed.results:
-        click.echo("  no object was there for a template to stand for")
+        click.echo("  the template matched no objects")
     if output is not None:
         click.echo(f"wrote {output}")
 
@@ -50,7 +47,7 @@ def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | Non
 def write_document(
     replayed: Replayed, file: str, inputs: Sequence[Path], *, signal: bool, window_ns: int | None
 ) -> None:
-    """Write everything found as one JSON object to a file, or to standard output for "-"."""
+    """Write all results as one JSON object to a file, or to standard output for "-"."""
     from spatial_replay.logs.output_file import replacing
     from spatial_replay.replay import document_from_replay
 
@@ -84,7 +81,7 @@ def _numbers(result: ReplayedSpec, first_ns: int) -> str:
 
 
 def _why_unknown(result: ReplayedSpec, first_ns: int) -> str:
-    """What was not known, or not surely enough."""
+    """Return the sentence about what was unknown, or too uncertain."""
     from spatial_replay.annotate.sentences import sentences_of
 
     if result.inquiry is None:
@@ -94,7 +91,7 @@ def _why_unknown(result: ReplayedSpec, first_ns: int) -> str:
 
 
 def _over_window(result: ReplayedSpec, first_ns: int, window_ns: int) -> str:
-    """How often, and when first, a spec did not hold over the samples of the last so many seconds."""
+    """Return how often, and when first, a spec was violated over the sliding window."""
     if result.inquiry is None:
         return ""
     values, times_ns = result.inquiry.window_signal(window_ns)[0], result.inquiry.times_ns
@@ -112,16 +109,16 @@ def _shown(number: float) -> str:
 
 
 _LEAST_WIDTH: Final = 60
-"""Of lines, however narrow a terminal is."""
+"""Width of lines on narrow terminals."""
 _LONGEST: Final = 400
-"""Characters of alternatives; JSON has all."""
+"""Characters of alternatives that are printed; JSON has all."""
 
 
 def decision_lines(log: Path, decisions: Sequence[PlanDecision], width: int) -> Iterator[str]:
-    """Step by step: what was aimed at, tried, rejected and chosen, and how it went.
+    """Yield lines about each decision: its aim, the candidates, the choice and the outcome.
 
     Args:
-        width: characters after which lines are broken.
+        width: of the lines, in characters.
     """
     for line in _whole_lines(log, decisions):
         indent = " " * (len(line) - len(line.lstrip(" ")) + 4)
@@ -135,7 +132,7 @@ def decision_lines(log: Path, decisions: Sequence[PlanDecision], width: int) -> 
 
 
 def decision_rows(decisions: Sequence[PlanDecision]) -> list[dict[str, Any]]:
-    """The same as values for JSON."""
+    """Return decisions as values for JSON."""
     from google.protobuf.json_format import MessageToDict
 
     rows = [MessageToDict(decision, preserving_proto_field_name=True) for decision in decisions]
@@ -146,7 +143,7 @@ def decision_rows(decisions: Sequence[PlanDecision]) -> list[dict[str, Any]]:
 
 
 def _write_numbers(row: dict[str, Any], message: Message) -> None:
-    """Write the numbers of a message as elsewhere; the library has its own texts for some."""
+    """Write numbers that protobuf writes as text, such as 64-bit integers, as in all our JSON."""
     for field, value in message.ListFields():
         written = row[field.name]
         if field.type == field.TYPE_FIXED64:
@@ -184,10 +181,10 @@ def _lines(decision: PlanDecision) -> Iterator[str]:
     if not decision.HasField("target"):
         yield f"  {decision.reason}"
     else:
-        # what it is for is told by the edge that is aimed at
+        # the aim is already printed with its edge
         aim = _either([guard.text for edge in decision.considered[-1:] for guard in edge.progress])
         yield f"  {decision.reason.removesuffix(f': {aim}')}"
-        yield f"  {_way(decision.target)}"
+        yield f"  {_target(decision.target)}"
     if decision.HasField("outcome"):
         outcome = decision.outcome
         how = "done" if outcome.succeeded else "failed"
@@ -214,23 +211,23 @@ def _candidate(candidate: PlanCandidate) -> str:
     if candidate.rejected:
         return f"{name}: rejected, {candidate.rejected}"
     mark = "chosen" if candidate.chosen else "possible"
-    return f"{name}: {mark}, {candidate.best:.4g} at best; {_way(candidate.target)}"
+    return f"{name}: {mark}, {candidate.best:.4g} at best; {_target(candidate.target)}"
 
 
 def _maps(candidate: PlanCandidate) -> str:
-    """Which messages on the topic of maps are its own."""
+    """Return the numbers of its messages on the topic of gradient maps."""
     numbers = sorted(each.number for each in candidate.maps)
     if len(numbers) < 2:
         return "".join(f" (map {number})" for number in numbers)
     return f" (maps {numbers[0]} to {numbers[-1]})"
 
 
-def _way(target: PlanTarget) -> str:
+def _target(target: PlanTarget) -> str:
     points = list(zip(target.waypoints[::2], target.waypoints[1::2], strict=True))
     length = sum(math.dist(one, other) for one, other in pairwise(points))
     turned = f", turned by {math.degrees(target.turn):.3g} deg" if target.turn else ""
     return (
-        f"{target.object} to ({target.x:.4g}, {target.y:.4g}){turned}, a way of {length:.4g}, "
+        f"{target.object} to ({target.x:.4g}, {target.y:.4g}){turned}, path length {length:.4g}, "
         f"robustness {target.robustness:.4g}"
     )
 
@@ -240,7 +237,7 @@ def _either(texts: Sequence[str]) -> str:
 
 
 def _some(texts: Sequence[str]) -> str:
-    """Alternatives, or the first of them and how many more there are."""
+    """Return alternatives, or the first of them and the number of the others."""
     ends = list(accumulate(map(len, texts)))
     count = max(1, sum(end <= _LONGEST for end in ends))
     more = f" or {len(texts) - count} more" if count < len(texts) else ""

@@ -1,4 +1,4 @@
-"""A progress bar for people, nothing for pipes."""
+"""A progress bar on terminals."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 PATIENCE_S = 1.0
-"""Work that is done within this time shows no bar."""
+"""Shorter work shows no bar."""
 COMPILING = "compiling, once on this machine"
-"""What a bar says while the first run on a machine waits for the compiler."""
+"""Label of a bar while kernels are compiled."""
 
 Advance = Callable[[int], None]
 
 
 @contextmanager
 def progress(label: str, total: int | None = None) -> Iterator[Advance]:
-    """Show how far some work is: `with progress("reading", len(items)) as advance: ... advance(1)`.
+    """Show the progress of some work: `with progress("reading", len(items)) as advance: ... advance(1)`.
 
-    The bar goes to standard error if that is a terminal, once the work has taken a second, and is
-    gone when the work is done. While code is compiled, it says so instead.
+    The bar appears on standard error, if that is a terminal, once the work has taken a second. It is removed
+    at the end of the work. While kernels are compiled, its label says so.
 
     Args:
-        total: how many steps there are; None if nobody knows.
+        total: number of steps; None if it is not known.
     """
     if not sys.stderr.isatty():
         yield lambda steps: None
         return
-    # who has work for a bar has work for the numerical libraries
+    # imports the compiler, which all work that is worth a bar needs anyway
     from spatial_replay.compiled import compilations
 
     bar = _Bar(label, total)
     try:
-        with compilations(bar.tell_compiling):
+        with compilations(bar.show_compiling):
             yield bar.advance
     finally:
         bar.close()
@@ -46,11 +46,11 @@ def progress(label: str, total: int | None = None) -> Iterator[Advance]:
 class _Bar:
     """A bar that appears after `PATIENCE_S`, even if no step has been done by then.
 
-    The first steps may be long in coming: kernels are compiled before them where no cache holds them.
+    A timer shows it: the first step may take long, because kernels are compiled before it.
     """
 
     def __init__(self, label: str, total: int | None) -> None:
-        self._label = self._told = label
+        self._label = self._description = label
         self._total = total
         self._done = 0
         self._shown: Progress | None = None
@@ -60,31 +60,31 @@ class _Bar:
 
     def advance(self, steps: int) -> None:
         self._done += steps
-        self._told = self._label
+        self._description = self._label
         self._update()
 
-    def tell_compiling(self) -> None:
-        """Say that code is compiled, until the next step is done."""
-        self._told = COMPILING
+    def show_compiling(self) -> None:
+        """Change the label until the next step is done."""
+        self._description = COMPILING
         self._update()
 
     def _update(self) -> None:
         if self._shown is not None:
-            self._shown.update(self._shown.task_ids[0], description=self._told, completed=self._done)
+            self._shown.update(self._shown.task_ids[0], description=self._description, completed=self._done)
 
     def _appear(self) -> None:
-        self._shown = _started(self._told, self._total, self._done)
+        self._shown = _started(self._description, self._total, self._done)
 
     def close(self) -> None:
         self._timer.cancel()
-        # it may just be putting up the bar
+        # the timer may be showing the bar right now
         self._timer.join()
         if self._shown is not None:
             self._shown.stop()
 
 
 def _started(label: str, total: int | None, done: int) -> Progress:
-    # rich takes a quarter of the time in which `--help` must answer
+    # importing rich would take a quarter of the time of `--help`
     from rich.console import Console
     from rich.progress import Progress
 

@@ -1,13 +1,9 @@
-"""`spatial-replay record`: turn a run into a log.
-
-`spatial-replay record push` and its like: simulated worlds, and the options that they have.
-"""
+"""`spatial-replay record`: turn a run, from a file or from a simulated world, into a log."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import wraps
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypedDict
@@ -16,19 +12,22 @@ import click
 
 from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import (
-    Reading,
+    ReadArguments,
+    add_options,
     duration_ns_from_text,
+    gather,
+    input_files,
     output_option,
     profile_option,
     reading_options,
-    report_reading,
+    specs_option,
+    warn_of_damage,
 )
 from spatial_replay.cli.progress import progress
 from spatial_replay.text import counted
 
 if TYPE_CHECKING:
     from spatial_replay.simulation.injection import Injection
-    from spatial_replay.spec.formula import Specification
 
 SCENARIOS: Mapping[str, str] = MappingProxyType(
     {
@@ -37,24 +36,27 @@ SCENARIOS: Mapping[str, str] = MappingProxyType(
         "table-setting": "cutlery, a cup and a plate, and a robot that sets the table",
     }
 )
-"""The simulated worlds, and what there is in each."""
+"""The simulated worlds, with a description of each."""
 
-_OPTIONS = (
+_SIMULATION = (
     click.option(
-        "--seed", type=click.IntRange(0), default=0, help="Where things lie, and noise.  [default: 0]"
+        "--seed",
+        type=click.IntRange(0),
+        default=0,
+        help="Seed of initial poses and noise.  [default: 0]",
     ),
     click.option(
         "--noise",
         metavar="METRES",
         type=click.FloatRange(0),
         default=0.0,
-        help="Detection is off by up to this much, and the recorded uncertainty says so.  [default: 0]",
+        help="Detection error, also recorded as uncertainty.  [default: 0]",
     ),
     click.option(
         "--inject",
         metavar="MISHAP",
         multiple=True,
-        help="What goes wrong: drop@7s, slip@7s, or slip for the whole run; repeat it for several.",
+        help="Mishap to inject: drop@7s, slip@7s, or slip for the whole run; repeat for several.",
     ),
     click.option(
         "--gui",
@@ -64,8 +66,8 @@ _OPTIONS = (
 )
 
 
-class Simulating(TypedDict):
-    """How a world is simulated: what `record_script` takes of it, as written."""
+class SimulationArguments(TypedDict):
+    """How to simulate a world, as given on the command line."""
 
     seed: int
     noise: float
@@ -74,24 +76,15 @@ class Simulating(TypedDict):
 
 
 def simulation_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The options that say how a world is simulated; the command takes them together, as `simulating`."""
-
-    @wraps(command)
-    def with_simulating(**given: Any) -> Any:
-        simulating: dict[str, Any] = {name: given.pop(name) for name in Simulating.__annotations__}
-        return command(simulating=simulating, **given)
-
-    decorated: Callable[..., Any] = with_simulating
-    for option in reversed(_OPTIONS):
-        decorated = option(decorated)
-    return decorated
+    """Add the options that say how to simulate a world; the command takes them as `simulation`."""
+    return add_options(_SIMULATION, gather("simulation", SimulationArguments, command))
 
 
-def injections_from(texts: Sequence[str]) -> list[Injection]:
-    """The mishaps that were asked for.
+def parse_injections(texts: Sequence[str]) -> list[Injection]:
+    """Return the mishaps given on the command line.
 
     Raises:
-        UsageError: one that is written otherwise.
+        UsageError: an unknown one.
     """
     from spatial_replay.simulation.injection import Injection
 
@@ -99,7 +92,7 @@ def injections_from(texts: Sequence[str]) -> list[Injection]:
 
 
 def recording_command(scenario: str) -> click.Command:
-    """`record SCENARIO`."""
+    """Return the command `record SCENARIO`."""
     help_text = f"""Record a simulated world: {SCENARIOS[scenario]}.
 
     The robot follows a script. Equal options give an equal log, byte for byte. Needs the extra `sim`.
@@ -107,25 +100,20 @@ def recording_command(scenario: str) -> click.Command:
     \b
     Examples:
       spatial-replay record {scenario} -o run.mcap
-      spatial-replay record {scenario} -o run.mcap --spec edited.spatial --seed 3 --duration 10s
+      spatial-replay record {scenario} -o run.mcap --seed 3 --duration 10s
       spatial-replay record {scenario} -o run.mcap --noise 0.002 --inject slip@4s
     """
 
     @click.command(scenario, help=help_text)
-    @output_option("Write the log here.", required=True)
-    @click.option(
-        "--spec",
-        "specs",
-        metavar="SPEC",
-        multiple=True,
-        type=click.Path(path_type=Path),
-        help="Evaluate this specification meanwhile instead of the scenario's own; repeat it for several.",
+    @output_option("Log to write (MCAP).", required=True)
+    @specs_option(
+        "Specification to evaluate while recording; repeat for several.  [default: the scenario's own]"
     )
     @profile_option
     @click.option(
         "--duration",
         metavar="T",
-        help="How long, such as 10s of simulated time.  [default: the script's end]",
+        help="Simulated time, such as 10s.  [default: to the end of the script]",
     )
     @simulation_options
     def command(
@@ -133,22 +121,23 @@ def recording_command(scenario: str) -> click.Command:
         specs: tuple[Path, ...],
         profile: str | None,
         duration: str | None,
-        simulating: Simulating,
+        simulation: SimulationArguments,
     ) -> int:
-        # the simulator and the numerical libraries load when there is work for them
+        # imported here so that --help stays fast
         from spatial_replay.runs.scripted import record_script
+        from spatial_replay.spec import load_specification
 
-        files = specifications_from(specs, profile)
+        files = [load_specification(spec, profile=profile) for spec in specs]
         with progress("samples") as advance:
             recorded = record_script(
                 scenario,
                 output,
-                files,
-                seed=simulating["seed"],
+                files or None,
+                seed=simulation["seed"],
                 duration_ns=None if duration is None else duration_ns_from_text(duration),
-                noise_m=simulating["noise"],
-                injections=injections_from(simulating["inject"]),
-                gui=simulating["gui"],
+                noise_m=simulation["noise"],
+                injections=parse_injections(simulation["inject"]),
+                gui=simulation["gui"],
                 inputs=specs,
                 advance=advance,
             )
@@ -162,21 +151,9 @@ def recording_command(scenario: str) -> click.Command:
     return command
 
 
-def specifications_from(paths: Sequence[Path], profile: str | None) -> list[Specification] | None:
-    """The specifications of some files; None, for the scenario's own, of no file.
-
-    Raises:
-        SpecificationError: one has faults.
-        UsageError: one is not there.
-    """
-    from spatial_replay.spec import load_specification
-
-    return [load_specification(path, profile=profile) for path in paths] or None
-
-
 @click.group()
 def record() -> None:
-    """Record a run as an MCAP log.
+    """Record a run as a log (MCAP).
 
     \b
     Examples:
@@ -191,21 +168,16 @@ for _scenario in SCENARIOS:
 
 @record.command()
 @click.argument("file", type=click.Path(path_type=Path))
-@output_option("Write the log here.", required=True)
-@click.option(
-    "--spec",
-    "specs",
-    metavar="SPEC",
-    multiple=True,
-    type=click.Path(path_type=Path),
-    help="Evaluate this specification meanwhile; repeat it for several.",
-)
+@output_option("Log to write (MCAP).", required=True)
+@specs_option("Specification to evaluate while recording; repeat for several.")
 @profile_option
 @reading_options
-def tracks(file: Path, output: Path, specs: tuple[Path, ...], profile: str | None, reading: Reading) -> int:
-    """Record the objects of any log that can be read: tracks, annotations, scenarios, bags with a mapping.
+def tracks(
+    file: Path, output: Path, specs: tuple[Path, ...], profile: str | None, reading: ReadArguments
+) -> int:
+    """Record the objects of any readable log: tracks, annotations, scenarios, bags with a mapping.
 
-    What cannot be read of the file is reported and left out, and the exit code is then 3.
+    Parts of the file that cannot be read are reported and left out; the exit code is then 3.
 
     \b
     Examples:
@@ -213,18 +185,17 @@ def tracks(file: Path, output: Path, specs: tuple[Path, ...], profile: str | Non
       spatial-replay record tracks people.csv -o run.mcap --spec social.spatial
       spatial-replay record tracks annotations.txt -o run.mcap --lost keep
     """
-    # the numerical libraries load when there is work for them
+    # imported here so that --help stays fast
     from spatial_replay.recording import record_source
     from spatial_replay.sources.open_log import open_source
     from spatial_replay.spec import load_specification
 
-    mapping = reading["mapping"]
-    inputs = (file, *specs, *([] if mapping is None else [mapping]))
+    inputs = input_files(file, *specs, reading=reading)
     source = open_source(file, **reading)
     files = [load_specification(spec, profile=profile) for spec in specs]
     with progress("samples") as advance:
         recorded = record_source(source, output, files, inputs=inputs, advance=advance)
-    report_reading(recorded)
+    warn_of_damage(recorded)
     for name in recorded.missing:
         click.echo(replace(name, severity="warning"), err=True)
     seconds = (recorded.end_ns - recorded.start_ns) / 1e9

@@ -1,4 +1,4 @@
-"""`spatial-replay replay`: evaluate a recorded run, and write what was found."""
+"""`spatial-replay replay`: evaluate specifications over a recorded run."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import click
 
 from spatial_replay.cli.application import exit_code_from_verdicts
 from spatial_replay.cli.options import (
-    Request,
+    EvaluationArguments,
     duration_ns_from_text,
     evaluation_options,
+    naming_option,
+    open_inputs,
     output_option,
-    prepared,
-    read_for,
-    report_reading,
     semantics_option,
+    warn_of_damage,
 )
 from spatial_replay.cli.output import print_verdicts, write_document
 from spatial_replay.cli.progress import progress
@@ -28,24 +28,29 @@ if TYPE_CHECKING:
 
 @click.command()
 @evaluation_options
-@output_option("Write the annotated log (MCAP) here.")
-@click.option("--layer", is_flag=True, help="Leave the log's own messages out of the annotated one.")
-@click.option("--json", "json_file", metavar="FILE|-", help="Write what was found as one JSON object.")
-@click.option("--series", is_flag=True, help="With --json: also the numbers of every node at every sample.")
+@output_option("Annotated log to write (MCAP).")
+@click.option("--layer", is_flag=True, help="Write the derived messages only, without the log's own.")
+@click.option(
+    "--json",
+    "json_file",
+    metavar="FILE|-",
+    help="Results to write, as one JSON object.",
+)
+@click.option("--series", is_flag=True, help="With --json: add the numbers of every node at every sample.")
 @click.option(
     "--signal",
     is_flag=True,
-    help="With --json: the series, and each node's robustness from each sample to the end.",
+    help="With --json: --series, and the robustness of each node from each sample to the end.",
 )
 @click.option(
     "--window",
     "width",
     metavar="DURATION",
-    help="Also evaluate the samples of the last so many seconds, at every sample: 10s.",
+    help="Also evaluate a sliding window, such as 10s, at every sample.",
 )
 @semantics_option
 def replay(
-    request: Request,
+    request: EvaluationArguments,
     output: Path | None,
     layer: bool,
     json_file: str | None,
@@ -58,36 +63,36 @@ def replay(
 
     T is 12.5s or 1500ms after the first sample, integer nanoseconds, or 2026-01-31T12:00:00Z.
 
-    Exits with 0 if everything is satisfied, 1 if anything is violated, 4 if nothing is but something is
-    unknown, 3 if the log is damaged: the verdict is then that of what could be read.
+    Exits with 0 if all results are satisfied, 1 if any is violated, 4 if none is violated and any is unknown,
+    3 if the log is damaged and the verdicts cover only what could be read.
 
     \b
     Examples:
       spatial-replay replay run.mcap --spec blocks.spatial -o annotated.mcap
       spatial-replay replay run.mcap --spec edited.spatial --json -
       spatial-replay replay run.mcap --spec blocks.spatial --window 10s
-      spatial-replay replay people.jsonl --spec social.spatial --each ego=class:pedestrian --from 10s
-      spatial-replay replay drive.bag --mapping drive.yaml --spec social.spatial -o annotated.mcap
+      spatial-replay replay walk.jsonl --spec walk.spatial --each ego=class:person
+      spatial-replay replay drive.bag --mapping drive.yaml --spec drive.spatial
     """
-    # the numerical libraries load when there is work for them
+    # imported here so that --help stays fast
     from spatial_replay.replay import ReplayOptions, run_replay
 
     if (series or signal) and json_file is None:
         option = "--series" if series else "--signal"
-        raise UsageError(f"{option} goes into the JSON object; add --json FILE or --json -")
+        raise UsageError(f"{option} adds to the JSON object; add --json FILE or --json -")
     if layer and output is None:
-        raise UsageError("--layer is about the annotated log; add -o FILE")
+        raise UsageError("--layer applies to the annotated log; add -o FILE")
     window_ns = None if width is None else _width_ns(width)
     if semantics != "ltlf" and (signal or window_ns is not None):
         option = "--signal" if signal else "--window"
-        raise UsageError(f"{option} is not defined under --semantics {semantics}; leave one of them out")
+        raise UsageError(f"{option} is not defined under --semantics {semantics}; remove one of them")
     _check_outputs(output, json_file, request.inputs)
-    task = prepared(request)
+    inputs = open_inputs(request)
     with progress("samples") as advance:
         replayed = run_replay(
-            task.source,
-            task.files,
-            ReplayOptions(task.window, task.each, semantics),
+            inputs.source,
+            inputs.files,
+            ReplayOptions(inputs.window, inputs.each, semantics),
             keep_series=json_file is not None and (series or signal or window_ns is not None),
             keep_leaves=True,
             output=output,
@@ -95,7 +100,7 @@ def replay(
             layer=layer,
             advance=advance,
         )
-    report_reading(replayed)
+    warn_of_damage(replayed)
     if json_file is not None:
         write_document(replayed, json_file, request.inputs, signal=signal, window_ns=window_ns)
     if json_file != "-":
@@ -104,15 +109,15 @@ def replay(
 
 
 def _width_ns(text: str) -> int:
-    with read_for("--window"):
+    with naming_option("--window"):
         width_ns = duration_ns_from_text(text)
     if width_ns == 0:
-        raise UsageError(f"--window {text} holds no sample; give it a width, as in --window 10s")
+        raise UsageError(f"--window {text} contains no sample; give it a width, as in --window 10s")
     return width_ns
 
 
 def _check_outputs(output: Path | None, json_file: str | None, inputs: tuple[Path, ...]) -> None:
-    """Refuse before the work what would fail after it."""
+    """Refuse outputs that could not be written, before the work is done."""
     from spatial_replay.logs.output_file import refuse_inputs
 
     if output is not None:
@@ -120,4 +125,4 @@ def _check_outputs(output: Path | None, json_file: str | None, inputs: tuple[Pat
     if json_file is not None and json_file != "-":
         refuse_inputs(Path(json_file), inputs)
         if output is not None and output.resolve() == Path(json_file).resolve():
-            raise UsageError(f"-o and --json both name {json_file}; give them two names")
+            raise UsageError(f"-o and --json both name {json_file}; give them different names")

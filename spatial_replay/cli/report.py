@@ -1,4 +1,4 @@
-"""`spatial-replay report`: what a run did, and why, as one page."""
+"""`spatial-replay report`: one HTML page about a run."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import click
 
 from spatial_replay.cli.application import exit_code_from_verdicts
 from spatial_replay.cli.options import (
-    Request,
+    EvaluationArguments,
     evaluation_options,
+    open_inputs,
     output_option,
-    prepared,
-    report_reading,
     semantics_option,
+    warn_of_damage,
 )
 from spatial_replay.cli.output import print_verdicts
 from spatial_replay.cli.progress import progress
@@ -25,37 +25,37 @@ if TYPE_CHECKING:
 
 @click.command()
 @evaluation_options
-@output_option("Write the page (HTML) here.", required=True)
+@output_option("Report to write (HTML).", required=True)
 @semantics_option
-def report(request: Request, output: Path, semantics: Semantics) -> int:
-    """Write what a recorded run did as one page that any browser opens.
+def report(request: EvaluationArguments, output: Path, semantics: Semantics) -> int:
+    """Write an HTML report of a recorded run, for any browser.
 
-    Verdicts and explanations, the specification's tree, curves, the scene from above, the automaton, events
-    and a planner's decisions, with one time cursor through all. The page needs no network and no other file.
+    It shows verdicts and explanations, the specification's tree, curves, the scene from above, the automaton,
+    events and planner decisions, with one time cursor for all. It needs no network and no other file.
 
     Exits with the code of the verdicts, as `replay` does.
 
     \b
     Examples:
       spatial-replay report run.mcap --spec blocks.spatial -o run.html
-      spatial-replay report people.jsonl --spec social.spatial --each ego=class:pedestrian -o people.html
+      spatial-replay report run.mcap --spec edited.spatial --semantics paper -o run.html
     """
-    # the numerical libraries load when there is work for them
+    # imported here so that --help stays fast
     from spatial_replay.logs.output_file import refuse_inputs
     from spatial_replay.replay import ReplayOptions
     from spatial_replay.report.write import write_report
 
     refuse_inputs(output, request.inputs)
-    task = prepared(request)
+    inputs = open_inputs(request)
     with progress("samples") as advance:
         replayed = write_report(
-            task.source,
-            task.files,
+            inputs.source,
+            inputs.files,
             output,
-            ReplayOptions(task.window, task.each, semantics),
+            ReplayOptions(inputs.window, inputs.each, semantics),
             inputs=request.inputs,
             advance=advance,
         )
-    report_reading(replayed)
+    warn_of_damage(replayed)
     print_verdicts(replayed, output)
     return exit_code_from_verdicts((result.verdict for result in replayed.results), bool(replayed.faults))

@@ -1,4 +1,4 @@
-"""`spatial-replay serve`: look at a replay in a viewer, and change the specification's constants there."""
+"""`spatial-replay serve`: replay live to a viewer, with the specification's constants as parameters."""
 
 from __future__ import annotations
 
@@ -7,8 +7,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spatial_replay.cli.application import ExitCode, say
-from spatial_replay.cli.options import Request, evaluation_options, prepared, report_reading, semantics_option
+from spatial_replay.cli.application import ExitCode, warn
+from spatial_replay.cli.options import (
+    EvaluationArguments,
+    evaluation_options,
+    open_inputs,
+    semantics_option,
+    warn_of_damage,
+)
 from spatial_replay.cli.output import print_verdicts
 from spatial_replay.cli.progress import progress
 
@@ -25,31 +31,29 @@ if TYPE_CHECKING:
     type=click.IntRange(0, 65535),
     default=8765,
     show_default=True,
-    help="Where to listen; 0 for any that is free.",
+    help="Port to listen on; 0 for any free port.",
 )
 @click.option(
     "--host",
     metavar="ADDRESS",
     default="127.0.0.1",
     show_default=True,
-    help="The address to listen at; anyone who reaches it can read the log.",
+    help="Address to listen on; anyone who can reach it can read the log.",
 )
-@click.option(
-    "--play", is_flag=True, help="Play at once, rather than wait at the start for a viewer to do so."
-)
-@click.option("--layout", is_flag=True, help="Print the layout to import in the viewer, and serve nothing.")
+@click.option("--play", is_flag=True, help="Start playing at once instead of waiting for a viewer.")
+@click.option("--layout", is_flag=True, help="Print the layout to import in the viewer, and exit.")
 @semantics_option
 def serve(
-    request: Request, port: int, host: str, play: bool, layout: bool, semantics: Semantics
+    request: EvaluationArguments, port: int, host: str, play: bool, layout: bool, semantics: Semantics
 ) -> ExitCode | None:
-    """Replay a log to Foxglove or Lichtblick, over WebSocket.
+    """Replay a log live to Foxglove or Lichtblick over WebSocket.
 
-    In the viewer, open a connection to the address that is printed. There, play, pause, seek and change the
-    speed; every constant of the specifications is a parameter: change one, and the curves, colours, events
-    and the verdict of the whole log follow.
+    Connect the viewer to the printed address, then play, pause, seek and change the speed. Every constant of
+    the specifications is a parameter: change one, and the curves, colours, events and verdicts of the whole
+    log are updated.
 
-    T is 12.5s or 1500ms after the first sample, integer nanoseconds, or 2026-01-31T12:00:00Z. Ctrl-C ends it,
-    with code 130.
+    T is 12.5s or 1500ms after the first sample, integer nanoseconds, or 2026-01-31T12:00:00Z. Ctrl-C stops
+    the server, with exit code 130.
 
     \b
     Examples:
@@ -60,36 +64,39 @@ def serve(
     if layout:
         click.echo(tuned.layout.data)
         return None
-    report_reading(tuned.replayed)
+    warn_of_damage(tuned.replayed)
     try:
         _serve(tuned, host, port, play)
     except KeyboardInterrupt:
-        # this is how it ends
+        # the regular way to stop the server
         return ExitCode.INTERRUPTED
     return None
 
 
 def _serve(tuned: Tuned, host: str, port: int, play: bool) -> None:
-    # the numerical libraries load when there is work for them
+    # imported here so that --help stays fast
     from spatial_replay.serve import open_server
 
     with open_server(tuned, host=host, port=port, play=play) as server:
         print_verdicts(tuned.replayed, None)
         if not _is_loopback(host):
-            say("warning", f"anyone who reaches {server.address} can read this log", colour="yellow")
-        click.echo(f"serving at {server.address}; Ctrl-C ends it")
+            warn(f"anyone who can reach {server.address} can read this log")
+        click.echo(f"serving at {server.address}; stop with Ctrl-C")
         click.echo(f"  in Foxglove or Lichtblick: Open connection, Foxglove WebSocket, {server.address}")
-        click.echo("  its layout: the same command with --layout > live.json, to import there")
+        click.echo("  layout to import there: run the same command with --layout > live.json")
         server.wait()
 
 
-def _tuned(request: Request, semantics: Semantics) -> Tuned:
+def _tuned(request: EvaluationArguments, semantics: Semantics) -> Tuned:
     from spatial_replay.replay import ReplayOptions, Tuning
 
-    task = prepared(request)
+    inputs = open_inputs(request)
     with progress("samples") as advance:
         tuning = Tuning(
-            task.source, task.files, ReplayOptions(task.window, task.each, semantics), advance=advance
+            inputs.source,
+            inputs.files,
+            ReplayOptions(inputs.window, inputs.each, semantics),
+            advance=advance,
         )
     return tuning.evaluate()
 

@@ -15,7 +15,7 @@ from cli.program import PROGRAM, environment, run_program, standard_error_on_ter
 from spatial_replay.cli.application import COMMANDS
 
 
-def test_version_and_help_answer_on_standard_output(tmp_path: Path) -> None:
+def test_version_and_help_go_to_standard_output(tmp_path: Path) -> None:
     version = run_program("--version", cwd=tmp_path)
     assert (version.returncode, version.stdout, version.stderr) == (
         0,
@@ -32,7 +32,7 @@ def test_version_and_help_answer_on_standard_output(tmp_path: Path) -> None:
 def test_help_loads_no_command_and_no_numerical_library(tmp_path: Path) -> None:
     program = (
         "import sys\n"
-        "from spatial_replay.cli.application import run\n"
+        "from spatial_replay.cli import run\n"
         "run(['--help'])\n"
         "heavy = {'numpy', 'numba', 'mcap', 'lark', 'rich', 'google.protobuf'} & set(sys.modules)\n"
         "sys.exit(', '.join(heavy) or 0)\n"
@@ -52,7 +52,7 @@ def test_help_loads_no_command_and_no_numerical_library(tmp_path: Path) -> None:
         (("completion", "tcsh"), "'tcsh' is not one of"),
     ],
 )
-def test_wrong_usage_is_said_on_standard_error_with_code_2(
+def test_wrong_usage_is_reported_on_standard_error_with_code_2(
     tmp_path: Path, arguments: tuple[str, ...], said: str
 ) -> None:
     done = run_program(*arguments, cwd=tmp_path)
@@ -69,14 +69,14 @@ def test_a_traceback_is_shown_on_request_only(tmp_path: Path) -> None:
     assert "Traceback" in shown.stderr
 
 
-def test_colours_are_for_terminals_that_want_them(tmp_path: Path) -> None:
+def test_colours_appear_on_terminals_unless_turned_off(tmp_path: Path) -> None:
     command = (*PROGRAM, "info", "missing.mcap")
     assert "\x1b[" not in run_program("info", "missing.mcap", cwd=tmp_path).stderr
     assert "\x1b[" in standard_error_on_terminal(command, tmp_path, {})
     assert "\x1b[" not in standard_error_on_terminal(command, tmp_path, {"NO_COLOR": "1"})
 
 
-def test_a_reader_that_leaves_early_is_no_error(tmp_path: Path) -> None:
+def test_a_broken_pipe_is_not_an_error(tmp_path: Path) -> None:
     ours, theirs = os.pipe()
     os.close(ours)
     try:
@@ -142,7 +142,7 @@ def test_long_work_shows_a_bar_on_a_terminal_and_short_work_nothing(tmp_path: Pa
     assert shown(0.0) == ""
 
 
-def test_a_first_step_that_takes_long_shows_the_bar_already(tmp_path: Path) -> None:
+def test_a_slow_first_step_already_shows_the_bar(tmp_path: Path) -> None:
     work = "import time\nfrom spatial_replay.cli.progress import progress\n"
     work += "with progress('samples'):\n    time.sleep(2.5)\n"
     assert "samples" in standard_error_on_terminal((sys.executable, "-c", work), tmp_path, {})
@@ -172,7 +172,7 @@ with progress("samples") as advance:
 """
 
 
-def test_the_bar_says_when_code_is_compiled(tmp_path: Path) -> None:
+def test_the_bar_shows_that_code_is_being_compiled(tmp_path: Path) -> None:
     (tmp_path / "work.py").write_text(_COMPILED)
     command = (sys.executable, "work.py")
     assert "compiling, once on this machine" in standard_error_on_terminal(command, tmp_path, {})

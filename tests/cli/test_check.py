@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from spatial_replay.cli.application import run
+from spatial_replay.cli import run
 
 SPECIFICATION = """\
 region goal = box(0, 0, 4, 4)
@@ -57,7 +57,7 @@ def test_json_holds_the_same_nodes(specification: Path, capsys: pytest.CaptureFi
     ]
 
 
-def test_every_fault_is_shown_with_its_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_error_is_shown_with_its_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     faulty = tmp_path / "faulty.spatial"
     faulty.write_text("spec a = F (x ovlap y)\nspec b = G[5, 2] x ovlp y\n")
     assert run(["check", str(faulty)]) == 2
@@ -65,10 +65,10 @@ def test_every_fault_is_shown_with_its_place(tmp_path: Path, capsys: pytest.Capt
     assert said.out == ""
     assert "faulty.spatial:1:15: error" in said.err
     assert "faulty.spatial:2:" in said.err
-    assert said.err.rstrip().endswith("the specification has 2 faults, shown above")
+    assert said.err.rstrip().endswith("the specification has 2 errors, shown above")
 
 
-def test_warnings_go_to_standard_error_and_change_no_code(
+def test_warnings_go_to_standard_error_and_do_not_change_the_exit_code(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     odd = tmp_path / "odd.spatial"
@@ -79,7 +79,7 @@ def test_warnings_go_to_standard_error_and_change_no_code(
     assert "warning" not in said.out
 
 
-def test_names_are_compared_with_a_log(
+def test_names_are_compared_with_those_in_a_log(
     specification: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = tmp_path / "run.jsonl"

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from spatial_replay.cli.application import run
-from spatial_replay.spec.load import parse_specification
+from spatial_replay import parse_specification
+from spatial_replay.cli import run
 
 TEXT = "spec reach = F (cube enclosedin tray)\nspec calm = G (battery >= 0.2)\nspec done = reach and calm\n"
 
@@ -20,7 +20,7 @@ def specification(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_automaton_is_shown_in_words_below_the_tree(
+def test_the_automaton_is_printed_as_text_below_the_tree(
     specification: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["check", str(specification), "--dfa", "-"]) == 0
@@ -31,7 +31,7 @@ def test_the_automaton_is_shown_in_words_below_the_tree(
 
 
 @pytest.mark.parametrize(("suffix", "begin"), [("dot", 'digraph "done" {'), ("hoa", "HOA: v1")])
-def test_the_end_of_a_files_name_says_what_it_is(
+def test_the_suffix_of_the_file_chooses_the_format(
     specification: Path, suffix: str, begin: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = specification.with_suffix(f".{suffix}")
@@ -40,7 +40,9 @@ def test_the_end_of_a_files_name_says_what_it_is(
     assert f"wrote {output}: 3 states, 2 propositions" in capsys.readouterr().out
 
 
-def test_json_stays_whole_beside_a_file(specification: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_output_stays_valid_when_an_automaton_is_written(
+    specification: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     output = specification.with_suffix(".dot")
     assert run(["check", str(specification), "--json", "--dfa", str(output)]) == 0
     captured = capsys.readouterr()
@@ -49,18 +51,20 @@ def test_json_stays_whole_beside_a_file(specification: Path, capsys: pytest.Capt
     assert run(["check", str(specification), "--json", "--dfa", "-"]) == 2
 
 
-def test_other_files_are_refused(specification: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_file_types_and_inputs_are_refused(
+    specification: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(["check", str(specification), "--dfa", "done.png"]) == 2
     captured = capsys.readouterr()
-    assert "ends in .dot, .hoa or .svg" in captured.err
-    # before the tree, which is not what was asked for
+    assert ".dot, .hoa or .svg files" in captured.err
+    # refused before the tree is printed
     assert not captured.out
     same = specification.rename(specification.with_suffix(".dot"))
     assert run(["check", str(same), "--dfa", str(same)]) == 2
     assert parse_specification(same.read_text()).results
 
 
-def test_one_of_several_results_is_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_of_several_results_has_to_be_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, output = tmp_path / "two.spatial", tmp_path / "two.dot"
     path.write_text("spec reach = F p >= 0\nspec before = G (O p >= 0)\n")
     assert run(["check", str(path), "--dfa", str(output)]) == 2

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from spatial_replay import errors
 from spatial_replay.cli.application import (
     ExitCode,
+    exit_code_from_error,
     exit_code_from_verdicts,
-    exit_code_of,
-    gravest,
-    message_of,
+    message_from_error,
+    most_severe,
 )
 from spatial_replay.spec.diagnostics import Diagnostic
 
@@ -26,12 +26,12 @@ codes = st.sampled_from([ExitCode(code) for code in ORDER])
 
 
 @given(st.lists(codes, min_size=1), st.randoms(use_true_random=False))
-def test_of_several_codes_the_gravest_stands_whatever_their_order(
+def test_of_several_codes_the_most_severe_stands_whatever_their_order(
     several: list[ExitCode], source: random.Random
 ) -> None:
     expected = next(code for code in ORDER if code in several)
     source.shuffle(several)
-    assert gravest(several) == expected
+    assert most_severe(several) == expected
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_of_several_codes_the_gravest_stands_whatever_their_order(
         (["violated"], True, 3),
     ],
 )
-def test_verdicts_make_the_code(verdicts: list[str], damaged: bool, code: int) -> None:
+def test_verdicts_determine_the_exit_code(verdicts: list[str], damaged: bool, code: int) -> None:
     assert exit_code_from_verdicts(verdicts, damaged) == code
 
 
@@ -69,14 +69,14 @@ def test_verdicts_make_the_code(verdicts: list[str], damaged: bool, code: int) -
         (RuntimeError("no"), 70),
     ],
 )
-def test_every_error_has_its_code_and_a_message_of_a_few_lines(error: BaseException, code: int) -> None:
-    assert exit_code_of(error) == code
-    message = message_of(error)
+def test_every_error_has_an_exit_code_and_a_short_message(error: BaseException, code: int) -> None:
+    assert exit_code_from_error(error) == code
+    message = message_from_error(error)
     assert message
     assert len(message.splitlines()) <= 3
 
 
-def test_a_fault_of_ours_asks_for_a_report_and_one_of_the_machine_does_not() -> None:
-    assert "please report" in message_of(ZeroDivisionError("division by zero"))
+def test_an_internal_error_asks_for_a_report_and_a_full_disk_does_not() -> None:
+    assert "please report" in message_from_error(ZeroDivisionError("division by zero"))
     full = OSError(errno.ENOSPC, "No space left on device", "run.mcap")
-    assert message_of(full) == "run.mcap: No space left on device"
+    assert message_from_error(full) == "run.mcap: No space left on device"

@@ -1,4 +1,4 @@
-"""`spatial-replay explain`, and what else `replay` tells beside verdicts, from outside."""
+"""`spatial-replay explain`, and the witnesses, signals and windows of `replay`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from spatial_replay.cli.application import run as run_in_process
+from spatial_replay.cli import run as run_in_process
 
 TRACKS = """\
 {"time_ns": 0, "objects": [{"name": "cube", "polygon": [[0,0],[1,0],[1,1],[0,1]]}], "signals": {"battery": 0.9}}
@@ -65,7 +65,7 @@ def test_every_result_is_explained_in_a_few_sentences(
     ]
 
 
-def test_a_node_at_a_time(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_named_spec_is_explained_at_a_time(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, text = said(capsys, *EXPLAIN, "--node", "reach", "--at", "1.2s")
     assert code == 1
     assert text.startswith("`reach` is violated so far: robustness -0.5, since 0.000 s; later samples may")
@@ -74,19 +74,21 @@ def test_a_node_at_a_time(folder: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert at_the_end.startswith("`reach` is satisfied: robustness 0.5, since 1.500 s.")
 
 
-def test_what_cannot_be_explained_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_that_cannot_be_explained_are_refused_by_name(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for arguments, expected in [
         (("--node", "rech"), "did you mean 'reach'"),
         (("--object", "7"), "no result is about object '7'"),
-        (("--at", "1s", "--to", "2s"), "give one of them"),
+        (("--at", "1s", "--to", "2s"), "give only one"),
         (("--at", "-3"), "is not a time"),
-        (("--from", "1s", "--at", "0.2s"), "lies before --from"),
+        (("--from", "1s", "--at", "0.2s"), "is before --from"),
     ]:
         assert run_in_process([*EXPLAIN, *arguments]) == 2
         assert expected in capsys.readouterr().err
 
 
-def test_explanations_for_machines(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_explanations_are_available_as_json(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, text = said(capsys, *EXPLAIN, "--node", "charged", "--json")
     (found,) = json.loads(text)
     assert found["atom"]["text"] == "battery >= 0.3"
@@ -103,14 +105,16 @@ def specifications(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[
     return {each["name"]: each for each in json.loads(text)["specifications"]}
 
 
-def test_the_worst_is_in_the_document(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_json_document_contains_the_witness_of_the_worst_result(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     found = specifications(capsys)
     assert found["met"]["worst"]["atom"]["objects"] == ["cube", "cup"]
     assert found["met"]["worst"]["atom"]["measured"][0]["points"] == [[8.0, 0.0], [9.0, 0.0]]
     assert found["apart"]["worst"]["atom"]["unknown"] == ["cup is not in the sample"]
 
 
-def test_signals_and_windows_are_series(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_signals_and_windows_are_written_as_series(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     series = specifications(capsys, "--signal", "--window", "600ms")["done"]["series"]
     nodes = specifications(capsys)["done"]["nodes"]
     charged = next(node["id"] for node in nodes if node["name"] == "charged")
@@ -119,12 +123,12 @@ def test_signals_and_windows_are_series(folder: Path, capsys: pytest.CaptureFixt
     assert len(series["value"]) == len(series["signal"]) == len(nodes)
 
 
-def test_a_window_is_summed_up(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_sliding_window_is_summarised_in_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, text = said(capsys, *REPLAY, "--window", "600ms")
     assert "over the last 0.6s violated at 3 of 4 samples, first at 0s; robustness at the end 0.2" in text
 
 
-def test_unknown_verdicts_say_what_was_unknown(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_verdict_names_what_was_unknown(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, text = said(capsys, *REPLAY)
     assert "cup is not in the sample" in text
 
@@ -133,12 +137,12 @@ def test_unknown_verdicts_say_what_was_unknown(folder: Path, capsys: pytest.Capt
     ("arguments", "expected"),
     [
         (("--signal",), "add --json"),
-        (("--window", "0s"), "holds no sample"),
+        (("--window", "0s"), "contains no sample"),
         (("--window", "ten"), "is not a duration"),
         (("--window", "1s", "--semantics", "paper"), "not defined under --semantics paper"),
     ],
 )
-def test_what_cannot_be_asked_for(
+def test_options_that_exclude_each_other_are_refused(
     folder: Path, arguments: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run_in_process([*REPLAY, *arguments]) == 2

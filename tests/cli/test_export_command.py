@@ -8,9 +8,9 @@ import pytest
 
 from cli.program import run_program
 from replay.runs import SPECIFICATION, PiecewiseSource, record, run
-from spatial_replay.cli.application import run as run_in_process
+from spatial_replay import parse_specification
+from spatial_replay.cli import run as run_in_process
 from spatial_replay.replay import run_replay
-from spatial_replay.spec.load import parse_specification
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_it_says_what_it_wrote(folder: Path) -> None:
+def test_the_command_reports_what_it_wrote(folder: Path) -> None:
     done = run_program("export", "annotated.mcap", "-o", "run.csv", cwd=folder)
     said = "wrote run.csv: 12 rows, 4 nodes\n"
     assert (done.returncode, done.stdout, done.stderr) == (0, said, "")
@@ -45,10 +45,10 @@ def test_the_quantity_can_be_chosen(folder: Path) -> None:
         ("annotated.mcap", "none/run.csv", 2, "there is no folder none"),
         ("tracks.csv", "run.csv", 2, "tracks.csv is not an annotated log; write one with"),
         ("recorded.mcap", "run.csv", 2, "recorded.mcap holds no /spatial/robustness; write it with"),
-        ("annotated.mcap", "-", 2, "- is no file; name one"),
+        ("annotated.mcap", "-", 2, "'-' is not a file"),
     ],
 )
-def test_what_cannot_be_exported(
+def test_an_export_that_cannot_work_is_refused(
     folder: Path, capsys: pytest.CaptureFixture[str], log: str, output: str, code: int, said: str
 ) -> None:
     (folder / "tracks.csv").write_text("time_ns,name,polygon\n0,a,0 0 1 0 1 1\n")
@@ -59,7 +59,7 @@ def test_what_cannot_be_exported(
     assert not (folder / "-").exists()
 
 
-def test_a_damaged_log_gives_what_is_left_and_its_code(
+def test_the_readable_part_of_a_damaged_log_is_exported_with_code_3(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     whole = (folder / "annotated.mcap").read_bytes()

@@ -9,10 +9,10 @@ import pytest
 
 from replay.runs import SPECIFICATION, PiecewiseSource
 from replay.runs import run as recorded_run
-from spatial_replay.cli.application import run
+from spatial_replay import parse_specification
+from spatial_replay.cli import run
 from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.replay import run_replay
-from spatial_replay.spec.load import parse_specification
 
 CUBE = '{"name": "cube", "class": "block", "polygon": [[0, 0], [1, 0], [1, 1]]}'
 LOST_CUBE = '{"name": "cube", "class": "block", "polygon": [[NaN, 0], [1, 0], [1, 1]]}'
@@ -30,7 +30,7 @@ def log(tmp_path: Path) -> Path:
     return path
 
 
-def test_samples_objects_and_signals_are_named(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_samples_objects_and_signals_are_listed(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["info", str(log)]) == 0
     said = capsys.readouterr().out
     assert "2 samples" in said
@@ -39,7 +39,7 @@ def test_samples_objects_and_signals_are_named(log: Path, capsys: pytest.Capture
     assert "battery" in said
 
 
-def test_json_counts_what_was_seen(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_counts_samples_and_observations(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["info", str(log), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert (document["samples"], document["start_ns"], document["end_ns"]) == (2, 10**9, 3_500_000_000)
@@ -50,7 +50,7 @@ def test_json_counts_what_was_seen(log: Path, capsys: pytest.CaptureFixture[str]
     assert document["damaged"] is False
 
 
-def test_damage_is_told_and_has_its_own_code(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damage_is_reported_and_has_its_own_code(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log.write_text("\n".join([*SAMPLES, "no sample"]))
     assert run(["info", str(log), "--json"]) == 3
     said = capsys.readouterr()
@@ -59,7 +59,7 @@ def test_damage_is_told_and_has_its_own_code(log: Path, capsys: pytest.CaptureFi
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\n", b"hello\n"])
-def test_something_else_is_no_log(tmp_path: Path, content: bytes) -> None:
+def test_a_file_of_another_kind_is_not_a_log(tmp_path: Path, content: bytes) -> None:
     other = tmp_path / "other"
     other.write_bytes(content)
     assert run(["info", str(other)]) == 3
@@ -74,7 +74,7 @@ def layer(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_log_of_something_else_is_listed(layer: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_mcap_file_without_samples_is_listed(layer: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["info", str(layer), "--json"]) == 0
     said = capsys.readouterr()
     document = json.loads(said.out)
@@ -86,7 +86,7 @@ def test_a_log_of_something_else_is_listed(layer: Path, capsys: pytest.CaptureFi
     assert "spatial_replay_certificate" in {each["name"] for each in document["metadata"]}
 
 
-def test_a_log_of_something_else_cannot_be_evaluated_but_is_not_damaged(
+def test_an_mcap_file_without_samples_cannot_be_evaluated_but_is_not_damaged(
     layer: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     spec = tmp_path / "a.spatial"
@@ -98,7 +98,7 @@ def test_a_log_of_something_else_cannot_be_evaluated_but_is_not_damaged(
         assert "'/spatial/robustness'" in said
 
 
-def test_a_damaged_attachment_is_told_by_info_and_replay(
+def test_a_damaged_attachment_is_reported_by_info_and_replay(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, spec = tmp_path / "whole.mcap", tmp_path / "a.spatial"
@@ -113,7 +113,9 @@ def test_a_damaged_attachment_is_told_by_info_and_replay(
         assert said.count("an attachment's checksum does not fit") == 1
 
 
-def test_a_scenario_without_objects_is_sound(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_scenario_without_objects_is_not_damaged(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     empty = tmp_path / "empty.xml"
     empty.write_text('<?xml version="1.0"?><commonRoad timeStepSize="0.1"/>')
     assert run(["info", str(empty)]) == 0
@@ -122,7 +124,7 @@ def test_a_scenario_without_objects_is_sound(tmp_path: Path, capsys: pytest.Capt
     assert "without obstacles" in said.err
 
 
-def test_a_log_by_others_says_what_could_be_read(
+def test_an_external_log_lists_the_topics_that_could_map_to_objects(
     data_folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bag = data_folder / "bags" / "two_turtles_lz4.bag"
@@ -133,7 +135,9 @@ def test_a_log_by_others_says_what_could_be_read(
     assert "spatial-replay info two_turtles_lz4.bag --suggest-mapping" in said
 
 
-def test_topics_of_a_log_by_others_as_json(data_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_topics_of_an_external_log_are_available_as_json(
+    data_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(["info", str(data_folder / "bags" / "pose_db3"), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert (document["kind"], document["samples"], document["messages"]["count"]) == ("ROS 2 bag", 0, 4695)
@@ -148,7 +152,7 @@ def test_topics_of_a_log_by_others_as_json(data_folder: Path, capsys: pytest.Cap
     }
 
 
-def test_bags_that_others_read_as_empty_are_read(
+def test_bags_that_other_readers_take_for_empty_are_read(
     data_folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("talker_mcap", "talker_sqlite3"):
@@ -175,7 +179,7 @@ def test_a_mapping_is_suggested_and_nothing_else_is_printed(
     }
 
 
-def test_no_mapping_is_suggested_where_none_is_needed(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_mapping_is_suggested_if_none_is_needed(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["info", str(log), "--suggest-mapping"]) == 2
     assert "run.jsonl needs no mapping" in capsys.readouterr().err
     assert run(["info", str(log), "--suggest-mapping", "--json"]) == 2
@@ -183,13 +187,15 @@ def test_no_mapping_is_suggested_where_none_is_needed(log: Path, capsys: pytest.
     assert run(["info", str(log), "--suggest-mapping"]) == 3
 
 
-def test_a_folder_that_is_no_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_without_a_bag_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for more in ([], ["--suggest-mapping"]):
         assert run(["info", str(tmp_path), *more]) == 2
         assert "is a directory; check the path" in capsys.readouterr().err
 
 
-def test_a_damaged_bag_is_told(data_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_damaged_bag_is_reported(
+    data_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     cut = tmp_path / "cut.bag"
     cut.write_bytes((data_folder / "bags" / "two_turtles.bag").read_bytes()[:860_000])
     assert run(["info", str(cut)]) == 3
@@ -200,14 +206,16 @@ def test_a_damaged_bag_is_told(data_folder: Path, tmp_path: Path, capsys: pytest
     assert parse_mapping(capsys.readouterr().out).topics
 
 
-def test_the_layout_kept_in_a_log_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_layout_stored_in_a_log_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     annotated = tmp_path / "annotated.mcap"
     run_replay(PiecewiseSource(recorded_run(), 12), [parse_specification(SPECIFICATION)], output=annotated)
     assert run(["info", str(annotated), "--layout"]) == 0
     assert "3D!scene" in json.loads(capsys.readouterr().out)["configById"]
 
 
-def test_a_log_without_a_layout_says_how_to_get_one(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_for_a_log_without_a_layout_the_error_says_how_to_get_one(
+    log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(["info", str(log), "--layout"]) == 2
-    assert "run.jsonl holds no layout" in capsys.readouterr().err
+    assert "run.jsonl has no layout" in capsys.readouterr().err
     assert run(["info", str(log), "--layout", "--json"]) == 2

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from spatial_replay.cli.application import run
+from spatial_replay.cli import run
 from spatial_replay.planning.read import read_decisions
 
 SATISFIED = "spec calm = F (green leftof red)\n"
@@ -26,7 +26,7 @@ def plan(folder: Path, text: str, *options: str) -> int:
     return run(["plan", "push", "-o", str(output), "--spec", str(folder / "task.spatial"), *options])
 
 
-def test_what_is_satisfied_exits_with_0(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_satisfied_plan_exits_with_0(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert plan(tmp_path, SATISFIED) == 0
     said = capsys.readouterr()
     assert "0 motions, 0 edges given up" in said.out
@@ -34,23 +34,25 @@ def test_what_is_satisfied_exits_with_0(tmp_path: Path, capsys: pytest.CaptureFi
     assert re.fullmatch(r"planning took \d+\.\d\d s\n", said.err)
 
 
-def test_where_no_path_is_left_it_exits_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_plan_without_a_path_left_exits_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert plan(tmp_path, IMPOSSIBLE) == 1
     said = capsys.readouterr().out
     reason = "no path left: every way from state 0 was given up (0 -> 1: no object can do it)"
     assert f"the planner: {reason}\n" in said
-    assert f"spatial-replay info {tmp_path / 'run.mcap'} --decisions tells" in said
+    assert f"spatial-replay info {tmp_path / 'run.mcap'} --decisions shows" in said
     assert said.endswith("the log: torn is violated\n")
 
 
-def test_what_is_too_uncertain_exits_with_4(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_plan_with_too_uncertain_objects_exits_with_4(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert plan(tmp_path, SATISFIED, "--noise", "0.1") == 4
     assert "the planner: the specification is satisfied: hold\nthe log: calm is unknown\n" in (
         capsys.readouterr().out
     )
 
 
-def test_of_several_results_one_is_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_of_several_results_has_to_be_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert plan(tmp_path, IMPOSSIBLE + SATISFIED) == 2
     assert "task.spatial has several results; choose one with --of: torn, calm" in capsys.readouterr().err
     assert not (tmp_path / "run.mcap").exists()
@@ -69,7 +71,7 @@ def test_of_several_results_one_is_chosen(tmp_path: Path, capsys: pytest.Capture
         (SATISFIED, ["--inject", "drop@1s"], "drop"),
     ],
 )
-def test_what_cannot_be_planned_for_exits_with_2(
+def test_a_specification_that_cannot_be_planned_for_exits_with_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, options: list[str], message: str
 ) -> None:
     assert plan(tmp_path, text, *options) == 2

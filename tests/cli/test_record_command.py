@@ -10,8 +10,8 @@ import pytest
 from cli.interruptions import MANY, interrupted, write_many
 from cli.program import PROGRAM, run_program
 from replay.runs import content_of, run, write_tracks
-from spatial_replay.cli.application import run as run_in_process
-from spatial_replay.sources.open_log import read_trace
+from spatial_replay import read_trace
+from spatial_replay.cli import run as run_in_process
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def tracks(tmp_path: Path) -> Path:
     return write_tracks(run(), tmp_path / "run.jsonl")
 
 
-def test_it_says_what_it_wrote(tracks: Path) -> None:
+def test_the_command_reports_what_it_wrote(tracks: Path) -> None:
     done = run_program("record", "tracks", "run.jsonl", "-o", "run.mcap", cwd=tracks.parent)
     said = "wrote run.mcap: 12 samples over 2.750 s of 2 objects: cube, cup 物\n"
     assert (done.returncode, done.stdout, done.stderr) == (0, said, "")
@@ -33,7 +33,7 @@ def test_a_log_can_be_recorded_again(tracks: Path, monkeypatch: pytest.MonkeyPat
     assert content_of(Path("once.mcap")).messages == content_of(Path("twice.mcap")).messages
 
 
-def test_names_that_nothing_has_are_a_warning(
+def test_unknown_names_are_a_warning(
     tracks: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tracks.parent)
@@ -44,7 +44,7 @@ def test_names_that_nothing_has_are_a_warning(
     assert "'cube'" in said
 
 
-def test_a_full_disk_has_its_code_and_one_line(tracks: Path) -> None:
+def test_a_full_disk_gives_code_70_and_one_line(tracks: Path) -> None:
     if not Path("/dev/full").is_char_device():
         pytest.skip("no /dev/full here")
     done = run_program("record", "tracks", "run.jsonl", "-o", "/dev/full", cwd=tracks.parent)
@@ -54,7 +54,7 @@ def test_a_full_disk_has_its_code_and_one_line(tracks: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_recording_is_a_proper_shorter_log(tmp_path: Path, number: signal.Signals) -> None:
+def test_an_interrupted_recording_is_a_valid_shorter_log(tmp_path: Path, number: signal.Signals) -> None:
     write_many(tmp_path / "run.jsonl")
     (tmp_path / "a.spatial").write_text("spec s = F cube ovlp cube\nspec t = G cube ovlp cube\n")
     command = [*PROGRAM, "record", "tracks", "run.jsonl", "--spec", "a.spatial", "-o", "run.mcap"]

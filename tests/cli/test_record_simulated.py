@@ -14,8 +14,8 @@ import pytest
 from cli.interruptions import interrupted
 from cli.program import PROGRAM, environment, run_program
 from replay.runs import content_of
-from spatial_replay.cli.application import run
-from spatial_replay.sources.open_log import read_trace
+from spatial_replay import read_trace
+from spatial_replay.cli import run
 
 LONG = ("record", "push", "-o", "run.mcap", "--duration", "3000s")
 
@@ -38,7 +38,7 @@ def test_equal_options_give_equal_bytes_in_every_process(tmp_path: Path) -> None
     assert json.loads(about["options"]) == {"seed": 7, "noise_m": 0.001, "inject": ["slip@1s"]}
 
 
-def test_a_specification_takes_the_place_of_the_scenarios(tmp_path: Path) -> None:
+def test_a_specification_replaces_that_of_the_scenario(tmp_path: Path) -> None:
     (tmp_path / "a.spatial").write_text("spec left = F (red leftof blue)\n")
     options = ("-o", "run.mcap", "--duration", "100ms")
     assert run_program("record", "push", *options, "--spec", "a.spatial", cwd=tmp_path).returncode == 0
@@ -47,7 +47,7 @@ def test_a_specification_takes_the_place_of_the_scenarios(tmp_path: Path) -> Non
     assert "recorded/push.spatial" not in kept
 
 
-def test_names_that_the_world_does_not_have_leave_the_output_alone(
+def test_names_that_are_not_in_the_world_leave_the_output_untouched(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, specification = tmp_path / "run.mcap", tmp_path / "a.spatial"
@@ -64,7 +64,7 @@ def test_names_that_the_world_does_not_have_leave_the_output_alone(
 @pytest.mark.parametrize(
     "wrong", [["--inject", "drop@1s"], ["--duration", "0s"], ["--inject", "quake"], ["--noise", "inf"]]
 )
-def test_what_cannot_be_simulated_leaves_the_output_alone(
+def test_options_that_cannot_be_simulated_leave_the_output_untouched(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], wrong: list[str]
 ) -> None:
     path = tmp_path / "run.mcap"
@@ -80,7 +80,7 @@ def test_what_cannot_be_simulated_leaves_the_output_alone(
     ("scenario", "module", "name"),
     [("push", "pybullet", "PyBullet"), ("table-setting", "py_trees", "py_trees")],
 )
-def test_without_the_extra_it_says_what_to_install(
+def test_without_the_extra_the_error_says_what_to_install(
     tmp_path: Path, scenario: str, module: str, name: str
 ) -> None:
     program = f"import sys; sys.modules[{module!r}] = None; from spatial_replay.cli import main; main()"
@@ -98,7 +98,7 @@ def test_without_the_extra_it_says_what_to_install(
     assert not (tmp_path / "run.mcap").exists()
 
 
-def test_an_interrupted_simulation_is_a_proper_shorter_log(tmp_path: Path) -> None:
+def test_an_interrupted_simulation_is_a_valid_shorter_log(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     code, said = interrupted([*PROGRAM, *LONG], signal.SIGINT, tmp_path, lambda: _size(path) > 10**5)
     assert (code, said.splitlines()) == (

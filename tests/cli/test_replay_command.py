@@ -16,8 +16,8 @@ import pytest
 from cli.interruptions import interrupted, write_many
 from cli.program import PROGRAM, run_program
 from replay.runs import SPECIFICATION, content_of, run, write_tracks
-from spatial_replay.cli.application import run as run_in_process
-from spatial_replay.trace.trace import Trace
+from spatial_replay import Trace
+from spatial_replay.cli import run as run_in_process
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 REPLAY = ("replay", "run.jsonl", "--spec", "blocks.spatial")
 
 
-def test_verdicts_go_to_standard_output_in_words(folder: Path) -> None:
+def test_verdicts_are_printed_on_standard_output(folder: Path) -> None:
     done = run_program(*REPLAY, "-o", "out.mcap", cwd=folder)
     assert (done.returncode, done.stderr) == (4, "")
     head, reach, apart, reason, wrote = done.stdout.splitlines()
@@ -43,7 +43,7 @@ def test_verdicts_go_to_standard_output_in_words(folder: Path) -> None:
     assert wrote == "wrote out.mcap"
 
 
-def test_json_goes_where_it_is_asked_to(folder: Path) -> None:
+def test_json_goes_to_a_file_or_to_standard_output(folder: Path) -> None:
     to_stream = run_program(*REPLAY, "--json", "-", cwd=folder)
     to_file = run_program(*REPLAY, "--json", "found.json", cwd=folder)
     assert (to_stream.returncode, to_file.returncode) == (4, 4)
@@ -67,7 +67,9 @@ def test_the_exit_code_is_the_verdict(folder: Path, formula: str, code: int) -> 
     assert run_in_process(["replay", "run.jsonl", "--spec", "a.spatial"]) == code
 
 
-def test_each_and_times_reach_the_evaluation(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_and_the_window_are_passed_to_the_evaluation(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (folder / "near.spatial").write_text("spec near(ego) = G (ego dist cube <= 9)")
     arguments = ["replay", "run.jsonl", "--spec", "near.spatial", "--each", "ego=class:dish", "--json", "-"]
     assert run_in_process([*arguments, "--from", "1s", "--to", "2000ms", "--every", "2"]) == 0
@@ -77,16 +79,16 @@ def test_each_and_times_reach_the_evaluation(folder: Path, capsys: pytest.Captur
 
 
 @pytest.mark.parametrize("window", [(), ("--from", "1s"), ("--from", "500000000", "--every", "2")])
-def test_the_time_that_is_told_can_be_given_back(
+def test_a_printed_time_can_be_used_as_an_option(
     folder: Path, window: Sequence[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     odd = Trace.from_samples(replace(each, time_ns=each.time_ns * 10 // 7 + 5) for each in run().samples())
     write_tracks(odd, folder / "run.jsonl")
     run_in_process([*REPLAY, *window, "--json", "found.json"])
     reach = json.loads((folder / "found.json").read_text())["specifications"][0]
-    told = re.search(r"reach .*first satisfied at (\S+)", capsys.readouterr().out)
-    assert told is not None
-    run_in_process([*REPLAY, "--from", told[1], "--json", "-"])
+    printed = re.search(r"reach .*first satisfied at (\S+)", capsys.readouterr().out)
+    assert printed is not None
+    run_in_process([*REPLAY, "--from", printed[1], "--json", "-"])
     assert json.loads(capsys.readouterr().out)["log"]["start_ns"] == reach["first_satisfied_ns"]
 
 
@@ -132,14 +134,16 @@ TWICE = GOOD.replace("0,", "9,", 1).replace("[{", '[{"name": "cube", "polygon": 
         "nothing",
         "gzip without a line",
         "gzip that breaks off",
-        "a line that is no JSON",
-        "a line that is no sample",
+        "a line that is not JSON",
+        "a line that is not a sample",
         "a time twice",
         "a time that decreases",
         "an object twice",
     ],
 )
-def test_a_log_that_is_none_or_damaged(folder: Path, content: bytes, code: int, said: str) -> None:
+def test_a_file_that_is_not_a_log_or_is_damaged_is_reported(
+    folder: Path, content: bytes, code: int, said: str
+) -> None:
     (folder / "run.bin").write_bytes(content)
     (folder / "a.spatial").write_text("G cube ovlp cube")
     done = run_program("replay", "run.bin", "--spec", "a.spatial", "-o", "out.mcap", cwd=folder)
@@ -184,16 +188,16 @@ TEN_FAULTS = "\n".join(
         ((*REPLAY, "--from", "99s"), "run.jsonl has no sample in the requested window; its samples are from"),
         ((*REPLAY, "--from", "2s", "--to", "1000ms"), "the window --from 2s --to 1000ms is empty"),
         ((*REPLAY, "--to", "0s"), "the window --to 0s is empty"),
-        ((*REPLAY, "-o", "-"), "- is no file; name one. `replay … --json -` writes to standard output"),
+        ((*REPLAY, "-o", "-"), "'-' is not a file; only --json - writes to standard output"),
         ((*REPLAY, "--every", "0"), "0 is not in the range x>=1"),
         ((*REPLAY, "--layer"), "add -o FILE"),
         ((*REPLAY, "--series"), "add --json FILE"),
         ((*REPLAY, "--each", "ego=all"), "no template has a parameter 'ego'"),
-        ((*REPLAY, "--each", "ego"), "write --each VAR=class:NAME"),
+        ((*REPLAY, "--each", "ego"), "write VAR=class:NAME"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )
-def test_wrong_usage(
+def test_wrong_usage_is_reported_and_writes_nothing(
     folder: Path, arguments: Sequence[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
@@ -205,7 +209,7 @@ def test_wrong_usage(
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_a_template_needs_its_objects(folder: Path) -> None:
+def test_a_template_requires_each(folder: Path) -> None:
     (folder / "near.spatial").write_text("spec near(ego) = G (ego dist cube <= 9)")
     replay = ("replay", "run.jsonl", "--spec", "near.spatial")
     without = run_program(*replay, cwd=folder)
@@ -216,7 +220,7 @@ def test_a_template_needs_its_objects(folder: Path) -> None:
     assert "is of the class 'dog'; its classes are: Block, dish" in unknown.stderr
 
 
-def test_every_fault_of_a_specification_is_told(folder: Path) -> None:
+def test_every_error_of_a_specification_is_reported(folder: Path) -> None:
     (folder / "faulty.spatial").write_text(TEN_FAULTS)
     done = run_program("replay", "run.jsonl", "--spec", "faulty.spatial", cwd=folder)
     assert (done.returncode, done.stdout) == (2, "")
@@ -225,7 +229,7 @@ def test_every_fault_of_a_specification_is_told(folder: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-def test_an_object_that_the_log_never_has(folder: Path) -> None:
+def test_an_object_that_is_not_in_the_log_is_unknown(folder: Path) -> None:
     (folder / "a.spatial").write_text("spec s = F (cub ovlp cube)\n")
     done = run_program("replay", "run.jsonl", "--spec", "a.spatial", "-o", "out.mcap", cwd=folder)
     assert (done.returncode, done.stdout) == (2, "")
@@ -235,7 +239,7 @@ def test_an_object_that_the_log_never_has(folder: Path) -> None:
     assert not (folder / "out.mcap").exists()
 
 
-def test_a_full_disk_has_its_code_and_leaves_nothing(folder: Path) -> None:
+def test_a_full_disk_gives_code_70_and_leaves_no_file(folder: Path) -> None:
     if not Path("/dev/full").is_char_device():
         pytest.skip("no /dev/full here")
     (folder / "full").symlink_to("/dev/full")
@@ -247,7 +251,7 @@ def test_a_full_disk_has_its_code_and_leaves_nothing(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_replay_leaves_nothing(tmp_path: Path, number: signal.Signals) -> None:
+def test_an_interrupted_replay_leaves_no_file(tmp_path: Path, number: signal.Signals) -> None:
     write_many(tmp_path / "run.jsonl")
     (tmp_path / "a.spatial").write_text("F cube ovlp cube")
     command = [*PROGRAM, "replay", "run.jsonl", "--spec", "a.spatial", "-o", "out.mcap"]

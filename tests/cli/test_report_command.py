@@ -10,8 +10,8 @@ from click.testing import CliRunner
 
 import spatial_replay as sr
 from report.report_pages import RECORDINGS, page_of
+from spatial_replay import SpecificationError, UsageError
 from spatial_replay.cli.application import application
-from spatial_replay.errors import SpecificationError, UsageError
 
 
 def call(*arguments: object) -> tuple[int, str]:
@@ -22,7 +22,7 @@ def call(*arguments: object) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize(("spec", "code"), [("table.spatial", 0), ("table_edited.spatial", 1)])
-def test_the_code_is_the_verdict(tmp_path: Path, spec: str, code: int) -> None:
+def test_the_exit_code_is_the_verdict(tmp_path: Path, spec: str, code: int) -> None:
     output = tmp_path / "run.html"
     ended, said = call("report", RECORDINGS / "table.jsonl", "--spec", RECORDINGS / spec, "-o", output)
     assert ended == code
@@ -30,13 +30,13 @@ def test_the_code_is_the_verdict(tmp_path: Path, spec: str, code: int) -> None:
     assert ("violated" if code else "satisfied") in page_of(output).within("header#")
 
 
-def test_a_log_is_reported_on_with_its_own_specification(tmp_path: Path) -> None:
+def test_a_report_uses_the_specification_of_the_log_by_default(tmp_path: Path) -> None:
     code, _ = call("report", RECORDINGS / "push.mcap", "-o", tmp_path / "run.html")
     assert code == 0
     assert "push.spatial" in page_of(tmp_path / "run.html").within("header#")
 
 
-def test_what_is_left_of_a_damaged_log_is_reported_on(tmp_path: Path) -> None:
+def test_a_report_covers_the_readable_part_of_a_damaged_log(tmp_path: Path) -> None:
     log = tmp_path / "broken.mcap"
     log.write_bytes((RECORDINGS / "push.mcap").read_bytes()[:200_000])
     code, said = call("report", log, "--spec", RECORDINGS / "push.spatial", "-o", tmp_path / "run.html")
@@ -45,7 +45,7 @@ def test_what_is_left_of_a_damaged_log_is_reported_on(tmp_path: Path) -> None:
     assert "The log is damaged" in page_of(tmp_path / "run.html").within("header#")
 
 
-def test_what_is_unknown_is_said_to_be(tmp_path: Path) -> None:
+def test_a_report_marks_unknown_results(tmp_path: Path) -> None:
     spec = tmp_path / "s.spatial"
     spec.write_text("spec s = a ovlp b\n")
     with sr.Recorder(tmp_path / "run.mcap", specifications=[sr.load_specification(spec)]) as recorder:
@@ -59,7 +59,7 @@ def test_what_is_unknown_is_said_to_be(tmp_path: Path) -> None:
     assert page.facts["results"][0]["nodes"][0]["value"] == "-inf … inf"
 
 
-def test_part_of_a_log_and_another_meaning(tmp_path: Path) -> None:
+def test_a_report_takes_a_window_and_the_paper_semantics(tmp_path: Path) -> None:
     spec = tmp_path / "s.spatial"
     spec.write_text("spec s = F (cup ovlp plate)\n")
     arguments = (
@@ -82,7 +82,7 @@ def test_part_of_a_log_and_another_meaning(tmp_path: Path) -> None:
     assert (times[0], round(times[-1], 3), len(times)) == (2.0, 3.967, 60)
 
 
-def test_what_cannot_work_leaves_no_page(tmp_path: Path) -> None:
+def test_options_that_cannot_work_leave_no_report(tmp_path: Path) -> None:
     output, log = tmp_path / "run.html", RECORDINGS / "table.jsonl"
     with pytest.raises(click.MissingParameter):
         call("report", log)

@@ -11,7 +11,7 @@ import pytest
 from cli.program import run_program
 from replay.runs import SPECIFICATION, content_of, record, run, write_tracks
 from spatial_replay.annotate.robustness import decode_robustness
-from spatial_replay.cli.application import run as run_in_process
+from spatial_replay.cli import run as run_in_process
 from spatial_replay.logs.topics import METADATA, ROBUSTNESS
 
 REPLAY = ("replay", "run.jsonl", "--spec", "blocks.spatial")
@@ -34,7 +34,7 @@ def found(*options: str, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     return document
 
 
-def test_results_say_what_they_mean(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_results_name_their_semantics(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     default = found(capsys=capsys)
     paper = found("--semantics", "paper", "--series", capsys=capsys)
     assert (default["semantics"], paper["semantics"]) == ("ltlf", "paper")
@@ -52,7 +52,7 @@ def test_results_say_what_they_mean(folder: Path, capsys: pytest.CaptureFixture[
     assert soon["series"]["value"][0][0] is None
 
 
-def test_in_words_what_is_undetermined_has_no_ends(folder: Path) -> None:
+def test_an_undetermined_result_is_printed_without_an_interval(folder: Path) -> None:
     done = run_program(*REPLAY, "--semantics", "paper", cwd=folder)
     assert (done.returncode, done.stderr) == (4, "")
     _, reach, apart, _ = done.stdout.splitlines()
@@ -60,7 +60,7 @@ def test_in_words_what_is_undetermined_has_no_ends(folder: Path) -> None:
     assert apart.startswith("  apart  unknown    robustness not determined, first satisfied at")
 
 
-def test_an_annotated_log_says_so_and_is_replayed_with_the_default(folder: Path) -> None:
+def test_an_annotated_log_names_its_semantics_and_is_replayed_with_the_default(folder: Path) -> None:
     record(run(), Path("run.mcap"))
     options = ("--spec", "blocks.spatial", "-o", "out.mcap", "--semantics", "paper")
     assert run_in_process(["replay", "run.mcap", *options]) == 4
@@ -77,7 +77,7 @@ def test_an_annotated_log_says_so_and_is_replayed_with_the_default(folder: Path)
     assert dict(content_of(Path("again.mcap")).metadata)[METADATA]["semantics"] == "ltlf"
 
 
-def test_another_operator_is_wrong_usage(folder: Path) -> None:
+def test_an_operator_outside_the_paper_is_wrong_usage(folder: Path) -> None:
     Path("past.spatial").write_text("spec fine = F (cube ovlp cube)\nspec past = G O (cube ovlp cube)\n")
     done = run_program("replay", "run.jsonl", "--spec", "past.spatial", "--semantics", "paper", cwd=folder)
     assert (done.returncode, done.stdout) == (2, "")

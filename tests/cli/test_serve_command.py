@@ -42,7 +42,7 @@ def running(*options: str) -> Iterator[tuple[subprocess.Popen[str], str, str]]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_it_says_its_verdict_and_its_address_and_ends_when_it_is_told_to(number: signal.Signals) -> None:
+def test_the_server_prints_verdict_and_address_and_stops_on_a_signal(number: signal.Signals) -> None:
     with running("--port", "0") as (process, address, said):
         assert "table_set  satisfied" in said
 
@@ -56,7 +56,7 @@ def test_it_says_its_verdict_and_its_address_and_ends_when_it_is_told_to(number:
         assert (process.returncode, warned) == (130, "")
 
 
-def test_it_plays_at_once_if_asked_to() -> None:
+def test_play_starts_playing_at_once() -> None:
     with running("--port", "0", "--play", "--to", "5s") as (process, address, _):
 
         async def looking() -> None:
@@ -68,14 +68,14 @@ def test_it_plays_at_once_if_asked_to() -> None:
         process.send_signal(signal.SIGINT)
 
 
-def test_it_warns_when_others_can_connect() -> None:
+def test_an_address_that_others_can_reach_is_a_warning() -> None:
     with running("--port", "0", "--host", "0.0.0.0") as (process, _, _):
         process.send_signal(signal.SIGINT)
         _, warned = process.communicate(timeout=60)
-    assert "anyone who reaches ws://0.0.0.0" in warned
+    assert "anyone who can reach ws://0.0.0.0" in warned
 
 
-def test_it_evaluates_with_the_semantics_asked_for(tmp_path: Path) -> None:
+def test_the_server_evaluates_with_the_chosen_semantics(tmp_path: Path) -> None:
     with running("--port", "0", "--semantics", "paper") as (process, address, _):
 
         async def looking() -> None:
@@ -88,7 +88,7 @@ def test_it_evaluates_with_the_semantics_asked_for(tmp_path: Path) -> None:
         process.send_signal(signal.SIGINT)
 
 
-def test_it_prints_its_layout(tmp_path: Path) -> None:
+def test_the_layout_is_printed(tmp_path: Path) -> None:
     done = run_program(*TABLE, "--layout", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert "Parameters!constants" in json.loads(done.stdout)["configById"]
@@ -105,13 +105,13 @@ def test_it_prints_its_layout(tmp_path: Path) -> None:
         (("--from", "99s"), "no sample in the window"),
     ],
 )
-def test_what_cannot_work_is_refused(options: tuple[str, ...], said: str, tmp_path: Path) -> None:
+def test_options_that_cannot_work_are_refused(options: tuple[str, ...], said: str, tmp_path: Path) -> None:
     done = run_program(*TABLE, *options, cwd=tmp_path)
     assert done.returncode == 2
     assert said in done.stderr
 
 
-def test_without_its_library_it_says_what_to_install(tmp_path: Path) -> None:
+def test_without_the_library_the_error_says_what_to_install(tmp_path: Path) -> None:
     program = "import sys; sys.modules['foxglove'] = None; from spatial_replay.cli import main; main()"
     done = subprocess.run(
         [sys.executable, "-c", program, *TABLE, "--port", "0"],

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from spatial_replay import UsageError
 from spatial_replay.cli.options import (
     TimePoint,
     duration_ns_from_text,
     text_from_duration_ns,
     time_point_from_text,
 )
-from spatial_replay.errors import UsageError
 from spatial_replay.trace.sample import LATEST_NS
 
 times_ns = st.integers(0, LATEST_NS)
@@ -22,7 +22,7 @@ zones = st.integers(-14 * 60, 14 * 60).map(lambda minutes: timezone(timedelta(mi
 
 
 @given(times_ns)
-def test_integers_are_nanoseconds_on_the_log_s_own_clock(time_ns: int) -> None:
+def test_integers_are_nanoseconds_on_the_clock_of_the_log(time_ns: int) -> None:
     assert time_point_from_text(str(time_ns)).absolute_ns(first_ns=17) == time_ns
 
 
@@ -42,7 +42,7 @@ def test_milliseconds_are_thousandths_of_seconds(count: int) -> None:
     zones,
     st.integers(0, 999),
 )
-def test_calendar_times_keep_nanoseconds_and_obey_their_zone(
+def test_calendar_times_keep_nanoseconds_and_time_zones(
     local: datetime, zone: timezone, nanoseconds: int
 ) -> None:
     moment = local.replace(tzinfo=zone)
@@ -52,7 +52,7 @@ def test_calendar_times_keep_nanoseconds_and_obey_their_zone(
     assert time_point_from_text(text) == TimePoint(microseconds * 1000 + nanoseconds, "zero")
 
 
-def test_z_is_utc_and_a_blank_may_stand_for_t() -> None:
+def test_z_means_utc_and_a_blank_can_replace_t() -> None:
     expected = TimePoint(1_769_860_800 * 10**9, "zero")
     assert time_point_from_text("2026-01-31T12:00:00Z") == expected
     assert time_point_from_text("2026-01-31 13:00:00+01:00") == expected
@@ -79,7 +79,7 @@ def test_z_is_utc_and_a_blank_may_stand_for_t() -> None:
         "٣s",
     ],
 )
-def test_anything_else_is_refused_by_name(text: str) -> None:
+def test_any_other_text_is_refused_with_the_text_in_the_message(text: str) -> None:
     with pytest.raises(UsageError) as refusal:
         time_point_from_text(text)
     assert repr(text) in str(refusal.value)
@@ -95,15 +95,15 @@ def test_no_text_raises_anything_but_a_usage_error(text: str) -> None:
 
 
 @given(st.integers(0, LATEST_NS))
-def test_a_duration_that_is_written_is_read_again(nanoseconds: int) -> None:
+def test_a_written_duration_reads_back_as_the_same_number(nanoseconds: int) -> None:
     assert duration_ns_from_text(text_from_duration_ns(nanoseconds)) == nanoseconds
 
 
-def test_a_duration_is_written_without_idle_digits() -> None:
+def test_a_duration_is_written_without_trailing_zeros() -> None:
     assert [text_from_duration_ns(ns) for ns in (0, 10 * 10**9, 250_000_000)] == ["0s", "10s", "0.25s"]
 
 
-def test_a_duration_names_its_unit() -> None:
+def test_a_duration_requires_a_unit() -> None:
     assert duration_ns_from_text("2s") == 2 * 10**9
     with pytest.raises(UsageError, match="write it as 2s"):
         duration_ns_from_text("2")

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from mcap.writer import Writer
 
-from spatial_replay.cli.application import run
-from spatial_replay.sources.open_log import read_trace
+from spatial_replay import read_trace
+from spatial_replay.cli import run
 
 TURTLES = """\
 sample: {topic: /turtle2/pose}    # the later of the two: no sample without the other
@@ -93,7 +93,7 @@ def test_names_are_compared_with_those_of_the_mapping(
     assert run(["check", "turtles.spatial", "--mapping", "turtles.yaml"]) == 2
 
 
-def test_a_mapping_is_asked_for_checked_and_never_written_to(
+def test_a_mapping_is_required_checked_and_never_overwritten(
     data_folder: Path, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bag = str(data_folder / "bags" / "two_turtles_lz4.bag")
@@ -109,7 +109,7 @@ def test_a_mapping_is_asked_for_checked_and_never_written_to(
     assert (folder / "turtles.yaml").read_text() == TURTLES
 
 
-def test_annotations_on_the_command_line(
+def test_drone_annotations_are_replayed(
     data_folder: Path, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = data_folder / "sdd" / "quad_video1_annotations.txt"
@@ -126,7 +126,7 @@ def test_annotations_on_the_command_line(
     assert "mapping 'turtles.yaml' is not needed" in capsys.readouterr().err
 
 
-def test_a_scenario_on_the_command_line(
+def test_a_commonroad_scenario_is_replayed(
     data_folder: Path, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = data_folder / "commonroad" / "ZAM_Tutorial-1_2_T-1.xml"
@@ -138,7 +138,7 @@ def test_a_scenario_on_the_command_line(
     assert replayed(capsys, folder / "annotated.mcap")["specifications"] == first["specifications"]
 
 
-def test_what_is_out_of_date_is_unknown_and_told_but_no_damage(
+def test_stale_observations_are_unknown_and_reported_but_not_damage(
     data_folder: Path, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / "turtles.yaml").write_text("max_age: 1ns\n" + TURTLES)
@@ -162,13 +162,15 @@ def test_what_is_out_of_date_is_unknown_and_told_but_no_damage(
     assert "1,344 unknown" in said.out
 
 
-def test_a_clock_that_jumps_back(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_clock_that_jumps_back_is_an_error_or_ends_the_log(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with (folder / "jump.mcap").open("wb") as stream:
         writer = Writer(stream)
         writer.start()
         schema = writer.register_schema("any.Pose", "jsonschema", b'{"type": "object"}')
         channel = writer.register_channel("/pose", "json", schema)
-        # stamps begin anew with a simulation that is started again, recording goes on
+        # the simulation restarts, and its stamps with it, while recording continues
         for number, seconds in enumerate([*range(10), *range(5)]):
             data = json.dumps({"stamp": seconds * 10**9, "x": float(number), "y": 0.0}).encode()
             writer.add_message(channel, number * 10**9, data, number * 10**9)
