@@ -1,13 +1,7 @@
-"""Gradient maps (Def. 19): how well guards would hold with one object somewhere else.
+"""Gradient maps (Def. 19): robustness of guards with one object at every cell of a grid.
 
-How well propositions would hold with one object somewhere else.
-
-The grid's positions are the samples of a trace in which nothing but that object moves, so the kernels that
-evaluate a log evaluate a map, all relations in one call, and a map's number is that of a log's sample.
-
-What propositions are about: which objects, and whether the present alone.
-
-Objects put elsewhere: one at a time, or at every cell of a grid at once.
+The positions of the grid become the samples of a trace in which only that object moves. So the kernels that
+evaluate a log evaluate a map, all relations in one call, and a cell has the number that a log's sample would.
 """
 
 from __future__ import annotations
@@ -45,14 +39,288 @@ from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, 
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
-_LESS_THAN_AREA = 1e-12
+Cube: TypeAlias = tuple[tuple[int, bool], ...]
+"""A conjunction of literals: number of a proposition, and whether it has to hold. The empty one is true."""
+
+Cubes: TypeAlias = tuple[Cube, ...]
+"""A disjunction of cubes. The empty one is false."""
+
+FREE: Final = 0
+
+CONSTRAINED: Final = 1
+
+OCCUPIED: Final = 2
+
+OUT_OF_REACH: Final = 3
+
+UNKNOWN: Final = 4
+
+REASONS: Final = ("free", "a constraint would hold", "an obstacle is there", "out of reach", "unknown")
+"""Why a cell is blocked, by its number in `GradientMap.blocked`."""
+
+_FLAT: Final = 1e-12
+"""Twice the area over the squared perimeter; a polygon with less has no centroid of its area."""
+
+
+@dataclass(frozen=True, eq=False)
+class GradientMap(Displayed):
+    """The robustness of a progress set with an object at each cell of a grid (Def. 19).
+
+    Attributes:
+        name: of the object.
+        grid: the cells; larger than the workspace's if an object to be pushed lies outside.
+        robustness: (A, rows, columns), in the unit of the relations; also at blocked cells.
+        blocked: (A, rows, columns) uint8, `FREE` or why the object must not be there (see `REASONS`).
+        clearance: (A, rows, columns), signed distance to the nearest obstacle; +inf without obstacles.
+        turns: (A,) angles in radians by which the object is turned.
+    """
+
+    name: str
+    grid: Grid
+    robustness: Floats
+    blocked: NDArray[np.uint8]
+    clearance: Floats
+    turns: Floats
+
+    @property
+    def values(self) -> Floats:
+        """(A, rows, columns): the robustness, NaN at blocked cells."""
+        return np.where(self.blocked == FREE, self.robustness, np.nan)
+
+    def best(self) -> float:
+        """Return the greatest robustness at a free cell; -inf without one."""
+        free = self.blocked == FREE
+        return float(self.robustness[free].max()) if free.any() else -np.inf
+
+    def __repr__(self) -> str:
+        cells = f"{self.grid.columns} x {self.grid.rows}"
+        return f"<GradientMap of {self.name}: {cells} cells, {self.best():.4g} at best>"
+
+
+def gradient_map(
+    maps: PropositionMaps,
+    progress: Cubes,
+    constraints: Cubes,
+    workspace: Workspace,
+    margin: float = 0.0,
+) -> GradientMap:
+    """Return the map of a progress set, blocked where the constraint set would hold.
+
+    Args:
+        progress: one of these cubes has to hold.
+        constraints: the robustness of each of these has to be less than -`margin`; unknown values count as
+            holding.
+        margin: in the unit of the relations, at least 0.
+    """
+    shape = maps.clearance.shape
+    robustness = np.full(shape, -np.inf)
+    for cube in progress:
+        np.maximum(robustness, _holds(maps.lower, maps.upper, cube, shape), out=robustness)
+    danger = np.full(shape, -np.inf)
+    for cube in constraints:
+        np.maximum(danger, _holds(maps.upper, maps.lower, cube, shape), out=danger)
+    blocked = np.zeros(shape, np.uint8)
+    # later assignments win: a cell is reported as constrained even if it is also occupied or out of reach
+    blocked[robustness == -np.inf] = UNKNOWN
+    blocked[~np.broadcast_to(workspace.within_reach(maps.grid), shape)] = OUT_OF_REACH
+    blocked[maps.clearance <= workspace.clearance] = OCCUPIED
+    blocked[danger >= -margin] = CONSTRAINED
+    return GradientMap(maps.name, maps.grid, robustness, blocked, maps.clearance, maps.turns)
+
+
+def _holds(positive: Floats, negative: Floats, cube: Cube, shape: tuple[int, ...]) -> Floats:
+    """Return the robustness of a cube: the minimum over its literals."""
+    least = np.full(shape, np.inf)
+    for number, wanted in cube:
+        np.minimum(least, positive[number] if wanted else -negative[number], out=least)
+    return least
+
+
+@dataclass(frozen=True, eq=False)
+class PropositionMaps:
+    """The robustness of P propositions with one object at every cell of a grid, in A orientations.
+
+    Attributes:
+        name: of the object.
+        grid: the cells.
+        lower, upper: (P, A, rows, columns), bounds of the robustness; -inf and +inf if it is unknown.
+        clearance: (A, rows, columns), signed distance to the nearest obstacle; +inf without obstacles.
+        turns: (A,) angles in radians by which the object is turned.
+    """
+
+    name: str
+    grid: Grid
+    lower: Floats
+    upper: Floats
+    clearance: Floats
+    turns: Floats
+
+
+def proposition_maps(
+    propositions: Sequence[Formula],
+    regions: Mapping[str, Outline],
+    sample: Sample,
+    name: str,
+    workspace: Workspace,
+    grid: Grid | None = None,
+) -> PropositionMaps:
+    """Return the robustness of propositions with the object `name` of a sample at every cell of a grid.
+
+    Args:
+        grid: cells to use instead of the workspace's.
+
+    Raises:
+        UsageError: the sample does not have the object, or a proposition looks at earlier samples.
+    """
+    refuse_delays(propositions)
+    tracked = sample.objects.get(name)
+    if not isinstance(tracked, TrackedObject):
+        present = ", ".join(sample.objects) or "none"
+        raise UsageError(f"there is no object {name!r} to move; the sample has: {present}")
+    cells = workspace.grid if grid is None else grid
+    turns = turns_for(tracked, workspace.yaws)
+    here = Trace.from_samples([sample])
+    everywhere = _trace_over_cells(here, tracked, name, cells, turns)
+    moves = np.array([concerns(each, name) for each in propositions], np.bool_)
+    concerned = [each for each, is_moving in zip(propositions, moves, strict=True) if is_moving]
+    others = [each for each, is_moving in zip(propositions, moves, strict=True) if not is_moving]
+    distances = _obstacle_distances(propositions, sample, name, workspace)
+    shape = (len(turns), *cells.shape)
+    over_cells = _intervals(everywhere, [*concerned, *distances], regions)
+    # propositions that do not depend on the object have the same value in every cell
+    fixed = _intervals(here, others, regions)
+    ends = []
+    for moving, still in zip(over_cells, fixed, strict=True):
+        values = np.empty((len(propositions), len(everywhere)))
+        values[moves], values[~moves] = moving[: len(concerned)], still
+        ends.append(values.reshape(len(propositions), *shape))
+    clearance = over_cells[0][len(concerned) :].min(axis=0, initial=np.inf)
+    if workspace.obstacles:
+        clearance = np.minimum(clearance, _to_static(everywhere, name, workspace))
+    lower, upper = ends
+    return PropositionMaps(name, cells, lower, upper, clearance.reshape(shape), turns)
+
+
+def _intervals(
+    trace: Trace, formulas: Sequence[Formula], regions: Mapping[str, Outline]
+) -> tuple[Floats, Floats]:
+    """Return the lower and the upper robustness, (K, T) each, of formulas without temporal operators."""
+    leaves = leaf_values(TraceScene(trace, regions), formulas, {})
+    return leaves[0], leaves[min(1, len(leaves) - 1)]
+
+
+def _obstacle_distances(
+    propositions: Sequence[Formula], sample: Sample, name: str, workspace: Workspace
+) -> list[Atom]:
+    """Return atoms for the distance from the object to each other object in its way.
+
+    A distance is at most 0 exactly if the object's centre lies in the Minkowski sum of the other object and
+    the mirrored one, the usual configuration-space obstacle.
+    """
+    measured = {
+        part
+        for proposition in propositions
+        for each in iter_formulas(proposition)
+        if isinstance(each, Atom)
+        for part in iter_expressions(each.expression)
+    }
+    atoms = []
+    for other in sorted(sample.objects):
+        if other != name and other not in workspace.supports:
+            one, two = TrackedName(name), TrackedName(other)
+            # in the order of a proposition's own measurement, so that the kernel computes it only once
+            swapped = SignedDistance(two, one)
+            atoms.append(Atom("", "dist", swapped if swapped in measured else SignedDistance(one, two)))
+    return atoms
+
+
+def _to_static(trace: Trace, name: str, workspace: Workspace) -> Floats:
+    """Return (T,) distances from the object to the workspace's obstacles."""
+    own = trace.rows[:, [trace.names.index(name)]]
+    static = np.arange(len(workspace.obstacles), dtype=np.int64) + len(trace.footprints)
+    obstacles = FootprintBatch.from_footprints(workspace.obstacles)
+    batch = FootprintBatch.concatenate([trace.footprints, obstacles])
+    operands = (Operand(own), Operand(np.tile(static, (len(trace), 1))))
+    distance: Floats = measure(batch, operands, [MeasureRequest("signed_distance", 0, 1)])[0]
+    return distance
+
+
+def _trace_over_cells(here: Trace, tracked: TrackedObject, name: str, grid: Grid, turns: Floats) -> Trace:
+    """Return a trace with the sample of `here` for each turn, row and column, the object moved there."""
+    places = moved_batch(tracked, grid.centres(), turns)
+    count, column = len(places), here.names.index(name)
+    own = np.full(count, here.rows[0, column])
+    rows = np.repeat(here.rows, count, axis=0)
+    rows[:, column] = len(here.footprints) + np.arange(count)
+    return Trace(
+        times_ns=np.arange(count, dtype=np.int64),
+        names=here.names,
+        rows=rows,
+        footprints=FootprintBatch.concatenate([here.footprints, places]),
+        yaw=np.concatenate((here.yaw, here.yaw[own] + np.repeat(turns, count // len(turns)))),
+        uncertainty=np.concatenate((here.uncertainty, here.uncertainty[own])),
+        class_code=np.concatenate((here.class_code, here.class_code[own])),
+        classes=here.classes,
+        signals={signal: np.repeat(values, count) for signal, values in here.signals.items()},
+    )
+
+
+def concerns(formula: Formula, name: str) -> bool:
+    """Return whether a formula depends on the pose of an object."""
+    for each in iter_formulas(formula):
+        if isinstance(each, Quantified):
+            return True
+        if isinstance(each, Atom) and any(_is_about(term, name) for term in terms_of(each.expression)):
+            return True
+    return False
+
+
+def _is_about(term: Term, name: str) -> bool:
+    base = base_of(term)
+    if isinstance(base, Group):
+        return base.members is None or name in base.members
+    return isinstance(base, TrackedName) and base.name == name
+
+
+def refuse_delays(propositions: Sequence[Formula]) -> None:
+    """Check that propositions depend on one sample each.
+
+    Raises:
+        UsageError: one looks at earlier samples, which moving an object now does not change.
+    """
+    for proposition in propositions:
+        for each in iter_formulas(proposition):
+            terms = list(terms_of(each.expression)) if isinstance(each, Atom) else []
+            terms += [each.group] if isinstance(each, Quantified) else []
+            if any(map(looks_back, terms)):
+                raise UsageError(
+                    f"{format_formula(each)} looks at earlier samples, so there is no map of it; plan "
+                    "without it, and evaluate it with replay"
+                )
+
+
+def refuse_unknown(names: Sequence[str], sample: Sample, propositions: Sequence[Formula]) -> None:
+    """Check that objects are in a sample, or in a proposition, since these may appear later.
+
+    Raises:
+        UsageError: with every name that is in neither.
+    """
+    faults = []
+    for name in names:
+        if name not in sample.objects and not any(concerns(each, name) for each in propositions):
+            hint = nearest_hint(name, sample.objects)
+            faults.append(
+                f"{name!r} is movable, but neither the specification nor the first sample has it; "
+                f"{hint or 'the sample has: ' + (', '.join(sample.objects) or 'none')}"
+            )
+    refuse_faults(faults)
 
 
 def centre_of(footprint: Footprint) -> tuple[float, float]:
-    """The point that says where an object is: the centroid of its parts' areas.
+    """Return the centre (x, y) of an object: the centroid of its parts' areas.
 
-    Each part counts by its area, with the centroid of its polygon before it is rounded: for one without area,
-    the mean of their vertices. Where parts overlap, their area counts twice.
+    A part is weighted by its area, and has the centroid of its polygon before rounding, or the mean of the
+    vertices if that polygon has no area. Areas of overlap count twice.
     """
     weights, centres = zip(*map(_weight_and_centre, footprint.parts), strict=True)
     if sum(weights) <= 0.0:
@@ -64,7 +332,7 @@ def centre_of(footprint: Footprint) -> tuple[float, float]:
 
 
 def moved_object(tracked: TrackedObject, x: float, y: float, turn: float = 0.0) -> TrackedObject:
-    """The object with its centre at (x, y), turned by an angle in radians; heights stay."""
+    """Return the object with its centre at (x, y), turned by an angle in radians; heights stay."""
     footprint = tracked.footprint
     centre = np.array(centre_of(footprint))
     parts = tuple(
@@ -76,7 +344,7 @@ def moved_object(tracked: TrackedObject, x: float, y: float, turn: float = 0.0) 
 
 
 def moved_batch(tracked: TrackedObject, positions: Floats, turns: Floats) -> FootprintBatch:
-    """The object turned by each angle (A,) in radians and put at each position (M, 2), as A * M rows."""
+    """Return the object turned by each angle (A,) in radians, at each position (M, 2), as A * M rows."""
     footprint = tracked.footprint
     centre = np.array(centre_of(footprint))
     count = len(positions) * len(turns)
@@ -96,14 +364,14 @@ def moved_batch(tracked: TrackedObject, positions: Floats, turns: Floats) -> Foo
 
 
 def turns_for(tracked: TrackedObject, yaws: tuple[float, ...]) -> Floats:
-    """(A,): by how much to turn an object so that it has each orientation; [0] to leave it as it is."""
+    """Return (A,) angles that turn an object to each orientation; [0] without orientations."""
     if not yaws:
         return np.zeros(1)
     return np.array(yaws) - (tracked.yaw or 0.0)
 
 
 def _placed(vertices: Floats, centre: Floats, positions: Floats, turn: float) -> Floats:
-    """(M, n, 2): vertices (n, 2) turned around the centre, which is then moved to each position (M, 2)."""
+    """Return (M, n, 2): vertices (n, 2) turned around the centre, which is moved to each position (M, 2)."""
     local = vertices - centre
     if turn != 0.0:
         cosine, sine = math.cos(turn), math.sin(turn)
@@ -114,8 +382,8 @@ def _placed(vertices: Floats, centre: Floats, positions: Floats, turn: float) ->
 
 
 def _weight_and_centre(part: ConvexPart) -> tuple[float, tuple[float, float]]:
-    """A part's area, and the centroid of its polygon before it is rounded."""
-    # a few vertices at most: plain numbers are quicker than arrays
+    """Return a part's area, and the centroid of its polygon before rounding."""
+    # plain numbers are quicker than arrays for the few vertices of a part
     corners = part.vertices.tolist()
     (x0, y0), *_ = corners
     doubled = sum_x = sum_y = length = 0.0
@@ -125,274 +393,9 @@ def _weight_and_centre(part: ConvexPart) -> tuple[float, tuple[float, float]]:
         sum_x += cross * (ax + bx - 2.0 * x0)
         sum_y += cross * (ay + by - 2.0 * y0)
         length += math.hypot(bx - ax, by - ay)
-    # a rounded polygon: its own area, a strip along its sides and a disc in all of its corners together
+    # a rounded polygon is the polygon, a strip along its sides, and sectors at its corners that make a disc
     area = doubled / 2 + length * part.radius + math.pi * part.radius**2
-    if len(corners) > 2 and doubled > _LESS_THAN_AREA * length**2:
+    if len(corners) > 2 and doubled > _FLAT * length**2:
         return area, (x0 + sum_x / (3.0 * doubled), y0 + sum_y / (3.0 * doubled))
     count = len(corners)
     return area, (sum(x for x, _ in corners) / count, sum(y for _, y in corners) / count)
-
-
-def concerns(formula: Formula, name: str) -> bool:
-    """Whether what a formula says depends on where an object is."""
-    for each in iter_formulas(formula):
-        if isinstance(each, Quantified):
-            return True
-        if isinstance(each, Atom) and any(_is_about(term, name) for term in terms_of(each.expression)):
-            return True
-    return False
-
-
-def _is_about(term: Term, name: str) -> bool:
-    base = base_of(term)
-    if isinstance(base, Group):
-        return base.members is None or name in base.members
-    return isinstance(base, TrackedName) and base.name == name
-
-
-def refuse_delays(propositions: Sequence[Formula]) -> None:
-    """That propositions are about one sample each.
-
-    Raises:
-        UsageError: one looks at earlier samples, which moving an object now does not change.
-    """
-    for proposition in propositions:
-        for each in iter_formulas(proposition):
-            terms = list(terms_of(each.expression)) if isinstance(each, Atom) else []
-            terms += [each.group] if isinstance(each, Quantified) else []
-            if any(map(looks_back, terms)):
-                raise UsageError(
-                    f"{format_formula(each)} looks at earlier samples, so there is no map of it; plan "
-                    "without it, and evaluate it with replay"
-                )
-
-
-def refuse_unknown(names: Sequence[str], sample: Sample, propositions: Sequence[Formula]) -> None:
-    """That objects are in a sample, or may come later: what propositions are about may.
-
-    Raises:
-        UsageError: with every name that is neither.
-    """
-    faults = []
-    for name in names:
-        if name not in sample.objects and not any(concerns(each, name) for each in propositions):
-            hint = nearest_hint(name, sample.objects)
-            faults.append(
-                f"{name!r} is movable, but neither the specification nor the first sample has it; "
-                f"{hint or 'the sample has: ' + (', '.join(sample.objects) or 'none')}"
-            )
-    refuse_faults(faults)
-
-
-@dataclass(frozen=True, eq=False)
-class PropositionMaps:
-    """Every proposition with one object at every cell of a grid, in A orientations.
-
-    Attributes:
-        name: of the object.
-        grid: the cells.
-        lower, upper: (P, A, rows, columns), robustness; -inf and +inf where it is unknown.
-        clearance: (A, rows, columns), signed distance to the nearest obstacle; +inf where there is none.
-        turns: (A,) radians by which the object is turned.
-    """
-
-    name: str
-    grid: Grid
-    lower: Floats
-    upper: Floats
-    clearance: Floats
-    turns: Floats
-
-
-def proposition_maps(
-    propositions: Sequence[Formula],
-    regions: Mapping[str, Outline],
-    sample: Sample,
-    name: str,
-    workspace: Workspace,
-    grid: Grid | None = None,
-) -> PropositionMaps:
-    """Each proposition with the object `name` of a sample at every cell of a grid.
-
-    Args:
-        grid: other cells than those of the workspace.
-
-    Raises:
-        UsageError: the sample does not have the object, or a proposition looks at earlier samples.
-    """
-    refuse_delays(propositions)
-    tracked = sample.objects.get(name)
-    if not isinstance(tracked, TrackedObject):
-        seen = ", ".join(sample.objects) or "none"
-        raise UsageError(f"there is no object {name!r} to move; the sample has: {seen}")
-    cells = workspace.grid if grid is None else grid
-    turns = turns_for(tracked, workspace.yaws)
-    here = Trace.from_samples([sample])
-    everywhere = _trace_over_cells(here, tracked, name, cells, turns)
-    moves = np.array([concerns(each, name) for each in propositions], np.bool_)
-    concerned = [each for each, is_moving in zip(propositions, moves, strict=True) if is_moving]
-    others = [each for each, is_moving in zip(propositions, moves, strict=True) if not is_moving]
-    standing = _standing(propositions, sample, name, workspace)
-    shape = (len(turns), *cells.shape)
-    over_cells = _intervals(everywhere, [*concerned, *standing], regions)
-    # what the object has no part in is measured once
-    fixed = _intervals(here, others, regions)
-    ends = []
-    for moving, still in zip(over_cells, fixed, strict=True):
-        values = np.empty((len(propositions), len(everywhere)))
-        values[moves], values[~moves] = moving[: len(concerned)], still
-        ends.append(values.reshape(len(propositions), *shape))
-    clearance = over_cells[0][len(concerned) :].min(axis=0, initial=np.inf)
-    if workspace.obstacles:
-        clearance = np.minimum(clearance, _to_static(everywhere, name, workspace))
-    lower, upper = ends
-    return PropositionMaps(name, cells, lower, upper, clearance.reshape(shape), turns)
-
-
-def _intervals(
-    trace: Trace, formulas: Sequence[Formula], regions: Mapping[str, Outline]
-) -> tuple[Floats, Floats]:
-    """(K, T), twice: formulas without temporal operators as intervals of their robustness."""
-    leaves = leaf_values(TraceScene(trace, regions), formulas, {})
-    return leaves[0], leaves[min(1, len(leaves) - 1)]
-
-
-def _standing(propositions: Sequence[Formula], sample: Sample, name: str, workspace: Workspace) -> list[Atom]:
-    """The distance from the object to each other one in its way.
-
-    It is at most 0 just where the object's centre lies in the Minkowski sum of the other with the object
-    mirrored.
-    """
-    measured = {
-        part
-        for proposition in propositions
-        for each in iter_formulas(proposition)
-        if isinstance(each, Atom)
-        for part in iter_expressions(each.expression)
-    }
-    atoms = []
-    for other in sorted(sample.objects):
-        if other != name and other not in workspace.supports:
-            one, two = TrackedName(name), TrackedName(other)
-            # what a proposition measures anyway is not measured twice
-            swapped = SignedDistance(two, one)
-            atoms.append(Atom("", "dist", swapped if swapped in measured else SignedDistance(one, two)))
-    return atoms
-
-
-def _to_static(trace: Trace, name: str, workspace: Workspace) -> Floats:
-    """(T,): the distance from the object to what stands in its way besides objects."""
-    own = trace.rows[:, [trace.names.index(name)]]
-    static = np.arange(len(workspace.obstacles), dtype=np.int64) + len(trace.footprints)
-    obstacles = FootprintBatch.from_footprints(workspace.obstacles)
-    batch = FootprintBatch.concatenate([trace.footprints, obstacles])
-    operands = (Operand(own), Operand(np.tile(static, (len(trace), 1))))
-    distance: Floats = measure(batch, operands, [MeasureRequest("signed_distance", 0, 1)])[0]
-    return distance
-
-
-def _trace_over_cells(here: Trace, tracked: TrackedObject, name: str, grid: Grid, turns: Floats) -> Trace:
-    """A trace whose samples are that of `here` but for one object, put elsewhere by turn, row and column."""
-    places = moved_batch(tracked, grid.centres(), turns)
-    count, column = len(places), here.names.index(name)
-    own = np.full(count, here.rows[0, column])
-    rows = np.repeat(here.rows, count, axis=0)
-    rows[:, column] = len(here.footprints) + np.arange(count)
-    return Trace(
-        times_ns=np.arange(count, dtype=np.int64),
-        names=here.names,
-        rows=rows,
-        footprints=FootprintBatch.concatenate([here.footprints, places]),
-        yaw=np.concatenate((here.yaw, here.yaw[own] + np.repeat(turns, count // len(turns)))),
-        uncertainty=np.concatenate((here.uncertainty, here.uncertainty[own])),
-        class_code=np.concatenate((here.class_code, here.class_code[own])),
-        classes=here.classes,
-        signals={signal: np.repeat(values, count) for signal, values in here.signals.items()},
-    )
-
-
-Cube: TypeAlias = tuple[tuple[int, bool], ...]
-"""A conjunction of propositions, by number, each to hold or not to; the empty one always holds."""
-
-Cubes: TypeAlias = tuple[Cube, ...]
-"""A disjunction of cubes; none never holds."""
-
-FREE: Final = 0
-CONSTRAINED: Final = 1
-OCCUPIED: Final = 2
-OUT_OF_REACH: Final = 3
-UNKNOWN: Final = 4
-REASONS: Final = ("free", "a constraint would hold", "an obstacle is there", "out of reach", "unknown")
-"""Why a cell is blocked, by the number that `GradientMap.blocked` has for it."""
-
-
-@dataclass(frozen=True, eq=False)
-class GradientMap(Displayed):
-    """How well a progress set would hold with an object at each cell (Def. 19).
-
-    Attributes:
-        name: of the object.
-        grid: the cells; more than the workspace has where an object that is to be pushed lies outside.
-        robustness: (A, rows, columns), in the unit of the relations; also at blocked cells.
-        blocked: (A, rows, columns) uint8, `FREE` or why the object must not be there (see `REASONS`).
-        clearance: (A, rows, columns), signed distance to the nearest obstacle; +inf where there is none.
-        turns: (A,) radians by which the object is turned.
-    """
-
-    name: str
-    grid: Grid
-    robustness: Floats
-    blocked: NDArray[np.uint8]
-    clearance: Floats
-    turns: Floats
-
-    @property
-    def values(self) -> Floats:
-        """(A, rows, columns): the robustness, NaN where cells are blocked."""
-        return np.where(self.blocked == FREE, self.robustness, np.nan)
-
-    def best(self) -> float:
-        """The greatest robustness at a free cell; -inf where there is none."""
-        free = self.blocked == FREE
-        return float(self.robustness[free].max()) if free.any() else -np.inf
-
-    def __repr__(self) -> str:
-        cells = f"{self.grid.columns} x {self.grid.rows}"
-        return f"<GradientMap of {self.name}: {cells} cells, {self.best():.4g} at best>"
-
-
-def gradient_map(
-    maps: PropositionMaps,
-    progress: Cubes,
-    constraints: Cubes,
-    workspace: Workspace,
-    margin: float = 0.0,
-) -> GradientMap:
-    """The map of a progress set, blocked where the constraint set would hold.
-
-    Args:
-        progress: one of these cubes is to hold.
-        constraints: none of these may hold, not even by -`margin`; what may hold for being unknown counts.
-        margin: in the unit of the relations, at least 0.
-    """
-    shape = maps.clearance.shape
-    robustness = np.full(shape, -np.inf)
-    for cube in progress:
-        np.maximum(robustness, _holds(maps.lower, maps.upper, cube, shape), out=robustness)
-    danger = np.full(shape, -np.inf)
-    for cube in constraints:
-        np.maximum(danger, _holds(maps.upper, maps.lower, cube, shape), out=danger)
-    blocked = np.zeros(shape, np.uint8)
-    blocked[robustness == -np.inf] = UNKNOWN
-    blocked[~np.broadcast_to(workspace.within_reach(maps.grid), shape)] = OUT_OF_REACH
-    blocked[maps.clearance <= workspace.clearance] = OCCUPIED
-    blocked[danger >= -margin] = CONSTRAINED
-    return GradientMap(maps.name, maps.grid, robustness, blocked, maps.clearance, maps.turns)
-
-
-def _holds(positive: Floats, negative: Floats, cube: Cube, shape: tuple[int, ...]) -> Floats:
-    """How well a cube holds: the least of its literals."""
-    least = np.full(shape, np.inf)
-    for number, wanted in cube:
-        np.minimum(least, positive[number] if wanted else -negative[number], out=least)
-    return least

@@ -1,10 +1,8 @@
-"""Shortest paths over the free cells of a map.
+"""Shortest paths over the free cells of a grid, by jump-point search (Harabor and Grastien, 2011).
 
-Jump-point search over a grid of cells (Harabor and Grastien, 2011), without cutting corners.
-
-A step goes to one of the eight neighbours; a diagonal one only where both cells beside it are free, too. Of
-all shortest paths between two cells that differ only in the order of their steps, the search follows the one
-that goes diagonally first; it stops where a path has to turn, or where a goal is.
+A step goes to one of the eight neighbours, a diagonal one only if both cells beside it are free too, so that
+no corner is cut. Among paths that differ only in the order of their steps, the search follows the one that
+goes diagonally first. It stops only at cells where a path may have to turn, and at goals.
 """
 
 from __future__ import annotations
@@ -23,82 +21,72 @@ from spatial_replay.geometry.arrays import Booleans, Flags, Integers, read_only_
 ROOT_2 = math.sqrt(2.0)
 
 
-@piece
-def _jump_straight(free: Flags, goals: Flags, row: int, column: int, down: int, right: int) -> int:
-    """Steps to the next cell along a row or column where a path may have to turn or ends; 0 for none."""
-    steps = 0
-    while True:
-        row += down
-        column += right
-        steps += 1
-        if not free[row, column]:
-            return 0
-        if goals[row, column]:
-            return steps
-        for side in (-1, 1):
-            beside_row, beside_column = row + side * right, column + side * down
-            # the cell beside is free and the one before it is not: no shorter way leads there
-            if free[beside_row, beside_column] and not free[beside_row - down, beside_column - right]:
-                return steps
+@dataclass(frozen=True, eq=False)
+class Path:
+    """A path over cells.
+
+    Attributes:
+        cells: (K, 2) rows and columns of its start, turns and end; between them it follows a row, a column or
+            a diagonal.
+        straight, diagonal: number of steps of each kind.
+    """
+
+    cells: Integers
+    straight: int
+    diagonal: int
+
+    @property
+    def length(self) -> float:
+        """Length in cells."""
+        return self.straight + ROOT_2 * self.diagonal
 
 
-@piece
-def _jump_diagonal(free: Flags, goals: Flags, row: int, column: int, down: int, right: int) -> int:
-    """The same along a diagonal."""
-    steps = 0
-    while True:
-        if not (free[row + down, column] and free[row, column + right] and free[row + down, column + right]):
-            return 0
-        row += down
-        column += right
-        steps += 1
-        if goals[row, column]:
-            return steps
-        if _jump_straight(free, goals, row, column, down, 0):
-            return steps
-        if _jump_straight(free, goals, row, column, 0, right):
-            return steps
+def shortest_path(free: Booleans, start: tuple[int, int], goals: Booleans) -> Path | None:
+    """Return the shortest path from a cell to any goal over free cells, if there is one.
+
+    Args:
+        free: (R, C), whether the path may cross a cell; the start need not be free.
+        start: row and column.
+        goals: (R, C), whether it may end in a cell, if that is free.
+
+    Raises:
+        UsageError: the start is outside the grid, or the arrays differ in shape.
+    """
+    rows, columns = free.shape
+    row, column = start
+    if goals.shape != free.shape or not (0 <= row < rows and 0 <= column < columns):
+        raise UsageError(f"no path from {start} over {free.shape} cells to goals among {goals.shape}")
+    is_free = free.copy()
+    is_free[row, column] = True
+    ends = np.argwhere(goals & is_free)
+    if not len(ends):
+        return None
+    first, last = ends.min(axis=0) + 1, ends.max(axis=0) + 1
+    box = np.array([first[0], last[0], first[1], last[1]])
+    # with a border of blocked cells, the search needs no check of bounds
+    cells = search(_bordered(is_free), _bordered(goals & is_free), box, row + 1, column + 1) - 1
+    if not len(cells):
+        return None
+    steps = np.abs(np.diff(cells, axis=0))
+    diagonal = int(steps.min(axis=1).sum())
+    return Path(read_only_integers(cells), int(steps.max(axis=1).sum()) - diagonal, diagonal)
 
 
-@piece
-def _directions(free: Flags, row: int, column: int, down: int, right: int, found: Integers) -> int:
-    """Fill in where a path may go on from a cell that it reached in a direction; returns how many ways."""
-    if down != 0 and right != 0:
-        found[0, 0], found[0, 1] = down, 0
-        found[1, 0], found[1, 1] = 0, right
-        found[2, 0], found[2, 1] = down, right
-        return 3
-    found[0, 0], found[0, 1] = down, right
-    count = 1
-    for side in (-1, 1):
-        aside_down, aside_right = side * right, side * down
-        beside_row, beside_column = row + aside_down, column + aside_right
-        if free[beside_row, beside_column] and not free[beside_row - down, beside_column - right]:
-            found[count, 0], found[count, 1] = aside_down, aside_right
-            found[count + 1, 0], found[count + 1, 1] = down + aside_down, right + aside_right
-            count += 2
-    return count
-
-
-@piece
-def _at_least(row: int, column: int, box: Integers) -> float:
-    """A lower bound of the way from a cell to the goals: that to the box around them, nothing in between."""
-    rows = max(box[0] - row, row - box[1], 0)
-    columns = max(box[2] - column, column - box[3], 0)
-    return float(abs(rows - columns) + ROOT_2 * min(rows, columns))
+def _bordered(cells: Booleans) -> NDArray[np.int8]:
+    return np.pad(cells, 1).astype(np.int8)
 
 
 @kernel
 def search(free: Flags, goals: Flags, box: Integers, start_row: int, start_column: int) -> Integers:
-    """The shortest path from a cell to any goal.
+    """Return the shortest path from a cell to any goal.
 
     Args:
-        free: (R, C), 1 where a path may go; a border of zeros around all.
-        goals: (R, C), 1 where it may end; only free cells.
+        free: (R, C), 1 for cells that a path may cross; the border has to be 0.
+        goals: (R, C), 1 for cells where it may end; they have to be free.
         box: (4,): first and last row, first and last column with a goal.
 
     Returns:
-        (K, 2), the cells where it turns, from the start to the goal; (0, 2) where there is no path.
+        (K, 2), the start, the cells where the path turns, and the goal; (0, 2) if there is no path.
     """
     rows, columns = free.shape
     straight = np.full(rows * columns, -1, np.int64)
@@ -108,9 +96,9 @@ def search(free: Flags, goals: Flags, box: Integers, start_row: int, start_colum
     ways = np.zeros((8, 2), np.int64)
     first = start_row * columns + start_column
     straight[first] = 0
-    waiting = [(_at_least(start_row, start_column, box), np.int64(first))]
-    while len(waiting) > 0:
-        current = heapq.heappop(waiting)[1]
+    queue = [(_at_least(start_row, start_column, box), np.int64(first))]
+    while len(queue) > 0:
+        current = heapq.heappop(queue)[1]
         if closed[current]:
             continue
         closed[current] = True
@@ -140,15 +128,80 @@ def search(free: Flags, goals: Flags, box: Integers, start_row: int, start_colum
             there = (row + steps * down) * columns + column + steps * right
             new_straight = straight[current] + (0 if is_diagonal else steps)
             new_diagonal = diagonal[current] + (steps if is_diagonal else 0)
-            # lengths from whole numbers of steps: equal ways are equal to the bit
+            # sums of step counts, unlike sums of lengths, make equal paths equal to the last bit
             length = new_straight + ROOT_2 * new_diagonal
             if straight[there] >= 0 and straight[there] + ROOT_2 * diagonal[there] <= length:
                 continue
             straight[there], diagonal[there] = new_straight, new_diagonal
             parent[there] = current
             ahead = _at_least(row + steps * down, column + steps * right, box)
-            heapq.heappush(waiting, (length + ahead, np.int64(there)))
+            heapq.heappush(queue, (length + ahead, np.int64(there)))
     return np.zeros((0, 2), np.int64)
+
+
+@piece
+def _at_least(row: int, column: int, box: Integers) -> float:
+    """Return a lower bound of the distance to the goals: the one to their bounding box without obstacles."""
+    rows = max(box[0] - row, row - box[1], 0)
+    columns = max(box[2] - column, column - box[3], 0)
+    return float(abs(rows - columns) + ROOT_2 * min(rows, columns))
+
+
+@piece
+def _directions(free: Flags, row: int, column: int, down: int, right: int, ways: Integers) -> int:
+    """Write the directions in which a path may go on from a cell reached in a direction; return how many."""
+    if down != 0 and right != 0:
+        ways[0, 0], ways[0, 1] = down, 0
+        ways[1, 0], ways[1, 1] = 0, right
+        ways[2, 0], ways[2, 1] = down, right
+        return 3
+    ways[0, 0], ways[0, 1] = down, right
+    count = 1
+    for side in (-1, 1):
+        aside_down, aside_right = side * right, side * down
+        beside_row, beside_column = row + aside_down, column + aside_right
+        if free[beside_row, beside_column] and not free[beside_row - down, beside_column - right]:
+            ways[count, 0], ways[count, 1] = aside_down, aside_right
+            ways[count + 1, 0], ways[count + 1, 1] = down + aside_down, right + aside_right
+            count += 2
+    return count
+
+
+@piece
+def _jump_diagonal(free: Flags, goals: Flags, row: int, column: int, down: int, right: int) -> int:
+    """Return the steps along a diagonal to the next cell where a path may turn or end; 0 for none."""
+    steps = 0
+    while True:
+        if not (free[row + down, column] and free[row, column + right] and free[row + down, column + right]):
+            return 0
+        row += down
+        column += right
+        steps += 1
+        if goals[row, column]:
+            return steps
+        if _jump_straight(free, goals, row, column, down, 0):
+            return steps
+        if _jump_straight(free, goals, row, column, 0, right):
+            return steps
+
+
+@piece
+def _jump_straight(free: Flags, goals: Flags, row: int, column: int, down: int, right: int) -> int:
+    """Return the steps along a row or column to the next cell where a path may turn or end; 0 for none."""
+    steps = 0
+    while True:
+        row += down
+        column += right
+        steps += 1
+        if not free[row, column]:
+            return 0
+        if goals[row, column]:
+            return steps
+        for side in (-1, 1):
+            beside_row, beside_column = row + side * right, column + side * down
+            # the cell beside is free and the one before it is not: no shorter way leads there
+            if free[beside_row, beside_column] and not free[beside_row - down, beside_column - right]:
+                return steps
 
 
 @piece
@@ -159,7 +212,7 @@ def _sign(value: int) -> int:
 
 @piece
 def _turns(parent: Integers, last: np.int64, columns: int) -> Integers:
-    """(K, 2): the cells from the start to the last one."""
+    """Return (K, 2): the cells from the start to the last one."""
     count = 1
     at = last
     while parent[at] >= 0:
@@ -171,63 +224,3 @@ def _turns(parent: Integers, last: np.int64, columns: int) -> Integers:
         cells[k, 0], cells[k, 1] = at // columns, at % columns
         at = parent[at]
     return cells
-
-
-@dataclass(frozen=True, eq=False)
-class Path:
-    """A path from cell to cell.
-
-    Attributes:
-        cells: (K, 2) rows and columns where it starts, turns and ends; in between it goes straight along
-            rows, columns or diagonals.
-        straight, diagonal: how many steps of each kind it has.
-    """
-
-    cells: Integers
-    straight: int
-    diagonal: int
-
-    @property
-    def length(self) -> float:
-        """In cells."""
-        return self.straight + math.sqrt(2.0) * self.diagonal
-
-
-def shortest_path(free: Booleans, start: tuple[int, int], goals: Booleans) -> Path | None:
-    """The shortest path from a cell to any goal, over free cells and past no corner of a blocked one.
-
-    Found by jump-point search (Harabor and Grastien, 2011). The start need not be free.
-
-    Args:
-        free: (R, C), where the path may go.
-        start: row and column.
-        goals: (R, C), where it may end, if the cell is free.
-
-    Returns:
-        None where there is no path.
-
-    Raises:
-        UsageError: the start is outside, or the arrays differ in shape.
-    """
-    rows, columns = free.shape
-    row, column = start
-    if goals.shape != free.shape or not (0 <= row < rows and 0 <= column < columns):
-        raise UsageError(f"no path from {start} over {free.shape} cells to goals among {goals.shape}")
-    is_free = free.copy()
-    is_free[row, column] = True
-    ends = np.argwhere(goals & is_free)
-    if not len(ends):
-        return None
-    first, last = ends.min(axis=0) + 1, ends.max(axis=0) + 1
-    box = np.array([first[0], last[0], first[1], last[1]])
-    # the border saves the search from looking where there are no cells
-    cells = search(_bordered(is_free), _bordered(goals & is_free), box, row + 1, column + 1) - 1
-    if not len(cells):
-        return None
-    steps = np.abs(np.diff(cells, axis=0))
-    diagonal = int(steps.min(axis=1).sum())
-    return Path(read_only_integers(cells), int(steps.max(axis=1).sum()) - diagonal, diagonal)
-
-
-def _bordered(cells: Booleans) -> NDArray[np.int8]:
-    return np.pad(cells, 1).astype(np.int8)

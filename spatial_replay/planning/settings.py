@@ -1,7 +1,4 @@
-"""How a planner plans: where, with which objects, with which care.
-
-Settings of a planner as text and back, so that a log can hold them and a decision be made again.
-"""
+"""Settings of a planner, and their text in a log, from which decisions can be recomputed."""
 
 from __future__ import annotations
 
@@ -24,27 +21,27 @@ from spatial_replay.planning.workspace import (
 )
 
 Skill: TypeAlias = Literal["push", "place"]
-"""What the robot does with an object: push it along a path in the plane, or pick it up and place it."""
+"""What the robot does with an object: push it along a path in the plane, or pick and place it."""
 
 _SKILLS = ("push", "place")
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What a planner has to know besides the specification and the samples.
+    """The settings of a planner, besides the specification.
 
     Attributes:
         workspace: where objects can be put.
-        skill: whether the way matters ("push") or only where it ends ("place").
-        movable: names of the objects that the robot can move; None for all that a sample has.
-        margin: how well progress has to hold at a target, in the unit of the relations, at least 0.
+        skill: "push", for which the path matters, or "place", for which only the target does.
+        movable: names of the objects that the robot can move; None for all objects of a sample.
+        margin: the least robustness of progress at a target, in the unit of the relations, at least 0.
         constraint_margin: how far constraints have to stay from holding, in the same unit, at least 0.
-        room: how far from obstacles an object is placed if it can be, in footprint units, so that it and its
-            neighbours can be grasped later; at least 0.
-        attempts: how often an edge is tried before it is given up, at least 1.
+        room: preferred clearance of a placed object, in footprint units, so that it and its neighbours can be
+            grasped later; at least 0. Targets with less are used if there is no other.
+        attempts: how many failed motions prune an edge, at least 1.
 
     Raises:
-        UsageError: values that cannot be, all of them told.
+        UsageError: invalid values, all of them reported.
     """
 
     workspace: Workspace
@@ -64,7 +61,7 @@ class Settings:
         faults = kind_faults("workspace", self.workspace, Workspace, "a Workspace")
         yield from faults
         if not faults and self.skill == "push" and self.workspace.yaws:
-            yield "an object that is pushed keeps no orientation; leave `yaws` of the workspace out"
+            yield "the orientation of a pushed object cannot be chosen; leave `yaws` of the workspace out"
         if self.movable is not None:
             yield from member_faults("movable", self.movable, tuple, str, "a tuple of names")
         distances = {name: getattr(self, name) for name in ("margin", "constraint_margin", "room")}
@@ -73,7 +70,7 @@ class Settings:
 
 
 def text_from_settings(settings: Settings) -> str:
-    """Settings in JSON; every number is read back as it was."""
+    """Return settings as JSON, from which `settings_from_text` reads the same numbers."""
     workspace, grid = settings.workspace, settings.workspace.grid
     return json.dumps(
         {
@@ -99,10 +96,10 @@ def text_from_settings(settings: Settings) -> str:
 
 
 def settings_from_text(text: str) -> Settings:
-    """Settings from what `text_from_settings` gave.
+    """Read settings from the text of `text_from_settings`.
 
     Raises:
-        LogError: the text is not that.
+        LogError: any other text.
     """
     try:
         return _settings(json.loads(text))

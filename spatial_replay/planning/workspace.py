@@ -1,6 +1,6 @@
-"""Where objects can be put: a grid of positions, how they may be turned, what stands in the way.
+"""The workspace: a grid of positions, orientations, reach and obstacles; and checks of such settings.
 
-What is wrong with the values of settings, in words: all of it at once.
+Checks collect what is wrong with all values, so that it is reported together.
 """
 
 from __future__ import annotations
@@ -17,81 +17,24 @@ from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.trace.sample import Sample
 
-
-def refuse_faults(faults: Iterable[str]) -> None:
-    """That there are no faults.
-
-    Raises:
-        UsageError: with each of them on a line.
-    """
-    told = "\n".join(faults)
-    if told:
-        raise UsageError(told)
-
-
-def is_number(value: object) -> bool:
-    """Whether a value is a number but NaN; truth values are none."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
-
-
-def number_faults(values: Mapping[str, Any], least: float = -math.inf) -> list[str]:
-    """Values by name, to be finite numbers of at least so much."""
-    wanted = "a finite number" if least == -math.inf else f"a finite number of at least {least:g}"
-    return [
-        f"{name} is {value!r}; give {wanted}"
-        for name, value in values.items()
-        if not (is_number(value) and math.isfinite(value) and value >= least)
-    ]
-
-
-def point_faults(name: str, value: Any) -> list[str]:
-    """A value to be a point (x, y) of finite numbers."""
-    if not isinstance(value, tuple) or len(value) != 2:
-        return [f"{name} is {value!r}; give (x, y)"]
-    return number_faults({f"{name}[{place}]": number for place, number in enumerate(value)})
-
-
-def count_faults(values: Mapping[str, Any]) -> list[str]:
-    """Values by name, to be whole numbers of at least 1."""
-    return [
-        f"{name} is {value!r}; give a whole number of at least 1"
-        for name, value in values.items()
-        if not isinstance(value, int) or isinstance(value, bool) or value < 1
-    ]
-
-
-def kind_faults(name: str, value: object, kind: type, wanted: str) -> list[str]:
-    """A value to be of a kind."""
-    return [] if isinstance(value, kind) else [f"{name} is {value!r}; give {wanted}"]
-
-
-def member_faults(
-    name: str, members: Collection[Any], collection: type, member: type, wanted: str
-) -> list[str]:
-    """A value to be a collection of members of one kind."""
-    return kind_faults(name, members, collection, wanted) or [
-        f"{name} has {each!r}; give {wanted}" for each in members if not isinstance(each, member)
-    ]
-
-
 MOST_CELLS = 1_000_000
-"""Cells of a grid, over all angles: maps of so many take a gigabyte. Beyond it a cell size was mistyped."""
+"""The most cells of a grid, over all orientations. Their maps take a gigabyte; more is a typing error."""
 
 CELLS_AROUND = 80
-"""Cells along the longer side of a workspace that nobody gave."""
+"""Cells along the longer side of a default workspace."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Cells that are squares in the plane; a map has a value for the middle of each.
+    """A grid of square cells in the plane; a map has a value for the middle of each cell.
 
     Attributes:
-        xmin, ymin: the corner from which cells are counted, in footprint units.
+        xmin, ymin: the corner of the first cell, in footprint units.
         cell_size: side of a cell, in footprint units.
-        columns, rows: how many cells along x and along y.
+        columns, rows: number of cells along x and along y.
 
     Raises:
-        UsageError: numbers that make no grid, or more than `MOST_CELLS`.
+        UsageError: invalid numbers, or more than `MOST_CELLS` cells.
     """
 
     xmin: float
@@ -113,10 +56,10 @@ class Grid:
 
     @classmethod
     def over(cls, xmin: float, ymin: float, xmax: float, ymax: float, cell_size: float) -> Grid:
-        """The grid over a box; its last cells may reach beyond it.
+        """Return the grid over a box; its last cells may extend beyond it.
 
         Raises:
-            UsageError: an empty box, or numbers that make no grid.
+            UsageError: an empty box, or invalid numbers.
         """
         box = f"the box ({xmin}, {ymin}, {xmax}, {ymax})"
         if not all(map(math.isfinite, (xmin, ymin, xmax, ymax))):
@@ -125,7 +68,7 @@ class Grid:
             raise UsageError(f"{box} is empty; give xmin, ymin, xmax, ymax")
         if not (is_number(cell_size) and cell_size > 0.0):
             raise UsageError(f"cell_size is {cell_size!r}; give a number above 0")
-        # a box that is a whole number of cells long must not get one more for the last bit of its length
+        # rounding must not add a cell to a box that is a whole number of cells long
         columns, rows = (math.ceil(length / cell_size - 1e-9) for length in (xmax - xmin, ymax - ymin))
         return cls(xmin, ymin, cell_size, columns, rows)
 
@@ -135,26 +78,26 @@ class Grid:
         return self.rows, self.columns
 
     def centres(self) -> Floats:
-        """(rows * columns, 2): the middle of each cell, row after row."""
+        """Return (rows * columns, 2): the middle of each cell, row by row."""
         x = self.xmin + (np.arange(self.columns) + 0.5) * self.cell_size
         y = self.ymin + (np.arange(self.rows) + 0.5) * self.cell_size
         return np.stack(np.broadcast_arrays(x[None, :], y[:, None]), axis=-1).reshape(-1, 2)
 
     def centre(self, row: int, column: int) -> tuple[float, float]:
-        """The middle (x, y) of a cell."""
+        """Return the middle (x, y) of a cell."""
         x = self.xmin + (column + 0.5) * self.cell_size
         return x, self.ymin + (row + 0.5) * self.cell_size
 
     def contains(self, points: Floats) -> Booleans:
-        """(…, 2) points → (…): whether each lies in a cell."""
+        """Return whether each of the points (…, 2) lies in a cell, as (…)."""
         cells = (points - np.array([self.xmin, self.ymin])) / self.cell_size
         inside: Booleans = ((cells >= 0.0) & (cells < np.array([self.columns, self.rows]))).all(axis=-1)
         return inside
 
     def reaching(self, x: float, y: float) -> Grid:
-        """This grid with cells added on two sides at most, so that a point lies in it.
+        """Return this grid, extended on up to two sides so that a point lies in it.
 
-        It stays as it is where the point lies in it already, or farther away than it is long.
+        A point farther away than the grid is long does not extend it.
         """
         column = math.floor((x - self.xmin) / self.cell_size)
         row = math.floor((y - self.ymin) / self.cell_size)
@@ -168,7 +111,7 @@ class Grid:
         return Grid(xmin, ymin, self.cell_size, columns, rows)
 
     def cell(self, x: float, y: float) -> tuple[int, int]:
-        """The cell (row, column) that a point lies in; of one outside the grid, the nearest one."""
+        """Return the cell (row, column) of a point, or the nearest one to a point outside the grid."""
         column = math.floor((x - self.xmin) / self.cell_size)
         row = math.floor((y - self.ymin) / self.cell_size)
         return min(max(row, 0), self.rows - 1), min(max(column, 0), self.columns - 1)
@@ -176,20 +119,20 @@ class Grid:
 
 @dataclass(frozen=True)
 class Workspace:
-    """Where a robot can put the centres of objects.
+    """The poses that a robot can bring objects to.
 
     Attributes:
-        grid: the positions that are considered.
-        yaws: orientations in radians that an object may be given; empty to leave objects as they are. An
-            object of unknown orientation is turned by these angles instead.
-        base: (x, y) around which the robot reaches.
-        nearest, farthest: from and up to which distance from the base it does, in footprint units.
-        obstacles: what stands in the way besides the objects of a sample.
-        supports: objects on which others may be put: to these they are no obstacles.
-        clearance: how far objects have to stay apart, in footprint units.
+        grid: the positions considered for the centre of an object.
+        yaws: orientations in radians that an object may be given; empty to keep orientations. An object of
+            unknown orientation is turned by these angles.
+        base: position (x, y) of the robot.
+        nearest, farthest: the range of distances from the base that the robot reaches, in footprint units.
+        obstacles: static obstacles, besides the objects of a sample.
+        supports: names of objects on which others may be put; they are not obstacles.
+        clearance: the least distance between objects, in footprint units.
 
     Raises:
-        UsageError: values that cannot be, all of them told.
+        UsageError: invalid values, all of them reported.
     """
 
     grid: Grid
@@ -216,7 +159,7 @@ class Workspace:
         if not is_number(self.farthest):
             yield f"farthest is {self.farthest!r}; give a number, or math.inf"
         elif not faults and self.farthest < self.nearest:
-            yield f"nothing is farther than {self.nearest} and nearer than {self.farthest}"
+            yield f"farthest is {self.farthest}; give at least nearest, {self.nearest}"
         yield from member_faults("obstacles", self.obstacles, tuple, Footprint, "a tuple of footprints")
         yield from member_faults("supports", self.supports, frozenset, str, "a frozenset of names")
         yield from number_faults({"clearance": self.clearance}, 0)
@@ -232,7 +175,7 @@ class Workspace:
 
     @classmethod
     def around(cls, sample: Sample) -> Workspace:
-        """A workspace over everything in a sample and half as far again to each side.
+        """Return a workspace over all objects of a sample, with a margin of half their extent on each side.
 
         Raises:
             UsageError: the sample has no object.
@@ -252,12 +195,68 @@ class Workspace:
         return cls(Grid.over(xmin, ymin, xmax, ymax, 2.0 * longer / CELLS_AROUND))
 
     def within_reach(self, grid: Grid) -> Booleans:
-        """(rows, columns): whether the robot can put an object into the middle of each cell of a grid.
+        """Return (rows, columns): whether the robot reaches the middle of each cell of a grid.
 
-        What lies outside the workspace's own cells is out of reach.
+        Cells outside the workspace's own grid are out of reach.
         """
         centres = grid.centres()
         distance = np.hypot(*(centres - np.array(self.base)).T)
         reached = (distance >= self.nearest) & (distance <= self.farthest) & self.grid.contains(centres)
         result: Booleans = reached.reshape(grid.shape)
         return result
+
+
+def refuse_faults(faults: Iterable[str]) -> None:
+    """Check that there are no faults.
+
+    Raises:
+        UsageError: with each fault on a line.
+    """
+    message = "\n".join(faults)
+    if message:
+        raise UsageError(message)
+
+
+def is_number(value: object) -> bool:
+    """Return whether a value is a number other than NaN; booleans are not numbers."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
+
+
+def number_faults(values: Mapping[str, Any], least: float = -math.inf) -> list[str]:
+    """Return what keeps values, by name, from being finite numbers of at least `least`."""
+    wanted = "a finite number" if least == -math.inf else f"a finite number of at least {least:g}"
+    return [
+        f"{name} is {value!r}; give {wanted}"
+        for name, value in values.items()
+        if not (is_number(value) and math.isfinite(value) and value >= least)
+    ]
+
+
+def point_faults(name: str, value: Any) -> list[str]:
+    """Return what keeps a value from being a point (x, y) of finite numbers."""
+    if not isinstance(value, tuple) or len(value) != 2:
+        return [f"{name} is {value!r}; give (x, y)"]
+    return number_faults({f"{name}[{place}]": number for place, number in enumerate(value)})
+
+
+def count_faults(values: Mapping[str, Any]) -> list[str]:
+    """Return what keeps values, by name, from being whole numbers of at least 1."""
+    return [
+        f"{name} is {value!r}; give a whole number of at least 1"
+        for name, value in values.items()
+        if not isinstance(value, int) or isinstance(value, bool) or value < 1
+    ]
+
+
+def kind_faults(name: str, value: object, kind: type, wanted: str) -> list[str]:
+    """Return what keeps a value from being of a type."""
+    return [] if isinstance(value, kind) else [f"{name} is {value!r}; give {wanted}"]
+
+
+def member_faults(
+    name: str, members: Collection[Any], collection: type, member: type, wanted: str
+) -> list[str]:
+    """Return what keeps a value from being a collection with members of one type."""
+    return kind_faults(name, members, collection, wanted) or [
+        f"{name} has {each!r}; give {wanted}" for each in members if not isinstance(each, member)
+    ]

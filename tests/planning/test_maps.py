@@ -147,7 +147,7 @@ def test_a_grid_has_whole_numbers_of_cells():
     [
         ({"yaws": (math.nan,)}, "finite"),
         ({"base": (math.inf, 0.0)}, "finite"),
-        ({"nearest": 2.0, "farthest": 1.0}, "farther than 2.0"),
+        ({"nearest": 2.0, "farthest": 1.0}, "farthest is 1.0; give at least nearest, 2.0"),
         ({"nearest": -1.0, "clearance": "1"}, r"nearest is -1.0(.|\n)*clearance is '1'"),
         ({"farthest": math.nan}, "farthest is nan"),
         ({"base": 3.0}, "base is 3.0"),
