@@ -16,18 +16,18 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from spatial_replay.annotate.automaton_state import (
     AutomatonRun,
-    KeptAutomaton,
+    SpecAutomaton,
     automata_attachments,
     automata_metadata,
     automata_of,
 )
-from spatial_replay.annotate.events import EventTeller, Told
-from spatial_replay.annotate.foxglove_layout import Contents, Extent, layout_attachment
-from spatial_replay.annotate.requirements import Evaluated, concerns_of
+from spatial_replay.annotate.events import EncodedEvent, EventReporter
+from spatial_replay.annotate.foxglove_layout import LayoutContents, SceneBounds, layout_attachment
+from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.robustness import encode_robustness
-from spatial_replay.annotate.scene_update import SceneEncoder, SceneState
+from spatial_replay.annotate.scene_update import SceneEncoder, SceneFrames, SceneState
 from spatial_replay.annotate.specification import ReportedTree, encode_specification, reported_trees
-from spatial_replay.annotate.violations import Judged, pointing_of
+from spatial_replay.annotate.violations import EvaluatedResult, leaf_pairs
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Attachment, Channel, Messages, merge, messages_of
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
@@ -61,26 +61,28 @@ class Annotator:
         files: Sequence[Specification],
         trees: Sequence[ReportedTree],
         instances: Sequence[Instance],
-        automata: Sequence[KeptAutomaton],
+        automata: Sequence[SpecAutomaton],
         semantics: Semantics,
         scene: SceneState | None = None,
+        show: Callable[[SceneFrames], None] = lambda frames: None,
     ) -> None:
         """Start before the first sample.
 
         Args:
             instances, automata: one for each of `trees`.
-            scene: what a viewer shows already, if it goes on with it.
+            scene: what a viewer already shows, if it continues with these messages.
+            show: takes what the messages of the scene show.
         """
         self._files = files
         self._trees = trees
-        self._concerns = [concerns_of(tree.formula, tree.object) for tree in trees]
+        self._requirements = [requirements_of(tree.formula, tree.object) for tree in trees]
         self._names = [[node.name for _, _, node in iter_nodes(tree.formula)] for tree in trees]
-        self._pointing = [
-            pointing_of(instance, concerns, files[tree.file].regions)
-            for tree, instance, concerns in zip(trees, instances, self._concerns, strict=True)
+        self._leaf_pairs = [
+            leaf_pairs(instance, requirements, files[tree.file].regions)
+            for tree, instance, requirements in zip(trees, instances, self._requirements, strict=True)
         ]
         self._tellers = [
-            EventTeller(tree, instance, files[tree.file], semantics)
+            EventReporter(tree, instance, files[tree.file], semantics)
             for tree, instance in zip(trees, instances, strict=True)
         ]
         self._runs = [
@@ -91,6 +93,7 @@ class Annotator:
         ]
         self._encoder = SceneEncoder(shown_regions(files))
         self._scene = scene or SceneState()
+        self._show = show
         self._written = dict.fromkeys(DERIVED, 0)
 
     @property
@@ -152,7 +155,7 @@ class Annotator:
         ]
         return self._in_order(_ROBUSTNESS, stretches, encoded)
 
-    def _told(self, stretches: Sequence[SeriesBlock]) -> list[Told]:
+    def _told(self, stretches: Sequence[SeriesBlock]) -> list[EncodedEvent]:
         """What changed, by time, then in the order of results and of their nodes."""
         told = [
             each
@@ -161,7 +164,7 @@ class Annotator:
         ]
         return sorted(told, key=lambda each: each.time_ns)
 
-    def _events(self, told: Sequence[Told]) -> list[Messages]:
+    def _events(self, told: Sequence[EncodedEvent]) -> list[Messages]:
         times_ns = np.array([each.time_ns for each in told], np.int64)
         return [
             self._messages(_EVENTS, times_ns, [each.event for each in told]),
@@ -178,15 +181,15 @@ class Annotator:
 
     def _drawn(self, trace: Trace, stretches: Sequence[SeriesBlock]) -> Messages:
         """The scene."""
-        evaluated = [
-            Evaluated(concerns, stretch.times_ns, stretch.series)
-            for concerns, stretch in zip(self._concerns, stretches, strict=True)
+        results = [
+            EvaluatedResult(requirements, block, pairs)
+            for requirements, block, pairs in zip(
+                self._requirements, stretches, self._leaf_pairs, strict=True
+            )
         ]
-        judged = [
-            Judged(each, stretch.leaves, pointing)
-            for each, stretch, pointing in zip(evaluated, stretches, self._pointing, strict=True)
-        ]
-        drawn = self._encoder.encode(trace, evaluated, self._scene, judged)
+        drawn = self._encoder.encode(trace, results, self._scene)
+        if drawn.frames is not None:
+            self._show(drawn.frames)
         self._scene = drawn.state
         return self._messages(_SCENE, drawn.times_ns, drawn.payloads)
 
@@ -239,7 +242,8 @@ class AnnotatedEvaluation:
         instances: Sequence[Sequence[Instance]],
         semantics: Semantics = "ltlf",
         compiled_before: Callable[[], Sequence[Attachment]] = list,
-        known: Sequence[KeptAutomaton] = (),
+        known: Sequence[SpecAutomaton] = (),
+        show: Callable[[SceneFrames], None] = lambda frames: None,
     ) -> None:
         """Start before the first sample.
 
@@ -247,18 +251,20 @@ class AnnotatedEvaluation:
             instances: what to evaluate of each file.
             compiled_before: gives the attachments of a log; automata among them need no MONA.
             known: automata of specs of these files, which are not compiled again.
+            show: takes what the messages of the scene show.
         """
         self._files = files
         self._semantics = semantics
         self._compiled_before = compiled_before
         self._known = known
+        self._show = show
         begin = partial(instance_evaluation, semantics=semantics)
         self._evaluations = [
             EvaluationStream(own, file.regions, begin) for own, file in zip(instances, files, strict=True)
         ]
         self.streams = [stream for evaluation in self._evaluations for stream in evaluation.streams]
         self.trees = reported_trees(files, instances)
-        self._extent: Extent | None = None
+        self._extent: SceneBounds | None = None
         self._has_samples = False
 
     def extend(self, trace: Trace) -> list[SeriesBlock]:
@@ -267,7 +273,7 @@ class AnnotatedEvaluation:
 
     def messages(self, trace: Trace, stretches: Sequence[SeriesBlock]) -> list[Messages]:
         """Return what to write beside samples, from the stretches that `extend` gave for them."""
-        self._extent = Extent.of(trace, self._extent)
+        self._extent = SceneBounds.of(trace, self._extent)
         self._has_samples |= len(trace) > 0
         return self._annotator.messages(trace, stretches)
 
@@ -290,7 +296,7 @@ class AnnotatedEvaluation:
         specification = [_SPECIFICATION] if self.trees else []
         return (*specification, _ROBUSTNESS, _AUTOMATON, _EVENTS, _EVENT_LOG, _SCENE)
 
-    def contents(self, extent: Extent | None, topics: Collection[str] = ()) -> Contents:
+    def contents(self, extent: SceneBounds | None, topics: Collection[str] = ()) -> LayoutContents:
         """Return what an annotated log of these results has for a viewer to show.
 
         Args:
@@ -300,7 +306,7 @@ class AnnotatedEvaluation:
         has_states = [each.automaton is not None for each in self.automata]
         # every result has events: a verdict is reported when it is reached, or else when the log ends
         derived = {SCENE, *(DERIVED if self.trees else ())} - set(() if any(has_states) else (AUTOMATON,))
-        return Contents(self.trees, has_states, extent, derived | set(topics))
+        return LayoutContents(self.trees, has_states, extent, derived | set(topics))
 
     def layout(self, topics: Collection[str] = ()) -> Attachment:
         """Return the layout that opens the log in a viewer, once everything else is written.
@@ -309,7 +315,7 @@ class AnnotatedEvaluation:
             topics: those of messages that are not derived from samples.
         """
         if not self._has_samples:
-            return layout_attachment(Contents(self.trees, [False] * len(self.trees), None, topics))
+            return layout_attachment(LayoutContents(self.trees, [False] * len(self.trees), None, topics))
         return layout_attachment(self.contents(self._extent, topics))
 
     def automata_metadata(self) -> Mapping[str, str]:
@@ -321,18 +327,20 @@ class AnnotatedEvaluation:
         return automata_attachments(self.automata, prefix)
 
     @cached_property
-    def automata(self) -> Sequence[KeptAutomaton]:
+    def automata(self) -> Sequence[SpecAutomaton]:
         """Of each tree; compiled when first asked for, since not every evaluation is written down."""
         return automata_of(self._files, self.trees, self._semantics, self._compiled_before(), self._known)
 
     def annotator(self, scene: SceneState | None = None) -> Annotator:
-        """Who writes what is to be said of the samples, from the first on.
+        """Return an annotator that starts before the first sample.
 
         Args:
-            scene: what a viewer shows already, if it goes on with it.
+            scene: what a viewer already shows, if it continues with these messages.
         """
         instances = [stream.instance for stream in self.streams]
-        return Annotator(self._files, self.trees, instances, self.automata, self._semantics, scene)
+        return Annotator(
+            self._files, self.trees, instances, self.automata, self._semantics, scene, self._show
+        )
 
     @cached_property
     def _annotator(self) -> Annotator:

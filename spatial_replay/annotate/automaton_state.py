@@ -193,7 +193,7 @@ _MOST_LITERALS = 50_000
 
 
 @dataclass(frozen=True)
-class KeptAutomaton:
+class SpecAutomaton:
     """The automaton of a spec or, for a template, of all its instances.
 
     Attributes:
@@ -223,8 +223,8 @@ def automata_of(
     trees: Sequence[ReportedTree],
     semantics: Semantics,
     compiled_before: Sequence[Attachment] = (),
-    known: Sequence[KeptAutomaton] = (),
-) -> list[KeptAutomaton]:
+    known: Sequence[SpecAutomaton] = (),
+) -> list[SpecAutomaton]:
     """The automaton of each tree's spec, one for each of `trees`; instances of a template share theirs.
 
     Args:
@@ -237,16 +237,16 @@ def automata_of(
         if id(tree.formula) not in found:
             file = files[tree.file]
             spec = next(each for each in file.results if each.formula is tree.formula)
-            found[id(tree.formula)] = _kept(tree.name, file, spec, semantics, stored)
+            found[id(tree.formula)] = _spec_automaton(tree.name, file, spec, semantics, stored)
     return [found[id(tree.formula)] for tree in trees]
 
 
-def automata_metadata(automata: Sequence[KeptAutomaton]) -> Mapping[str, str]:
+def automata_metadata(automata: Sequence[SpecAutomaton]) -> Mapping[str, str]:
     """For each spec, how large its automaton is, or why there is none."""
     return {each.name: each.summary for each in automata}
 
 
-def automata_attachments(automata: Sequence[KeptAutomaton], prefix: str) -> list[Attachment]:
+def automata_attachments(automata: Sequence[SpecAutomaton], prefix: str) -> list[Attachment]:
     """The automata as files: for a replay, for Graphviz, for tools of automata theory.
 
     Args:
@@ -272,12 +272,12 @@ def _is_stored(attachment: Attachment) -> bool:
     return attachment.name.startswith(AUTOMATA_PREFIX) and attachment.name.endswith(_STORED)
 
 
-def _kept(
+def _spec_automaton(
     name: str, file: Specification, spec: NamedSpec, semantics: Semantics, stored: Sequence[bytes]
-) -> KeptAutomaton:
+) -> SpecAutomaton:
     if semantics != "ltlf":
-        return KeptAutomaton(name, file, spec, None, "an automaton is of the semantics ltlf")
+        return SpecAutomaton(name, file, spec, None, "an automaton is of the semantics ltlf")
     try:
-        return KeptAutomaton(name, file, spec, automaton(file, spec.name, stored=stored))
+        return SpecAutomaton(name, file, spec, automaton(file, spec.name, stored=stored))
     except NoAutomatonError as error:
-        return KeptAutomaton(name, file, spec, None, error.reason, str(error))
+        return SpecAutomaton(name, file, spec, None, error.reason, str(error))

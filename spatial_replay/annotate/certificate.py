@@ -165,7 +165,7 @@ def specification_sha256(files: Sequence[Specification]) -> str:
     return total.hexdigest()
 
 
-def described(files: Sequence[Specification]) -> str:
+def specifications_json(files: Sequence[Specification]) -> str:
     """Specifications as a log's metadata lists them, in JSON: name and SHA-256 of the canonical text."""
     texts = [format_specification(file).encode("utf-8", "surrogatepass") for file in files]
     hashes = [hashlib.sha256(text).hexdigest() for text in texts]

@@ -37,7 +37,7 @@ class LeavesBelow(NamedTuple):
     signs: Floats
 
 
-class Attained(NamedTuple):
+class LeafValue(NamedTuple):
     """A leaf at a sample.
 
     Attributes:
@@ -71,7 +71,9 @@ def leaves_below(formula: Formula, leaves: Sequence[Formula]) -> list[LeavesBelo
     return [_columns(list(each)) for each in found]
 
 
-def attained(below: LeavesBelow, ends: tuple[Floats, Floats], number: float, *, low: bool) -> Attained | None:
+def find_leaf(
+    below: LeavesBelow, ends: tuple[Floats, Floats], number: float, *, low: bool
+) -> LeafValue | None:
     """The first leaf below a node that is what the node is, in one sample.
 
     Args:
@@ -86,7 +88,7 @@ def attained(below: LeavesBelow, ends: tuple[Floats, Floats], number: float, *, 
     hits = np.flatnonzero(own * below.signs == number)
     if not len(hits):
         return None
-    return Attained(int(below.indices[hits[0]]), float(own[hits[0]]) + 0.0)
+    return LeafValue(int(below.indices[hits[0]]), float(own[hits[0]]) + 0.0)
 
 
 def _columns(entries: Sequence[tuple[int, int]]) -> LeavesBelow:
@@ -103,7 +105,7 @@ def _key(leaf: Formula) -> tuple[object, ...]:
     raise TypeError(f"{leaf!r} is no leaf")
 
 
-class Parts:
+class DecidingLeaves:
     """The parts of some nodes of a formula, each with the sample that its value is from.
 
     Into how many stretches the samples are cut changes nothing.
@@ -144,7 +146,7 @@ class Parts:
         for part, t in zip(self._parts[changed].tolist(), last[changed].tolist(), strict=True):
             self._leaves[part] = samples[t]
 
-    def attained(self, node: int, ends: Floats, *, low: bool, wide: bool) -> Attained | None:
+    def find_leaf(self, node: int, ends: Floats, *, low: bool, wide: bool) -> LeafValue | None:
         """The leaf whose number is an end of a node's interval, if it is one's at the sample it is from.
 
         Args:
@@ -158,12 +160,12 @@ class Parts:
                 return None
             leaves = self._leaves[node]
             lows, highs = low_and_high(len(leaves), wide=wide)
-            return attained(self._below[node], (leaves[lows], leaves[highs]), number, low=low)
+            return find_leaf(self._below[node], (leaves[lows], leaves[highs]), number, low=low)
         for place, operand in enumerate(self._operands[node]):
             for sign in operand_signs(formula, place):
                 is_low = low == (sign > 0)
                 if sign * _end(ends, operand, is_low) == number:
-                    found = self.attained(operand, ends, low=is_low, wide=wide)
+                    found = self.find_leaf(operand, ends, low=is_low, wide=wide)
                     if found is not None:
                         return found
         return None

@@ -14,21 +14,27 @@ from foxglove_schemas_protobuf.Event_pb2 import Event
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from spatial_replay.annotate.deciding_leaf import Attained, LeavesBelow, Parts, attained, leaves_below
+from spatial_replay.annotate.deciding_leaf import (
+    DecidingLeaves,
+    LeafValue,
+    LeavesBelow,
+    find_leaf,
+    leaves_below,
+)
 from spatial_replay.annotate.sentences import number_text
 from spatial_replay.annotate.specification import ReportedTree
 from spatial_replay.annotate.verdict_changes import (
     FAILING,
     HOLDING,
     OF_CANDIDATE,
-    OF_STANDING,
+    OF_CURRENT,
     SATISFIED,
     START,
     VIOLATED,
     Change,
+    NodeStates,
     Period,
-    Standings,
-    follow,
+    track,
 )
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.instances import Instance
@@ -100,7 +106,7 @@ def past_sentence(before: Period, until_ns: int, witness: str) -> str:
     return f"Before, it {did} for {seconds}{worst}."
 
 
-class Watched(NamedTuple):
+class ReportedNode(NamedTuple):
     """A node whose changes are told.
 
     Attributes:
@@ -118,7 +124,7 @@ class Watched(NamedTuple):
     below: LeavesBelow
 
 
-class Stated(NamedTuple):
+class PeriodText(NamedTuple):
     """What is said of a period: its number as that of a leaf, "" if it is none's, and a sentence."""
 
     period: Period
@@ -126,7 +132,7 @@ class Stated(NamedTuple):
     sentence: str
 
 
-class Told(NamedTuple):
+class EncodedEvent(NamedTuple):
     """One change, encoded for both topics, and when it is told."""
 
     time_ns: int
@@ -134,7 +140,7 @@ class Told(NamedTuple):
     log: bytes
 
 
-class EventTeller:
+class EventReporter:
     """Tells what becomes of one result's root and of the specs that it is made of, up to the end of the log.
 
     What it keeps from one stretch of samples to the next is a few numbers for each of these, and for each of
@@ -149,22 +155,22 @@ class EventTeller:
         self._tree, self._filename = tree, "" if file.filename == "<text>" else file.filename
         self._leaves = instance.program.leaves
         below = leaves_below(tree.formula, self._leaves)
-        self._watched = _watched(tree, below, file)
+        self._watched = _reported_nodes(tree, below, file)
         self._nodes = np.array([each.node for each in self._watched], np.int64)
-        self._parts = Parts(tree.formula, below, self._nodes.tolist())
+        self._parts = DecidingLeaves(tree.formula, below, self._nodes.tolist())
         self._bindings = instance.bindings
         self._relations = RELATION_NAMES | file.relations
-        self._standings = Standings.begin(len(self._watched))
-        self._carried: dict[tuple[int, int], Attained | None] = {}
+        self._standings = NodeStates.begin(len(self._watched))
+        self._carried: dict[tuple[int, int], LeafValue | None] = {}
         self._last_ns: int | None = None
 
-    def tell(self, stretch: SeriesBlock) -> list[Told]:
+    def tell(self, stretch: SeriesBlock) -> list[EncodedEvent]:
         """Take in the next samples; the changes that they confirm, by node, then in the order of time."""
         if not len(stretch.times_ns) or self._standings.are_final:
             return []
         self._last_ns = int(stretch.times_ns[-1])
         self._parts.extend(stretch)
-        followed = follow(
+        followed = track(
             self._standings, stretch.times_ns, stretch.series, self._nodes, settles=self._settles
         )
         self._standings = followed.standings
@@ -174,11 +180,11 @@ class EventTeller:
             codes = followed.standings.integers[node, [0, 3]].tolist()
             for slot, (code, place) in enumerate(zip(codes, places, strict=True)):
                 period = Period(code, 0, 0, float(followed.standings.worst[node, slot]), place)
-                carried[node, (OF_STANDING, OF_CANDIDATE)[slot]] = self._attained(node, period, stretch)
+                carried[node, (OF_CURRENT, OF_CANDIDATE)[slot]] = self._attained(node, period, stretch)
         self._carried = carried
         return told
 
-    def end(self, time_ns: int, final: Floats) -> list[Told]:
+    def end(self, time_ns: int, final: Floats) -> list[EncodedEvent]:
         """What the end of the log makes of the nodes that samples after it could still change.
 
         Args:
@@ -189,45 +195,47 @@ class EventTeller:
             return []
         return [self._told_at_end(node, time_ns, self._last_ns, final) for node in self._standings.pending]
 
-    def _attained(self, node: int, period: Period, stretch: SeriesBlock) -> Attained | None:
+    def _attained(self, node: int, period: Period, stretch: SeriesBlock) -> LeafValue | None:
         """The leaf that a period's worst number is that of, if it is one's at the sample in which it came."""
         if period.place < 0:
             return self._carried.get((node, period.place))
         leaves = stretch.leaves[:, :, period.place]
         low, high = low_and_high(len(leaves), wide=period.code in (SATISFIED, VIOLATED))
         ends = leaves[low], leaves[high]
-        return attained(self._watched[node].below, ends, period.worst, low=period.code != VIOLATED)
+        return find_leaf(self._watched[node].below, ends, period.worst, low=period.code != VIOLATED)
 
-    def _told(self, change: Change, stretch: SeriesBlock) -> Told:
+    def _told(self, change: Change, stretch: SeriesBlock) -> EncodedEvent:
         watched, after, before = self._watched[change.node], change.after, change.before
         witness = self._words(self._attained(change.node, after, stretch))
-        now = Stated(after, witness, change_sentence(watched.title, after, witness))
+        now = PeriodText(after, witness, change_sentence(watched.title, after, witness))
         past = None
         if before is not None:
             past = self._past(before, after.start_ns, self._attained(change.node, before, stretch))
         return self._encoded(watched, int(stretch.times_ns[change.sample]), now, past)
 
-    def _told_at_end(self, node: int, time_ns: int, last_ns: int, final: Floats) -> Told:
+    def _told_at_end(self, node: int, time_ns: int, last_ns: int, final: Floats) -> EncodedEvent:
         watched, before = self._watched[node], self._standings.period(node)
         lower, upper = final[watched.node].tolist()
         verdict = final_verdict(lower, upper)
         low, found = verdict is not Verdict.VIOLATED, None
         if verdict is not Verdict.UNKNOWN:
-            found = self._parts.attained(watched.node, final, low=low, wide=self._settles)
-        after = Period(_ENDED[verdict], last_ns, last_ns, lower if low else upper, OF_STANDING)
+            found = self._parts.find_leaf(watched.node, final, low=low, wide=self._settles)
+        after = Period(_ENDED[verdict], last_ns, last_ns, lower if low else upper, OF_CURRENT)
         witness = self._words(found)
-        now = Stated(after, witness, end_sentence(watched.title, verdict, (lower, upper), witness))
+        now = PeriodText(after, witness, end_sentence(watched.title, verdict, (lower, upper), witness))
         past = None
         if before.code != START and before.start_ns < last_ns:
-            past = self._past(before, last_ns, self._carried[node, OF_STANDING])
+            past = self._past(before, last_ns, self._carried[node, OF_CURRENT])
         return self._encoded(watched, time_ns, now, past)
 
-    def _past(self, period: Period, until_ns: int, worst: Attained | None) -> Stated:
+    def _past(self, period: Period, until_ns: int, worst: LeafValue | None) -> PeriodText:
         """What was, before something else began."""
         witness = self._words(worst, past=True)
-        return Stated(period, witness, past_sentence(period, until_ns, witness))
+        return PeriodText(period, witness, past_sentence(period, until_ns, witness))
 
-    def _encoded(self, watched: Watched, time_ns: int, now: Stated, past: Stated | None) -> Told:
+    def _encoded(
+        self, watched: ReportedNode, time_ns: int, now: PeriodText, past: PeriodText | None
+    ) -> EncodedEvent:
         period, witness, sentence = now
         facts = self._facts(watched) | self._facts_of(period, witness, "")
         if past is not None:
@@ -245,16 +253,16 @@ class EventTeller:
             file=self._filename,
             line=watched.line,
         )
-        return Told(time_ns, *(each.SerializeToString(deterministic=True) for each in (event, log)))
+        return EncodedEvent(time_ns, *(each.SerializeToString(deterministic=True) for each in (event, log)))
 
-    def _words(self, found: Attained | None, *, past: bool = False) -> str:
+    def _words(self, found: LeafValue | None, *, past: bool = False) -> str:
         """A leaf and its number in words; "" for none."""
         if found is None:
             return ""
         leaf: Formula = substitute(self._leaves[found.leaf], self._bindings)
         return leaf_words(format_formula(leaf, relations=self._relations), found.number, past=past)
 
-    def _facts(self, watched: Watched) -> dict[str, str]:
+    def _facts(self, watched: ReportedNode) -> dict[str, str]:
         of = {} if self._tree.object is None else {"object": self._tree.object}
         return {"specification": self._tree.name, **of, "node": str(watched.node), "name": watched.name}
 
@@ -271,14 +279,16 @@ class EventTeller:
         return {f"{key}{suffix}": text for key, text in facts.items()}
 
 
-def _watched(tree: ReportedTree, below: Sequence[LeavesBelow], file: Specification) -> list[Watched]:
+def _reported_nodes(
+    tree: ReportedTree, below: Sequence[LeavesBelow], file: Specification
+) -> list[ReportedNode]:
     """The root, and each named part that later samples can change, once.
 
     Args:
         below: of each node of the tree, its leaves.
     """
     lines = {spec.name: _line(file.source, spec.span.start, spec.span.end) for spec in file.specs}
-    found: list[Watched] = []
+    found: list[ReportedNode] = []
     names: set[str] = set()
     for identifier, parent, node in iter_nodes(tree.formula):
         if parent is None:
@@ -289,7 +299,9 @@ def _watched(tree: ReportedTree, below: Sequence[LeavesBelow], file: Specificati
             continue
         name = tree.name if parent is None else node.name or ""
         names.add(node.name or name)
-        found.append(Watched(identifier, title, name, lines.get(node.name or name, 0), below[identifier]))
+        found.append(
+            ReportedNode(identifier, title, name, lines.get(node.name or name, 0), below[identifier])
+        )
     return found
 
 

@@ -219,7 +219,7 @@ _MARGIN = 1.5
 """The height of the picture by the size of what is in it; a panel may be narrower than it is high."""
 
 
-class Extent(NamedTuple):
+class SceneBounds(NamedTuple):
     """The box that a log's footprints have covered so far, in footprint units."""
 
     xmin: float
@@ -228,7 +228,7 @@ class Extent(NamedTuple):
     ymax: float
 
     @classmethod
-    def of(cls, trace: Trace, before: Extent | None = None) -> Extent | None:
+    def of(cls, trace: Trace, before: SceneBounds | None = None) -> SceneBounds | None:
         """The box of some samples and of those before; None while nothing was seen."""
         vertices = trace.footprints.vertices
         low, high = _corners(vertices)
@@ -243,7 +243,7 @@ class Extent(NamedTuple):
         return cls(low[0], low[1], high[0], high[1])
 
 
-class Contents(NamedTuple):
+class LayoutContents(NamedTuple):
     """What a log has that a layout shows.
 
     Attributes:
@@ -255,21 +255,21 @@ class Contents(NamedTuple):
 
     trees: Sequence[ReportedTree]
     has_states: Sequence[bool]
-    extent: Extent | None
+    extent: SceneBounds | None
     topics: Collection[str]
 
 
-def layout_attachment(contents: Contents) -> Attachment:
+def layout_attachment(contents: LayoutContents) -> Attachment:
     """The layout of a log as a file to be kept in it (see `viewer_layout`)."""
     return _attachment(viewer_layout(contents))
 
 
-def live_layout_attachment(contents: Contents) -> Attachment:
+def live_layout_attachment(contents: LayoutContents) -> Attachment:
     """The layout for a server that replays a log as a file (see `layout_for_live`)."""
     return _attachment(layout_for_live(contents))
 
 
-def viewer_layout(contents: Contents) -> dict[str, Any]:
+def viewer_layout(contents: LayoutContents) -> dict[str, Any]:
     """The layout of a log: the scene on the left, what is said of it on the right.
 
     Where a planner's decisions are in the log, its map lies under the scene and its words below.
@@ -277,7 +277,7 @@ def viewer_layout(contents: Contents) -> dict[str, Any]:
     return _layout(_shown(contents), _said(contents))
 
 
-def layout_for_live(contents: Contents) -> dict[str, Any]:
+def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
     """The layout for a server that replays a log: the same, with the curves of the whole log at any time, and
     the constants that it lets one change."""
     said = _said(contents)
@@ -291,13 +291,13 @@ _Weighted = tuple[Panel, float]
 """A panel, and its share of the room beside its neighbours."""
 
 
-def _shown(contents: Contents) -> list[_Weighted]:
+def _shown(contents: LayoutContents) -> list[_Weighted]:
     """The scene and, of a planner, its words."""
     scene = scene_panel(_camera(contents.extent), contents.topics)
     return [(scene, 4.0), *([(decision_words(), 1.0)] if PLAN_DECISION in contents.topics else [])]
 
 
-def _said(contents: Contents) -> list[_Weighted]:
+def _said(contents: LayoutContents) -> list[_Weighted]:
     """What is said of the samples, from above to below."""
     trees = contents.trees
     if not trees:
@@ -351,9 +351,9 @@ def _corners(vertices: Floats) -> tuple[list[float], list[float]]:
     return low, [float(column.max(initial=-np.inf)) for column in columns]
 
 
-def _camera(extent: Extent | None) -> dict[str, Any]:
+def _camera(extent: SceneBounds | None) -> dict[str, Any]:
     """From straight above, so that the box fits."""
-    box = extent or Extent(-1.0, -1.0, 1.0, 1.0)
+    box = extent or SceneBounds(-1.0, -1.0, 1.0, 1.0)
     distance = _MARGIN * max(box.xmax - box.xmin, box.ymax - box.ymin) or 1.0
     return {
         "perspective": False,

@@ -1,14 +1,14 @@
-"""Which objects and regions a formula is about, and the worst that it says of each now.
+"""The requirements of a formula: what it demands of objects and regions in a single sample.
 
-A formula without temporal operators inside speaks of its objects in the present sample. The largest such
-subformulas of a specification are its *concerns*; each counts with the sign in which the specification
-needs it: under a negation, or left of an implication, low robustness is what is wanted. A concern counts
-until the largest temporal subformula that it is in, its *duty*, is done: no later sample can undo it.
+A formula without temporal operators is about the present sample alone. The largest such subformulas of a
+specification are its *requirements*. Each has the sign in which the specification needs it: under a negation,
+or left of an implication, low robustness is what is wanted. A requirement counts until its *obligation*, the
+largest temporal subformula around it, is fulfilled: no later sample can undo that.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -33,19 +33,20 @@ from spatial_replay.spec.formula import (
 from spatial_replay.spec.walks import base_of, operand_signs
 
 
-class OpenGroup(NamedTuple):
-    """The objects of a class in a sample, but for some.
+class ClassMembers(NamedTuple):
+    """An open group: all objects of a class in a sample, with exceptions.
 
     Attributes:
-        class_name: without upper case, or `ANY_CLASS`.
+        class_name: casefolded, or `ANY_CLASS`.
+        excluded: names of the exceptions.
     """
 
     class_name: str
     excluded: frozenset[str]
 
 
-class Duty(NamedTuple):
-    """A largest temporal subformula.
+class Obligation(NamedTuple):
+    """A temporal subformula that is in no larger one.
 
     Attributes:
         node: its id in the formula's tree.
@@ -55,77 +56,56 @@ class Duty(NamedTuple):
     node: int
     sign: float
 
-    def is_done(self, series: Floats, at: Integers) -> NDArray[np.bool_]:
-        """(S,) whether it holds, or does not where it must not, whatever comes; see `Evaluated`."""
+    def is_fulfilled(self, series: Floats, at: Integers) -> NDArray[np.bool_]:
+        """Return (S,) whether it is decided as it should be, whatever samples follow.
+
+        Args:
+            series: (N, 4, T): value, now, lower, upper of each node.
+            at: (S,) indices of samples.
+        """
         if self.sign > 0.0:
             return np.asarray(series[self.node, 2, at] >= 0.0)
         return np.asarray(series[self.node, 3, at] < 0.0)
 
 
-class Concern(NamedTuple):
-    """One largest subformula without temporal operators.
+class Requirement(NamedTuple):
+    """A subformula without temporal operators that is in no larger one.
 
     Attributes:
         node: its id in the formula's tree.
         sign: 1 where the formula needs it to hold, -1 where it needs it not to.
-        duty: what it is asked for; None where nothing temporal is about it.
+        obligation: the temporal subformula that needs it; None if there is none.
         objects, regions: names.
         groups: open groups, whose members are objects too.
     """
 
     node: int
     sign: float
-    duty: Duty | None
+    obligation: Obligation | None
     objects: frozenset[str]
     regions: frozenset[str]
-    groups: frozenset[OpenGroup]
+    groups: frozenset[ClassMembers]
 
     def robustness(self, series: Floats, at: Integers) -> Floats:
-        """(S,) how well it holds now, in the sign that counts; NaN once its duty is done.
+        """Return (S,) its robustness now, in the sign that counts; NaN once its obligation is fulfilled.
 
         Args:
-            series: (N, 4, T), see `Evaluated`.
+            series: (N, 4, T): value, now, lower, upper of each node.
             at: (S,) indices of samples.
         """
         now: Floats = self.sign * series[self.node, 1, at]
-        return now if self.duty is None else np.where(self.duty.is_done(series, at), np.nan, now)
-
-
-class Evaluated(NamedTuple):
-    """What is known of a formula over some samples.
-
-    Attributes:
-        concerns: the formula's.
-        times_ns: (T,) int64.
-        series: (N, 4, T): value, now, lower, upper of each node.
-    """
-
-    concerns: tuple[Concern, ...]
-    times_ns: Integers
-    series: Floats
-
-
-class Seen(NamedTuple):
-    """Who is in S samples.
-
-    Attributes:
-        times_ns: (S,) int64.
-        names: the objects' names.
-        class_code: (S, len(names)) int64, index into `classes`; -1 where the object is not seen.
-        classes: class names, or None.
-    """
-
-    times_ns: Integers
-    names: Sequence[str]
-    class_code: Integers
-    classes: Sequence[str | None]
+        return (
+            now
+            if self.obligation is None
+            else np.where(self.obligation.is_fulfilled(series, at), np.nan, now)
+        )
 
 
 _Bindings: TypeAlias = Mapping[str, Group]
 
 
-def concerns_of(formula: Formula, object: str | None = None) -> tuple[Concern, ...]:
-    """The concerns of a formula, by node; those that count in both signs (under `xor`, `<->`) are left out.
+def requirements_of(formula: Formula, object: str | None = None) -> tuple[Requirement, ...]:
+    """Return the requirements of a formula, by node, but for those needed in both signs (`xor`, `<->`).
 
     Args:
         object: what the parameter of a template stands for.
@@ -136,67 +116,43 @@ def concerns_of(formula: Formula, object: str | None = None) -> tuple[Concern, .
         if parent is not None:
             temporal[parent] |= temporal[identifier]
     signs: list[float] = []
-    duties: list[Duty | None] = []
+    obligations: list[Obligation | None] = []
     operands_passed = [0] * len(nodes)
-    found = []
+    requirements = []
     for identifier, parent, node in nodes:
         if parent is None:
             signs.append(1.0)
         else:
             signs.append(signs[parent] * _sign(nodes[parent][2], operands_passed[parent]))
             operands_passed[parent] += 1
-        above = None if parent is None else duties[parent]
+        above = None if parent is None else obligations[parent]
         starts = above is None and isinstance(node, Temporal)
-        duties.append(Duty(identifier, signs[identifier]) if starts else above)
+        obligations.append(Obligation(identifier, signs[identifier]) if starts else above)
         if signs[identifier] and not temporal[identifier] and (parent is None or temporal[parent]):
-            found.append(_concern(identifier, signs[identifier], duties[identifier], node, object))
-    return tuple(found)
+            requirements.append(
+                _requirement(identifier, signs[identifier], obligations[identifier], node, object)
+            )
+    return tuple(requirements)
 
 
 def iter_subformulas(formula: Formula) -> Iterator[Formula]:
-    """A formula and all below it, what open quantifiers say of their members included."""
+    """Yield a formula and all below it, including the bodies of open quantifiers."""
     for node, _ in _with_bindings(formula):
         yield node
 
 
-def worst_robustness(
-    evaluated: Sequence[Evaluated], seen: Seen, regions: Sequence[str]
-) -> tuple[Floats, Floats]:
-    """The least robustness now, in the sign that counts, that each object and region still takes part in.
-
-    Returns:
-        (S, objects) and (S, regions); NaN for what takes part in nothing that is known.
-    """
-    objects = np.full(seen.class_code.shape, np.nan)
-    places = np.full((len(seen.times_ns), len(regions)), np.nan)
-    for concerns, times_ns, series in evaluated:
-        if not len(times_ns):
-            continue
-        at = np.minimum(np.searchsorted(times_ns, seen.times_ns), len(times_ns) - 1)
-        is_evaluated = times_ns[at] == seen.times_ns
-        for concern in concerns:
-            now = np.where(is_evaluated, concern.robustness(series, at), np.nan)
-            for column in _columns(concern.objects, seen.names):
-                objects[:, column] = np.fmin(objects[:, column], now)
-            for column in _columns(concern.regions, regions):
-                places[:, column] = np.fmin(places[:, column], now)
-            for group in concern.groups:
-                objects = np.where(_members(group, seen), np.fmin(objects, now[:, None]), objects)
-    return objects, places
-
-
 def _sign(parent: Formula, operand: int) -> float:
-    """Return how an operand's sign follows from that of the formula it stands in; 0 where neither does."""
+    """Return the sign that an operand has in its parent; 0 where it counts in both."""
     signs = operand_signs(parent, operand)
     return float(signs[0]) if len(signs) == 1 else 0.0
 
 
-def _concern(
-    identifier: int, sign: float, duty: Duty | None, formula: Formula, object: str | None
-) -> Concern:
+def _requirement(
+    identifier: int, sign: float, obligation: Obligation | None, formula: Formula, object: str | None
+) -> Requirement:
     objects: set[str] = set()
     regions: set[str] = set()
-    groups: set[OpenGroup] = set()
+    groups: set[ClassMembers] = set()
     for node, bindings in _with_bindings(formula):
         terms: tuple[Term, ...] = node.terms if isinstance(node, Atom) else ()
         if isinstance(node, Quantified):
@@ -212,16 +168,18 @@ def _concern(
                 case Group() as group:
                     excluded = _excluded(group, object)
                     if group.members is None:
-                        groups.add(OpenGroup((group.class_name or ANY_CLASS).casefold(), excluded))
+                        groups.add(ClassMembers((group.class_name or ANY_CLASS).casefold(), excluded))
                     else:
                         objects.update(set(group.members) - excluded)
                 case _:
                     pass
-    return Concern(identifier, sign, duty, frozenset(objects), frozenset(regions), frozenset(groups))
+    return Requirement(
+        identifier, sign, obligation, frozenset(objects), frozenset(regions), frozenset(groups)
+    )
 
 
 def _with_bindings(formula: Formula) -> Iterator[tuple[Formula, _Bindings]]:
-    """A formula and all below it, each with what the quantifiers above it bind."""
+    """Yield a formula and all below it, each with what the quantifiers above it bind."""
     stack: list[tuple[Formula, _Bindings]] = [(formula, {})]
     while stack:
         node, bindings = stack.pop()
@@ -235,23 +193,11 @@ def _with_bindings(formula: Formula) -> Iterator[tuple[Formula, _Bindings]]:
 
 
 def _referred(term: Term, bindings: _Bindings) -> TrackedName | RegionName | Variable | Group:
-    """What a term is about, whenever and however far around."""
+    """Return what a term is about, without its delay and enlargement."""
     base = base_of(term)
     return bindings.get(base.name, base) if isinstance(base, Variable) else base
 
 
 def _excluded(group: Group, object: str | None) -> frozenset[str]:
-    names = [object if isinstance(who, Variable) else who.name for who in group.excluded]
+    names = [object if isinstance(each, Variable) else each.name for each in group.excluded]
     return frozenset(name for name in names if name is not None)
-
-
-def _columns(chosen: frozenset[str], names: Sequence[str]) -> list[int]:
-    return [column for column, name in enumerate(names) if name in chosen]
-
-
-def _members(group: OpenGroup, seen: Seen) -> NDArray[np.bool_]:
-    """(S, objects), who belongs to an open group in each sample."""
-    fits = [group.class_name in (ANY_CLASS, (name or "").casefold()) for name in seen.classes]
-    included = np.array([name not in group.excluded for name in seen.names], np.bool_)
-    # the last entry is that of an object not seen, which has the code -1
-    return np.array([*fits, False], np.bool_)[seen.class_code] & included

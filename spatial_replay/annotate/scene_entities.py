@@ -169,6 +169,12 @@ class Rings(NamedTuple):
     form: Integers
     forms: tuple[Form, ...]
 
+    def rings_of(self, footprint: int) -> tuple[Floats, ...]:
+        """Return the rings (n, 2) of one of the footprints."""
+        points = self.points[self.start[footprint] : self.start[footprint + 1]]
+        ends = np.cumsum(self.forms[self.form[footprint]].rings)[:-1]
+        return tuple(np.split(points, ends))
+
 
 class Form(NamedTuple):
     """What footprints have in common that are drawn with the same primitives."""
@@ -199,9 +205,7 @@ def rings_of(footprints: FootprintBatch, point_radius: float) -> Rings:
 
 def outlines_of(footprint: Footprint) -> list[Floats]:
     """The ring (n, 2) of each part of one footprint."""
-    rings = rings_of(FootprintBatch.from_footprints([footprint]), 0.0)
-    ends = np.cumsum(rings.forms[0].rings)[:-1]
-    return np.split(rings.points, ends)
+    return list(rings_of(FootprintBatch.from_footprints([footprint]), 0.0).rings_of(0))
 
 
 def extents(footprints: FootprintBatch) -> Floats:
@@ -265,7 +269,7 @@ _LABEL_LIFT: Final = 0.01
 """How far above a region its name stands, by the region's size."""
 
 
-class Layout(NamedTuple):
+class SceneLayout(NamedTuple):
     """What decides where the numbers of a message stand.
 
     Attributes:
@@ -314,7 +318,7 @@ class SceneTemplate:
         return rows
 
 
-def make_template(layout: Layout, regions: tuple[Region, ...], lift: float) -> SceneTemplate:
+def make_template(layout: SceneLayout, regions: tuple[Region, ...], lift: float) -> SceneTemplate:
     """The template of a layout.
 
     Args:
@@ -347,6 +351,11 @@ def words_of_region(region: Region, colour: Floats) -> list[Floats]:
     """What a template leaves open in a region: the colours (S, 3) of its lines and faces."""
     primitives = _region_entity(region)
     return [colour] * (len(primitives.lines) + len(primitives.triangles))
+
+
+def border_of(region: Region) -> list[Floats]:
+    """Return the rings (n, 2) that outline a region: its border as it was written, or of a disc its ring."""
+    return list(region.rings) if region.outline.is_disc else [np.array(region.outline.vertices, np.float64)]
 
 
 def words_of_object(
@@ -412,8 +421,6 @@ def _add_region(entity: SceneEntity, region: Region) -> None:
 
     The name stands at its upper edge, where objects inside do not cover it.
     """
-    corners = np.array(region.outline.vertices, np.float64)
-    outlines = list(region.rings) if region.outline.is_disc else [corners]
     bottom, top = region.outline.height or (0.0, 0.0)
     sides = None if region.outline.height is None else (bottom, top - bottom)
     everything = np.concatenate(region.rings)
@@ -422,7 +429,7 @@ def _add_region(entity: SceneEntity, region: Region) -> None:
     draw(
         entity,
         region.name,
-        outlines,
+        border_of(region),
         list(region.rings),
         ((left + right) / 2.0, high),
         Elevation(top, sides, label),

@@ -1,6 +1,6 @@
-"""Objects, regions and how well they do → messages of /spatial/scene.
+"""The scene: objects and regions in the colours of their robustness → messages of /spatial/scene.
 
-How strongly robustness is coloured, by how large it is.
+The encoder also returns what the messages show as values (`SceneFrames`), for a page that draws them itself.
 """
 
 from __future__ import annotations
@@ -14,22 +14,31 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spatial_replay.annotate.requirements import Evaluated, Seen, worst_robustness
 from spatial_replay.annotate.scene_entities import (
     LABEL_LENGTH,
+    OBJECT,
+    REGION,
     Form,
-    Layout,
     Region,
     Rings,
+    SceneLayout,
     SceneTemplate,
+    border_of,
     extents,
     make_template,
+    outlines_of,
     rings_of,
     words_of_object,
     words_of_region,
     words_of_witness,
 )
-from spatial_replay.annotate.violations import Judged, Pointers, pointers
+from spatial_replay.annotate.violations import (
+    EvaluatedResult,
+    Presence,
+    Violations,
+    worst_robustness,
+    worst_violations,
+)
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.logs.objects.wire import payloads_of
@@ -39,7 +48,7 @@ from spatial_replay.spec.formula import Outline
 from spatial_replay.trace.trace import Trace
 
 _LEAST: Final = 0.4
-"""How far the colour of the slightest robustness is from grey: its sign can be seen."""
+"""How far the colour of the slightest robustness is from grey, so that its sign shows."""
 
 _OPACITY: Final = 0.6
 """Of a map's cells: what lies over them stands out."""
@@ -55,7 +64,7 @@ def colours(robustness: ArrayLike, scale: ArrayLike) -> Floats:
     share = _LEAST + (1.0 - _LEAST) * np.minimum(np.abs(values) / np.asarray(scale)[..., None], 1.0)
     hue = np.where(values >= 0.0, POSITIVE, NEGATIVE)
     mixed = np.where(np.isnan(values), NEUTRAL, NEUTRAL + share * (hue - NEUTRAL))
-    # the steps of a screen: finer ones nobody sees, and a log of them is larger
+    # the steps of a screen: finer ones are invisible and compress badly
     return np.asarray(np.round(mixed * 255.0) / 255.0)
 
 
@@ -75,9 +84,9 @@ _POINT: Final = 0.02
 """Height of flat objects above the plane, and radius of a point, by the scale of the scene."""
 
 _UNSCALED: Final = 1.0
-"""The scale before any object is seen, and that of a scene of points, which have no size."""
+"""The scale before any object is shown, and that of a scene of points, which have no size."""
 
-_TEMPLATES_KEPT: Final = 256
+_MOST_TEMPLATES: Final = 256
 _ABSENT, _DELETED, _FIRST_FORM = -1, 0, 1
 
 
@@ -91,14 +100,14 @@ class SceneState:
         is_pointing: whether it points at a violation.
         scale: the robustness at which colours are full: the median size (longer side of the bounding box) of
             the objects in the first message that shows any; None before that.
-        templates: the layouts met so far; they save time and change no message.
+        templates: those of the layouts so far; a cache that changes no message.
     """
 
     written_ns: int | None = None
     shown: tuple[str, ...] = ()
     is_pointing: bool = False
     scale: float | None = None
-    templates: Mapping[Layout, SceneTemplate] = field(default_factory=lambda: MappingProxyType({}))
+    templates: Mapping[SceneLayout, SceneTemplate] = field(default_factory=lambda: MappingProxyType({}))
 
 
 def scene_scale(trace: Trace) -> float | None:
@@ -112,44 +121,110 @@ def scene_scale(trace: Trace) -> float | None:
     return _scale_of(trace, rows[int(is_shown.argmax())]) if is_shown.any() else None
 
 
+class DrawnEntity(NamedTuple):
+    """An object or a region in one message.
+
+    Attributes:
+        rings: its outlines, (n, 2) each.
+        colour: red, green and blue, 0 to 255.
+    """
+
+    rings: tuple[Floats, ...]
+    colour: tuple[int, int, int]
+
+
+class DrawnViolation(NamedTuple):
+    """The arrow at the worst violation in one message.
+
+    Attributes:
+        ends: (2, 2), from where to where it points.
+        label: the robustness, as it is written beside the arrow.
+        result: which of the results is violated.
+        node: id of the requirement that is violated.
+        robustness: that of the requirement, in the sign that counts.
+    """
+
+    ends: Floats
+    label: str
+    result: int
+    node: int
+    robustness: float
+
+
+class SceneFrame(NamedTuple):
+    """What one message shows.
+
+    Attributes:
+        entities: by their ids.
+        violation: None without an arrow.
+        is_violated: whether a requirement on an object or a region is violated.
+    """
+
+    entities: Mapping[str, DrawnEntity]
+    violation: DrawnViolation | None
+    is_violated: bool
+
+    @property
+    def corners(self) -> int:
+        """How many corners its outlines have."""
+        return sum(len(ring) for each in self.entities.values() for ring in each.rings)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneFrames:
+    """What S messages show.
+
+    Attributes:
+        times_ns: (S,) int64.
+        objects, regions: (S, objects) and (S, regions), the worst robustness of their requirements.
+        object_colours, region_colours: the same with a last axis of red, green and blue, 0 to 1.
+    """
+
+    times_ns: Integers
+    objects: Floats
+    regions: Floats
+    object_colours: Floats
+    region_colours: Floats
+    _content: _SceneContent
+    _regions: tuple[Region, ...]
+
+    def frame(self, index: int) -> SceneFrame:
+        """Return what one of the messages shows."""
+        entities = {
+            REGION + region.name: DrawnEntity(tuple(border_of(region)), _bytes(colour))
+            for region, colour in zip(self._regions, self.region_colours[index], strict=True)
+        }
+        content = self._content
+        for column, name in enumerate(content.names):
+            if content.forms[index, column] >= _FIRST_FORM:
+                rings = content.rings.rings_of(int(content.observations[index, column]))
+                entities[OBJECT + name] = DrawnEntity(rings, _bytes(self.object_colours[index, column]))
+        found, violation = content.violations, None
+        if found.is_shown[index]:
+            robustness = float(found.robustness[index])
+            which, node = int(found.result[index]), int(found.node[index])
+            violation = DrawnViolation(found.points[index], _label(robustness), which, node, robustness)
+        is_violated = bool((self.objects[index] < 0.0).any() or (self.regions[index] < 0.0).any())
+        return SceneFrame(entities, violation, is_violated)
+
+
 class SceneMessages(NamedTuple):
-    """Encoded messages, their times (S,) int64, and the state to go on from."""
+    """Encoded messages, their times (S,) int64, the state to go on from, and what they show if any."""
 
     times_ns: Integers
     payloads: list[bytes]
     state: SceneState
-
-
-class _Cast(NamedTuple):
-    """Who is in S samples, and where.
-
-    Attributes:
-        names: objects that are, or just were, in sight.
-        rows: (S, names), rows of the trace; below 0 where an object is not seen.
-        forms: (S, names), `_ABSENT`, `_DELETED`, or from `_FIRST_FORM` on the number of its form.
-        observations: (S, names), rows of `rings` and `footprints`.
-        pointers: of the S samples.
-        witness: (S,), the same as `forms` for the arrow at the worst violation.
-    """
-
-    names: tuple[str, ...]
-    rows: Integers
-    forms: Integers
-    observations: Integers
-    footprints: FootprintBatch
-    rings: Rings
-    pointers: Pointers
-    witness: Integers
+    frames: SceneFrames | None
 
 
 @dataclass(frozen=True, eq=False)
 class SceneEncoder:
     """Draws traces over the regions of a specification.
 
-    Every message holds all regions and all objects seen, so that a viewer that jumps to it misses nothing;
-    objects no longer seen are deleted. Blue, vermillion and grey say how the worst of what is asked of an
-    object or region stands now (see `palette` and `involvement`). Where that is violated, an arrow with the
-    number points at the worst (see `pointing`).
+    Every message holds all regions and all objects that are observed, so that a viewer can jump to any of
+    them; objects that are gone are deleted. Blue, vermillion and grey show the worst of the requirements on an
+    object or region (see `palette` and `requirements`). Where one is violated, an arrow with its robustness
+    points at the worst (see `violations`).
 
     Attributes:
         regions: by name.
@@ -163,70 +238,97 @@ class SceneEncoder:
         object.__setattr__(self, "_drawn", drawn)
 
     def encode(
-        self,
-        trace: Trace,
-        evaluated: Sequence[Evaluated] = (),
-        state: SceneState | None = None,
-        judged: Sequence[Judged] = (),
+        self, trace: Trace, results: Sequence[EvaluatedResult] = (), state: SceneState | None = None
     ) -> SceneMessages:
-        """The messages of the next samples; it does not matter into how many blocks a run is cut.
+        """Return the messages of the next samples; into how many blocks a run is cut changes none.
 
         Args:
             trace: the next samples, after those of the state.
-            evaluated: what specifications say of these samples; others have no say in the colours.
+            results: what is evaluated over these samples.
             state: what the call before returned, or None to begin.
-            judged: the same of those whose violations are to be pointed at.
         """
         state = state or SceneState()
         written = _spaced(trace.times_ns, state.written_ns)
         times_ns = trace.times_ns[written]
         if not len(written):
-            return SceneMessages(times_ns, [], state)
+            return SceneMessages(times_ns, [], state, None)
         state, scales = _scaled(state, trace, trace.rows[written])
         scale = state.scale or _UNSCALED
-        cast = _cast(trace, trace.rows[written], state, scale, pointers(judged, trace, written))
-        seen = Seen(times_ns, cast.names, _class_codes(trace, cast.rows), trace.classes)
-        objects, regions = worst_robustness(evaluated, seen, [region.name for region in self._drawn])
+        violations = worst_violations(results, trace, written)
+        content = _content(trace, trace.rows[written], state, scale, violations)
+        presence = Presence(times_ns, content.names, _class_codes(trace, content.rows), trace.classes)
+        objects, regions = worst_robustness(results, presence, [region.name for region in self._drawn])
         shades = colours(objects, scales), colours(regions, scales)
         templates = dict(state.templates)
         payloads = [b""] * len(written)
-        for layout, samples in _by_layout(cast):
+        for layout, samples in _by_layout(content):
             if layout not in templates:
                 templates[layout] = make_template(layout, self._drawn, _LIFT * scale)
-            words = self._words(layout, samples, cast, *shades, scale)
+            words = self._words(layout, samples, content, *shades, scale)
             rows = templates[layout].fill(times_ns[samples], words)
             for sample, payload in zip(samples.tolist(), payloads_of(rows), strict=True):
                 payloads[sample] = payload
-        last = cast.forms[-1] >= _FIRST_FORM
+        last = content.forms[-1] >= _FIRST_FORM
         after = SceneState(
             written_ns=int(times_ns[-1]),
-            shown=tuple(name for name, is_shown in zip(cast.names, last.tolist(), strict=True) if is_shown),
-            is_pointing=bool(cast.pointers.is_shown[-1]),
+            shown=tuple(
+                name for name, is_shown in zip(content.names, last.tolist(), strict=True) if is_shown
+            ),
+            is_pointing=bool(content.violations.is_shown[-1]),
             scale=state.scale,
-            templates=MappingProxyType(dict(list(templates.items())[-_TEMPLATES_KEPT:])),
+            templates=MappingProxyType(dict(list(templates.items())[-_MOST_TEMPLATES:])),
         )
-        return SceneMessages(times_ns, payloads, after)
+        frames = SceneFrames(times_ns, objects, regions, *shades, content, self._drawn)
+        return SceneMessages(times_ns, payloads, after, frames)
 
     def _words(
-        self, layout: Layout, samples: Integers, cast: _Cast, objects: Floats, regions: Floats, scale: float
+        self,
+        layout: SceneLayout,
+        samples: Integers,
+        content: _SceneContent,
+        objects: Floats,
+        regions: Floats,
+        scale: float,
     ) -> Floats:
         """(S, W) what the layout's template leaves open."""
         columns = []
         for index, region in enumerate(self._drawn):
             columns += words_of_region(region, regions[samples, index])
         for name, form in layout.objects:
-            column = cast.names.index(name)
-            rows = cast.observations[samples, column]
-            points = cast.rings.points[cast.rings.start[rows][:, None] + np.arange(sum(form.rings))]
-            bottom, top = cast.footprints.bottom[rows], cast.footprints.top[rows]
+            column = content.names.index(name)
+            rows = content.observations[samples, column]
+            points = content.rings.points[content.rings.start[rows][:, None] + np.arange(sum(form.rings))]
+            bottom, top = content.footprints.bottom[rows], content.footprints.top[rows]
             colour = objects[samples, column]
             columns += words_of_object(form, points, bottom, top, colour, _LIFT * scale)
         if layout.witness:
-            columns += _words_of_witness(cast.pointers, samples, scale)
+            columns += _words_of_witness(content.violations, samples, scale)
         return np.concatenate([np.empty((len(samples), 0)), *columns], axis=1)
 
 
-def _words_of_witness(found: Pointers, samples: Integers, scale: float) -> list[Floats]:
+class _SceneContent(NamedTuple):
+    """What S messages hold.
+
+    Attributes:
+        names: objects that are shown, or have just been.
+        rows: (S, names), rows of the trace; below 0 where an object is absent.
+        forms: (S, names), `_ABSENT`, `_DELETED`, or from `_FIRST_FORM` on the number of its form.
+        observations: (S, names), rows of `rings` and `footprints`.
+        violations: of the S samples.
+        arrow: (S,), the same as `forms` for the arrow at the worst violation.
+    """
+
+    names: tuple[str, ...]
+    rows: Integers
+    forms: Integers
+    observations: Integers
+    footprints: FootprintBatch
+    rings: Rings
+    violations: Violations
+    arrow: Integers
+
+
+def _words_of_witness(found: Violations, samples: Integers, scale: float) -> list[Floats]:
     z = np.fmax(found.top[samples], 0.0) + 3.0 * _LIFT * scale
     labels = [_label(number) for number in found.robustness[samples].tolist()]
     return words_of_witness(found.points[samples], z, scale, labels)
@@ -241,9 +343,12 @@ def _label(number: float) -> str:
 
 
 def _region(name: str, outline: Outline) -> Region:
-    rings = rings_of(FootprintBatch.from_footprints([footprint_from_outline(outline)]), 0.0)
-    ends = np.cumsum(rings.forms[0].rings)[:-1]
-    return Region(name, outline, tuple(np.split(rings.points, ends)))
+    return Region(name, outline, tuple(outlines_of(footprint_from_outline(outline))))
+
+
+def _bytes(colour: Floats) -> tuple[int, int, int]:
+    red, green, blue = (round(255.0 * share) for share in colour.tolist())
+    return red, green, blue
 
 
 def _spaced(times_ns: Integers, written_ns: int | None) -> Integers:
@@ -280,7 +385,9 @@ def _scale_of(trace: Trace, rows: Integers) -> float:
     return float(np.median(extents(trace.footprints.select(rows[rows >= 0])))) or _UNSCALED
 
 
-def _cast(trace: Trace, rows: Integers, before: SceneState, scale: float, found: Pointers) -> _Cast:
+def _content(
+    trace: Trace, rows: Integers, before: SceneState, scale: float, found: Violations
+) -> _SceneContent:
     names = tuple(sorted({*trace.names, *before.shown}))
     of_all = np.full((len(rows), len(names)), -1, np.int64)
     of_all[:, [names.index(name) for name in trace.names]] = rows
@@ -294,7 +401,7 @@ def _cast(trace: Trace, rows: Integers, before: SceneState, scale: float, found:
     forms[is_seen] = _FIRST_FORM + rings.form
     was_pointing = np.append(before.is_pointing, found.is_shown[:-1])
     witness = np.where(found.is_shown, _FIRST_FORM, np.where(was_pointing, _DELETED, _ABSENT))
-    return _Cast(names, of_all, forms, observations, footprints, rings, found, witness)
+    return _SceneContent(names, of_all, forms, observations, footprints, rings, found, witness)
 
 
 def _class_codes(trace: Trace, rows: Integers) -> Integers:
@@ -303,22 +410,22 @@ def _class_codes(trace: Trace, rows: Integers) -> Integers:
     return codes
 
 
-def _by_layout(cast: _Cast) -> Iterator[tuple[Layout, Integers]]:
+def _by_layout(content: _SceneContent) -> Iterator[tuple[SceneLayout, Integers]]:
     """The layouts, and the samples (S,) that have each."""
-    forms = np.column_stack([cast.forms, cast.witness])
+    forms = np.column_stack([content.forms, content.arrow])
     if (forms == forms[0]).all():
-        yield _layout(cast, forms[0]), np.arange(len(forms))
+        yield _layout(content, forms[0]), np.arange(len(forms))
         return
     rows, which = np.unique(forms, axis=0, return_inverse=True)
     for number, row in enumerate(rows):
-        yield _layout(cast, row), np.flatnonzero(which.reshape(-1) == number)
+        yield _layout(content, row), np.flatnonzero(which.reshape(-1) == number)
 
 
-def _layout(cast: _Cast, forms: NDArray[np.int64]) -> Layout:
+def _layout(content: _SceneContent, forms: NDArray[np.int64]) -> SceneLayout:
     *of_objects, witness = forms.tolist()
-    listed: list[tuple[str, int]] = list(zip(cast.names, of_objects, strict=True))
+    listed: list[tuple[str, int]] = list(zip(content.names, of_objects, strict=True))
     seen: list[tuple[str, Form]] = [
-        (name, cast.rings.forms[form - _FIRST_FORM]) for name, form in listed if form >= _FIRST_FORM
+        (name, content.rings.forms[form - _FIRST_FORM]) for name, form in listed if form >= _FIRST_FORM
     ]
     deleted = tuple(name for name, form in listed if form == _DELETED)
-    return Layout(deleted, tuple(seen), None if witness == _DELETED else witness == _FIRST_FORM)
+    return SceneLayout(deleted, tuple(seen), None if witness == _DELETED else witness == _FIRST_FORM)

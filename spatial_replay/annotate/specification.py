@@ -158,7 +158,7 @@ def _units(expression: Expression, signal_units: Mapping[str, str]) -> Iterator[
                 yield FOOTPRINT_UNITS
 
 
-def kept_files(files: Sequence[Specification]) -> list[Specification]:
+def logged_specifications(files: Sequence[Specification]) -> list[Specification]:
     """The specifications as a log keeps them, so that who reads it back gets equal ones of equal names.
 
     Each has a file name whose stem no other has. A text that would not be read back as the same specification
@@ -179,7 +179,7 @@ def kept_files(files: Sequence[Specification]) -> list[Specification]:
 
 
 def specification_attachments(files: Sequence[Specification], prefix: str) -> list[Attachment]:
-    """The texts of `kept_files`, to be kept in a log under names that begin with `prefix`."""
+    """The texts of `logged_specifications`, to be kept in a log under names that begin with `prefix`."""
     return [Attachment(f"{prefix}{file.filename}", "text/plain", file.source.encode()) for file in files]
 
 

@@ -21,7 +21,7 @@ LASTING: Final = 3
 START, HOLDING, FAILING, SATISFIED, VIOLATED = 0, 1, 2, 3, 4
 """Nothing known yet; pending, with a value of at least 0; pending, below 0; and the final ones."""
 
-OF_STANDING, OF_CANDIDATE = -1, -2
+OF_CURRENT, OF_CANDIDATE = -1, -2
 """In place of a sample of the stretch: one before it, that at which what was carried was worst."""
 
 _CODE, _SINCE, _UNTIL, _NEXT, _COUNT, _NEXT_SINCE = range(6)
@@ -61,7 +61,7 @@ class Change(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Standings:
+class NodeStates:
     """How some nodes stand.
 
     Attributes:
@@ -74,7 +74,7 @@ class Standings:
     worst: Floats
 
     @classmethod
-    def begin(cls, nodes: int) -> Standings:
+    def begin(cls, nodes: int) -> NodeStates:
         """Before the first sample."""
         return cls(np.zeros((nodes, 6), np.int64), np.full((nodes, 2), np.inf))
 
@@ -91,10 +91,10 @@ class Standings:
     def period(self, node: int) -> Period:
         """How a node stands, up to the last sample at which it stood so; its worst is carried."""
         code, since, until = self.integers[node, [_CODE, _SINCE, _UNTIL]].tolist()
-        return Period(code, since, until, float(self.worst[node, 0]), OF_STANDING)
+        return Period(code, since, until, float(self.worst[node, 0]), OF_CURRENT)
 
 
-class Followed(NamedTuple):
+class TrackedChanges(NamedTuple):
     """What a stretch did to some nodes.
 
     Attributes:
@@ -103,14 +103,14 @@ class Followed(NamedTuple):
             carried.
     """
 
-    standings: Standings
+    standings: NodeStates
     changes: list[Change]
     places: Integers
 
 
-def follow(
-    before: Standings, times_ns: Integers, series: Floats, nodes: Integers, *, settles: bool = True
-) -> Followed:
+def track(
+    before: NodeStates, times_ns: Integers, series: Floats, nodes: Integers, *, settles: bool = True
+) -> TrackedChanges:
     """Take in the next samples.
 
     Args:
@@ -120,7 +120,7 @@ def follow(
         settles: whether an interval on one side of 0 is a verdict that stays.
     """
     integers, worst = before.integers.copy(), before.worst.copy()
-    places = np.tile(np.array([OF_STANDING, OF_CANDIDATE], np.int64), (len(nodes), 1))
+    places = np.tile(np.array([OF_CURRENT, OF_CANDIDATE], np.int64), (len(nodes), 1))
     room = len(nodes) * (len(times_ns) // LASTING + 2)
     found, numbers = np.empty((room, 10), np.int64), np.empty((room, 2))
     count = _follow(times_ns, series, nodes, settles, integers, worst, places, found, numbers)
@@ -132,7 +132,7 @@ def follow(
         period = Period(code, start, end, worst_before, place) if code != START else None
         after = Period(next_code, next_start, next_end, worst_after, next_place)
         changes.append(Change(node, sample, period, after))
-    return Followed(Standings(integers, worst), changes, places)
+    return TrackedChanges(NodeStates(integers, worst), changes, places)
 
 
 @kernel
@@ -147,7 +147,7 @@ def _follow(
     found: Integers,
     numbers: Floats,
 ) -> int:
-    """Take samples into the state (see `Standings`, `Followed`); how many rows of `found` are filled."""
+    """Take samples into the state (see `NodeStates`, `TrackedChanges`); how many rows of `found` are filled."""
     count = 0
     for k in range(nodes.shape[0]):
         value, lower, upper = series[nodes[k], 0], series[nodes[k], 2], series[nodes[k], 3]

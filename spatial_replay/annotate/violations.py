@@ -1,4 +1,7 @@
-"""The worst that is violated in a sample, and the two points between which that is so."""
+"""How well objects and regions meet the requirements in each sample, and where the worst violation is.
+
+The scene is coloured by the one, and an arrow in it points at the other.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.annotate.deciding_leaf import LeavesBelow, leaves_below
-from spatial_replay.annotate.requirements import Concern, Evaluated
+from spatial_replay.annotate.requirements import ClassMembers, Requirement
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.contact import contacts
 from spatial_replay.geometry.measure import Operand
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
+from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import (
+    ANY_CLASS,
     Atom,
     Formula,
     Outline,
@@ -29,19 +34,19 @@ from spatial_replay.trace.trace import Trace
 
 
 class Pair(NamedTuple):
-    """What an atom is about: how far apart two terms are, or how far one sticks out of the other."""
+    """Two terms that an atom relates: by their distance, or by how far one sticks out of the other."""
 
     first: Term
     second: Term
     is_protrusion: bool
 
 
-class Pointing(NamedTuple):
-    """What one result can point at.
+class LeafPairs(NamedTuple):
+    """The pairs of objects and regions that the leaves of one result relate.
 
     Attributes:
-        pairs: of each of the program's leaves; None of one that is not about two things in one sample.
-        below: of each concern of the formula, its leaves.
+        pairs: of each of the program's leaves; None for one that does not relate two things in one sample.
+        below: of each requirement of the formula, its leaves.
         regions: shapes by name.
     """
 
@@ -50,115 +55,168 @@ class Pointing(NamedTuple):
     regions: Mapping[str, Outline]
 
 
-class Judged(NamedTuple):
-    """One result over some samples, with what its numbers were made of.
+class EvaluatedResult(NamedTuple):
+    """One result over some samples, as the scene shows it.
 
     Attributes:
-        leaves: (C, A, T), the program's leaves.
+        requirements: the formula's.
+        block: the numbers of nodes and leaves.
+        leaf_pairs: what its violations can be traced to; None leaves them out.
     """
 
-    evaluated: Evaluated
-    leaves: Floats
-    pointing: Pointing
+    requirements: tuple[Requirement, ...]
+    block: SeriesBlock
+    leaf_pairs: LeafPairs | None = None
 
 
-class Pointers(NamedTuple):
-    """At what to point in S samples.
+class Presence(NamedTuple):
+    """Which objects are in S samples.
 
     Attributes:
-        is_shown: (S,), whether there is anything to point at.
+        times_ns: (S,) int64.
+        names: the objects' names.
+        class_code: (S, len(names)) int64, index into `classes`; -1 where the object is absent.
+        classes: class names, or None.
+    """
+
+    times_ns: Integers
+    names: Sequence[str]
+    class_code: Integers
+    classes: Sequence[str | None]
+
+
+class Violations(NamedTuple):
+    """The worst violation in each of S samples, and where it can be pointed at.
+
+    Attributes:
+        result: (S,) int64, which of the results it is of; -1 where nothing is violated.
+        node: (S,) int64, id of the requirement that is violated.
+        is_shown: (S,), whether there are two points to show it between.
         points: (S, 2, 2), a point of the first of the pair and one of the second.
         top: (S,), the upper end of the higher one, NaN if neither has a height.
-        robustness: (S,), below 0: of what is violated.
+        robustness: (S,), below 0: of the requirement.
     """
 
+    result: Integers
+    node: Integers
     is_shown: NDArray[np.bool_]
     points: Floats
     top: Floats
     robustness: Floats
 
-    @classmethod
-    def nowhere(cls, samples: int) -> Pointers:
-        """Nothing is violated."""
-        return cls(
-            np.zeros(samples, np.bool_),
-            np.full((samples, 2, 2), np.nan),
-            np.full(samples, np.nan),
-            np.full(samples, np.nan),
-        )
 
-
-def pointing_of(instance: Instance, concerns: Sequence[Concern], regions: Mapping[str, Outline]) -> Pointing:
-    """How to point at what an instance finds violated."""
+def leaf_pairs(
+    instance: Instance, requirements: Sequence[Requirement], regions: Mapping[str, Outline]
+) -> LeafPairs:
+    """Return what the leaves of an instance relate."""
     below = leaves_below(instance.formula, instance.program.leaves)
     pairs = tuple(_pair(substitute(leaf, instance.bindings)) for leaf in instance.program.leaves)
-    return Pointing(pairs, tuple(below[concern.node] for concern in concerns), regions)
+    return LeafPairs(pairs, tuple(below[requirement.node] for requirement in requirements), regions)
 
 
-def pointers(judged: Sequence[Judged], trace: Trace, samples: Integers) -> Pointers:
-    """At what to point in some samples of a trace.
+def worst_robustness(
+    results: Sequence[EvaluatedResult], presence: Presence, regions: Sequence[str]
+) -> tuple[Floats, Floats]:
+    """Return the least robustness of the requirements on each object and region, in the sign that counts.
 
-    It is the atom that gives its number to the worst of all concerns (see `involvement`), where that is
-    violated: the two points at which the signed distance of its two terms is attained, or of an enclosure how
-    far the one sticks out of the other.
+    Returns:
+        (S, objects) and (S, regions); NaN where no requirement is known.
+    """
+    objects = np.full(presence.class_code.shape, np.nan)
+    places = np.full((len(presence.times_ns), len(regions)), np.nan)
+    for result in results:
+        for requirement, now in _robustness(result, presence.times_ns):
+            for column in _columns(requirement.objects, presence.names):
+                objects[:, column] = np.fmin(objects[:, column], now)
+            for column in _columns(requirement.regions, regions):
+                places[:, column] = np.fmin(places[:, column], now)
+            for group in requirement.groups:
+                objects = np.where(_members(group, presence), np.fmin(objects, now[:, None]), objects)
+    return objects, places
+
+
+def worst_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: Integers) -> Violations:
+    """Return the worst violation in some samples of a trace.
+
+    It is shown at the atom that gives the requirement its number: between the two points at which the signed
+    distance of its two terms is attained or, of an enclosure, along which the one sticks out of the other.
 
     Args:
         samples: (S,) int64, indices.
     """
-    found = Pointers.nowhere(len(samples))
-    result, concern, worst = _worst([each.evaluated for each in judged], trace.times_ns[samples])
-    for index, own in enumerate(judged):
-        here = np.flatnonzero((result == index) & (worst < 0.0))
-        if len(here):
-            at = np.searchsorted(own.evaluated.times_ns, trace.times_ns[samples[here]])
-            _point(own.pointing, _deciding(own, concern[here], at), trace, samples, here, found)
-    found.robustness[found.is_shown] = worst[found.is_shown]
+    times_ns = trace.times_ns[samples]
+    which, requirement, worst = _worst(results, times_ns)
+    found = Violations(
+        result=which,
+        node=np.full(len(samples), -1, np.int64),
+        is_shown=np.zeros(len(samples), np.bool_),
+        points=np.full((len(samples), 2, 2), np.nan),
+        top=np.full(len(samples), np.nan),
+        robustness=worst,
+    )
+    for index, result in enumerate(results):
+        here = np.flatnonzero(which == index)
+        if result.leaf_pairs is not None and len(here):
+            nodes = np.array([each.node for each in result.requirements], np.int64)
+            found.node[here] = nodes[requirement[here]]
+            at = np.searchsorted(result.block.times_ns, times_ns[here])
+            leaves = _deciding(result, result.leaf_pairs, requirement[here], at)
+            _locate(result.leaf_pairs, leaves, trace, samples, here, found)
     return found
 
 
-def _worst(evaluated: Sequence[Evaluated], times_ns: Integers) -> tuple[Integers, Integers, Floats]:
-    """(S,) the worst of all concerns in each sample: of which result, which one, how bad it is.
+def _robustness(result: EvaluatedResult, times_ns: Integers) -> Iterator[tuple[Requirement, Floats]]:
+    """Yield each requirement with its robustness (S,) at some times; NaN where it is not evaluated."""
+    own_ns = result.block.times_ns
+    if not len(own_ns):
+        return
+    at = np.minimum(np.searchsorted(own_ns, times_ns), len(own_ns) - 1)
+    is_evaluated = own_ns[at] == times_ns
+    for requirement in result.requirements:
+        yield requirement, np.where(is_evaluated, requirement.robustness(result.block.series, at), np.nan)
 
-    What is violated without a number, as when there is nobody to satisfy it, is passed over.
+
+def _worst(results: Sequence[EvaluatedResult], times_ns: Integers) -> tuple[Integers, Integers, Floats]:
+    """Return (S,) the worst violation at each time: the result, the place of its requirement, its robustness.
+
+    A requirement of -inf is passed over: it has no members to satisfy it, and so no place in the scene.
     """
-    result, concern = np.full(len(times_ns), -1, np.int64), np.full(len(times_ns), -1, np.int64)
-    worst = np.full(len(times_ns), np.inf)
-    for index, own in enumerate(evaluated):
-        if not len(own.times_ns):
+    which, place = np.full(len(times_ns), -1, np.int64), np.full(len(times_ns), -1, np.int64)
+    worst = np.zeros(len(times_ns))
+    for index, result in enumerate(results):
+        if result.leaf_pairs is None:
             continue
-        at = np.minimum(np.searchsorted(own.times_ns, times_ns), len(own.times_ns) - 1)
-        is_evaluated = own.times_ns[at] == times_ns
-        for number, one in enumerate(own.concerns):
-            now = one.robustness(own.series, at)
-            is_worse = is_evaluated & (now < worst) & (now > -np.inf)
-            result[is_worse], concern[is_worse], worst[is_worse] = index, number, now[is_worse]
-    return result, concern, worst
+        for number, (_, now) in enumerate(_robustness(result, times_ns)):
+            is_worse = (now < worst) & (now > -np.inf)
+            which[is_worse], place[is_worse], worst[is_worse] = index, number, now[is_worse]
+    return which, place, np.where(which >= 0, worst, np.nan)
 
 
-def _deciding(own: Judged, concern: Integers, at: Integers) -> Integers:
-    """(H,) the leaf that a concern (H,) has its number from in a sample (H,); -1 where none has it."""
+def _deciding(result: EvaluatedResult, pairs: LeafPairs, requirement: Integers, at: Integers) -> Integers:
+    """Return (H,) the leaf that gives a requirement (H,) its number in a sample (H,); -1 for none."""
     leaf = np.full(len(at), -1, np.int64)
-    low, high = low_and_high(len(own.leaves), wide=False)
-    for number in np.unique(concern).tolist():
-        there = np.flatnonzero(concern == number)
-        below = own.pointing.below[number]
+    leaves = result.block.leaves
+    low, high = low_and_high(len(leaves), wide=False)
+    for number in np.unique(requirement).tolist():
+        there = np.flatnonzero(requirement == number)
+        below = pairs.below[number]
         if not len(below.indices):
             continue  # a constant
         places = below.indices[:, None], at[there][None, :]
-        lows, highs = own.leaves[low][places], own.leaves[high][places]
-        now = own.evaluated.series[own.evaluated.concerns[number].node, 1, at[there]]
+        lows, highs = leaves[low][places], leaves[high][places]
+        now = result.block.series[result.requirements[number].node, 1, at[there]]
         is_hit = (lows == highs) & (lows * below.signs[:, None] == now)
         leaf[there] = np.where(is_hit.any(axis=0), below.indices[is_hit.argmax(axis=0)], -1)
     return leaf
 
 
-def _point(
-    pointing: Pointing, leaf: Integers, trace: Trace, samples: Integers, here: Integers, found: Pointers
+def _locate(
+    pairs: LeafPairs, leaf: Integers, trace: Trace, samples: Integers, here: Integers, found: Violations
 ) -> None:
-    """Fill in the samples `here` (H,), whose leaves (H,) are given."""
-    scene = TraceScene(trace, pointing.regions)
+    """Fill in the points of the samples `here` (H,), whose leaves (H,) are given."""
+    scene = TraceScene(trace, pairs.regions)
     for index in np.unique(leaf[leaf >= 0]).tolist():
-        pair = pointing.pairs[index]
+        pair = pairs.pairs[index]
         if pair is None:
             continue
         there = here[leaf == index]
@@ -170,8 +228,20 @@ def _point(
         found.is_shown[there] = np.isfinite(numbers[:, :5]).all(axis=1)
 
 
+def _columns(chosen: frozenset[str], names: Sequence[str]) -> list[int]:
+    return [column for column, name in enumerate(names) if name in chosen]
+
+
+def _members(group: ClassMembers, presence: Presence) -> NDArray[np.bool_]:
+    """Return (S, objects), which objects belong to an open group in each sample."""
+    fits = [group.class_name in (ANY_CLASS, (name or "").casefold()) for name in presence.classes]
+    included = np.array([name not in group.excluded for name in presence.names], np.bool_)
+    # absent objects have the code -1, and so the last entry
+    return np.array([*fits, False], np.bool_)[presence.class_code] & included
+
+
 def _pair(leaf: Formula) -> Pair | None:
-    """The first distance or enclosure that an atom is made of, or else the distance of its first terms."""
+    """Return the first distance or enclosure in an atom, or else the distance of its first terms."""
     if not isinstance(leaf, Atom):
         return None
     for pair in _pairs(leaf):

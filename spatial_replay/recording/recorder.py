@@ -19,8 +19,8 @@ from typing import Self
 
 import numpy as np
 
-from spatial_replay.annotate.automaton_state import KeptAutomaton
 from spatial_replay.compiled import compile_ahead
+from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.errors import OutputError, TraceError, UsageError
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.contact import contacts
@@ -41,7 +41,7 @@ from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
 
-def warm_up(files: Sequence[Specification], automata: Sequence[KeptAutomaton]) -> None:
+def warm_up(files: Sequence[Specification], automata: Sequence[SpecAutomaton]) -> None:
     """Record some samples into nothing, as the specifications will have it done.
 
     With nothing in the compiler's cache this takes many seconds, otherwise a fraction of one.

@@ -7,16 +7,16 @@ from collections.abc import Mapping, Sequence
 
 from spatial_replay import __version__
 from spatial_replay.annotate.annotator import AnnotatedEvaluation
-from spatial_replay.annotate.automaton_state import KeptAutomaton
+from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.certificate import (
     Hashing,
     MessageHash,
     ResultHash,
     SampleHash,
     certificate,
-    described,
+    specifications_json,
 )
-from spatial_replay.annotate.specification import kept_files, specification_attachments
+from spatial_replay.annotate.specification import logged_specifications, specification_attachments
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.messages import Messages, Sink, merge, messages_of
 from spatial_replay.logs.objects.encode import encode_objects
@@ -45,7 +45,7 @@ class Recording:
         sink: Sink,
         files: Sequence[Specification] = (),
         about: Mapping[str, str] | None = None,
-        known: Sequence[KeptAutomaton] = (),
+        known: Sequence[SpecAutomaton] = (),
     ) -> None:
         """Write what comes before the first sample: metadata and specifications.
 
@@ -58,7 +58,7 @@ class Recording:
             UsageError: a template, since it stands for objects that are not known yet.
         """
         refuse_templates(files)
-        self._files = files = kept_files(files)
+        self._files = files = logged_specifications(files)
         self._sink = sink
         self._evaluation = AnnotatedEvaluation(
             files, [find_instances(file, {}, (), 0, FOREVER) for file in files], known=known
@@ -85,7 +85,7 @@ class Recording:
         return self._files
 
     @property
-    def automata(self) -> Sequence[KeptAutomaton]:
+    def automata(self) -> Sequence[SpecAutomaton]:
         """One for each result, or why it has none."""
         return self._evaluation.automata
 
@@ -140,7 +140,7 @@ def _metadata(files: Sequence[Specification], about: Mapping[str, str]) -> dict[
     return {
         "version": __version__,
         "written_by": "record",
-        "specifications": described(files),
+        "specifications": specifications_json(files),
         "options": "{}",
         **about,
     }

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from spatial_replay import __version__
-from spatial_replay.annotate.certificate import described
+from spatial_replay.annotate.certificate import specifications_json
 from spatial_replay.annotate.foxglove_layout import LAYOUT
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.mcap.writer import LogWriter
@@ -112,7 +112,7 @@ def _begin(sink: Sink, source: Source, replay: Replay, options: ReplayOptions, *
         "semantics": options.semantics,
         # a replay of a replay says what a replay of the first source says
         "source": before.get("source", source.name) if is_replayed else source.name,
-        "specifications": described(replay.files),
+        "specifications": specifications_json(replay.files),
         "options": json.dumps(_recorded_options(source, options, layer=layer)),
     }
     recorded = {key: value for key, value in before.items() if key not in about and key != "source"}

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from spatial_replay.annotate.annotator import AnnotatedEvaluation
-from spatial_replay.annotate.automaton_state import KeptAutomaton
+from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.certificate import Hashing, MessageHash, ResultHash, SampleHash, certificate
-from spatial_replay.annotate.specification import kept_files, specification_attachments
+from spatial_replay.annotate.scene_update import SceneFrames
+from spatial_replay.annotate.specification import logged_specifications, specification_attachments
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Attachment, Messages, merge
 from spatial_replay.logs.source import Source
@@ -104,12 +105,14 @@ class Replay:
         *,
         keep_series: bool = False,
         keep_leaves: bool = False,
+        show: Callable[[SceneFrames], None] = lambda frames: None,
     ) -> None:
         """Prepare; templates read the source once to find their objects.
 
         Args:
             keep_series: keep every sample's numbers in memory.
             keep_leaves: keep every sample's atoms in memory, for witnesses and signals.
+            show: takes what the messages of the scene show.
 
         Raises:
             UsageError: a template without its objects, or objects for a parameter that no template has; an
@@ -118,12 +121,13 @@ class Replay:
         self._source = source
         self._written_files = files
         self._selection = Selection(source, files, options)
-        self.files = kept_files(files)
+        self.files = logged_specifications(files)
         self._evaluation = AnnotatedEvaluation(
             self.files,
             [self._selection.instances(file) for file in self.files],
             options.semantics,
             source.attachments,
+            show=show,
         )
         self.trees = self._evaluation.trees
         self._keep_series, self._keep_leaves = keep_series, keep_leaves
@@ -176,7 +180,7 @@ class Replay:
         return self._replayed()
 
     @property
-    def automata(self) -> Sequence[KeptAutomaton]:
+    def automata(self) -> Sequence[SpecAutomaton]:
         """The automaton of each of `trees`, or the reason why it has none."""
         return self._evaluation.automata
 

@@ -15,9 +15,9 @@ from typing import Final
 
 from spatial_replay.annotate.annotator import AnnotatedEvaluation, Annotator
 from spatial_replay.annotate.curves import CurvedResult, encode_curves
-from spatial_replay.annotate.foxglove_layout import Extent, live_layout_attachment
+from spatial_replay.annotate.foxglove_layout import SceneBounds, live_layout_attachment
 from spatial_replay.annotate.scene_update import SceneState
-from spatial_replay.annotate.specification import kept_files
+from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.source import MemorySource, Source
@@ -230,7 +230,7 @@ class Tuned:
     def layout(self) -> Attachment:
         """The viewer layout for a server of this log."""
         topics = {each.topic for each in self.tuning.own.channels}
-        return live_layout_attachment(self.evaluation.contents(Extent.of(self.tuning.inside), topics))
+        return live_layout_attachment(self.evaluation.contents(SceneBounds.of(self.tuning.inside), topics))
 
     def annotator(self, scene: SceneState | None = None) -> Annotator:
         """Return the annotator of these samples, before the first; see `AnnotatedEvaluation`."""

@@ -35,7 +35,7 @@ class StatePath:
     sets: tuple[tuple[int, ...], ...]
 
 
-class StatePathMaker:
+class StatePathCollector:
     """Takes the states of one result from its messages as they come."""
 
     def __init__(self) -> None:
@@ -48,8 +48,9 @@ class StatePathMaker:
         self._times_ns.append(message.time_ns)
         self._codes.append(self._sets.setdefault(tuple(message.states), len(self._sets)))
 
+    @property
     def path(self) -> StatePath:
-        """What was taken so far."""
+        """The path so far."""
         times_ns, codes = np.array(self._times_ns, np.int64), np.array(self._codes, np.int64)
         return StatePath(times_ns, codes, tuple(self._sets))
 

@@ -1,4 +1,4 @@
-"""What a report is about."""
+"""The facts of a report, as they are collected from a run and before they are laid out on a page."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.report.automaton_panel import StatePath
-from spatial_replay.report.decision_panel import Plan
+from spatial_replay.report.decision_panel import ReportedDecisions
 from spatial_replay.report.event_panel import ReportedEvent
-from spatial_replay.report.scene_panel import Film
+from spatial_replay.report.scene_panel import ReportedScene
 from spatial_replay.report.tree_panel import final_text
 from spatial_replay.spec.formula import Formula, Specification
 
 MOST_DRAWN: Final = 24
-"""How many results a page explains and has trees and curves of: the worst; it has the verdicts of all."""
+"""Results with an explanation, a tree and curves, at most: the worst. All have their verdicts."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReportedResult:
-    """One result, with all that was found of it.
+    """One result of a run, with its explanation and its path through its automaton.
 
     Attributes:
         name: the name that it is reported under.
@@ -33,11 +33,11 @@ class ReportedResult:
         final: (N, 2), lower and upper end of each node for the finished log.
         first_satisfied_ns: the first sample with a value of at least 0, or None.
         times_ns, series: (T,) and (N, 4, T): value, now, lower, upper of each node.
-        sentences: why its verdict is what it is; none where that was not asked.
-        decided_ns: the sample that decided that; None where that was not asked.
+        sentences: the explanation of its verdict; none if the page does not explain it.
+        decided_ns: the sample that decided it; None without an explanation.
         automaton: None if it has none.
         no_automaton: why not.
-        path: where the run is in it.
+        path: the states of the run.
     """
 
     name: str
@@ -62,7 +62,7 @@ class ReportedResult:
 
     @property
     def fault_ns(self) -> int | None:
-        """The sample that made it violated, or unknown."""
+        """The sample that made it violated or unknown."""
         return None if self.verdict is Verdict.SATISFIED else self.decided_ns
 
     @property
@@ -72,14 +72,14 @@ class ReportedResult:
 
 
 @dataclass(frozen=True, eq=False)
-class Report:
-    """A run and what was found of it.
+class RunReport:
+    """A run with its results.
 
     Attributes:
         log: base name of the log.
         first_ns, start_ns, end_ns: times of the log's first sample, and of the first and last evaluated.
-        faults, remarks: what was lost, and what else the log says of its samples.
-        unreadable: how many observations are there and say nothing.
+        faults, remarks: what was lost while reading, and other notes of the reader.
+        unreadable: how many observations have no finite numbers.
     """
 
     log: str
@@ -94,9 +94,9 @@ class Report:
     certificate: Mapping[str, str]
     files: tuple[Specification, ...]
     results: tuple[ReportedResult, ...]
-    film: Film
+    scene: ReportedScene
     events: tuple[ReportedEvent, ...]
-    plan: Plan
+    decisions: ReportedDecisions
 
     @property
     def verdict(self) -> Verdict:
@@ -104,17 +104,21 @@ class Report:
 
     @property
     def drawn(self) -> tuple[ReportedResult, ...]:
-        """The results that have a tree and curves on the page, in order: the worst if they are too many."""
-        chosen = worst_results([result.verdict for result in self.results])
-        return tuple(self.results[number] for number in chosen)
+        """The results that have a tree and curves on the page, in order."""
+        return tuple(self.results[number] for number in self.drawn_numbers)
+
+    @property
+    def drawn_numbers(self) -> list[int]:
+        """The places of those results: the worst if there are too many."""
+        return worst_results([result.verdict for result in self.results])
 
 
 def worst_results(verdicts: Sequence[Verdict]) -> list[int]:
-    """Which results are looked into, in order: `MOST_DRAWN` of them at most."""
+    """Return which results are explained and drawn, in order: `MOST_DRAWN` at most."""
     return sorted(worst_first(verdicts)[:MOST_DRAWN])
 
 
 def worst_first(verdicts: Sequence[Verdict]) -> list[int]:
-    """The places of results: those violated, those unknown, the others, each kind in order."""
+    """Return the places of results: those violated, those unknown, the others, each kind in order."""
     severity = {Verdict.VIOLATED: 0, Verdict.UNKNOWN: 1}
     return sorted(range(len(verdicts)), key=lambda number: severity.get(verdicts[number], 2))

@@ -16,21 +16,21 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.palette import CURVES, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
 from spatial_replay.report.automaton_panel import automaton_value
 from spatial_replay.report.compact import Packing, sentence_parts, singles
-from spatial_replay.report.contents import MOST_DRAWN, Report, ReportedResult
-from spatial_replay.report.decision_panel import plan_value
+from spatial_replay.report.contents import MOST_DRAWN, ReportedResult, RunReport
+from spatial_replay.report.decision_panel import decisions_value
 from spatial_replay.report.event_panel import MOST_EVENTS, event_values
-from spatial_replay.report.scene_panel import film_value
+from spatial_replay.report.scene_panel import scene_value
 from spatial_replay.report.tree_panel import (
     MOST_NODES,
-    concern_values,
     named_nodes,
+    requirement_values,
     series_of,
     shown_nodes,
     tree_value,
 )
 
 
-class Curves(NamedTuple):
+class NodeSeries(NamedTuple):
     """What is to be seen of some nodes.
 
     Attributes:
@@ -42,7 +42,7 @@ class Curves(NamedTuple):
     series: Floats
 
 
-def kept_samples(times_ns: Integers, curves: Sequence[Curves], most: int) -> Integers:
+def choose_samples(times_ns: Integers, curves: Sequence[NodeSeries], most: int) -> Integers:
     """Indices of the samples to keep, in order: all of them, or at most `most`.
 
     Of a run that is too long those are the first and the last of all and of each curve, others at equal
@@ -123,18 +123,18 @@ class PageData:
     omissions: tuple[str, ...]
 
 
-def page_data(report: Report) -> PageData:
+def page_data(report: RunReport) -> PageData:
     """Everything that the page draws; equal reports give equal data."""
     packing = Packing()
     drawn = report.drawn
     times_ns = np.unique(
-        np.concatenate([report.film.times_ns, *(result.times_ns for result in drawn)]).astype(np.int64)
+        np.concatenate([report.scene.times_ns, *(result.times_ns for result in drawn)]).astype(np.int64)
     )
     curves = [_curves(each) for each in drawn if len(each.times_ns)]
     faults_ns = [each.fault_ns for each in drawn if each.fault_ns is not None]
     room = _room(drawn, len(times_ns)) - len(faults_ns)
-    kept = np.union1d(times_ns[kept_samples(times_ns, curves, room)], np.array(faults_ns, np.int64))
-    plan = plan_value(report.plan, report.first_ns, packing)
+    kept = np.union1d(times_ns[choose_samples(times_ns, curves, room)], np.array(faults_ns, np.int64))
+    decisions = decisions_value(report.decisions, report.first_ns, packing)
     facts = {
         "settles": report.semantics == "ltlf",
         "is_thinned": len(kept) < len(times_ns),
@@ -147,11 +147,11 @@ def page_data(report: Report) -> PageData:
             "curves": CURVES[2:],
         },
         "results": [_result_value(each, kept, report.first_ns, packing) for each in drawn],
-        "film": film_value(report.film, report.first_ns, packing),
+        "scene": scene_value(report.scene, report.first_ns, _places(report), packing),
         "events": event_values(report.events, report.first_ns),
-        "decisions": plan["decisions"],
+        "decisions": decisions["decisions"],
     }
-    omissions = tuple(_omissions(report, len(times_ns), len(kept), plan["maps_left_out"]))
+    omissions = tuple(_omissions(report, len(times_ns), len(kept), decisions["maps_left_out"]))
     return PageData(facts, packing.text(), omissions)
 
 
@@ -161,8 +161,17 @@ def _room(results: Sequence[ReportedResult], samples: int) -> int:
     return max(_FEWEST_SAMPLES, MOST_VALUES * max(samples, 1) // max(values, 1))
 
 
-def _curves(result: ReportedResult) -> Curves:
-    return Curves(result.times_ns, result.series[list(named_nodes(result.formula))])
+def _places(report: RunReport) -> Mapping[tuple[int, int], tuple[int, int]]:
+    """Return the places on the page of the run's results and their nodes, as far as it shows them."""
+    return {
+        (number, node): (index, place)
+        for index, number in enumerate(report.drawn_numbers)
+        for place, node in enumerate(shown_nodes(report.results[number].formula))
+    }
+
+
+def _curves(result: ReportedResult) -> NodeSeries:
+    return NodeSeries(result.times_ns, result.series[list(named_nodes(result.formula))])
 
 
 def _result_value(
@@ -180,7 +189,7 @@ def _result_value(
         "first": int(np.searchsorted(kept, here[0])) if len(here) else 0,
         "samples": len(here),
         "nodes": tree_value(result.formula, result.robustness, result.final, result.relations),
-        "concerns": concern_values(result.formula, result.object),
+        "requirements": requirement_values(result.formula, result.object),
         "series": packing.add(singles(series), "f4"),
         "automaton": None,
         "no_automaton": sentence_parts(result.no_automaton),
@@ -195,14 +204,14 @@ def _result_value(
     return value
 
 
-def _omissions(report: Report, samples: int, kept: int, maps: int) -> Iterator[str]:
+def _omissions(report: RunReport, samples: int, kept: int, maps: int) -> Iterator[str]:
     if kept < samples:
         yield (
             f"Curves and tree have {kept:,} of {samples:,} samples: those at equal distances, those around "
             "changes of sign, and the extremes of every curve in between."
         )
-    if report.film.stride > 1:
-        yield f"The scene has every {_ordinal(report.film.stride)} message of /spatial/scene."
+    if report.scene.stride > 1:
+        yield f"The scene has every {_ordinal(report.scene.stride)} message of /spatial/scene."
     if len(report.results) > MOST_DRAWN:
         yield (
             f"Explanations, trees and curves are of {MOST_DRAWN} of {len(report.results):,} results, "

@@ -32,7 +32,7 @@ _MOST_GUARDS: Final = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class ReportedDecisions:
     """What a log tells of decisions.
 
     Attributes:
@@ -44,7 +44,7 @@ class Plan:
     maps: Mapping[int, Grid]
 
 
-class PlanMaker:
+class DecisionCollector:
     """Takes decisions and maps from messages as they come."""
 
     def __init__(self) -> None:
@@ -63,9 +63,10 @@ class PlanMaker:
         except DecodeError:
             return
 
-    def plan(self) -> Plan:
-        """What was taken so far."""
-        return Plan(latest_decisions(self._decisions), dict(self._maps))
+    @property
+    def decisions(self) -> ReportedDecisions:
+        """The decisions and maps so far."""
+        return ReportedDecisions(latest_decisions(self._decisions), dict(self._maps))
 
 
 class _Owner(NamedTuple):
@@ -107,8 +108,8 @@ class _Drawn(NamedTuple):
     is_chosen: bool
 
 
-def plan_value(
-    plan: Plan, first_ns: int, packing: Packing, most_cells: int = MOST_CELLS
+def decisions_value(
+    plan: ReportedDecisions, first_ns: int, packing: Packing, most_cells: int = MOST_CELLS
 ) -> Mapping[str, Any]:
     """The decisions as the page reads them, and how many maps there was no room for."""
     drawn = [list(_maps_of(plan, decision)) for decision in plan.decisions]
@@ -131,7 +132,7 @@ def _kept(maps: Sequence[_Drawn], most_cells: int) -> set[int]:
     return kept
 
 
-def _maps_of(plan: Plan, decision: PlanDecision) -> Iterator[_Drawn]:
+def _maps_of(plan: ReportedDecisions, decision: PlanDecision) -> Iterator[_Drawn]:
     """The maps that a decision rests on; of a log that does not say whose they are, those of its time."""
     owners = {
         named.number: _Owner(edge, place, candidate, named.turn)

@@ -21,7 +21,7 @@ from spatial_replay.annotate.sentences import time_text
 from spatial_replay.notebook.figures import Html, element
 from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
 from spatial_replay.report.compact import json_text, sentence_parts
-from spatial_replay.report.contents import Report, ReportedResult, worst_first
+from spatial_replay.report.contents import ReportedResult, RunReport, worst_first
 from spatial_replay.report.data import page_data
 from spatial_replay.text import counted, printable
 
@@ -32,7 +32,7 @@ _MANY: Final = 6
 _WITHOUT_SCRIPTS: Final = "Without scripts this page shows verdicts and explanations alone."
 
 
-def header(report: Report, omissions: Sequence[str]) -> Html:
+def header(report: RunReport, omissions: Sequence[str]) -> Html:
     """Which run this is, and what a reader has to know before the verdicts.
 
     Args:
@@ -50,7 +50,7 @@ def header(report: Report, omissions: Sequence[str]) -> Html:
     )
 
 
-def panels(report: Report) -> Html:
+def panels(report: RunReport) -> Html:
     """The verdicts, and a place for everything that is drawn."""
     has_automaton = any(result.automaton is not None for result in report.drawn)
     sections = [
@@ -61,12 +61,12 @@ def panels(report: Report) -> Html:
         _panel("automaton", "Automaton", kind="panel" if has_automaton else "panel wide"),
         _panel("events", "Events"),
     ]
-    if report.plan.decisions:
+    if report.decisions.decisions:
         sections.append(_panel("decisions", "Decisions"))
     return element("main", *sections, id="main", tabindex="-1")
 
 
-def footer(report: Report) -> Html:
+def footer(report: RunReport) -> Html:
     """The texts of the specifications, and the certificate."""
     texts = [
         element("details", element("summary", text(file.filename)), element("pre", text(file.source)))
@@ -85,7 +85,7 @@ def text(words: str) -> Html:
     return Html("\n".join(escape(printable(line, len(line))) for line in words.split("\n")))
 
 
-def _about(report: Report) -> Iterator[str]:
+def _about(report: RunReport) -> Iterator[str]:
     yield ", ".join(file.filename for file in report.files)
     if report.first_ns >= _CALENDAR_NS:
         yield f"{datetime.fromtimestamp(report.first_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
@@ -96,7 +96,7 @@ def _about(report: Report) -> Iterator[str]:
     yield f"spatial-replay {__version__}"
 
 
-def _notices(report: Report, omissions: Sequence[str]) -> Iterator[Html]:
+def _notices(report: RunReport, omissions: Sequence[str]) -> Iterator[Html]:
     if report.faults:
         what = "The log is damaged: verdicts are over what could be read."
         yield _notice("alert", what, report.faults)
@@ -123,7 +123,7 @@ def _panel(name: str, title: str, *content: Html, kind: str = "panel") -> Html:
     return element("section", heading, body, id=name, **{"class": kind, "aria-labelledby": f"{name}-title"})
 
 
-def _verdicts(report: Report) -> Iterator[Html]:
+def _verdicts(report: RunReport) -> Iterator[Html]:
     if not report.results:
         yield element("p", "No object was there for a template to stand for.")
     places = {id(result): place for place, result in enumerate(report.drawn)}
@@ -234,7 +234,7 @@ _SCRIPTS: Final = (
 """Files of browser/, in the order in which they need each other."""
 
 
-def page(report: Report) -> bytes:
+def page(report: RunReport) -> bytes:
     """The page, in UTF-8; equal reports give equal bytes."""
     data = page_data(report)
     style = "\n".join([theme(), *map(_asset, _STYLES)])

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from spatial_replay.annotate.requirements import concerns_of
+from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.sentences import number_text
 from spatial_replay.annotate.specification import unit_of
 from spatial_replay.geometry.arrays import Floats
@@ -74,8 +74,8 @@ def tree_value(
     ]
 
 
-def concern_values(formula: Formula, object: str | None) -> list[Mapping[str, Any]]:
-    """What the formula asks of objects (see `involvement`), as far as the nodes for it are shown.
+def requirement_values(formula: Formula, object: str | None) -> list[Mapping[str, Any]]:
+    """Return the requirements of a formula (see `annotate.requirements`) whose nodes are shown.
 
     Args:
         object: what the parameter of a template stands for.
@@ -83,14 +83,14 @@ def concern_values(formula: Formula, object: str | None) -> list[Mapping[str, An
     place = {identifier: index for index, identifier in enumerate(shown_nodes(formula))}
     return [
         {
-            "node": place[concern.node],
-            "sign": concern.sign,
-            "duty": None if concern.duty is None else place[concern.duty.node],
-            "duty_sign": None if concern.duty is None else concern.duty.sign,
+            "node": place[requirement.node],
+            "sign": requirement.sign,
+            "obligation": None if requirement.obligation is None else place[requirement.obligation.node],
+            "obligation_sign": None if requirement.obligation is None else requirement.obligation.sign,
         }
-        for concern in concerns_of(formula, object)
-        # a duty stands above its concern, and is shown where that is
-        if concern.node in place
+        for requirement in requirements_of(formula, object)
+        # an obligation is above its requirement, and so shown where that is
+        if requirement.node in place
     ]
 
 

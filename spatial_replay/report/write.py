@@ -1,102 +1,63 @@
-"""Replays that write a report: one page with what a run did, and why.
+"""Reports: a log evaluated, and one HTML page that shows what the run did and why.
 
-Messages of an annotated log → what a report shows of them.
+A replay gives the results, and a `Collector` takes the rest from its messages; together they are a `RunReport`,
+which `page` turns into HTML.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
-from typing import Final, NamedTuple
 
 import numpy as np
 
+from spatial_replay.logs import topics as log_topics
 from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.source import Source
-from spatial_replay.logs.topics import AUTOMATON, EVENTS, GRADIENT_MAP, PLAN_DECISION, SCENE
 from spatial_replay.replay.document import explain_node
 from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions
-from spatial_replay.report.automaton_panel import StatePath, StatePathMaker
-from spatial_replay.report.contents import Report, ReportedResult, worst_results
-from spatial_replay.report.decision_panel import Plan, PlanMaker
+from spatial_replay.report.automaton_panel import StatePath, StatePathCollector
+from spatial_replay.report.contents import ReportedResult, RunReport, worst_results
+from spatial_replay.report.decision_panel import DecisionCollector
 from spatial_replay.report.event_panel import ReportedEvent, event_of
 from spatial_replay.report.page import page
-from spatial_replay.report.scene_panel import Film, FilmMaker
+from spatial_replay.report.scene_panel import SceneCollector
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.relations import RELATION_NAMES
 
 
-class Taken(NamedTuple):
-    """Where a message stands in its topic: its time, and its sequence number."""
-
-    time_ns: int
-    sequence: int
-
-
 class Collector:
-    """Takes the messages of a run as they come, and keeps what a page has room for."""
+    """Collects what a page shows from a run, as its messages come."""
 
     def __init__(self) -> None:
-        self._film = FilmMaker()
-        self._plan = PlanMaker()
-        self._events: list[ReportedEvent] = []
-        self._paths: dict[tuple[str, str], StatePathMaker] = {}
+        self.scene = SceneCollector()
+        self.decisions = DecisionCollector()
+        self.events: list[ReportedEvent] = []
+        self._paths: defaultdict[tuple[str, str], StatePathCollector] = defaultdict(StatePathCollector)
 
     def add(self, messages: Messages) -> None:
         """Take in the next messages."""
         topics = {number: channel.topic for number, channel in messages.channels.items()}
-        for index, number in enumerate(messages.channel.tolist()):
-            take = _TAKERS.get(topics[number])
-            if take is not None:
-                taken = Taken(int(messages.log_time_ns[index]), int(messages.sequence[index]))
-                take(self, taken, messages.payloads[index])
-
-    @property
-    def film(self) -> Film:
-        return self._film.film()
-
-    @property
-    def plan(self) -> Plan:
-        return self._plan.plan()
-
-    @property
-    def events(self) -> tuple[ReportedEvent, ...]:
-        return tuple(self._events)
+        numbered = zip(messages.channel.tolist(), messages.sequence.tolist(), messages.payloads, strict=True)
+        for channel, sequence, payload in numbered:
+            match topics[channel]:
+                case log_topics.EVENTS:
+                    self.events.append(event_of(payload))
+                case log_topics.AUTOMATON:
+                    message = AutomatonState.FromString(payload)
+                    self._paths[message.specification, message.object].add(message)
+                case log_topics.PLAN_DECISION:
+                    self.decisions.add_decision(payload)
+                case log_topics.GRADIENT_MAP:
+                    self.decisions.add_map(sequence, payload)
 
     def path(self, name: str, object: str | None) -> StatePath:
-        """Where the automaton of a result was; nowhere if it has none."""
-        return self._paths.get((name, object or ""), StatePathMaker()).path()
-
-    def _take_scene(self, taken: Taken, payload: bytes) -> None:
-        self._film.add(taken.time_ns, payload)
-
-    def _take_event(self, _: Taken, payload: bytes) -> None:
-        self._events.append(event_of(payload))
-
-    def _take_state(self, _: Taken, payload: bytes) -> None:
-        message = AutomatonState.FromString(payload)
-        self._paths.setdefault((message.specification, message.object), StatePathMaker()).add(message)
-
-    def _take_decision(self, _: Taken, payload: bytes) -> None:
-        self._plan.add_decision(payload)
-
-    def _take_map(self, taken: Taken, payload: bytes) -> None:
-        self._plan.add_map(taken.sequence, payload)
-
-
-_TAKERS: Final[Mapping[str, Callable[[Collector, Taken, bytes], None]]] = MappingProxyType(
-    {
-        SCENE: Collector._take_scene,
-        EVENTS: Collector._take_event,
-        AUTOMATON: Collector._take_state,
-        PLAN_DECISION: Collector._take_decision,
-        GRADIENT_MAP: Collector._take_map,
-    }
-)
+        """Return where the automaton of a result was; an empty path if it has none."""
+        return self._paths[name, object or ""].path
 
 
 def write_report(
@@ -108,13 +69,13 @@ def write_report(
     inputs: Sequence[Path] = (),
     advance: Callable[[int], None] = lambda samples: None,
 ) -> Replayed:
-    """Evaluate specifications over a source and write what was found as one HTML page.
+    """Evaluate specifications over a source and write a report as one HTML page.
 
     The page needs no other file and no network. Equal sources, specifications and options give an equal page.
 
     Args:
         inputs: files that the output must not be.
-        advance: told how many more samples are done.
+        advance: called with the number of samples of each block that is done.
 
     Raises:
         UsageError: an option that cannot work, no sample in the window, the output is an input.
@@ -122,16 +83,18 @@ def write_report(
         LogError: no sample in the log.
         OutputError: the output cannot be written.
     """
-    replay = Replay(source, files, options, keep_series=True, keep_leaves=True)
+    collector = Collector()
+    replay = Replay(
+        source, files, options, keep_series=True, keep_leaves=True, show=collector.scene.add
+    )
     with replacing(output, inputs) as stream:
-        collector = Collector()
         replayed = replay.run(collector.add, advance=advance)
         stream.write(page(_report(replay, replayed, collector)))
     return replayed
 
 
-def _report(replay: Replay, replayed: Replayed, collector: Collector) -> Report:
-    return Report(
+def _report(replay: Replay, replayed: Replayed, collector: Collector) -> RunReport:
+    return RunReport(
         log=replayed.log,
         samples=replayed.samples,
         first_ns=replayed.first_ns,
@@ -144,17 +107,17 @@ def _report(replay: Replay, replayed: Replayed, collector: Collector) -> Report:
         certificate=replayed.certificate,
         files=tuple(replay.files),
         results=tuple(_results(replay, replayed, collector)),
-        film=collector.film,
-        events=collector.events,
-        plan=collector.plan,
+        scene=collector.scene.scene,
+        events=tuple(collector.events),
+        decisions=collector.decisions.decisions,
     )
 
 
 def _results(replay: Replay, replayed: Replayed, collector: Collector) -> Iterator[ReportedResult]:
     explained = _explained(replayed)
     for index, result in enumerate(replayed.results):
-        tree, kept = replay.trees[index], replay.automata[index]
-        unseen = np.empty((len(result.robustness), 4, 0))
+        tree, compiled = replay.trees[index], replay.automata[index]
+        no_series = np.empty((len(result.robustness), 4, 0))
         why = explain_node(result, first_ns=replayed.first_ns) if index in explained else None
         yield ReportedResult(
             name=result.name,
@@ -166,17 +129,17 @@ def _results(replay: Replay, replayed: Replayed, collector: Collector) -> Iterat
             final=result.final,
             first_satisfied_ns=result.first_satisfied_ns,
             times_ns=np.empty(0, np.int64) if result.times_ns is None else result.times_ns,
-            series=unseen if result.series is None else result.series,
+            series=no_series if result.series is None else result.series,
             sentences=() if why is None else why.sentences,
             decided_ns=None if why is None else why.time_ns,
-            automaton=kept.automaton,
-            no_automaton=kept.reason,
+            automaton=compiled.automaton,
+            no_automaton=compiled.reason,
             path=collector.path(tree.name, tree.object),
         )
 
 
 def _explained(replayed: Replayed) -> frozenset[int]:
-    """Which results are explained; under the paper's semantics none can be."""
+    """Return which results are explained: under the paper's semantics, none can be."""
     if replayed.semantics != "ltlf":
         return frozenset()
     return frozenset(worst_results([result.verdict for result in replayed.results]))

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from spatial_replay.annotate.automaton_state import KeptAutomaton
-from spatial_replay.annotate.specification import kept_files
+from spatial_replay.annotate.automaton_state import SpecAutomaton
+from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.errors import UsageError
 from spatial_replay.monitor.verdict import Verdict
@@ -239,7 +239,7 @@ def record_plan(
             planned for.
         OutputError: the output cannot be written.
     """
-    (kept,) = kept_files([default_specification(scenario) if file is None else file])
+    (kept,) = logged_specifications([default_specification(scenario) if file is None else file])
     _refuse_missing(kept, name)
     made = about_run(scenario, seed=seed, noise_m=noise_m, injections=injections)
     about = {**made, "planned": "true"}
@@ -301,10 +301,10 @@ def _refuse_missing(file: Specification, name: str | None) -> None:
         raise UsageError(f"{file.filename} has no result {name!r}; its results are: {', '.join(results)}")
 
 
-def _known(file: Specification, automaton: Automaton) -> list[KeptAutomaton]:
+def _known(file: Specification, automaton: Automaton) -> list[SpecAutomaton]:
     """The automaton that is planned with, as a log keeps it."""
     return [
-        KeptAutomaton(spec.name, file, spec, automaton)
+        SpecAutomaton(spec.name, file, spec, automaton)
         for spec in file.results
         if spec.name == automaton.name
     ]

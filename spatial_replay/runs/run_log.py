@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from spatial_replay.annotate.automaton_state import KeptAutomaton
+from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.logs.mcap.writer import LogWriter
 from spatial_replay.logs.messages import Messages, merge
 from spatial_replay.logs.output_file import open_output, refuse_inputs
@@ -117,7 +117,7 @@ def run_log(
     files: Sequence[Specification] = (),
     about: Mapping[str, str] | None = None,
     inputs: Sequence[Path] = (),
-    known: Sequence[KeptAutomaton] = (),
+    known: Sequence[SpecAutomaton] = (),
 ) -> Iterator[RunLog]:
     """Open the log of a run, in place under its final name, and close it properly however the run ends.
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from spatial_replay.annotate.requirements import (
-    Concern,
-    Evaluated,
-    OpenGroup,
-    Seen,
-    concerns_of,
+    ClassMembers,
+    EvaluatedResult,
+    Presence,
+    Requirement,
+    requirements_of,
     worst_robustness,
 )
 from spatial_replay.spec.formula import (
@@ -37,12 +37,14 @@ NOTHING: frozenset[str] = frozenset()
 
 
 def signs(formula) -> list[tuple[int, float]]:
-    return [(concern.node, concern.sign) for concern in concerns_of(formula)]
+    return [(concern.node, concern.sign) for concern in requirements_of(formula)]
 
 
 def test_a_formula_without_temporal_operators_is_one_concern():
     formula = Boolean("not", (Boolean("->", (atom(A, B), atom(A, GOAL))),))
-    assert concerns_of(formula) == (Concern(0, 1.0, None, frozenset("ab"), frozenset({"goal"}), frozenset()),)
+    assert requirements_of(formula) == (
+        Requirement(0, 1.0, None, frozenset("ab"), frozenset({"goal"}), frozenset()),
+    )
 
 
 def test_concerns_are_the_largest_subformulas_below_temporal_operators():
@@ -62,22 +64,22 @@ def test_negations_and_the_left_of_an_implication_turn_the_sign():
 
 def test_terms_are_looked_through():
     named = Group("reds", members=("red1", "red2"), excluded=(TrackedName("red2"),))
-    [concern] = concerns_of(atom(Enlarged(Earlier(A, samples=2), 1.0), Earlier(named, samples=1)))
+    [concern] = requirements_of(atom(Enlarged(Earlier(A, samples=2), 1.0), Earlier(named, samples=1)))
     assert concern.objects == {"a", "red1"}
 
 
 def test_a_parameter_stands_for_its_object():
     others = Group("people", class_name="Pedestrian", excluded=(Variable("ego"),))
-    [concern] = concerns_of(atom(Variable("ego"), others), "7")
+    [concern] = requirements_of(atom(Variable("ego"), others), "7")
     assert concern.objects == {"7"}
-    assert concern.groups == {OpenGroup("pedestrian", frozenset({"7"}))}
+    assert concern.groups == {ClassMembers("pedestrian", frozenset({"7"}))}
 
 
 def test_a_quantifier_is_about_the_members_of_its_group():
     everyone = Group("everyone", class_name="*")
     formula = Quantified("forall", ("x",), Earlier(everyone, samples=1), atom(Variable("x"), A))
-    [concern] = concerns_of(formula)
-    assert (concern.objects, concern.groups) == ({"a"}, {OpenGroup("*", NOTHING)})
+    [concern] = requirements_of(formula)
+    assert (concern.objects, concern.groups) == ({"a"}, {ClassMembers("*", NOTHING)})
 
 
 def test_open_groups_have_the_members_of_each_sample():
@@ -85,10 +87,12 @@ def test_open_groups_have_the_members_of_each_sample():
     formula = atom(cups)
     times = np.array([0, 1, 2])
     codes = np.array([[0, 0, 1], [0, -1, 0], [-1, 0, 1]])
-    seen = Seen(times, ["a", "b", "c"], codes, ["Cup", None])
+    seen = Presence(times, ["a", "b", "c"], codes, ["Cup", None])
     series = np.array([[[0.0] * 3, [-1.0, 2.0, 3.0], [0.0] * 3, [0.0] * 3]])
     assert len(list(iter_nodes(formula))) == len(series)
-    objects, regions = worst_robustness([Evaluated(concerns_of(formula), times, series)], seen, ["goal"])
+    objects, regions = worst_robustness(
+        [EvaluatedResult(requirements_of(formula), times, series)], seen, ["goal"]
+    )
     nan = np.nan
     assert np.array_equal(objects, [[-1.0, nan, nan], [2.0, nan, 2.0], [nan] * 3], equal_nan=True)
     assert np.isnan(regions).all()

@@ -11,9 +11,9 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spatial_replay.annotate.requirements import Evaluated, concerns_of
+from spatial_replay.annotate.requirements import EvaluatedResult, requirements_of
 from spatial_replay.annotate.scene_update import PERIOD_NS, SceneEncoder
-from spatial_replay.annotate.violations import Judged, pointing_of
+from spatial_replay.annotate.violations import Judged, leaf_pairs
 from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.stream import EvaluationStream
@@ -35,18 +35,18 @@ def near(first: str, second: str) -> Atom:
     return Atom(f"{first} closeto[1] {second}", "closeto", 1.0 - SignedDistance(*terms), terms=terms)
 
 
-def says(formula, trace: Trace, now) -> Evaluated:
+def says(formula, trace: Trace, now) -> EvaluatedResult:
     """A formula with the given numbers (N, T) or (T,) of its nodes now."""
     series = np.full((len(list(iter_nodes(formula))), 4, len(trace)), np.nan)
     series[:, 1] = now
-    return Evaluated(concerns_of(formula), trace.times_ns, series)
+    return EvaluatedResult(requirements_of(formula), trace.times_ns, series)
 
 
 def run(*samples: dict, period_ns: int = FRAME_NS) -> Trace:
     return Trace.from_samples(Sample(index * period_ns, objects) for index, objects in enumerate(samples))
 
 
-def messages(trace: Trace, *evaluated: Evaluated, regions=None) -> list[SceneUpdate]:
+def messages(trace: Trace, *evaluated: EvaluatedResult, regions=None) -> list[SceneUpdate]:
     encoded = SceneEncoder(regions or {}).encode(trace, evaluated)
     return [SceneUpdate.FromString(payload) for payload in encoded.payloads]
 
@@ -364,15 +364,15 @@ def pointed(text: str, *samples: dict, cuts: tuple[int, ...] = ()) -> list[Scene
     trace = run(*samples)
     instances = find_instances(spec, {}, (), 0, 2**63 - 1)
     evaluation = EvaluationStream(instances, spec.regions)
-    concerns = [concerns_of(instance.formula) for instance in instances]
+    concerns = [requirements_of(instance.formula) for instance in instances]
     encoder, state, payloads = SceneEncoder(spec.regions), None, []
     for begin, end in pairwise((0, *cuts, len(trace))):
         part = trace.slice(begin, end)
         judged = [
             Judged(
-                Evaluated(own, stretch.times_ns, stretch.series),
+                EvaluatedResult(own, stretch.times_ns, stretch.series),
                 stretch.leaves,
-                pointing_of(instance, own, spec.regions),
+                leaf_pairs(instance, own, spec.regions),
             )
             for instance, own, stretch in zip(instances, concerns, evaluation.extend(part), strict=True)
         ]

@@ -12,7 +12,7 @@ from mcap.writer import Writer
 import spatial_replay as sr
 from annotate.layouts import layout_of, panels, paths_of
 from annotate.message_paths import split, values
-from spatial_replay.annotate.foxglove_layout import Contents, layout_for_live
+from spatial_replay.annotate.foxglove_layout import LayoutContents, layout_for_live
 from spatial_replay.logs.source import MemorySource
 from spatial_replay.replay import ReplayOptions, run_replay
 from spatial_replay.sources.open_log import open_source
@@ -123,7 +123,7 @@ def test_a_planned_run_has_its_map_path_and_decision(tmp_path):
 
 
 def test_the_layout_for_a_live_server_has_its_constants():
-    layout = layout_for_live(Contents((), (), None, ()))
+    layout = layout_for_live(LayoutContents((), (), None, ()))
     assert panels(layout["layout"]) == set(layout["configById"]) == {"3D!scene", "Parameters!constants"}
 
 

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laws.strategies_monitor import Recording, cuts, recordings, specifications
-from spatial_replay.annotate.events import EventTeller, Told
+from spatial_replay.annotate.events import EncodedEvent, EventReporter
 from spatial_replay.annotate.specification import reported_trees
-from spatial_replay.annotate.verdict_changes import LASTING, SATISFIED, START, Standings, follow
+from spatial_replay.annotate.verdict_changes import LASTING, SATISFIED, START, NodeStates, track
 from spatial_replay.errors import UsageError
 from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.instances import find_instances
@@ -71,10 +71,10 @@ def test_a_verdict_counts_at_once_and_a_sign_when_it_lasts(series: np.ndarray, d
     count = series.shape[2]
     times_ns = np.arange(count, dtype=np.int64) * 10
     ends = data.draw(cuts(count))
-    standings, found = Standings.begin(1), []
+    standings, found = NodeStates.begin(1), []
     for begin, end in pairwise(ends):
         part = np.ascontiguousarray(series[:, :, begin:end])
-        followed = follow(standings, times_ns[begin:end], part, np.array([0]))
+        followed = track(standings, times_ns[begin:end], part, np.array([0]))
         standings = followed.standings
         found += [
             (begin + each.sample, each.after.code, each.after.start_ns // 10, each.after.worst)
@@ -89,7 +89,7 @@ def _choices(spec: Specification) -> dict[str, str]:
 
 def _all_told(
     spec: Specification, recording: Recording, ends: list[int], semantics: Semantics = "ltlf"
-) -> list[Told]:
+) -> list[EncodedEvent]:
     """What is told of each result, one after the other, its end included."""
     trace = recording.trace()
     instances = find_instances(spec, _choices(spec), [trace], 0, 2**63 - 1)
@@ -97,10 +97,10 @@ def _all_told(
     evaluation = EvaluationStream(instances, spec.regions, begin_one)
     trees = reported_trees([spec], [instances])
     tellers = [
-        EventTeller(tree, stream.instance, spec, semantics)
+        EventReporter(tree, stream.instance, spec, semantics)
         for tree, stream in zip(trees, evaluation.streams, strict=True)
     ]
-    told: list[list[Told]] = [[] for _ in tellers]
+    told: list[list[EncodedEvent]] = [[] for _ in tellers]
     for begin, end in pairwise(ends):
         for own, teller, stretch in zip(
             told, tellers, evaluation.extend(trace.slice(begin, end)), strict=True
@@ -112,7 +112,7 @@ def _all_told(
     return [one for own in told for one in sorted(own, key=lambda each: each.time_ns)]
 
 
-def _facts(told: Told) -> dict[str, str]:
+def _facts(told: EncodedEvent) -> dict[str, str]:
     return {pair.key: pair.value for pair in Event.FromString(told.event).metadata}
 
 

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from spatial_replay.report.compact import json_text, sentence_parts, singles
-from spatial_replay.report.data import Curves, kept_samples
-from spatial_replay.report.scene_panel import MOST_CORNERS, MOST_FRAMES, FilmMaker
+from spatial_replay.report.data import NodeSeries, choose_samples
+from spatial_replay.report.scene_panel import MOST_CORNERS, MOST_FRAMES, SceneCollector
 
 NUMBERS = st.one_of(
     st.floats(-10, 10), st.sampled_from([np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-300, -1e-300])
@@ -28,7 +28,7 @@ VALUES = st.recursive(
 
 
 @st.composite
-def runs(draw: st.DrawFn) -> tuple[np.ndarray, list[Curves]]:
+def runs(draw: st.DrawFn) -> tuple[np.ndarray, list[NodeSeries]]:
     """Times of samples, and curves over stretches of them."""
     count = draw(st.integers(1, 300))
     times_ns = np.cumsum(draw(arrays.arrays(np.int64, count, elements=st.integers(1, 10**9))))
@@ -37,16 +37,18 @@ def runs(draw: st.DrawFn) -> tuple[np.ndarray, list[Curves]]:
         begin = draw(st.integers(0, count - 1))
         end = draw(st.integers(begin + 1, count))
         shape = (draw(st.integers(1, 3)), 4, end - begin)
-        curves.append(Curves(times_ns[begin:end], draw(arrays.arrays(np.float64, shape, elements=NUMBERS))))
+        curves.append(
+            NodeSeries(times_ns[begin:end], draw(arrays.arrays(np.float64, shape, elements=NUMBERS)))
+        )
     return times_ns, curves
 
 
 @given(runs(), st.integers(20, 400))
 def test_no_more_samples_are_kept_than_there_is_room_for(
-    run: tuple[np.ndarray, list[Curves]], most: int
+    run: tuple[np.ndarray, list[NodeSeries]], most: int
 ) -> None:
     times_ns, curves = run
-    kept = kept_samples(times_ns, curves, most)
+    kept = choose_samples(times_ns, curves, most)
     assert len(kept) <= most
     assert (np.diff(kept) > 0).all()
     ends = {0, len(times_ns) - 1}
@@ -62,7 +64,7 @@ def test_a_peak_of_one_sample_is_kept(numbers: np.ndarray, at: int, peak: float)
     numbers[at] = peak
     series = np.stack([numbers, numbers, numbers, numbers])[None]
     times_ns = np.arange(2_000)
-    kept = kept_samples(times_ns, [Curves(times_ns, series)], 400)
+    kept = choose_samples(times_ns, [NodeSeries(times_ns, series)], 400)
     assert at in kept
     assert numbers[kept].min() == numbers.min()
 
@@ -75,7 +77,7 @@ def test_of_few_changes_of_sign_both_sides_are_kept(changes: np.ndarray) -> None
         sign[turn:] *= -1.0
     series = np.stack([sign, sign, sign, sign])[None]
     times_ns = np.arange(1_500)
-    kept = set(kept_samples(times_ns, [Curves(times_ns, series)], 800).tolist())
+    kept = set(choose_samples(times_ns, [NodeSeries(times_ns, series)], 800).tolist())
     after = np.flatnonzero(np.diff(sign)) + 1
     assert set(after.tolist()) <= kept
     assert {turn - 1 for turn in after.tolist()} <= kept
@@ -83,7 +85,7 @@ def test_of_few_changes_of_sign_both_sides_are_kept(changes: np.ndarray) -> None
 
 @given(st.integers(1, 10_000), st.sampled_from([0, 7]))
 def test_frames_are_taken_at_equal_distances(count: int, corners: int) -> None:
-    maker = FilmMaker()
+    maker = SceneCollector()
     payload = scene(corners)
     for time_ns in range(count):
         maker.add(time_ns, payload)
@@ -94,7 +96,7 @@ def test_frames_are_taken_at_equal_distances(count: int, corners: int) -> None:
 
 
 def test_of_frames_with_many_corners_fewer_are_taken() -> None:
-    maker = FilmMaker()
+    maker = SceneCollector()
     payload = scene(MOST_CORNERS // 10)
     for time_ns in range(25):
         maker.add(time_ns, payload)
