@@ -222,9 +222,9 @@ class SceneEncoder:
     """Draws traces over the regions of a specification.
 
     Every message holds all regions and all objects that are observed, so that a viewer can jump to any of
-    them; objects that are gone are deleted. Blue, vermillion and grey show the worst of the requirements on an
-    object or region (see `palette` and `requirements`). Where one is violated, an arrow with its robustness
-    points at the worst (see `violations`).
+    them; objects that are gone are deleted. Blue, vermillion and grey show the worst of the requirements on
+    an object or region (see `palette` and `requirements`). Where one is violated, an arrow with its
+    robustness points at the worst (see `violations`).
 
     Attributes:
         regions: by name.

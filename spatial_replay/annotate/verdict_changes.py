@@ -147,7 +147,7 @@ def _follow(
     found: Integers,
     numbers: Floats,
 ) -> int:
-    """Take samples into the state (see `NodeStates`, `TrackedChanges`); how many rows of `found` are filled."""
+    """Update the state in place (see `NodeStates`) and return how many rows of `found` are filled."""
     count = 0
     for k in range(nodes.shape[0]):
         value, lower, upper = series[nodes[k], 0], series[nodes[k], 2], series[nodes[k], 3]

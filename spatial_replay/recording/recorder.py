@@ -19,8 +19,8 @@ from typing import Self
 
 import numpy as np
 
-from spatial_replay.compiled import compile_ahead
 from spatial_replay.annotate.automaton_state import SpecAutomaton
+from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import OutputError, TraceError, UsageError
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.contact import contacts

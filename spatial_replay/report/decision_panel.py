@@ -257,7 +257,7 @@ def _candidate_value(candidate: PlanCandidate) -> Mapping[str, Any]:
     return {
         "object": candidate.object,
         "best": "nowhere free" if math.isinf(candidate.best) else number_text(candidate.best),
-        "standing": "rejected" if candidate.rejected else "chosen" if candidate.chosen else "possible",
+        "status": "rejected" if candidate.rejected else "chosen" if candidate.chosen else "possible",
         "rejected": candidate.rejected,
         "target": _target_value(candidate.target) if candidate.HasField("target") else None,
     }

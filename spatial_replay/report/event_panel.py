@@ -38,7 +38,7 @@ def event_values(events: Sequence[ReportedEvent], first_ns: int) -> list[Mapping
     return [
         {
             "time": (each.start_ns - first_ns) / 1e9,
-            "standing": _standing(each.facts),
+            "status": _status(each.facts),
             "specification": each.facts.get("specification", ""),
             "object": each.facts.get("object"),
             "parts": sentence_parts(each.facts.get("message", "")),
@@ -47,7 +47,7 @@ def event_values(events: Sequence[ReportedEvent], first_ns: int) -> list[Mapping
     ]
 
 
-def _standing(facts: Mapping[str, str]) -> str:
+def _status(facts: Mapping[str, str]) -> str:
     if facts.get("verdict") != "pending":
         return facts.get("verdict", "")
     return "holding" if facts.get("sign") == "positive" else "failing"

@@ -228,10 +228,9 @@ def _rule(declarations: Mapping[str, str]) -> str:
 _STYLES: Final = ("uplot/uPlot.min.css", "browser/page.css", "browser/panels.css")
 _LIBRARY: Final = "uplot/uPlot.iife.min.js"
 _SCRIPTS: Final = (
-    "run", "elements", "clock", "standing", "transport", "verdicts", "tree", "lanes", "blocks", "curves",
-    "gradient", "trails", "asked", "caption", "scene", "automaton", "events", "decisions", "page",
+    "elements", "clock", "verdicts", "tree", "timeline", "curves", "decisions", "scene", "automaton", "page",
 )  # fmt: skip
-"""Files of browser/, in the order in which they need each other."""
+"""Files of browser/; page.js comes last, since it runs the others."""
 
 
 def page(report: RunReport) -> bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -46,7 +47,7 @@ class SceneCollector:
     def add(self, frames: SceneFrames) -> None:
         """Take in what the next messages show."""
         for index, time_ns in enumerate(frames.times_ns.tolist()):
-            self.add_frame(time_ns, lambda index=index: frames.frame(index))
+            self.add_frame(time_ns, partial(frames.frame, index))
 
     def add_frame(self, time_ns: int, frame_of: Callable[[], SceneFrame]) -> None:
         """Take in the next frame, which is made only if it has a place."""

@@ -35,15 +35,15 @@ def shown_nodes(formula: Formula) -> tuple[int, ...]:
     return tuple(sorted(uppermost[:MOST_NODES]))
 
 
-def asked_nodes(formula: Formula) -> frozenset[int]:
-    """Ids of the nodes that are asked at the first sample alone: no temporal operator stands above them."""
-    asked: set[int] = set()
+def initial_nodes(formula: Formula) -> frozenset[int]:
+    """Return the ids of the nodes that count at the first sample only: no temporal operator is above them."""
+    initial: set[int] = set()
     formulas: list[Formula] = []
     for identifier, parent, node in iter_nodes(formula):
         formulas.append(node)
-        if parent is None or (parent in asked and not isinstance(formulas[parent], Temporal)):
-            asked.add(identifier)
-    return frozenset(asked)
+        if parent is None or (parent in initial and not isinstance(formulas[parent], Temporal)):
+            initial.add(identifier)
+    return frozenset(initial)
 
 
 def tree_value(
@@ -55,7 +55,7 @@ def tree_value(
         robustness: (N,), each node's value on the whole log.
         final: (N, 2), lower and upper end of each node for the finished log.
     """
-    shown, asked = shown_nodes(formula), asked_nodes(formula)
+    shown, initial = shown_nodes(formula), initial_nodes(formula)
     place = {identifier: index for index, identifier in enumerate(shown)}
     return [
         {
@@ -65,7 +65,7 @@ def tree_value(
             "head": _cut(_head(node, relations)),
             "text": _cut(format_formula(node, relations=relations)),
             "unit": unit_of(node, {}),
-            "asked": identifier in asked,
+            "initial": identifier in initial,
             "verdict": str(final_verdict(*final[identifier].tolist())),
             "value": final_text(float(robustness[identifier]), *final[identifier].tolist()),
         }

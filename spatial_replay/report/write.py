@@ -1,7 +1,7 @@
 """Reports: a log evaluated, and one HTML page that shows what the run did and why.
 
-A replay gives the results, and a `Collector` takes the rest from its messages; together they are a `RunReport`,
-which `page` turns into HTML.
+A replay gives the results and a `Collector` takes the rest from its messages. Together they are a
+`RunReport`, which `page` turns into HTML.
 """
 
 from __future__ import annotations

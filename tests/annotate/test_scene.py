@@ -11,12 +11,12 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spatial_replay.annotate.requirements import EvaluatedResult, requirements_of
+from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.scene_update import PERIOD_NS, SceneEncoder
-from spatial_replay.annotate.violations import Judged, leaf_pairs
+from spatial_replay.annotate.violations import EvaluatedResult, leaf_pairs
 from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
 from spatial_replay.monitor.instances import find_instances
-from spatial_replay.monitor.stream import EvaluationStream
+from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
 from spatial_replay.spec.formula import Atom, Outline, RegionName, SignedDistance, TrackedName, iter_nodes
 from spatial_replay.spec.load import parse_specification
 from spatial_replay.trace.sample import Sample
@@ -39,7 +39,9 @@ def says(formula, trace: Trace, now) -> EvaluatedResult:
     """A formula with the given numbers (N, T) or (T,) of its nodes now."""
     series = np.full((len(list(iter_nodes(formula))), 4, len(trace)), np.nan)
     series[:, 1] = now
-    return EvaluatedResult(requirements_of(formula), trace.times_ns, series)
+    return EvaluatedResult(
+        requirements_of(formula), SeriesBlock(trace.times_ns, series, np.empty((1, 0, len(trace))))
+    )
 
 
 def run(*samples: dict, period_ns: int = FRAME_NS) -> Trace:
@@ -109,7 +111,7 @@ def runs(draw: st.DrawFn) -> Trace:
 
 @settings(max_examples=60)
 @given(runs(), st.data())
-def test_how_a_run_is_cut_into_blocks_changes_no_byte(trace, data):
+def test_cutting_a_run_into_blocks_changes_no_byte(trace, data):
     said = says(near("a", "goal"), trace, np.linspace(-1.0, 1.0, len(trace)))
     encoder = SceneEncoder(REGIONS)
     whole = encoder.encode(trace, [said])
@@ -128,7 +130,7 @@ def test_how_a_run_is_cut_into_blocks_changes_no_byte(trace, data):
 
 @settings(max_examples=60)
 @given(runs())
-def test_a_viewer_shows_exactly_the_objects_seen(trace):
+def test_a_viewer_shows_exactly_the_objects_of_the_sample(trace):
     encoded = SceneEncoder({}).encode(trace)
     shown: set[str] = set()
     samples = {sample.time_ns: sample for sample in trace.samples()}
@@ -265,7 +267,7 @@ def test_the_number_of_a_violation_stands_above_its_arrow():
     assert drawn.texts[0].pose.position.z > head
 
 
-def test_objects_stand_out_from_the_regions_that_they_lie_in():
+def test_objects_are_more_opaque_than_the_regions_that_they_lie_in():
     [message] = messages(run({"a": BOX}), regions=REGIONS)
     of_object, of_region = (
         entity(message, each).triangles[0].color.a for each in ("object/a", "region/goal")
@@ -325,20 +327,20 @@ def test_a_stronger_robustness_has_a_fuller_colour():
     assert blue[0] < blue[1] < blue[2] == blue[3]
 
 
-def test_samples_that_nothing_was_said_about_are_grey():
+def test_samples_without_an_evaluation_are_grey():
     trace = run(*[{"a": BOX}] * 4)
     late = says(near("a", "a"), trace.slice(2, 4), 1.0)
     shown = messages(trace, late)
     assert [tint(message, "object/a") for message in shown] == ["grey", "grey", "blue", "blue"]
 
 
-def test_no_robustness_left_is_still_blue():
+def test_a_robustness_of_zero_is_blue():
     trace = run({"a": BOX})
     [message] = messages(trace, says(near("a", "a"), trace, 0.0))
     assert tint(message, "object/a") == "blue"
 
 
-def test_colours_are_full_at_the_median_size_of_the_objects_first_seen():
+def test_colours_are_full_at_the_median_size_of_the_first_objects():
     # longer sides: 4, 2 and 1, far from the origin
     sizes = {"a": Footprint.box(100.0, 7.0, 104.0, 8.0), "b": Footprint.disc(-50.0, 0.0, 1.0)}
     sizes["c"] = Footprint.box(0.0, 0.0, 1.0, 1.0)
@@ -349,7 +351,7 @@ def test_colours_are_full_at_the_median_size_of_the_objects_first_seen():
     assert rest == [rest[0]] * 3
 
 
-def test_what_is_seen_later_does_not_change_earlier_colours():
+def test_later_objects_do_not_change_earlier_colours():
     trace = run({}, {"a": Footprint.box(0.0, 0.0, 90.0, 90.0)})
     said = says(near("a", "goal"), trace, 0.5)
     assert messages(trace, said, regions=REGIONS)[0] == messages(trace.slice(0, 1), said, regions=REGIONS)[0]
@@ -364,19 +366,15 @@ def pointed(text: str, *samples: dict, cuts: tuple[int, ...] = ()) -> list[Scene
     trace = run(*samples)
     instances = find_instances(spec, {}, (), 0, 2**63 - 1)
     evaluation = EvaluationStream(instances, spec.regions)
-    concerns = [requirements_of(instance.formula) for instance in instances]
+    requirements = [requirements_of(instance.formula) for instance in instances]
     encoder, state, payloads = SceneEncoder(spec.regions), None, []
     for begin, end in pairwise((0, *cuts, len(trace))):
         part = trace.slice(begin, end)
-        judged = [
-            Judged(
-                EvaluatedResult(own, stretch.times_ns, stretch.series),
-                stretch.leaves,
-                leaf_pairs(instance, own, spec.regions),
-            )
-            for instance, own, stretch in zip(instances, concerns, evaluation.extend(part), strict=True)
+        results = [
+            EvaluatedResult(own, block, leaf_pairs(instance, own, spec.regions))
+            for instance, own, block in zip(instances, requirements, evaluation.extend(part), strict=True)
         ]
-        encoded = encoder.encode(part, [each.evaluated for each in judged], state, judged)
+        encoded = encoder.encode(part, results, state)
         state = encoded.state
         payloads += encoded.payloads
     return [SceneUpdate.FromString(payload) for payload in payloads]
@@ -423,7 +421,7 @@ def test_the_arrow_of_a_direction_joins_what_is_nearest():
     assert (begin[0], end[0], label) == (4.0, 1.0, "-5")
 
 
-def test_what_is_asked_not_to_hold_is_pointed_at_too():
+def test_a_requirement_not_to_hold_is_pointed_at_too():
     [message] = pointed("spec s = G not a closeto[3] b", {"a": box_at(0.0), "b": box_at(2.0)})
     assert arrow(message)[2] == "-2"
 
@@ -442,19 +440,19 @@ def test_an_open_quantifier_and_a_look_back_have_no_arrow():
 @pytest.mark.parametrize(
     "text", ["F a closeto[1] b", "not (G a farfrom[1] b)", "(not a farfrom[9] b) U (a closeto[1] b)"]
 )
-def test_what_is_done_for_good_is_asked_no_more(text):
+def test_a_fulfilled_obligation_has_no_requirements(text):
     shown = pointed(f"spec s = {text}", *[{"a": box_at(0.0), "b": box_at(x)} for x in (4.0, 1.5, 12.0)])
     assert [tint(message, "object/a") for message in shown[1:]] == ["grey", "grey"]
     assert not any(each.id == "witness" for message in shown[1:] for each in message.entities)
 
 
-def test_a_group_with_nobody_in_it_hides_no_arrow():
+def test_an_empty_group_hides_no_arrow():
     drink = 'group drinks = class "drink"\nspec s = F (exists o in drinks: o closeto[1] a)\n'
     [message] = pointed(drink + "spec t = G a closeto[1] b", {"a": box_at(0.0), "b": box_at(3.0)})
     assert arrow(message)[2] == "-1"
 
 
-def test_how_a_run_is_cut_moves_no_arrow():
+def test_cutting_a_run_moves_no_arrow():
     samples = [
         {"a": TrackedObject(box_at(0.0), height=(0.0, 2.0)), "b": box_at(x)} if x else {"b": box_at(1.0)}
         for x in (3.0, 1.5, 0.0, 9.0, 0.0, 0.0, 9.0)

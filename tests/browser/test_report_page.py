@@ -316,12 +316,12 @@ def test_what_no_arrow_can_point_at_is_told_too(open_page: Open) -> None:
     for time, words in (
         (0.5, "nothing is violated now"),
         (1.2, "nothing that can be seen is violated now; a dist b >= 1 of apart is unknown"),
-        (2, "battery >= 0.5 of power fails by 0.1 now; no arrow can point at that"),
+        (2, "battery >= 0.5 of power fails by 0.1 now; no arrow can show it"),
     ):
         caption = open_page("unseen", at=f"#t={time}").locator(".caption")
         expect(caption).to_have_text(words)
     caption = open_page("reached", at="#t=9").locator(".caption")
-    expect(caption).to_have_text("nothing more is asked of the objects: they are grey")
+    expect(caption).to_have_text("no more requirements on the objects: they are grey")
 
 
 def test_the_automaton_shows_where_the_run_is(open_page: Open) -> None:

@@ -6,14 +6,11 @@ import json
 from typing import Any
 
 import numpy as np
-from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
-from foxglove_schemas_protobuf.Point3_pb2 import Point3
-from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
-from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from spatial_replay.annotate.scene_update import DrawnEntity, SceneFrame
 from spatial_replay.report.compact import json_text, sentence_parts, singles
 from spatial_replay.report.data import NodeSeries, choose_samples
 from spatial_replay.report.scene_panel import MOST_CORNERS, MOST_FRAMES, SceneCollector
@@ -85,32 +82,29 @@ def test_of_few_changes_of_sign_both_sides_are_kept(changes: np.ndarray) -> None
 
 @given(st.integers(1, 10_000), st.sampled_from([0, 7]))
 def test_frames_are_taken_at_equal_distances(count: int, corners: int) -> None:
-    maker = SceneCollector()
-    payload = scene(corners)
+    collector = SceneCollector()
+    frame = frame_with(corners)
     for time_ns in range(count):
-        maker.add(time_ns, payload)
-    film = maker.film()
-    assert film.times_ns.tolist() == list(range(0, count, film.stride))
-    assert len(film.frames) == len(film.times_ns) <= MOST_FRAMES
-    assert film.stride == 1 or len(film.frames) >= MOST_FRAMES // 2
+        collector.add_frame(time_ns, lambda: frame)
+    scene = collector.scene
+    assert scene.times_ns.tolist() == list(range(0, count, scene.stride))
+    assert len(scene.frames) == len(scene.times_ns) <= MOST_FRAMES
+    assert scene.stride == 1 or len(scene.frames) >= MOST_FRAMES // 2
 
 
 def test_of_frames_with_many_corners_fewer_are_taken() -> None:
-    maker = SceneCollector()
-    payload = scene(MOST_CORNERS // 10)
+    collector = SceneCollector()
+    frame = frame_with(MOST_CORNERS // 10)
     for time_ns in range(25):
-        maker.add(time_ns, payload)
-    film = maker.film()
-    assert sum(frame.corners for frame in film.frames) <= MOST_CORNERS
-    assert film.times_ns.tolist() == list(range(0, 25, film.stride))
-    assert film.stride == 4
+        collector.add_frame(time_ns, lambda: frame)
+    scene = collector.scene
+    assert sum(frame.corners for frame in scene.frames) <= MOST_CORNERS
+    assert scene.times_ns.tolist() == list(range(0, 25, scene.stride))
+    assert scene.stride == 4
 
 
-def scene(corners: int) -> bytes:
-    """A message with one outline."""
-    points = [Point3(x=number) for number in range(corners)]
-    outline = LinePrimitive(points=points)
-    return SceneUpdate(entities=[SceneEntity(id="object/a", lines=[outline])]).SerializeToString()
+def frame_with(corners: int) -> SceneFrame:
+    return SceneFrame({"object/a": DrawnEntity((np.zeros((corners, 2)),), (0, 0, 0))}, None, False)
 
 
 @given(arrays.arrays(np.float64, st.integers(0, 50), elements=st.floats(width=64)))

@@ -101,13 +101,13 @@ def test_nodes_show_their_own_part_of_the_formula(violated: Page) -> None:
     assert nodes["laid"]["head"] == "F[0s, 4s] …"
     assert nodes["plate_first"]["head"] == "… U …"
     assert nodes["table_set"]["head"] == "and"
-    assert nodes["table_set"]["asked"]
+    assert nodes["table_set"]["initial"]
 
 
-def test_below_a_temporal_operator_a_node_is_asked_at_every_sample(tmp_path: Path) -> None:
+def test_below_a_temporal_operator_a_node_counts_at_every_sample(tmp_path: Path) -> None:
     text = "spec s = (a leftof b) and G (not (a ovlp b))"
     nodes = report_of_samples(tmp_path / "run.html", moving(5), text).facts["results"][0]["nodes"]
-    assert [(node["head"], node["asked"]) for node in nodes] == [
+    assert [(node["head"], node["initial"]) for node in nodes] == [
         ("and", True), ("a leftof b", True), ("G …", True), ("not", False), ("a ovlp b", False),
     ]  # fmt: skip
 
@@ -118,34 +118,39 @@ def test_events_are_those_of_an_annotated_log(violated: Page) -> None:
     found = next(
         event for event in events if event["parts"][1] == "table_set" and "is violated" in event["parts"][2]
     )
-    assert (found["time"], found["standing"], found["specification"]) == (4.0, "violated", "table_set")
+    assert (found["time"], found["status"], found["specification"]) == (4.0, "violated", "table_set")
 
 
 def test_the_scene_is_that_of_the_messages(tmp_path: Path) -> None:
     text = "region here = box(-1, -1, 3, 3)\nspec s = G (a enclosedin here)"
     page = report_of_samples(tmp_path / "run.html", moving(9), text)
-    film = page.facts["film"]
-    assert [(each["kind"], each["name"]) for each in film["entities"]] == [
+    scene = page.facts["scene"]
+    assert [(each["kind"], each["name"]) for each in scene["entities"]] == [
         ("region", "here"), ("object", "a"), ("object", "b"),
     ]  # fmt: skip
-    low, size = np.array(film["low"]), np.array(film["high"]) - film["low"]
+    low, size = np.array(scene["low"]), np.array(scene["high"]) - scene["low"]
     assert low.tolist() == [-1.0, -1.0]
-    box = film["entities"][1]
+    box = scene["entities"][1]
     corners = low + page.numbers(box["points"]).reshape(9, 4, 2) / 65535 * size
     assert np.allclose(corners[0].min(axis=0), [4, 0], atol=1e-3)
     assert np.allclose(corners[4].min(axis=0), [0, 0], atol=1e-3)
     # the first and the last two samples violate it, and are pointed at
-    assert page.numbers(film["witness"]["frames"]).tolist() == [0, 1, 7, 8]
-    assert film["witness"]["labels"][0] == "-2"
+    assert page.numbers(scene["violations"]["frames"]).tolist() == [0, 1, 7, 8]
+    assert scene["violations"]["labels"][0] == "-2"
+    assert page.numbers(scene["is_violated"]).tolist() == [1, 1, 0, 0, 0, 0, 0, 1, 1]
+    assert page.numbers(scene["violations"]["robustness"])[0] == -2
+    [result] = page.facts["results"]
+    places = page.numbers(scene["violations"]["places"]).reshape(-1, 2).tolist()
+    assert places == [[0, result["requirements"][0]["node"]]] * 4
 
 
-def test_an_object_out_of_sight_is_not_drawn(tmp_path: Path) -> None:
+def test_an_absent_object_is_not_drawn(tmp_path: Path) -> None:
     samples = [
         each if t != 2 else sr.Sample(each.time_ns, {"a": each.objects["a"]})
         for t, each in enumerate(moving(5))
     ]
     page = report_of_samples(tmp_path / "run.html", samples, "spec s = F (a ovlp b)")
-    entity = next(each for each in page.facts["film"]["entities"] if each["name"] == "b")
+    entity = next(each for each in page.facts["scene"]["entities"] if each["name"] == "b")
     assert page.numbers(entity["form"]).tolist() == [0, 0, 65535, 0, 0]
 
 
@@ -231,7 +236,7 @@ def test_texts_of_logs_and_specifications_stay_texts(tmp_path: Path) -> None:
         } == set()
         assert len(page.tags("script")) == 4
         assert not any(key.startswith("on") for _, attributes in page.elements for key in attributes)
-        assert name in {entity["name"] for entity in page.facts["film"]["entities"]}
+        assert name in {entity["name"] for entity in page.facts["scene"]["entities"]}
         assert "<!--" not in page.text
         assert "\u2028" not in page.script("facts")
 
@@ -306,7 +311,7 @@ def test_a_large_run_keeps_less_and_says_so(tmp_path: Path) -> None:
     assert len(kept) < 12_000
     assert sum(result["series"]["length"] for result in page.facts["results"]) <= 4_000_000
     assert (kept[0], kept[-1]) == (0.0, 119.99)
-    assert page.facts["film"]["times"]["length"] <= 3_000
+    assert page.facts["scene"]["times"]["length"] <= 3_000
     header = page.within("header#")
     assert f"Curves and tree have {len(kept):,} of 12,000 samples" in header
     assert "24 of 60 results, the worst" in header
@@ -368,11 +373,11 @@ def test_a_template_that_stands_for_nobody_says_so(tmp_path: Path) -> None:
 
 def test_objects_far_away_are_drawn(tmp_path: Path) -> None:
     samples = [sr.Sample(t, {"a": sr.Footprint.disc((-1) ** t * 1e99, 0, 1)}) for t in range(4)]
-    film = report_of_samples(tmp_path / "run.html", samples, "G (a ovlp a)").facts["film"]
-    assert np.isfinite(film["low"] + film["high"]).all()
+    scene = report_of_samples(tmp_path / "run.html", samples, "G (a ovlp a)").facts["scene"]
+    assert np.isfinite(scene["low"] + scene["high"]).all()
 
 
-def test_the_page_never_takes_the_place_of_an_input(tmp_path: Path) -> None:
+def test_the_page_never_replaces_an_input(tmp_path: Path) -> None:
     output = tmp_path / "run.html"
     output.write_text("mine")
     with pytest.raises(UsageError, match="is an input too"):

@@ -46,7 +46,7 @@ def value_of(told: PlanDecision, *grids: Grid) -> dict:
     maker.add_decision(told.SerializeToString())
     for number, each in enumerate(grids):
         maker.add_map(number, each.SerializeToString())
-    value = decisions_value(maker.plan(), 0, Packing())
+    value = decisions_value(maker.decisions, 0, Packing())
     assert json_text(value)
     return dict(value)
 
@@ -75,7 +75,7 @@ def test_what_cannot_be_read_tells_nothing() -> None:
     maker = DecisionCollector()
     maker.add_decision(b"\xff\xff")
     maker.add_map(0, b"\xff\xff")
-    assert decisions_value(maker.plan(), 0, Packing()) == {"decisions": [], "maps_left_out": 0}
+    assert decisions_value(maker.decisions, 0, Packing()) == {"decisions": [], "maps_left_out": 0}
 
 
 def test_a_map_whose_sizes_do_not_fit_is_not_drawn() -> None:
@@ -131,7 +131,7 @@ def test_where_room_is_short_the_maps_of_what_was_chosen_stay(most_cells: int, s
         maker.add_decision(told.SerializeToString())
     for number in range(6):
         maker.add_map(number, grid().SerializeToString())
-    value = decisions_value(maker.plan(), 0, Packing(), most_cells)
+    value = decisions_value(maker.decisions, 0, Packing(), most_cells)
     kept = [[(each["title"], each["chosen"]) for each in told["maps"]] for told in value["decisions"]]
     chosen = [[title for title, is_chosen in maps if is_chosen] for maps in kept]
     assert chosen == [["cup1"] if shown else [], ["cup2"] if shown > 1 else []]

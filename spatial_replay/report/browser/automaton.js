@@ -1,4 +1,4 @@
-// The automaton of the chosen result: its states with the present one lit, and what leads on from there.
+// The automaton of the chosen result: its states, the current one highlighted, and the transitions from there.
 
 const COLUMN = 96, ROW = 60, RADIUS = 17;
 // how far a move swings out at most, twice
@@ -115,6 +115,6 @@ function describe(automaton, states) {
   }
   if (automaton.left_out) parts.push(element("p", {class: "quiet"}, `${automaton.left_out} states are not drawn.`));
   return states.length > 1
-    ? [element("p", {}, `In one of the states ${states.join(", ")}: what was not seen leaves it open.`), ...parts]
+    ? [element("p", {}, `In one of the states ${states.join(", ")}: unknown propositions leave it open.`), ...parts]
     : parts;
 }

@@ -1,4 +1,4 @@
-// One time for the whole page, the part of the run that is looked at, and the result that is looked into.
+// The time, the view and the result that the page shows, and the bar at the bottom that controls them.
 
 class Clock {
   constructor(run) {
@@ -12,17 +12,17 @@ class Clock {
     this.time = this.opening;
     this.speed = 1;
     this.isPlaying = false;
-    this.watchers = {time: [], view: [], result: [], play: []};
+    this.listeners = {time: [], view: [], result: [], play: []};
   }
 
-  // Calls back on every change of "time", "view", "result" or "play", and once at once.
+  // Calls back now, and on every change of "time", "view", "result" or "play".
   on(what, callback) {
-    this.watchers[what].push(callback);
+    this.listeners[what].push(callback);
     callback(this);
   }
 
-  tell(what) {
-    for (const callback of this.watchers[what]) callback(this);
+  emit(what) {
+    for (const callback of this.listeners[what]) callback(this);
   }
 
   get sample() {
@@ -43,7 +43,7 @@ class Clock {
     if (inside === this.time) return;
     this.time = inside;
     this.follow();
-    this.tell("time");
+    this.emit("time");
   }
 
   step(samples) {
@@ -55,11 +55,11 @@ class Clock {
   choose(result) {
     if (result === this.result || !this.run.results[result]) return;
     this.result = result;
-    this.tell("result");
-    this.tell("time");
+    this.emit("result");
+    this.emit("time");
   }
 
-  // Looks at a part of the run, by a factor smaller or larger, around the cursor.
+  // Zooms the view by a factor around the cursor.
   zoom(factor) {
     const [from, to] = this.view;
     const share = to > from ? Math.min(Math.max((this.time - from) / (to - from), 0), 1) : 0.5;
@@ -71,10 +71,10 @@ class Clock {
 
   look(from, to) {
     this.view = [from, to];
-    this.tell("view");
+    this.emit("view");
   }
 
-  // Moves the part that is looked at to where the cursor is.
+  // Moves the view to the cursor.
   follow() {
     const [from, to] = this.view;
     if (this.time >= from && this.time <= to) return;
@@ -86,8 +86,8 @@ class Clock {
     if (this.isPlaying || this.end <= this.start) return;
     if (this.isAtEnd) this.seek(this.start);
     this.isPlaying = true;
-    this.tell("play");
-    // for those who want little motion, a few pictures a second
+    this.emit("play");
+    // a reader who wants little motion gets a few pictures a second
     const least = window.matchMedia("(prefers-reduced-motion: reduce)").matches ? 300 : 0;
     let before = performance.now();
     const tick = (now) => {
@@ -105,7 +105,7 @@ class Clock {
   pause() {
     if (!this.isPlaying) return;
     this.isPlaying = false;
-    this.tell("play");
+    this.emit("play");
   }
 
   toggle() {
@@ -120,8 +120,8 @@ function worstOf(results) {
   return found.find((place) => place >= 0) ?? 0;
 }
 
-// Keeps time and result in the address, so that a link leads to them: #t=4.2&r=1.
-function keepInAddress(clock) {
+// Writes time and result to the address and reads them from it: #t=4.2&r=1.
+function linkAddress(clock) {
   const given = new URLSearchParams(location.hash.slice(1));
   if (given.has("r")) clock.choose(Number(given.get("r")));
   const time = given.has("t") ? Number(given.get("t")) : NaN;
@@ -145,4 +145,138 @@ function keepInAddress(clock) {
     if (now.has("r")) clock.choose(Number(now.get("r")));
     if (now.has("t")) clock.seek(Number(now.get("t")) || 0);
   });
+}
+
+const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10, 50];
+const STEPS = 1000;
+const keysOf = (run) => [
+  ["Space", "play, pause"],
+  ["← →", `a ${run.is_thinned ? "kept sample" : "sample"} back, on`],
+  ["Shift ← →", "a second back, on"],
+  ["Home End", "first, last sample"],
+  ["N P", "next, previous event"],
+  ["+ − 0", "zoom in, out, show all"],
+];
+
+function makeTransport(clock, events) {
+  const play = button("Play", "play", () => clock.toggle());
+  const slider = element("input", {
+    type: "range", min: 0, max: STEPS, step: "any", "aria-label": "Time", class: "slider",
+    oninput: () => clock.seek(clock.start + slider.valueAsNumber / STEPS * (clock.end - clock.start)),
+  });
+  const now = element("output", {class: "now", "aria-live": "off"});
+  const speed = element("select", {"aria-label": "Speed", onchange: () => { clock.speed = Number(speed.value); }},
+    ...SPEEDS.map((each) => element("option", {value: each, selected: each === 1}, `${each}×`)));
+  const help = element("p", {class: "keys", id: "keys", hidden: true}, ...keysOf(clock.run).flatMap(([key, does]) => [
+    element("kbd", {}, key), ` ${does} `]));
+  const helper = button("Keys", "help", () => {
+    help.hidden = !help.hidden;
+    helper.setAttribute("aria-expanded", String(!help.hidden));
+  });
+  helper.setAttribute("aria-controls", "keys");
+  helper.setAttribute("aria-expanded", "false");
+  document.getElementById("transport").append(
+    button("To the first sample", "first", () => clock.seek(clock.start)),
+    button("Previous event", "previous", () => jump(clock, events, -1)),
+    play,
+    button("Next event", "next", () => jump(clock, events, 1)),
+    button("To the last sample", "last", () => clock.seek(clock.end)),
+    slider, now, speed, themeButton(), helper, help);
+  clock.on("time", () => {
+    const share = clock.end > clock.start ? (clock.time - clock.start) / (clock.end - clock.start) : 0;
+    slider.value = share * STEPS;
+    slider.setAttribute("aria-valuetext", secondsText(clock.time));
+    now.textContent = `${secondsText(clock.time)} / ${secondsText(clock.end)}`;
+  });
+  clock.on("play", () => {
+    play.className = `button ${clock.isPlaying ? "pause" : "play"}`;
+    play.setAttribute("aria-label", clock.isPlaying ? "Pause" : "Play");
+    play.title = play.getAttribute("aria-label");
+  });
+  window.addEventListener("keydown", (event) => {
+    if (act(event, clock, events)) event.preventDefault();
+  });
+}
+
+const ICONS = {
+  play: "M3 1 L14 8 L3 15 Z", pause: "M3 1 H6.5 V15 H3 Z M9.5 1 H13 V15 H9.5 Z",
+  first: "M2 2 H4 V14 H2 Z M14 2 L5 8 L14 14 Z", last: "M12 2 H14 V14 H12 Z M2 2 L11 8 L2 14 Z",
+  previous: "M10 2 L4 8 L10 14", next: "M6 2 L12 8 L6 14",
+};
+
+function button(label, kind, onclick) {
+  const icon = ICONS[kind] ? picture(kind) : label;
+  const made = element("button", {
+    type: "button", class: `button ${kind}`, title: label, "aria-label": ICONS[kind] ? label : null, onclick,
+  }, icon);
+  if (kind === "play") made.append(picture("pause"));
+  return made;
+}
+
+function picture(kind) {
+  return svg("svg", {viewBox: "0 0 16 16", class: `icon icon-${kind}`, "aria-hidden": "true"},
+    svg("path", {d: ICONS[kind]}));
+}
+
+// Goes to the event before or after the cursor.
+function jump(clock, events, direction) {
+  const ahead = events.filter((event) => direction * (event.time - clock.time) > 1e-6);
+  if (!ahead.length) return;
+  clock.pause();
+  goTo(clock, direction > 0 ? ahead[0] : ahead[ahead.length - 1]);
+}
+
+function goTo(clock, event) {
+  const found = clock.run.results.findIndex(
+    (result) => result.name === event.specification && (result.object ?? null) === (event.object ?? null));
+  if (found >= 0) clock.choose(found);
+  clock.seek(event.time);
+}
+
+// Runs the command of a key; returns whether the key has one.
+function act(event, clock, events) {
+  if (event.ctrlKey || event.metaKey || event.altKey) return false;
+  const target = event.target;
+  if (target.closest("select, textarea, input:not([type=range], [type=checkbox])")) return false;
+  const does = {
+    ArrowLeft: () => event.shiftKey ? clock.seek(clock.time - 1) : clock.step(-1),
+    ArrowRight: () => event.shiftKey ? clock.seek(clock.time + 1) : clock.step(1),
+    Home: () => clock.seek(clock.start),
+    End: () => clock.seek(clock.end),
+    n: () => jump(clock, events, 1),
+    p: () => jump(clock, events, -1),
+    "+": () => clock.zoom(0.5),
+    "=": () => clock.zoom(0.5),
+    "-": () => clock.zoom(2),
+    "0": () => clock.look(clock.start, clock.end),
+  }[event.key];
+  if (does) {
+    does();
+    return true;
+  }
+  // space presses the element that has the focus
+  if (event.key !== " " || target.closest("button, summary, input, a")) return false;
+  clock.toggle();
+  return true;
+}
+
+function themeButton() {
+  const root = document.documentElement;
+  const dark = window.matchMedia("(prefers-color-scheme: dark)");
+  const isDark = () => root.dataset.theme ? root.dataset.theme === "dark" : dark.matches;
+  const made = element("button", {type: "button", class: "button theme", onclick: () => {
+    root.dataset.theme = isDark() ? "light" : "dark";
+    show();
+    window.dispatchEvent(new Event("themechange"));
+  }});
+  const show = () => { made.textContent = isDark() ? "Light" : "Dark"; };
+  // print has its own colours
+  for (const query of [dark, window.matchMedia("print")]) {
+    query.addEventListener("change", () => {
+      show();
+      window.dispatchEvent(new Event("themechange"));
+    });
+  }
+  show();
+  return made;
 }

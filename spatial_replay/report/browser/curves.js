@@ -1,4 +1,4 @@
-// Robustness over time: the chosen result with the interval of what may still come, and its named parts.
+// Robustness over time: the chosen result with the interval of its final value, and its named parts.
 
 const CHART_HEIGHT = 250;
 const AXIS_LABEL = 18;
@@ -54,10 +54,10 @@ function quantityChooser(choose) {
     choice("now", NOW, "the robustness at the sample itself", false));
 }
 
-// What is drawn: the root, and the parts that have a name (so far: those that are asked once).
+// What is drawn: the root, and the parts that have a name (so far: those evaluated at the first sample).
 function curvesOf(run, result, quantity) {
   const named = result.nodes.filter(
-    (node) => node.parent === null || (node.name && (quantity === NOW || node.asked)));
+    (node) => node.parent === null || (node.name && (quantity === NOW || node.initial)));
   const {curves: colours} = run.palette;
   return named.slice(0, colours.length + 1).map((node, index) => ({
     node,

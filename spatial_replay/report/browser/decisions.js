@@ -1,4 +1,4 @@
-// What a planner decided: what it aimed at, tried, rejected and chose, with its maps, and how it went.
+// The decisions of a planner: candidates with their gradient maps, the choice, and its outcome.
 
 function makeDecisions(clock) {
   const place = body("decisions");
@@ -6,8 +6,8 @@ function makeDecisions(clock) {
   const cards = clock.run.decisions.map((decision) => makeDecision(clock, decision));
   const hasMaps = clock.run.decisions.some((decision) => decision.maps.length);
   if (hasMaps) {
-    place.append(key([{ground: "positive", words: "there it would hold"},
-      {ground: "negative", words: "there it would not"}, {ground: "hatched", words: "blocked"}]));
+    place.append(key([{ground: "positive", words: "would hold there"},
+      {ground: "negative", words: "would not hold there"}, {ground: "hatched", words: "blocked"}]));
   }
   place.append(element("ol", {class: "cards"}, ...cards));
   let here = null;
@@ -29,11 +29,11 @@ function makeDecision(clock, decision) {
   const tried = decision.edges.map((edge, number) => makeEdge(clock, decision, edge, number));
   const unnamed = decision.maps.filter((map) => map.edge === null);
   const meant = chosenMap(decision);
-  const said = element("div", {}, title, element("p", {}, sentence(decision.reason)),
+  const heading = element("div", {}, title, element("p", {}, sentence(decision.reason)),
     decision.outcome ? element("p", {}, outcomeWords(decision.outcome)) : null);
   return element("li", {class: "card"},
-    said, meant ? makeMap(clock, meant, false) : null,
-    tried.length ? element("details", {}, element("summary", {}, lookedInto(decision)), ...tried,
+    heading, meant ? makeMap(clock, meant, false) : null,
+    tried.length ? element("details", {}, element("summary", {}, summaryOf(decision)), ...tried,
       element("div", {class: "candidates"}, ...unnamed.map((map) => makeMap(clock, map, false)))) : null);
 }
 
@@ -42,7 +42,7 @@ function chosenMap({maps: drawn}) {
   return drawn.find((map) => map.chosen) ?? null;
 }
 
-function lookedInto({edges, maps: drawn}) {
+function summaryOf({edges, maps: drawn}) {
   const count = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
   const candidates = edges.reduce((sum, edge) => sum + edge.candidates.length, 0);
   const parts = [count(edges.length, "edge"), count(candidates, "candidate"), count(drawn.length, "map")];
@@ -80,10 +80,10 @@ function makeEdge(clock, decision, edge, number) {
 
 function makeCandidate(clock, candidate, own) {
   const {object, target, rejected, best} = candidate;
-  const standing = {chosen: "satisfied", possible: "holding", rejected: "violated"}[candidate.standing];
+  const status = {chosen: "satisfied", possible: "holding", rejected: "violated"}[candidate.status];
   const why = rejected || `to ${target.words}, robustness ${target.robustness}; at best ${best}`;
   return element("div", {class: "candidate"}, ...own.map((map) => makeMap(clock, map, own.length > 1)),
-    element("p", {}, mark(standing), element("b", {}, object), ` ${candidate.standing}: ${sentence(why)}`));
+    element("p", {}, mark(status), element("b", {}, object), ` ${candidate.status}: ${sentence(why)}`));
 }
 
 function makeMap(clock, map, isTitled) {
@@ -97,4 +97,113 @@ function makeMap(clock, map, isTitled) {
   made.style.aspectRatio = String((map.high[0] - map.low[0]) / (map.high[1] - map.low[1]));
   window.addEventListener("themechange", redraw);
   return element("figure", {}, made, isTitled ? element("figcaption", {}, map.title || "a candidate") : null);
+}
+
+// How far the colour of the slightest robustness is from grey, and how much of a map's colours covers the page.
+const LEAST = 0.4, OPACITY = 0.6;
+
+// The picture of a map, a pixel for each cell, lowest row at the bottom; what is blocked stays clear.
+function pictureOf(run, map) {
+  map.picture ??= painted(run, map);
+  return map.picture;
+}
+
+function painted(run, map) {
+  const values = run.numbers(map.values);
+  const rows = values.length / map.columns;
+  const made = document.createElement("canvas");
+  made.width = map.columns;
+  made.height = rows;
+  const context = made.getContext("2d");
+  const image = context.createImageData(map.columns, rows);
+  const good = rgb(run.palette.positive), bad = rgb(run.palette.negative), grey = rgb(run.palette.neutral);
+  for (let row = 0; row < rows; row++) {
+    for (let column = 0; column < map.columns; column++) {
+      const number = values[row * map.columns + column];
+      if (Number.isNaN(number)) continue;
+      const place = 4 * ((rows - 1 - row) * map.columns + column);
+      const share = LEAST + (1 - LEAST) * (map.scale > 0 ? Math.min(Math.abs(number) / map.scale, 1) : 0);
+      const hue = number >= 0 ? good : bad;
+      for (let part = 0; part < 3; part++) image.data[place + part] = grey[part] + share * (hue[part] - grey[part]);
+      image.data[place + 3] = 255;
+    }
+  }
+  context.putImageData(image, 0, 0);
+  return made;
+}
+
+function rgb(text) {
+  return [1, 3, 5].map((place) => parseInt(text.slice(place, place + 2), 16));
+}
+
+// How a part of the plane is shown in a rectangle of the screen, as large as fits, y upwards.
+function projection(low, high, width, height, margin) {
+  const scale = Math.min((width - 2 * margin) / (high[0] - low[0]), (height - 2 * margin) / (high[1] - low[1]));
+  const left = (width - scale * (high[0] - low[0])) / 2, bottom = (height + scale * (high[1] - low[1])) / 2;
+  return {
+    scale,
+    x: (x) => left + scale * (x - low[0]),
+    y: (y) => bottom - scale * (y - low[1]),
+  };
+}
+
+function drawMap(context, run, map, at) {
+  const left = at.x(map.low[0]), top = at.y(map.high[1]);
+  const width = at.x(map.high[0]) - left, height = at.y(map.low[1]) - top;
+  hatch(context, left, top, width, height);
+  context.save();
+  context.imageSmoothingEnabled = false;
+  context.globalCompositeOperation = "destination-out";
+  context.drawImage(pictureOf(run, map), left, top, width, height);
+  context.globalCompositeOperation = "source-over";
+  context.globalAlpha = OPACITY;
+  context.drawImage(pictureOf(run, map), left, top, width, height);
+  context.restore();
+}
+
+// Oblique lines, which stay where a map is clear.
+function hatch(context, left, top, width, height) {
+  context.save();
+  context.beginPath();
+  context.rect(left, top, width, height);
+  context.clip();
+  context.strokeStyle = colour("neutral");
+  context.lineWidth = 1;
+  context.beginPath();
+  for (let x = left - height; x < left + width; x += 7) {
+    context.moveTo(x, top + height);
+    context.lineTo(x + height, top);
+  }
+  context.stroke();
+  context.restore();
+}
+
+// Points x and y in turn, as a line.
+function drawWay(context, points, at, style) {
+  if (points.length < 4) return;
+  context.save();
+  context.strokeStyle = style.colour;
+  context.lineWidth = style.width;
+  context.setLineDash(style.dash ?? []);
+  context.lineJoin = "round";
+  context.beginPath();
+  for (let i = 0; i + 1 < points.length; i += 2) context.lineTo(at.x(points[i]), at.y(points[i + 1]));
+  context.stroke();
+  context.restore();
+}
+
+function drawTarget(context, target, at) {
+  if (!target) return;
+  const [x, y] = target;
+  context.save();
+  context.strokeStyle = colour("ink");
+  context.lineWidth = 2;
+  context.beginPath();
+  context.arc(at.x(x), at.y(y), 6, 0, 2 * Math.PI);
+  context.moveTo(at.x(x) - 10, at.y(y));
+  context.lineTo(at.x(x) + 10, at.y(y));
+  context.moveTo(at.x(x), at.y(y) - 10);
+  context.lineTo(at.x(x), at.y(y) + 10);
+  context.stroke();
+  context.restore();
 }

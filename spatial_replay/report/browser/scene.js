@@ -1,36 +1,36 @@
-// The scene from above at the cursor, with the map and the way of the decision that is in force.
+// The scene from above at the cursor: objects, regions, trails, the worst violation, and the plan.
 
 const STEPS_OF_SCENE = 65535;
 const ABSENT = 65535;
 
 function makeScene(clock) {
-  const film = readFilm(clock.run);
+  const scene = readScene(clock.run);
   const place = body("scene");
-  if (!film.times.length) {
+  if (!scene.times.length) {
     place.append(element("p", {}, "The log has no scene."));
     return;
   }
   const layers = {labels: true, trails: true, map: true};
   const {made, redraw} = canvas("The scene from above", (context, width, height) => {
-    drawScene(context, clock, film, layers, width, height);
+    drawScene(context, clock, scene, layers, width, height);
   });
   made.className = "stage";
-  made.style.aspectRatio = String(aspectOf(film));
+  made.style.aspectRatio = String(aspectOf(scene));
   const caption = element("p", {class: "caption"});
   const hasMaps = clock.run.decisions.some((decision) => decision.maps.length);
   place.append(made, element("div", {class: "scene-foot"}, caption, element("span", {class: "choice"},
     layerBox("names", "labels", layers, redraw), layerBox("trails", "trails", layers, redraw),
     hasMaps ? layerBox("map", "map", layers, redraw) : null)),
-  key([{ground: "positive", words: "all that is asked of it holds now"},
-    {ground: "negative", words: "something does not"}, {ground: "neutral", words: "nothing is asked, or unknown"}]));
+  key([{ground: "positive", words: "all requirements on it hold now"},
+    {ground: "negative", words: "one is violated"}, {ground: "neutral", words: "no requirement, or unknown"}]));
   let before = null;
   const show = () => {
-    const frame = indexAt(film.times, clock.time);
+    const frame = indexAt(scene.times, clock.time);
     const now = [frame, clock.sample, decisionAt(clock.run, clock.time)];
     if (now.every((each, index) => each === before?.[index])) return;
     before = now;
     redraw();
-    caption.replaceChildren(...captionOf(clock, film, frame));
+    caption.replaceChildren(...captionOf(clock, scene, frame));
   };
   clock.on("time", show);
   window.addEventListener("themechange", redraw);
@@ -44,24 +44,28 @@ function layerBox(label, name, layers, redraw) {
   return element("label", {}, box, label);
 }
 
-function readFilm(run) {
-  const {film, numbers} = run;
-  const size = [film.high[0] - film.low[0], film.high[1] - film.low[1]];
+function readScene(run) {
+  const {scene, numbers} = run;
+  const size = [scene.high[0] - scene.low[0], scene.high[1] - scene.low[1]];
   const coordinates = (steps) => Float64Array.from(
-    steps, (step, index) => film.low[index % 2] + step / STEPS_OF_SCENE * size[index % 2]);
-  const frames = numbers(film.witness.frames);
-  const points = coordinates(numbers(film.witness.points));
-  const witness = new Map(Array.from(frames, (frame, index) => [
-    frame, {ends: points.subarray(4 * index, 4 * index + 4), label: film.witness.labels[index]}]));
+    steps, (step, index) => scene.low[index % 2] + step / STEPS_OF_SCENE * size[index % 2]);
+  const {labels, ...found} = scene.violations;
+  const points = coordinates(numbers(found.points)), places = numbers(found.places);
+  const robustness = numbers(found.robustness);
+  const violations = new Map(Array.from(numbers(found.frames), (frame, index) => [frame, {
+    ends: points.subarray(4 * index, 4 * index + 4), label: labels[index], robustness: robustness[index],
+    result: places[2 * index], node: places[2 * index + 1],
+  }]));
   const maps = run.decisions.flatMap((decision) => decision.maps);
-  const least = (axis) => Math.min(film.low[axis], ...maps.map((map) => map.low[axis]));
-  const greatest = (axis) => Math.max(film.high[axis], ...maps.map((map) => map.high[axis]));
+  const least = (axis) => Math.min(scene.low[axis], ...maps.map((map) => map.low[axis]));
+  const greatest = (axis) => Math.max(scene.high[axis], ...maps.map((map) => map.high[axis]));
   return {
-    times: numbers(film.times),
+    times: numbers(scene.times),
     low: [least(0), least(1)],
     high: [greatest(0), greatest(1)],
-    witness,
-    entities: film.entities.map((entity) => readEntity(entity, numbers, coordinates)),
+    violations,
+    isViolated: numbers(scene.is_violated),
+    entities: scene.entities.map((entity) => readEntity(entity, numbers, coordinates)),
   };
 }
 
@@ -84,24 +88,24 @@ function readEntity(entity, numbers, coordinates) {
   };
 }
 
-function aspectOf(film) {
-  const aspect = (film.high[0] - film.low[0]) / (film.high[1] - film.low[1]);
+function aspectOf(scene) {
+  const aspect = (scene.high[0] - scene.low[0]) / (scene.high[1] - scene.low[1]);
   return Math.min(Math.max(aspect, 0.8), 2);
 }
 
-function drawScene(context, clock, film, layers, width, height) {
-  const frame = indexAt(film.times, clock.time);
-  const at = projection(film.low, film.high, width, height, 18);
+function drawScene(context, clock, scene, layers, width, height) {
+  const frame = indexAt(scene.times, clock.time);
+  const at = projection(scene.low, scene.high, width, height, 18);
   const decision = decisionAt(clock.run, clock.time);
   const map = decision && chosenMap(decision);
   if (layers.map && map) drawMap(context, clock.run, map, at);
-  if (layers.trails) drawTrails(context, film, frame, at);
+  if (layers.trails) drawTrails(context, scene, frame, at);
   const labels = [];
-  for (const entity of film.entities) drawEntity(context, entity, frame, at, labels);
+  for (const entity of scene.entities) drawEntity(context, entity, frame, at, labels);
   if (decision) drawPlan(context, clock, decision, at);
   if (layers.labels) drawLabels(context, labels, width);
-  const pointed = film.witness.get(frame);
-  if (pointed) drawWitness(context, pointed, at, width);
+  const violation = scene.violations.get(frame);
+  if (violation) drawViolation(context, violation, at, width);
 }
 
 function drawEntity(context, entity, frame, at, labels) {
@@ -167,7 +171,7 @@ function outlined(context, text, x, y, fill) {
   context.fillText(text, x, y);
 }
 
-function drawWitness(context, {ends, label}, at, width) {
+function drawViolation(context, {ends, label}, at, width) {
   const [x0, y0, x1, y1] = [at.x(ends[0]), at.y(ends[1]), at.x(ends[2]), at.y(ends[3])];
   const length = Math.hypot(x1 - x0, y1 - y0), angle = Math.atan2(y1 - y0, x1 - x0);
   const head = Math.min(11, length / 2);
@@ -208,4 +212,130 @@ function decisionAt(run, time) {
   let found = null;
   for (const decision of decisions) if (decision.time <= time + 1e-9) found = decision;
   return found;
+}
+
+// The share of the run that trails reach back over.
+const REACH = 0.15;
+
+function drawTrails(context, scene, frame, at) {
+  const first = Math.max(0, frame - Math.ceil(REACH * scene.times.length));
+  context.save();
+  context.strokeStyle = colour("quiet");
+  context.globalAlpha = 0.6;
+  context.lineWidth = 1;
+  for (const entity of scene.entities) {
+    if (entity.kind === "object") drawTrail(context, entity, first, frame, at);
+  }
+  context.restore();
+}
+
+// A line through the middles of an object, with a gap where it was absent.
+function drawTrail(context, entity, first, last, at) {
+  entity.middles ??= middlesOf(entity);
+  context.beginPath();
+  let isPresent = false;
+  for (let frame = first; frame <= last; frame++) {
+    const x = entity.middles[2 * frame], y = entity.middles[2 * frame + 1];
+    if (Number.isNaN(x)) {
+      isPresent = false;
+      continue;
+    }
+    if (isPresent) context.lineTo(at.x(x), at.y(y));
+    else context.moveTo(at.x(x), at.y(y));
+    isPresent = true;
+  }
+  context.stroke();
+}
+
+// The middle of an entity's first ring in each frame, x and y in turn.
+function middlesOf(entity) {
+  const middles = new Float64Array(2 * entity.form.length).fill(NaN);
+  for (let frame = 0; frame < entity.form.length; frame++) {
+    if (entity.form[frame] === ABSENT) continue;
+    const [corners] = entity.forms[entity.form[frame]];
+    const start = entity.starts[frame];
+    for (const axis of [0, 1]) {
+      let sum = 0;
+      for (let corner = 0; corner < corners; corner++) sum += entity.points[start + 2 * corner + axis];
+      middles[2 * frame + axis] = sum / corners;
+    }
+  }
+  return middles;
+}
+
+function captionOf(clock, scene, frame) {
+  const {run} = clock;
+  const violation = scene.violations.get(frame);
+  if (violation) return ["the arrow: ", ...violationWords(run, scene.times[frame], violation)];
+  const open = requirementsAt(run, clock.sample);
+  const failing = open.filter(({robustness}) => robustness < 0);
+  if (failing.length) return [...failureWords(failing[0]), others(failing), "; no arrow can show it"];
+  if (scene.isViolated[frame]) {
+    return ["something is violated now that no arrow can show"];
+  }
+  const unknown = open.filter(({robustness}) => Number.isNaN(robustness));
+  if (unknown.length) {
+    return ["no violation is known now; ", ...partWords(unknown[0]), " is unknown", others(unknown)];
+  }
+  if (open.length) return [`nothing is violated now${lostBefore(clock)}`];
+  const more = run.results.some((result) => result.requirements.length) ? "more " : "";
+  return [`no ${more}requirements on the objects: they are grey${lostBefore(clock)}`];
+}
+
+// Which results are violated by what was before.
+function lostBefore({run, sample}) {
+  const lost = run.results.filter(
+    (result) => statusOf(run, result, result.nodes[0], placeIn(result, sample)) === "violated");
+  return lost.length ? `; ${lost[0].title} was before${others(lost)}` : "";
+}
+
+// What the arrow points at; of a requirement that the page leaves out, only the number.
+function violationWords(run, time, {result: which, node: index, label, robustness}) {
+  if (which < 0) return [`what is violated there, by ${label.replace("-", "")}`];
+  const result = run.results[which], node = result.nodes[index];
+  const sample = indexAt(run.times, time), place = placeIn(result, sample);
+  if (Math.abs(run.times[sample] - time) < 1e-9 && place !== null && place < result.samples) {
+    return failureWords({result, node, place});
+  }
+  // a page of a long run leaves samples out: the atom that decides is not known
+  return [...partWords({result, node}), ` is violated by ${numberText(-robustness)} now`];
+}
+
+function failureWords(part) {
+  const node = atomOf(part), number = node.series[NOW][part.place];
+  const how = number < 0 ? "fails" : "must not hold, and does";
+  return [...partWords({...part, node}), ` ${how} by ${numberText(Math.abs(number))} now`];
+}
+
+function partWords({result, node}) {
+  return [element("code", {}, node.text), ` of ${result.title}`];
+}
+
+function others({length}) {
+  return length > 1 ? `, and ${length - 1} more` : "";
+}
+
+// The requirements of all results at a sample, each with its robustness in the sign that counts.
+function requirementsAt(run, sample) {
+  return run.results.flatMap((result) => {
+    const place = placeIn(result, sample);
+    if (place === null || place >= result.samples) return [];
+    return result.requirements.filter((requirement) => !isFulfilled(result, requirement, place)).map(({node, sign}) => ({
+      result, node: result.nodes[node], place, robustness: sign * result.nodes[node].series[NOW][place],
+    }));
+  });
+}
+
+// Whether the obligation of a requirement is fulfilled, so that no later sample can undo it.
+function isFulfilled(result, {obligation, obligation_sign: sign}, place) {
+  if (obligation === null) return false;
+  const series = result.nodes[obligation].series;
+  return sign > 0 ? series[LOWER][place] >= 0 : series[UPPER][place] < 0;
+}
+
+// The atom that gives a requirement its number; the requirement itself if the page shows no such atom.
+function atomOf({node, place}) {
+  const size = Math.abs(node.series[NOW][place]);
+  const leaves = (each) => each.children.length ? each.children.flatMap(leaves) : [each];
+  return leaves(node).find((leaf) => Math.abs(leaf.series[NOW][place]) === size) ?? node;
 }

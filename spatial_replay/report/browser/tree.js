@@ -1,4 +1,4 @@
-// The tree of the chosen result's formula: every node with its numbers, and how it stands at the cursor.
+// The formula of the chosen result as a tree: every node with its numbers and its status at the cursor.
 
 function makeTree(clock) {
   const place = body("tree");
@@ -24,7 +24,7 @@ function makeTree(clock) {
     if (!result) return;
     const sample = placeIn(result, clock.sample);
     const isLast = sample !== null && sample >= result.samples - 1;
-    title.textContent = `${result.title} at ${secondsText(clock.time)}${isLast ? ", when all is seen" : ""}`;
+    title.textContent = `${result.title} at ${secondsText(clock.time)}${isLast ? ", the last sample" : ""}`;
     for (const row of rows) showRow(row, clock.run, result, sample, isLast);
   });
 }
@@ -45,7 +45,7 @@ function makeRow(node) {
     words: element("span", {class: "hidden"}),
     soFar: element("span", {class: "number"}),
     now: element("span", {class: "number"}),
-    standing: null,
+    status: null,
   };
   const what = element("span", {class: "what", title: node.text}, row.sign,
     node.name ? element("b", {}, node.name) : null, node.name ? " " : null,
@@ -56,15 +56,15 @@ function makeRow(node) {
 
 function showRow(row, run, result, place, isLast) {
   const {node} = row;
-  const standing = standingOf(run, result, node, place);
-  if (standing !== row.standing) {
-    row.standing = standing;
-    setMark(row.sign, standing);
-    row.words.textContent = ` ${STANDINGS[standing].words} `;
+  const status = statusOf(run, result, node, place);
+  if (status !== row.status) {
+    row.status = status;
+    setMark(row.sign, status);
+    row.words.textContent = ` ${STATUSES[status].words} `;
   }
-  const isSeen = place !== null && place < result.samples;
-  showNumber(row.now, isSeen ? node.series[NOW][place] : NaN, !isSeen);
-  const hasValue = node.asked && place !== null;
+  const isPresent = place !== null && place < result.samples;
+  showNumber(row.now, isPresent ? node.series[NOW][place] : NaN, !isPresent);
+  const hasValue = node.initial && place !== null;
   const at = Math.min(place ?? 0, result.samples - 1);
   showNumber(row.soFar, hasValue ? node.series[VALUE][at] : NaN, !hasValue);
   if (hasValue && isLast) row.soFar.title = node.value;
@@ -72,7 +72,7 @@ function showRow(row, run, result, place, isLast) {
 }
 
 function intervalText(lower, upper) {
-  return `between ${numberText(lower)} and ${numberText(upper)}, whatever comes`;
+  return `final value between ${numberText(lower)} and ${numberText(upper)}`;
 }
 
 function showNumber(made, number, isEmpty) {

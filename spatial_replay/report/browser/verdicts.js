@@ -1,6 +1,58 @@
-// The times in the explanations: choosing one goes there, and to the result that it is told of.
+// Verdicts: the status of a node at a sample, links from explanations to their times, and the list of events.
 
-const TOLD_TIME = /\b((?:at|since) )(-?\d+\.\d{3}) s/g;
+const STATUSES = {
+  satisfied: {sign: "✓", words: "satisfied", colour: "positive"},
+  holding: {sign: "+", words: "holds so far", colour: "positive"},
+  violated: {sign: "✕", words: "violated", colour: "negative"},
+  failing: {sign: "−", words: "fails so far", colour: "negative"},
+  unknown: {sign: "?", words: "unknown", colour: "neutral"},
+  absent: {sign: "·", words: "not evaluated here", colour: "neutral"},
+};
+
+// A node above all temporal operators is evaluated at the first sample: its status is the sign of its value on the
+// samples so far and, at the last sample, its verdict. One below a temporal operator has the status of the sample.
+function statusOf(run, result, node, place) {
+  const last = result.samples - 1;
+  if (place === null || (place > last && !node.initial)) return "absent";
+  const [value, now, lower, upper] = node.series;
+  if (!node.initial) return signOf(now[place]);
+  if (place >= last) return node.verdict;
+  if (run.settles && lower[place] >= 0) return "satisfied";
+  if (run.settles && upper[place] < 0) return "violated";
+  return signOf(value[place]);
+}
+
+function signOf(number) {
+  if (number >= 0) return "holding";
+  return number < 0 ? "failing" : "unknown";
+}
+
+// The periods of one status of a node: [from, to, status], in seconds.
+function stretchesOf(run, result, node) {
+  const stretches = [];
+  const {times, samples} = result;
+  let from = 0, status = samples ? statusOf(run, result, node, 0) : "absent";
+  for (let place = 1; place < samples; place++) {
+    const after = statusOf(run, result, node, place);
+    if (after === status) continue;
+    stretches.push([times[from], times[place], status]);
+    from = place;
+    status = after;
+  }
+  if (samples) stretches.push([times[from], run.times[run.times.length - 1], status]);
+  return stretches;
+}
+
+function mark(status) {
+  return element("span", {class: `mark is-${status}`, "aria-hidden": "true"}, STATUSES[status].sign);
+}
+
+function setMark(made, status) {
+  made.className = `mark is-${status}`;
+  made.textContent = STATUSES[status].sign;
+}
+
+const TIME_TEXT = /\b((?:at|since) )(-?\d+\.\d{3}) s/g;
 
 function linkVerdicts(clock) {
   for (const verdict of document.querySelectorAll(".verdict")) {
@@ -15,7 +67,7 @@ function linkVerdicts(clock) {
 function withLinks(clock, text, result) {
   const parts = [];
   let done = 0;
-  for (const found of text.matchAll(TOLD_TIME)) {
+  for (const found of text.matchAll(TIME_TEXT)) {
     const [all, word, seconds] = found;
     parts.push(text.slice(done, found.index) + word, element("button", {
       type: "button", class: "link",
@@ -28,4 +80,44 @@ function withLinks(clock, text, result) {
     done = found.index + all.length;
   }
   return [...parts, text.slice(done)];
+}
+
+function makeEvents(clock) {
+  const place = body("events");
+  const {events} = clock.run;
+  if (!events.length) {
+    place.append(element("p", {}, "No verdict changed, nor any sign for long enough to count."));
+    return;
+  }
+  const rows = events.map((event) => {
+    const row = element("button", {type: "button", class: "event", onclick: () => {
+      clock.pause();
+      goTo(clock, event);
+    }}, mark(event.status), element("time", {}, secondsText(event.time)),
+    element("span", {class: "hidden"}, STATUSES[event.status].words),
+    element("span", {class: "sentence"}, ...withCode(event.parts)));
+    return row;
+  });
+  const list = element("ol", {class: "list"}, ...rows.map((row) => element("li", {}, row)));
+  place.append(list);
+  const starts = events.map((event) => event.time);
+  let here = null;
+  clock.on("time", () => {
+    const now = starts[0] <= clock.time + 1e-9 ? indexAt(starts, clock.time) : -1;
+    if (now === here) return;
+    if (here !== null && here >= 0) rows[here].removeAttribute("aria-current");
+    here = now;
+    if (now < 0) return;
+    rows[now].setAttribute("aria-current", "true");
+    keepInSight(list, rows[now].parentElement);
+  });
+}
+
+// Scrolls a list, and nothing around it, so that one of its rows shows.
+function keepInSight(list, row) {
+  const top = row.offsetTop;
+  if (top < list.scrollTop) list.scrollTop = top;
+  else if (top + row.offsetHeight > list.scrollTop + list.clientHeight) {
+    list.scrollTop = top + row.offsetHeight - list.clientHeight;
+  }
 }

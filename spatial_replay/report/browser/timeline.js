@@ -1,7 +1,7 @@
-// A lane for each result, and for the named parts of the chosen one: how it stands over time; and below them
-// what the automaton and a planner do.
+// The timeline: a lane for each result and each named part of the chosen one, for the states of its
+// automaton, and for the decisions of a planner.
 
-// How much room names and the scale of curves take at the left, so that all times stand below each other.
+// The width of names, and of the scale of curves, so that lanes and curves share one time axis.
 function gutter() {
   return window.matchMedia("(max-width: 640px)").matches ? 92 : 168;
 }
@@ -25,7 +25,7 @@ function makeLanes(clock) {
     const share = shareOf(clock, clock.time);
     cursor.hidden = share < 0 || share > 1;
     cursor.style.left = `${100 * share}%`;
-    for (const lane of lanes) lane.tell();
+    for (const lane of lanes) lane.update();
   };
   clock.on("time", moveCursor);
   clock.on("view", moveCursor);
@@ -34,11 +34,11 @@ function makeLanes(clock) {
 }
 
 function laneKey() {
-  return key(Object.keys(HEIGHTS).map((standing) => {
-    const {colour: ground, words} = STANDINGS[standing];
-    const isFinal = standing === "violated" || standing === "satisfied";
-    const [height, opacity] = [HEIGHTS[standing], OPACITIES[standing]];
-    return {ground, words: isFinal ? `${words}, whatever comes` : words, height, opacity};
+  return key(Object.keys(HEIGHTS).map((status) => {
+    const {colour: ground, words} = STATUSES[status];
+    const isFinal = status === "violated" || status === "satisfied";
+    const [height, opacity] = [HEIGHTS[status], OPACITIES[status]];
+    return {ground, words: isFinal ? `${words}, final` : words, height, opacity};
   }));
 }
 
@@ -50,7 +50,7 @@ function shareOf(clock, time) {
 function lanesOf(clock, result, number) {
   const made = [makeLane(clock, result, result.nodes[0], number)];
   if (number !== clock.result) return made;
-  const named = result.nodes.filter((node) => node.parent !== null && node.name && node.asked);
+  const named = result.nodes.filter((node) => node.parent !== null && node.name && node.initial);
   return made.concat(named.map((node) => makeLane(clock, result, node, number)));
 }
 
@@ -73,7 +73,7 @@ function makeLane(clock, result, node, number) {
   return {
     made: element("div", {class: "lane"}, label, strip.made),
     redraw: strip.redraw,
-    tell: () => setMark(sign, standingOf(clock.run, result, node, placeIn(result, clock.sample))),
+    update: () => setMark(sign, statusOf(clock.run, result, node, placeIn(result, clock.sample))),
   };
 }
 
@@ -81,17 +81,17 @@ function makeLane(clock, result, node, number) {
 const HEIGHTS = {violated: 1, failing: 1, holding: 0.6, satisfied: 0.6, unknown: 0.3};
 const OPACITIES = {violated: 1, failing: 0.5, holding: 0.4, satisfied: 1, unknown: 0.6};
 
-function drawStretch(context, clock, [from, to, standing], fills, width, height) {
+function drawStretch(context, clock, [from, to, status], fills, width, height) {
   const left = shareOf(clock, from) * width, right = shareOf(clock, to) * width;
   if (right < 0 || left > width) return;
   const begin = Math.max(left, 0), size = Math.max(Math.min(right, width) - begin, 1);
-  const high = HEIGHTS[standing] * (height - 6);
-  context.globalAlpha = OPACITIES[standing];
-  context.fillStyle = fills[STANDINGS[standing].colour];
+  const high = HEIGHTS[status] * (height - 6);
+  context.globalAlpha = OPACITIES[status];
+  context.fillStyle = fills[STATUSES[status].colour];
   context.fillRect(begin, height - 3 - high, size, high);
 }
 
-// Pressing and dragging on something whose width is the part of the run that is looked at moves the cursor.
+// Moves the cursor when the pointer is pressed or dragged on an element that spans the view.
 function scrub(made, clock, left = () => 0, right = () => 0) {
   const seek = (event) => {
     const box = made.getBoundingClientRect();
@@ -108,4 +108,47 @@ function scrub(made, clock, left = () => 0, right = () => 0) {
   made.addEventListener("pointermove", (event) => {
     if (made.hasPointerCapture(event.pointerId)) seek(event);
   });
+}
+
+function stateLane(clock, result) {
+  const {automaton, times} = result;
+  const blocks = [];
+  automaton.path.forEach((code, place) => {
+    if (place && code === automaton.path[place - 1]) return;
+    if (blocks.length) blocks.at(-1).to = times[place];
+    blocks.push({from: times[place], to: clock.end, text: automaton.sets[code].join(", ")});
+  });
+  return blockLane(clock, "state", `States of the automaton of ${result.title}`, blocks);
+}
+
+function decisionLane(clock) {
+  const {decisions} = clock.run;
+  const blocks = decisions.map(({time, kind, target}, index) => ({
+    from: time, to: decisions[index + 1]?.time ?? clock.end, text: target ? `move ${target.object}` : kind,
+  }));
+  return blockLane(clock, "decision", "Decisions of the planner", blocks);
+}
+
+function blockLane(clock, name, title, blocks) {
+  const strip = canvas(title, (context, width, height) => {
+    const ground = colour("line"), ink = colour("ink");
+    context.font = FONT;
+    context.textBaseline = "middle";
+    for (const {from, to, text} of blocks) {
+      const left = Math.max(shareOf(clock, from) * width, 0), right = Math.min(shareOf(clock, to) * width, width);
+      if (right < left) continue;
+      context.fillStyle = ground;
+      context.fillRect(left, 3, Math.max(right - left - 1, 1), height - 6);
+      if (context.measureText(text).width + 10 > right - left) continue;
+      context.fillStyle = ink;
+      context.fillText(text, left + 5, height / 2 + 0.5);
+    }
+  });
+  strip.made.className = "strip";
+  scrub(strip.made, clock);
+  return {
+    made: element("div", {class: "lane"}, element("span", {class: "lane-name part"}, name), strip.made),
+    redraw: strip.redraw,
+    update: () => {},
+  };
 }

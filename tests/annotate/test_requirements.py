@@ -4,14 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from spatial_replay.annotate.requirements import (
-    ClassMembers,
-    EvaluatedResult,
-    Presence,
-    Requirement,
-    requirements_of,
-    worst_robustness,
-)
+from spatial_replay.annotate.requirements import ClassMembers, Requirement, requirements_of
+from spatial_replay.annotate.violations import EvaluatedResult, Presence, worst_robustness
+from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
@@ -37,17 +32,17 @@ NOTHING: frozenset[str] = frozenset()
 
 
 def signs(formula) -> list[tuple[int, float]]:
-    return [(concern.node, concern.sign) for concern in requirements_of(formula)]
+    return [(requirement.node, requirement.sign) for requirement in requirements_of(formula)]
 
 
-def test_a_formula_without_temporal_operators_is_one_concern():
+def test_a_formula_without_temporal_operators_is_one_requirement():
     formula = Boolean("not", (Boolean("->", (atom(A, B), atom(A, GOAL))),))
     assert requirements_of(formula) == (
         Requirement(0, 1.0, None, frozenset("ab"), frozenset({"goal"}), frozenset()),
     )
 
 
-def test_concerns_are_the_largest_subformulas_below_temporal_operators():
+def test_requirements_are_the_largest_subformulas_below_temporal_operators():
     both = Boolean("and", (atom(A, B), atom(A, GOAL)))
     formula = Boolean("and", (Temporal("F", (both,)), Temporal("U", (atom(A), Temporal("G", (atom(B),))))))
     assert signs(formula) == [(2, 1.0), (6, 1.0), (8, 1.0)]
@@ -62,24 +57,24 @@ def test_negations_and_the_left_of_an_implication_turn_the_sign():
     assert signs(Boolean("xor", (atom(A), later))) == []
 
 
-def test_terms_are_looked_through():
+def test_delays_and_enlargements_of_terms_do_not_matter():
     named = Group("reds", members=("red1", "red2"), excluded=(TrackedName("red2"),))
-    [concern] = requirements_of(atom(Enlarged(Earlier(A, samples=2), 1.0), Earlier(named, samples=1)))
-    assert concern.objects == {"a", "red1"}
+    [requirement] = requirements_of(atom(Enlarged(Earlier(A, samples=2), 1.0), Earlier(named, samples=1)))
+    assert requirement.objects == {"a", "red1"}
 
 
-def test_a_parameter_stands_for_its_object():
+def test_a_parameter_is_replaced_by_its_object():
     others = Group("people", class_name="Pedestrian", excluded=(Variable("ego"),))
-    [concern] = requirements_of(atom(Variable("ego"), others), "7")
-    assert concern.objects == {"7"}
-    assert concern.groups == {ClassMembers("pedestrian", frozenset({"7"}))}
+    [requirement] = requirements_of(atom(Variable("ego"), others), "7")
+    assert requirement.objects == {"7"}
+    assert requirement.groups == {ClassMembers("pedestrian", frozenset({"7"}))}
 
 
 def test_a_quantifier_is_about_the_members_of_its_group():
     everyone = Group("everyone", class_name="*")
     formula = Quantified("forall", ("x",), Earlier(everyone, samples=1), atom(Variable("x"), A))
-    [concern] = requirements_of(formula)
-    assert (concern.objects, concern.groups) == ({"a"}, {ClassMembers("*", NOTHING)})
+    [requirement] = requirements_of(formula)
+    assert (requirement.objects, requirement.groups) == ({"a"}, {ClassMembers("*", NOTHING)})
 
 
 def test_open_groups_have_the_members_of_each_sample():
@@ -87,11 +82,13 @@ def test_open_groups_have_the_members_of_each_sample():
     formula = atom(cups)
     times = np.array([0, 1, 2])
     codes = np.array([[0, 0, 1], [0, -1, 0], [-1, 0, 1]])
-    seen = Presence(times, ["a", "b", "c"], codes, ["Cup", None])
+    presence = Presence(times, ["a", "b", "c"], codes, ["Cup", None])
     series = np.array([[[0.0] * 3, [-1.0, 2.0, 3.0], [0.0] * 3, [0.0] * 3]])
     assert len(list(iter_nodes(formula))) == len(series)
     objects, regions = worst_robustness(
-        [EvaluatedResult(requirements_of(formula), times, series)], seen, ["goal"]
+        [EvaluatedResult(requirements_of(formula), SeriesBlock(times, series, np.empty((1, 0, 3))))],
+        presence,
+        ["goal"],
     )
     nan = np.nan
     assert np.array_equal(objects, [[-1.0, nan, nan], [2.0, nan, 2.0], [nan] * 3], equal_nan=True)
