@@ -85,7 +85,7 @@ class Tuning:
         selection = Selection(source, tuple(files), options)
         self.name, self.options = source.name, options
         self._attachments = source.attachments
-        self._files, self._kept = tuple(files), kept_files(files)
+        self._files, self._kept = tuple(files), logged_specifications(files)
         self.own = OwnMessages(selection)
         traces: list[Trace] = []
         remarks: list[str] = []

@@ -7,7 +7,7 @@ A replay gives the results and a `Collector` takes the rest from its messages. T
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -84,9 +84,7 @@ def write_report(
         OutputError: the output cannot be written.
     """
     collector = Collector()
-    replay = Replay(
-        source, files, options, keep_series=True, keep_leaves=True, show=collector.scene.add
-    )
+    replay = Replay(source, files, options, keep_series=True, keep_leaves=True, show=collector.scene.add)
     with replacing(output, inputs) as stream:
         replayed = replay.run(collector.add, advance=advance)
         stream.write(page(_report(replay, replayed, collector)))
