@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -79,10 +79,12 @@ def report_of_samples(output: Path, samples: Iterable[sr.Sample], *texts: str, *
     return report_of_trace(output, Trace.from_samples(samples), *texts, **options)
 
 
-def report_of_trace(output: Path, trace: Trace, *texts: str, **options: Any) -> Page:
+def report_of_trace(
+    output: Path, trace: Trace, *texts: str, inputs: Sequence[Path] = (), **options: Any
+) -> Page:
     """The page of a trace and specifications."""
     files = [sr.parse_specification(text) for text in texts]
-    write_report(MemorySource(trace), files, output, ReplayOptions(**options))
+    write_report(MemorySource(trace), files, output, ReplayOptions(**options), inputs=inputs)
     return page_of(output)
 
 
