@@ -1,0 +1,46 @@
+"""Mapping files: from the messages of external logs to objects and signals.
+
+Names are loaded when they are first used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+from spatial_replay.lazy import loaded_when_used
+
+if TYPE_CHECKING:
+    from spatial_replay.mapping.assemble import Assembler
+    from spatial_replay.mapping.mapped_source import MappedSource
+    from spatial_replay.mapping.mapping_file import load_mapping, parse_mapping
+    from spatial_replay.mapping.model import LogMapping
+    from spatial_replay.mapping.reading_plan import ReadingPlan
+    from spatial_replay.mapping.suggest import suggest_mapping, suggest_topics
+
+__all__ = [
+    "Assembler",
+    "LogMapping",
+    "MappedSource",
+    "ReadingPlan",
+    "load_mapping",
+    "parse_mapping",
+    "suggest_mapping",
+    "suggest_topics",
+]
+
+_HOMES: Mapping[str, str] = MappingProxyType(
+    {
+        "Assembler": "spatial_replay.mapping.assemble",
+        "LogMapping": "spatial_replay.mapping.model",
+        "MappedSource": "spatial_replay.mapping.mapped_source",
+        "ReadingPlan": "spatial_replay.mapping.reading_plan",
+        "load_mapping": "spatial_replay.mapping.mapping_file",
+        "parse_mapping": "spatial_replay.mapping.mapping_file",
+        "suggest_mapping": "spatial_replay.mapping.suggest",
+        "suggest_topics": "spatial_replay.mapping.suggest",
+    }
+)
+
+__getattr__, __dir__ = loaded_when_used(globals(), _HOMES)

@@ -1,6 +1,7 @@
-"""Logs of messages as sources of samples: read, mapped, and copied.
+"""External logs as sources: a log and a mapping in; blocks of samples, with the raw messages behind them,
+out.
 
-Messages of other logs as a copy of the log keeps them: raw, with their definitions.
+The raw messages and their definitions go into copies of the log, so that viewers show both.
 """
 
 from __future__ import annotations
@@ -29,15 +30,148 @@ from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
 
+_WAITING_BYTES = 2**26
+"""Raw messages that wait for their samples; beyond that, all are passed on."""
 
-class CopiedMessages:
-    """Collects raw messages until the samples made of them are there, and gives them in the order of time."""
+_MOST_UNREAD = 20
+"""Topics that cannot be decoded and are listed one by one."""
+
+
+@dataclass(frozen=True)
+class MappedSource:
+    """An external log, with a mapping from its messages to objects."""
+
+    path: Path
+    mapping: LogMapping
+    kind: str
+    concave: Concave = "decompose"
+    on_time_jump: OnTimeJump = "error"
+
+    @property
+    def name(self) -> str:
+        return self.path.name or self.path.absolute().name
+
+    @property
+    def options(self) -> Mapping[str, object]:
+        """The options of reading, for the metadata of a copy."""
+        mapping = {"mapping": self.mapping.name, "mapping_sha256": self.mapping.sha256}
+        return mapping | ({} if self.on_time_jump == "error" else {"on_time_jump": self.on_time_jump})
+
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        """See `Source.iter_blocks`; of an indexed log, only what the window needs is read.
+
+        Blocks hold the messages of mapped topics, raw.
+        """
+        # no window if it covers everything: only a full read checks the counts that a log declares
+        start_ns = start_ns or None
+        end_ns = None if end_ns is None or end_ns >= FOREVER else end_ns
+        reader = open_messages(self.path)
+        topics = reader.topics()
+        plan = self._plan(reader, topics)
+        read = [topic for topic in topics if topic.name in plan.topics]
+        assembler = Assembler(
+            plan,
+            reader.decoder,
+            name=self.name,
+            start_ns=start_ns,
+            end_ns=end_ns,
+            on_time_jump=self.on_time_jump,
+            concave=self.concave,
+        )
+        blocks = _Blocks(assembler, reader, _CopiedMessages(read, _WAITING_BYTES), start_ns, end_ns)
+        blocks.remarks.extend(_unread(self.name, topics, plan))
+        as_recorded = self.on_time_jump == "split"
+        columns = _columns(reader, plan, start_ns, end_ns, as_recorded=as_recorded)
+        if not as_recorded:
+            columns = without_jumps(columns, self.name)
+        for piece in in_pieces(columns):
+            yield from blocks.of(assembler.add(piece), piece)
+            if assembler.is_finished:
+                break
+        yield from blocks.of(assembler.finish(), MessageColumns(), last=True)
+        if not blocks.any_sample and start_ns is None and end_ns is None:
+            reason = blocks.first_fault or "its messages make none with this mapping"
+            raise LogError(f"{self.name} holds no sample: {reason}")
+
+    def _plan(self, reader: MessageReader, topics: Sequence[Topic]) -> ReadingPlan:
+        """Compare the mapping with the topics of the log.
+
+        Raises:
+            LogError: a mapped topic cannot be decoded, or is missing from a damaged log.
+            UsageError: the mapping does not fit the log.
+        """
+        mapped = {*(each.topic for each in self.mapping.topics), self.mapping.sampling.topic}
+        reasons = [topic.unreadable for topic in topics if topic.name in mapped and topic.unreadable]
+        if reasons:
+            raise LogError("\n".join(f"{self.name}: {reason}" for reason in reasons))
+        try:
+            return ReadingPlan.of(self.mapping, topics)
+        except UsageError as error:
+            faults = reader.take_faults()
+            if faults:
+                raise LogError("\n".join([str(error), *faults])) from None
+            raise
+
+    def attachments(self) -> tuple[Attachment, ...]:
+        """See `Source.attachments`; external logs hold no specifications."""
+        return ()
+
+    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
+        """See `Source.metadata`."""
+        return ()
+
+
+class _Blocks:
+    """Makes blocks of samples and messages, with all faults so far."""
+
+    def __init__(
+        self,
+        assembler: Assembler,
+        reader: MessageReader,
+        copied: _CopiedMessages,
+        start_ns: int | None,
+        end_ns: int | None,
+    ) -> None:
+        self._assembler = assembler
+        self._reader = reader
+        self._copied = copied
+        self._window = start_ns or 0, end_ns
+        self._faults = FaultList()
+        self.remarks: list[str] = []
+        self.any_sample = False
+        self.first_fault: str | None = None
+
+    def of(self, trace: Trace, messages: MessageColumns, *, last: bool = False) -> Iterator[Block]:
+        """Yield a block, or nothing while there is nothing to yield."""
+        start_ns, end_ns = self._window
+        if start_ns or end_ns is not None:
+            inside = messages.log_time_ns >= start_ns
+            if end_ns is not None:
+                inside &= messages.log_time_ns < end_ns
+            messages = messages.take(np.flatnonzero(inside))
+        self._copied.add(messages)
+        for fault in trace.faults:
+            self._faults.add(fault)
+        self._reader.move_faults(self._faults)
+        self._assembler.move_faults(self._faults)
+        faults = self._faults.take(last=last)
+        self.any_sample = self.any_sample or len(trace) > 0
+        self.first_fault = self.first_fault or next(iter(faults), None)
+        remarks = (*self.remarks, *self._reader.take_remarks(), *self._assembler.take_remarks())
+        self.remarks = []
+        copied = self._copied.take(trace, last=last)
+        if len(trace) or len(copied) or faults or remarks:
+            yield Block(replace(trace, faults=faults), copied, remarks)
+
+
+class _CopiedMessages:
+    """Holds raw messages until the samples made of them are ready, and returns them in the order of time."""
 
     def __init__(self, topics: Sequence[Topic], most_bytes: int) -> None:
         channels = {
             topic.name: _channel(topic)
             for topic in topics
-            # what we write under these names is made anew from the samples
+            # the topics of our own names are written from the samples
             if topic.name != OBJECTS and topic.name not in DERIVED
         }
         self._numbers = {topic: number for number, topic in enumerate(sorted(channels))}
@@ -48,17 +182,17 @@ class CopiedMessages:
         self._waiting_bytes = 0
 
     def add(self, messages: MessageColumns) -> None:
-        """Take messages that a copy of the log contains."""
+        """Add messages for a copy of the log."""
         if not self._has_all:
-            kept = [place for place, topic in enumerate(messages.topics) if topic in self._numbers]
-            messages = messages.take(np.array(kept, np.int64))
+            copied = [place for place, topic in enumerate(messages.topics) if topic in self._numbers]
+            messages = messages.take(np.array(copied, np.int64))
         self._waiting.append(messages)
         self._waiting_bytes += sum(map(len, messages.payloads))
 
     def take(self, trace: Trace, *, last: bool = False) -> Messages:
-        """The messages up to the last of some new samples; with `last`, all that wait.
+        """Return the messages up to the last of some new samples; with `last`, all that wait.
 
-        Messages whose clock has nothing to do with that of the samples do not wait for ever.
+        Beyond a number of bytes all are returned, because log times and header stamps may be far apart.
         """
         is_all = last or self._waiting_bytes > self._most_bytes
         if not self._waiting or not (is_all or len(trace)):
@@ -91,140 +225,8 @@ def _channel(topic: Topic) -> Channel:
     return Channel(topic.name, topic.encoding, schema, topic.metadata)
 
 
-_WAITING_BYTES = 2**26
-_MOST_UNREAD = 20
-"""How many topics that cannot be decoded are told one by one."""
-
-
-@dataclass(frozen=True)
-class MappedSource:
-    """A log of messages that others recorded, with a mapping that says what in them are objects."""
-
-    path: Path
-    mapping: LogMapping
-    kind: str
-    concave: Concave = "decompose"
-    on_time_jump: OnTimeJump = "error"
-
-    @property
-    def name(self) -> str:
-        return self.path.name or self.path.absolute().name
-
-    @property
-    def options(self) -> Mapping[str, object]:
-        """How the log is read, for the metadata of a copy."""
-        mapping = {"mapping": self.mapping.name, "mapping_sha256": self.mapping.sha256}
-        return mapping | ({} if self.on_time_jump == "error" else {"on_time_jump": self.on_time_jump})
-
-    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
-        """See `Source.iter_blocks`; of an indexed log, only what the window needs is read.
-
-        Blocks hold the messages of mapped topics, raw.
-        """
-        # a window that leaves nothing out is none: what a log declares is compared with all that is read
-        start_ns = start_ns or None
-        end_ns = None if end_ns is None or end_ns >= FOREVER else end_ns
-        reader = open_messages(self.path)
-        topics = reader.topics()
-        plan = self._plan(reader, topics)
-        read = [topic for topic in topics if topic.name in plan.topics]
-        assembler = Assembler(
-            plan,
-            reader.decoder,
-            name=self.name,
-            start_ns=start_ns,
-            end_ns=end_ns,
-            on_time_jump=self.on_time_jump,
-            concave=self.concave,
-        )
-        blocks = _Blocks(assembler, reader, CopiedMessages(read, _WAITING_BYTES), start_ns, end_ns)
-        blocks.remarks.extend(_unread(self.name, topics, plan))
-        as_recorded = self.on_time_jump == "split"
-        columns = _columns(reader, plan, start_ns, end_ns, as_recorded=as_recorded)
-        if not as_recorded:
-            columns = without_jumps(columns, self.name)
-        for piece in in_pieces(columns):
-            yield from blocks.of(assembler.add(piece), piece)
-            if assembler.is_finished:
-                break
-        yield from blocks.of(assembler.finish(), MessageColumns(), last=True)
-        if not blocks.any_sample and start_ns is None and end_ns is None:
-            reason = blocks.first_fault or "its messages make none with this mapping"
-            raise LogError(f"{self.name} holds no sample: {reason}")
-
-    def _plan(self, reader: MessageReader, topics: Sequence[Topic]) -> ReadingPlan:
-        """What has to be read, and how.
-
-        Raises:
-            LogError: a topic that is mapped cannot be decoded, or is missing from a damaged log.
-            UsageError: the mapping does not fit the log.
-        """
-        mapped = {*(each.topic for each in self.mapping.topics), self.mapping.sampling.topic}
-        reasons = [topic.unreadable for topic in topics if topic.name in mapped and topic.unreadable]
-        if reasons:
-            raise LogError("\n".join(f"{self.name}: {reason}" for reason in reasons))
-        try:
-            return ReadingPlan.of(self.mapping, topics)
-        except UsageError as error:
-            faults = reader.take_faults()
-            if faults:
-                raise LogError("\n".join([str(error), *faults])) from None
-            raise
-
-    def attachments(self) -> tuple[Attachment, ...]:
-        """See `Source.attachments`; a log of others keeps nothing that a replay needs."""
-        return ()
-
-    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
-        """See `Source.metadata`."""
-        return ()
-
-
-class _Blocks:
-    """Samples and messages to blocks, with what was lost on the way."""
-
-    def __init__(
-        self,
-        assembler: Assembler,
-        reader: MessageReader,
-        copied: CopiedMessages,
-        start_ns: int | None,
-        end_ns: int | None,
-    ) -> None:
-        self._assembler = assembler
-        self._reader = reader
-        self._copied = copied
-        self._window = start_ns or 0, end_ns
-        self._faults = FaultList()
-        self.remarks: list[str] = []
-        self.any_sample = False
-        self.first_fault: str | None = None
-
-    def of(self, trace: Trace, messages: MessageColumns, *, last: bool = False) -> Iterator[Block]:
-        """A block, or none while there is nothing to say."""
-        start_ns, end_ns = self._window
-        if start_ns or end_ns is not None:
-            inside = messages.log_time_ns >= start_ns
-            if end_ns is not None:
-                inside &= messages.log_time_ns < end_ns
-            messages = messages.take(np.flatnonzero(inside))
-        self._copied.add(messages)
-        for fault in trace.faults:
-            self._faults.add(fault)
-        self._reader.move_faults(self._faults)
-        self._assembler.move_faults(self._faults)
-        faults = self._faults.take(last=last)
-        self.any_sample = self.any_sample or len(trace) > 0
-        self.first_fault = self.first_fault or next(iter(faults), None)
-        remarks = (*self.remarks, *self._reader.take_remarks(), *self._assembler.take_remarks())
-        self.remarks = []
-        copied = self._copied.take(trace, last=last)
-        if len(trace) or len(copied) or faults or remarks:
-            yield Block(replace(trace, faults=faults), copied, remarks)
-
-
 def _unread(name: str, topics: Sequence[Topic], plan: ReadingPlan) -> list[str]:
-    """Remarks on topics that are not mapped and could not be, with how many messages they have."""
+    """Return remarks on topics that are not mapped and could not be, with their numbers of messages."""
     unread = [each for each in topics if each.unreadable and each.count != 0 and each.name not in plan.topics]
     remarks = []
     for topic in unread[:_MOST_UNREAD]:
@@ -239,7 +241,7 @@ def _unread(name: str, topics: Sequence[Topic], plan: ReadingPlan) -> list[str]:
 def _columns(
     reader: MessageReader, plan: ReadingPlan, start_ns: int | None, end_ns: int | None, *, as_recorded: bool
 ) -> Columns:
-    """The messages that samples of a window depend on."""
+    """Iterate over the messages that the samples of a window depend on."""
     if not plan.by_log_time or (not start_ns and end_ns is None):
         return reader.iter_columns(plan.topics, as_recorded=as_recorded)
     last = None if end_ns is None else end_ns + plan.margin_ns

@@ -1,8 +1,7 @@
-"""Mapping files: from text to values, with all faults at once.
+"""Load mapping files: YAML in, a `LogMapping` or a list of all errors out.
 
-The entry of one topic in a mapping file, as a value.
-
-The published JSON Schema of mapping files, and its faults in words.
+The text is checked in two steps: against the published JSON Schema, whose violations are put into plain
+words, and for contradictions that a schema cannot express.
 """
 
 from __future__ import annotations
@@ -42,18 +41,139 @@ from spatial_replay.text import nearest_hint
 if TYPE_CHECKING:
     from jsonschema.protocols import Validator
 
+SCHEMA_FILE = "mapping.schema.json"
+
+_MOST_FAULTS = 100
 _SIGNAL_KEYS = frozenset({"signals", "max_age", "clock", "stamp"})
-"""Keys that say nothing about objects: a topic with signals and these alone has no objects."""
+"""Keys that do not concern objects: a topic with signals and no other keys has no objects."""
 
 
-def topic_mapping_from_values(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) -> TopicMapping:
-    """An entry that follows the schema.
+def load_mapping(path: str | PathLike[str]) -> LogMapping:
+    """Load a mapping file.
+
+    Raises:
+        MissingFileError: there is no such file.
+        UsageError: the file is not a valid mapping; all errors are listed.
+    """
+    try:
+        with Path(path).open("rb") as stream:
+            data = stream.read(LARGEST_TEXT + 1)
+    except (OSError, ValueError) as error:
+        raise MissingFileError.of(path, error) from None
+    name = Path(path).name
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise UsageError(f"{name}:{line}: a byte is not UTF-8; give a text file") from None
+    return parse_mapping(text, name)
+
+
+def parse_mapping(text: str, name: str = "mapping") -> LogMapping:
+    """Parse the text of a mapping file.
+
+    Args:
+        name: of the file, for errors.
+
+    Raises:
+        UsageError: the text is not a valid mapping; all errors are listed.
+    """
+    document = document_from_text(text)
+    faults = list(document.faults)
+    if not faults:
+        # one error for each place; a contradiction says more than the schema
+        by_place = dict([*_schema_faults(document.value), *_contradictions(document)])
+        faults = [
+            (document.line_of(place), f"{_text_from_place(place)}{what}") for place, what in by_place.items()
+        ]
+    if faults:
+        raise UsageError(_listed(name, faults))
+    try:
+        return _mapping(document, name)
+    except UsageError as error:
+        raise UsageError(f"{name}: {error}") from None
+
+
+def _mapping(document: Document, name: str) -> LogMapping:
+    value: Any = document.value
+    shapes = value.get("shapes") or {}
+    sample = value.get("sample", {})
+    # the hash ignores layout and comments: the same mapping has the same hash
+    canonical = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=True)
+    fixed_frame = value.get("fixed_frame")
+    return LogMapping(
+        name=name,
+        sha256=hashlib.sha256(canonical.encode("utf-8", "surrogatepass")).hexdigest(),
+        topics=tuple(_topic_mapping(topic, entry or {}, shapes) for topic, entry in value["topics"].items()),
+        fixed_frame=None if fixed_frame is None else fixed_frame.removeprefix("/"),
+        clock=value.get("clock", "log"),
+        sampling=Sampling(sample.get("topic"), duration_ns(sample["every"]) if "every" in sample else None),
+        max_age_ns=age_ns(value["max_age"]) if "max_age" in value else None,
+    )
+
+
+def _contradictions(document: Document) -> list[tuple[Place, str]]:
+    """Find what a schema cannot express: unknown shapes, keys that exclude each other, durations of 0."""
+    value = document.value
+    if not isinstance(value, dict) or not isinstance(value.get("topics"), dict):
+        return []
+    listed = value.get("shapes")
+    shapes = list(listed) if isinstance(listed, dict) else []
+    faults: list[tuple[Place, str]] = []
+    topics: Any = value["topics"]
+    for topic, entry in topics.items():
+        if not isinstance(entry, dict):
+            continue
+        shape = entry.get("shape")
+        if isinstance(shape, str) and shape not in shapes:
+            hint = nearest_hint(shape, shapes) or f"shapes are {', '.join(shapes) or 'none'}"
+            faults.append((("topics", topic, "shape"), f"there is no shape {shape[:60]!r}; {hint}"))
+        for one, other in (("polygon", "shape"), ("orientation", "yaw")):
+            if one in entry and other in entry:
+                faults.append((("topics", topic, other), f"there is {one!r} already; give one of the two"))
+    for place, text in _durations(value):
+        if isinstance(text, str) and text[:1].isdigit() and Decimal(0) == _leading_number(text):
+            faults.append((place, f"{text!r} is not a time; give a duration above 0"))
+    return faults
+
+
+def _durations(value: Any) -> list[tuple[Place, Any]]:
+    sample = value.get("sample")
+    durations: list[tuple[Place, Any]] = [(("max_age",), value.get("max_age"))]
+    if isinstance(sample, dict):
+        durations.append((("sample", "every"), sample.get("every")))
+    for topic, entry in value["topics"].items():
+        if isinstance(entry, dict):
+            durations.append((("topics", topic, "max_age"), entry.get("max_age")))
+    return durations
+
+
+def _leading_number(text: str) -> Decimal | None:
+    digits = text.rstrip("nums")
+    return Decimal(digits) if digits.replace(".", "", 1).isdigit() else None
+
+
+def _text_from_place(place: Place) -> str:
+    text = ""
+    for step in place:
+        text += f"[{step}]" if isinstance(step, int) else f"{'.' if text else ''}{step[:80]}"
+    return f"{text}: " if text else ""
+
+
+def _listed(name: str, faults: list[tuple[int, str]]) -> str:
+    lines = [f"{name}:{line}: {what}" for line, what in sorted(faults)]
+    more = len(lines) - _MOST_FAULTS
+    return "\n".join(lines[:_MOST_FAULTS] + ([f"… and {more} more"] if more > 0 else []))
+
+
+def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) -> TopicMapping:
+    """Return the mapping of a topic from an entry that follows the schema.
 
     Args:
         shapes: the shapes by name.
 
     Raises:
-        UsageError: a path or a template that the schema let pass.
+        UsageError: a path or a template is invalid, although the schema allows it.
     """
     if "objects" in entry:
         FieldPath.of(entry["objects"])
@@ -146,13 +266,10 @@ def _signal(name: str, value: Any) -> SignalMapping:
     )
 
 
-SCHEMA_FILE = "mapping.schema.json"
-
-
-def schema_faults(value: Value) -> Iterator[tuple[Place, str]]:
-    """Where a value does not follow the schema, and what belongs there, in the order of the schema."""
+def _schema_faults(value: Value) -> Iterator[tuple[Place, str]]:
+    """Iterate over the places where a value violates the schema, with what belongs there."""
     for error in _validator().iter_errors(value):
-        yield from _told(error)
+        yield from _described(error)
 
 
 @cache
@@ -163,14 +280,14 @@ def _validator() -> Validator:
     return Draft202012Validator(json.loads(text))
 
 
-def _told(error: Any) -> Iterator[tuple[Place, str]]:
+def _described(error: Any) -> Iterator[tuple[Place, str]]:
     place: Place = tuple(error.absolute_path)
     keyword = error.validator
     if keyword == "anyOf" and isinstance(error.instance, dict | list):
         for branch in _branches(error):
             if not any(_is_of_another_kind(each, len(place)) for each in branch):
                 for each in branch:
-                    yield from _told(each)
+                    yield from _described(each)
                 return
     if keyword == "additionalProperties" and isinstance(error.instance, dict):
         known = list(error.schema.get("properties", {}))
@@ -185,11 +302,11 @@ def _told(error: Any) -> Iterator[tuple[Place, str]]:
         yield place, "a name is empty; give it a name"
     else:
         wanted = error.schema.get("description", _around(error))
-        yield place, f"{shown(error.instance)} where this belongs: {wanted}"
+        yield place, f"{_shown(error.instance)} where this belongs: {wanted}"
 
 
 def _around(error: Any) -> str:
-    """What belongs where a rule without a description of its own was broken: that of the rule around it."""
+    """Return what belongs where a rule without a description was violated: that of the rule around it."""
     parent = error.parent
     while parent is not None and "description" not in parent.schema:
         parent = parent.parent
@@ -205,131 +322,13 @@ def _branches(error: Any) -> Iterable[list[Any]]:
 
 
 def _is_of_another_kind(error: Any, depth: int) -> bool:
-    """Whether an alternative failed because the value as a whole is of another kind."""
+    """Return whether an alternative failed because the whole value has another type."""
     return error.validator == "type" and len(error.absolute_path) == depth
 
 
-def shown(value: object) -> str:
-    """A value in a few words."""
+def _shown(value: object) -> str:
+    """Return a short text for a value."""
     if isinstance(value, dict):
         return f"keys {', '.join(map(str, value))[:60]}" if value else "{}"
     text = json.dumps(value, ensure_ascii=False, default=str)
     return text if len(text) <= 60 else text[:59] + "…"
-
-
-_MOST_FAULTS = 100
-
-
-def load_mapping(path: str | PathLike[str]) -> LogMapping:
-    """The mapping in a file.
-
-    Raises:
-        MissingFileError: there is no such file.
-        UsageError: the file is no mapping; all its faults are listed.
-    """
-    try:
-        with Path(path).open("rb") as stream:
-            data = stream.read(LARGEST_TEXT + 1)
-    except (OSError, ValueError) as error:
-        raise MissingFileError.of(path, error) from None
-    name = Path(path).name
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise UsageError(f"{name}:{line}: a byte is not UTF-8; give a text file") from None
-    return parse_mapping(text, name)
-
-
-def parse_mapping(text: str, name: str = "mapping") -> LogMapping:
-    """The mapping that a text holds.
-
-    Raises:
-        UsageError: it is no mapping; all its faults are listed.
-    """
-    document = document_from_text(text)
-    faults = list(document.faults)
-    if not faults:
-        told = dict([*schema_faults(document.value), *_contradictions(document)])
-        faults = [
-            (document.line_of(place), f"{_text_from_place(place)}{what}") for place, what in told.items()
-        ]
-    if faults:
-        raise UsageError(_listed(name, faults))
-    try:
-        return _mapping(document, name)
-    except UsageError as error:
-        raise UsageError(f"{name}: {error}") from None
-
-
-def _mapping(document: Document, name: str) -> LogMapping:
-    value: Any = document.value
-    shapes = value.get("shapes") or {}
-    sample = value.get("sample", {})
-    canonical = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=True)
-    fixed_frame = value.get("fixed_frame")
-    return LogMapping(
-        name=name,
-        sha256=hashlib.sha256(canonical.encode("utf-8", "surrogatepass")).hexdigest(),
-        topics=tuple(
-            topic_mapping_from_values(topic, entry or {}, shapes) for topic, entry in value["topics"].items()
-        ),
-        fixed_frame=None if fixed_frame is None else fixed_frame.removeprefix("/"),
-        clock=value.get("clock", "log"),
-        sampling=Sampling(sample.get("topic"), duration_ns(sample["every"]) if "every" in sample else None),
-        max_age_ns=age_ns(value["max_age"]) if "max_age" in value else None,
-    )
-
-
-def _contradictions(document: Document) -> list[tuple[Place, str]]:
-    """What the schema cannot say: names of shapes that are not there, keys that exclude each other."""
-    value = document.value
-    if not isinstance(value, dict) or not isinstance(value.get("topics"), dict):
-        return []
-    listed = value.get("shapes")
-    shapes = list(listed) if isinstance(listed, dict) else []
-    faults: list[tuple[Place, str]] = []
-    topics: Any = value["topics"]
-    for topic, entry in topics.items():
-        if not isinstance(entry, dict):
-            continue
-        shape = entry.get("shape")
-        if isinstance(shape, str) and shape not in shapes:
-            hint = nearest_hint(shape, shapes) or f"shapes are {', '.join(shapes) or 'none'}"
-            faults.append((("topics", topic, "shape"), f"there is no shape {shape[:60]!r}; {hint}"))
-        for one, other in (("polygon", "shape"), ("orientation", "yaw")):
-            if one in entry and other in entry:
-                faults.append((("topics", topic, other), f"there is {one!r} already; give one of the two"))
-    for place, text in _durations(value):
-        if isinstance(text, str) and text[:1].isdigit() and Decimal(0) == _leading_number(text):
-            faults.append((place, f"{text!r} is no time; give a duration above 0"))
-    return faults
-
-
-def _durations(value: Any) -> list[tuple[Place, Any]]:
-    sample = value.get("sample")
-    found: list[tuple[Place, Any]] = [(("max_age",), value.get("max_age"))]
-    if isinstance(sample, dict):
-        found.append((("sample", "every"), sample.get("every")))
-    for topic, entry in value["topics"].items():
-        if isinstance(entry, dict):
-            found.append((("topics", topic, "max_age"), entry.get("max_age")))
-    return found
-
-
-def _leading_number(text: str) -> Decimal | None:
-    digits = text.rstrip("nums")
-    return Decimal(digits) if digits.replace(".", "", 1).isdigit() else None
-
-
-def _text_from_place(place: Place) -> str:
-    text = ""
-    for step in place:
-        text += f"[{step}]" if isinstance(step, int) else f"{'.' if text else ''}{step[:80]}"
-    return f"{text}: " if text else ""
-
-
-def _listed(name: str, faults: list[tuple[int, str]]) -> str:
-    lines = [f"{name}:{line}: {what}" for line, what in sorted(faults)]
-    more = len(lines) - _MOST_FAULTS
-    return "\n".join(lines[:_MOST_FAULTS] + ([f"… and {more} more"] if more > 0 else []))

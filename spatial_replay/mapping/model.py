@@ -1,7 +1,5 @@
-"""What a mapping file says: which topics carry which objects and signals, and when a sample is taken.
-
-Durations as mapping files write them.
-"""
+"""The content of a mapping file as values: topics with their objects and signals, and when samples are
+taken."""
 
 from __future__ import annotations
 
@@ -16,14 +14,14 @@ from typing import Literal, TypeAlias
 from spatial_replay.errors import UsageError
 
 Clock: TypeAlias = Literal["log", "publish", "header"]
-"""Which of a message's times counts: when it was recorded, when it was sent, or the stamp inside it."""
+"""Which time of a message counts: when it was recorded, when it was sent, or the stamp inside it."""
 
 DEFAULT_MAX_AGE_NS = 10**9
 FOREVER_NS = 2**63 - 1
-"""A `max_age` that never ends."""
+"""The `max_age` of observations that stay valid forever."""
 
 Measure: TypeAlias = float | str
-"""A number, or the field path where a message has it."""
+"""A number, or the field path of one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +31,7 @@ class ShapeMapping:
     Attributes:
         kind: "box" (sizes: length along x, width along y, or also height along z), "disc" (sizes: radius) or
             "polygon" (points: its corners).
-        offset: where its centre stands in the object's own frame (x, y), in footprint units.
+        offset: its centre (x, y) in the object's own frame, in footprint units.
     """
 
     kind: Literal["box", "disc", "polygon"]
@@ -44,7 +42,7 @@ class ShapeMapping:
 
 @dataclass(frozen=True, slots=True)
 class ClassMapping:
-    """What a field's values mean: `table[str(value)]`, or `other` for values that are not in it."""
+    """Maps a field to a class: `table[str(value)]`, or `other` for values that are not in the table."""
 
     field: str
     table: Table[str, str | None] = value_of(default_factory=lambda: MappingProxyType({}), hash=False)
@@ -54,10 +52,10 @@ class ClassMapping:
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """A radius: a number, a field of that number, or `sigmas` standard deviations of a covariance.
+    """A radius: a number, the field of one, or `sigmas` standard deviations of a covariance.
 
     Attributes:
-        measure: the number or the field path; "" for the covariance that a built-in type has.
+        measure: the number or the field path; "" for the covariance of a built-in type.
     """
 
     measure: Measure
@@ -67,7 +65,7 @@ class Uncertainty:
 
 @dataclass(frozen=True, slots=True)
 class SignalMapping:
-    """A numeric signal: the field that holds it, and its unit as text."""
+    """A numeric signal: the path of its field, and its unit for readers."""
 
     name: str
     field: str
@@ -76,7 +74,7 @@ class SignalMapping:
 
 @dataclass(frozen=True, slots=True)
 class Stamp:
-    """Where a message or an object says when it was: a ROS or protobuf time, or a number of `unit`."""
+    """The field of a time: a ROS or protobuf time, or a number of `unit_ns`."""
 
     field: str
     unit_ns: int = 1
@@ -84,17 +82,17 @@ class Stamp:
 
 @dataclass(frozen=True, slots=True)
 class TopicMapping:
-    """How one topic is read; what is None is as the message's type has it.
+    """How one topic is read; None leaves the default of the message type.
 
     Attributes:
-        objects: path of the list that holds the objects; "" for a message that is one object.
-        complete: whether a message lists every object there is, so that those it leaves out have left.
+        objects: path of the list of objects; "" for a message that is one object.
+        complete: whether a message lists all objects that exist, so that those it leaves out have left.
         position: path of a point, or paths of x, y and maybe z.
         orientation: path of a quaternion.
-        yaw: path of an angle, which `yaw_scale` turns into radians.
+        yaw: path of an angle; times `yaw_scale` it is in radians.
         only, without: patterns of names to keep, and to leave out.
         max_age_ns: how long an observation stays valid.
-        clock: the clock of this topic where it is not the mapping's.
+        clock: the clock of this topic, if not that of the mapping.
         reads_objects: false for topics that are read for their signals only.
     """
 
@@ -125,10 +123,10 @@ class TopicMapping:
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """When samples are taken: at each message of a topic, or at each multiple of a step.
+    """When samples are taken: at each message of a topic, or at multiples of a step.
 
     Attributes:
-        topic: None (and no step) for the first topic with objects.
+        topic: None, without a step, for the first topic with objects.
     """
 
     topic: str | None = None
@@ -137,12 +135,12 @@ class Sampling:
 
 @dataclass(frozen=True, slots=True)
 class LogMapping:
-    """A mapping file, checked.
+    """A valid mapping.
 
     Attributes:
         name: of the file.
-        sha256: of what it says, however it is laid out.
-        fixed_frame: the frame that everything is brought into; None leaves coordinates as they are.
+        sha256: of its content, independent of layout and comments.
+        fixed_frame: the frame that coordinates are transformed into; None leaves them as they are.
         topics: in the file's order.
     """
 
@@ -160,27 +158,27 @@ _DURATION = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)(ns|us|ms|s)", re.ASCII)
 
 
 def duration_ns(text: str) -> int:
-    """`100ms` or `0.5s` as nanoseconds.
+    """Parse `100ms` or `0.5s` to nanoseconds.
 
     Raises:
-        UsageError: for anything else, and for 0.
+        UsageError: the text is not a duration above 0.
     """
-    found = _DURATION.fullmatch(text)
-    nanoseconds = int(Decimal(found[1]) * _UNITS_NS[found[2]]) if found else 0
+    match = _DURATION.fullmatch(text)
+    nanoseconds = int(Decimal(match[1]) * _UNITS_NS[match[2]]) if match else 0
     if nanoseconds <= 0:
-        raise UsageError(f"{text!r} is no duration; write 100ms or 0.5s")
+        raise UsageError(f"{text!r} is not a duration; write 100ms or 0.5s")
     return nanoseconds
 
 
 def age_ns(text: str) -> int:
-    """A duration, or `forever`.
+    """Parse a duration, or `forever`, to nanoseconds.
 
     Raises:
-        UsageError: for anything else.
+        UsageError: the text is neither.
     """
     return FOREVER_NS if text == "forever" else duration_ns(text)
 
 
 def unit_ns(text: str) -> int:
-    """Nanoseconds of a unit of time: ns, us, ms or s."""
+    """Return the nanoseconds in a unit of time: ns, us, ms or s."""
     return _UNITS_NS[text]

@@ -1,6 +1,7 @@
-"""A mapping file to start from, out of what a log holds.
+"""Suggest a mapping file: the topics of a log and example messages in, YAML with comments out.
 
-What in a message looks like an object: where it is, what it is called, how large it is.
+A topic of a known type needs no fields. In other messages, fields that look like the position, orientation,
+size and name of an object are found by their names and the types of their values.
 """
 
 from __future__ import annotations
@@ -18,7 +19,21 @@ from spatial_replay.mapping.field_paths import field_names, get_field, is_list, 
 from spatial_replay.mapping.message_types import BUILT_IN, TRANSFORM_TYPES, short_type
 from spatial_replay.trace.sample import FOREVER
 
+EXAMPLES = 20
+"""Decoded messages of each topic to use at most."""
+
+_RADIUS = "0.5"
+_TOGETHER_NS = 10**9
+_NOT_KNOWN: Mapping[str, int] = MappingProxyType({})
+_MOST_SIGNALS = 8
+_PLAIN = re.compile(r"/?[A-Za-z_][\w/.-]*", re.ASCII)
+_WORDS = frozenset({"true", "false", "null", "yes", "no", "on", "off", "y", "n"})
+"""Words that YAML 1.1 does not read as text."""
+_MIDDLEWARE = frozenset({"rosout", "rosout_agg", "parameter_events", "clock", "diagnostics"})
+"""Topics about programs rather than objects, by the last part of their names."""
+
 _DEEPEST = 4
+"""Levels of nested fields to search."""
 _POSITIONS = ("position", "center", "centre", "translation", "location", "point")
 _TURNS = ("orientation", "rotation", "quaternion")
 _YAWS = ("yaw", "theta", "heading", "angle")
@@ -44,14 +59,236 @@ _NOT_PLACES = frozenset(
 
 
 @dataclass(frozen=True, slots=True)
-class Guess:
-    """How an object may be read; texts are field paths.
+class TopicSuggestion:
+    """A suggestion for one topic.
 
     Attributes:
-        objects: the path of the list that it is in, or None.
-        position: of a point, or paths of x and y.
-        size: paths of length, width and maybe height; or of a radius.
-        others: further lists whose elements look like objects.
+        entry: its entry in a mapping, in YAML's flow style; empty if nothing looks like an object.
+        remarks: what a reader should know or change.
+        is_transforms: whether it carries transforms. They are suggested as objects only if there are no
+            others.
+        frame: the frame of its coordinates.
+        numbers: paths of possible signals.
+    """
+
+    topic: Topic
+    entry: str = ""
+    remarks: tuple[str, ...] = ()
+    is_transforms: bool = False
+    frame: str | None = None
+    numbers: tuple[str, ...] = ()
+
+
+def suggest_topics(
+    topics: Sequence[Topic], examples: Mapping[str, Sequence[object]]
+) -> tuple[TopicSuggestion, ...]:
+    """Suggest an entry for each topic.
+
+    Args:
+        examples: some decoded messages of each topic, by its name.
+    """
+    return tuple(_suggestion(topic, examples.get(topic.name, ())) for topic in topics)
+
+
+def suggest_mapping(
+    log: str,
+    topics: Sequence[Topic],
+    examples: Mapping[str, Sequence[object]],
+    first_ns: Mapping[str, int] = _NOT_KNOWN,
+) -> str:
+    """Return the text of a mapping file, with comments; it is valid if some topic holds objects.
+
+    Args:
+        log: the log's name.
+        examples: some decoded messages of each topic, by its name.
+        first_ns: log time of the first message of each topic, by its name.
+    """
+    suggestions = suggest_topics(topics, examples)
+    mapped = [each for each in suggestions if each.entry and not each.is_transforms]
+    transforms = [each for each in suggestions if each.is_transforms]
+    active = mapped or [each for each in transforms if each.entry]
+    lines = [f"# How messages of {_comment(log)} become objects: a start, made from the first of them."]
+    lines += [*_frame_lines(active, transforms, examples), *_time_lines(active, first_ns), "topics:"]
+    if not active:
+        lines.append("  # nothing looks like an object; name the fields of a topic that is one, such as")
+        lines.append("  # /robot/state: {name: robot, position: [x, y], yaw: theta, shape: {disc: 0.5}}")
+    for each in active:
+        lines += [f"  # {_described(each.topic)}", *(f"  # {remark}" for remark in each.remarks)]
+        lines.append(f"  {_text(each.topic.name)}: {each.entry}")
+    rest = [each for each in suggestions if each not in active]
+    if rest:
+        lines += ["", "  # not used:", *(line for each in rest for line in _unused(each))]
+    return "\n".join(lines) + "\n"
+
+
+def _suggestion(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
+    if topic.name in DERIVED or topic.name.rstrip("/").split("/")[-1] in _MIDDLEWARE:
+        return TopicSuggestion(topic)
+    kind = short_type(topic.type)
+    frame = next((name for each in examples if (name := _frame_of(each)) is not None), None)
+    if topic.unreadable is not None:
+        return TopicSuggestion(topic, remarks=(f"cannot be read: {_comment(topic.unreadable)}",))
+    if kind in TRANSFORM_TYPES:
+        return TopicSuggestion(topic, f"{{shape: {{disc: {_RADIUS}}}}}", _SIZELESS, is_transforms=True)
+    if kind in BUILT_IN:
+        reading = BUILT_IN[kind]
+        has_outline = bool(reading.polygon or reading.sizes or reading.solids)
+        entry = "{}" if has_outline else f"{{shape: {{disc: {_RADIUS}}}}}"
+        return TopicSuggestion(topic, entry, () if has_outline else _SIZELESS, frame=frame)
+    guesses = [guess for each in examples if (guess := _guess(each)) is not None]
+    if not guesses:
+        return TopicSuggestion(topic, numbers=_numbers_in(examples[0]) if examples else ())
+    best = max(guesses, key=lambda guess: guess.score)
+    return TopicSuggestion(topic, _entry(topic, best), _remarks(best), frame=frame)
+
+
+_SIZELESS = (f"messages have no size: {_RADIUS} is a guess, {{box: [length, width]}} is another shape",)
+
+
+def _entry(topic: Topic, guess: _Guess) -> str:
+    parts: list[tuple[str, str | tuple[str, ...] | None]] = [
+        ("objects", guess.objects),
+        ("name", _name(topic, guess)),
+        ("class", guess.class_name),
+        ("position", guess.position),
+        ("orientation", guess.orientation),
+        ("yaw", guess.yaw),
+        ("polygon", guess.polygon),
+    ]
+    texts = [f"{key}: {_value(key, value)}" for key, value in parts if value is not None]
+    if guess.polygon is None:
+        texts.append(f"shape: {_shape(guess)}")
+    return "{" + ", ".join(texts) + "}"
+
+
+def _value(key: str, value: str | tuple[str, ...]) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_text, value))}]"
+    return f"{{field: {_text(value)}}}" if key == "class" else _text(value)
+
+
+def _shape(guess: _Guess) -> str:
+    if not guess.size:
+        return f"{{disc: {_RADIUS}}}"
+    return f"{{disc: {guess.size[0]}}}" if len(guess.size) == 1 else f"{{box: [{', '.join(guess.size)}]}}"
+
+
+def _name(topic: Topic, guess: _Guess) -> str:
+    if guess.objects is None:
+        return name_from_topic(topic.name)
+    word = guess.objects.removesuffix("[*]").split(".")[-1].removesuffix("s") or "object"
+    return f"{word}{{{guess.name or 'index'}}}"
+
+
+def _remarks(guess: _Guess) -> tuple[str, ...]:
+    sizeless = () if guess.polygon is not None or guess.size else _SIZELESS
+    others = (f"other lists that look like objects: {', '.join(guess.others[:6])}",) if guess.others else ()
+    return sizeless + others
+
+
+def _frame_lines(
+    active: Sequence[TopicSuggestion],
+    transforms: Sequence[TopicSuggestion],
+    examples: Mapping[str, Sequence[object]],
+) -> Iterator[str]:
+    """Yield the lines about the fixed frame, which coordinates in more than one frame need."""
+    frames = sorted({each.frame for each in active if each.frame is not None})
+    edges = {
+        edge
+        for each in transforms
+        for message in examples.get(each.topic.name, ())
+        for edge in _edges(message)
+    }
+    roots = sorted({parent for parent, _ in edges} - {child for _, child in edges})
+    if len(frames) > 1:
+        yield f"# coordinates are in the frames {_comment(', '.join(frames))}: bring them into one"
+        known = {name for edge in edges for name in edge}
+        fixed = next((root for root in roots if known.issuperset(frames)), None)
+        yield f"{'' if fixed else '# '}fixed_frame: {_text(fixed or frames[0])}"
+    elif edges:
+        yield "# without a fixed frame, coordinates are taken as they are"
+        yield f"# fixed_frame: {_text((roots or frames or ['map'])[0])}"
+
+
+def _edges(message: object) -> Iterator[tuple[str, str]]:
+    """Iterate over the pairs (parent, child) of frames in a message with transforms."""
+    listed = getattr(message, "transforms", None)
+    if isinstance(message, dict):
+        listed = message.get("transforms")
+    for each in [message] if listed is None else listed:
+        known = field_names(each)
+        parent = _frame_of(each) or ("parent_frame_id" in known and get_field(each, "parent_frame_id"))
+        child = "child_frame_id" in known and get_field(each, "child_frame_id")
+        if isinstance(parent, str) and isinstance(child, str) and parent and child:
+            yield parent.removeprefix("/"), child.removeprefix("/")
+
+
+def _time_lines(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) -> Iterator[str]:
+    yield "clock: log    # when a message was recorded; publish: when it was sent; header: its own stamp"
+    if active:
+        topic = _text(_sampled(active, first_ns).name)
+        yield f"sample: {{topic: {topic}}}    # a sample at each of its messages; or {{every: 100ms}}"
+        yield "max_age: 1s    # after which an object that nothing is heard of is unknown"
+
+
+def _sampled(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) -> Topic:
+    """Choose the topic to sample: the last to start of those that start together, so that none is missing."""
+    topics = [each.topic for each in active]
+    begins = [first_ns.get(topic.name, FOREVER) for topic in topics]
+    often = max(topic.count or 0 for topic in topics)
+    together = [
+        (begin, topic)
+        for begin, topic in zip(begins, topics, strict=True)
+        if begin <= min(begins) + _TOGETHER_NS and 2 * (topic.count or 0) >= often
+    ]
+    return max(together, key=itemgetter(0))[1] if together else topics[0]
+
+
+def _unused(each: TopicSuggestion) -> Iterator[str]:
+    topic = _text(each.topic.name)
+    if each.entry:
+        yield f"  # {topic}: {each.entry}    # {_described(each.topic)}"
+    elif each.numbers:
+        path = {number: _text(number.replace(".", "_")) for number in each.numbers[:_MOST_SIGNALS]}
+        signals = ", ".join(f"{_signal_name(each.topic, name)}: {number}" for number, name in path.items())
+        yield f"  # {topic}: {{signals: {{{signals}}}}}    # {_described(each.topic)}"
+    else:
+        remark = "".join(f"; {remark}" for remark in each.remarks)
+        yield f"  # {topic}: {_described(each.topic)}{remark}"
+
+
+def _signal_name(topic: Topic, name: str) -> str:
+    return f"{name_from_topic(topic.name)}_{name}"
+
+
+def _described(topic: Topic) -> str:
+    kind = _comment(topic.type) or "type unknown"
+    return (
+        kind if topic.count is None else f"{kind}, {topic.count:,} message{'' if topic.count == 1 else 's'}"
+    )
+
+
+def _comment(text: str) -> str:
+    """Return a text that fits on one line."""
+    return " ".join("".join(each if each.isprintable() else " " for each in text).split())[:200]
+
+
+def _text(text: str) -> str:
+    """Return a text as a YAML scalar."""
+    return (
+        text if _PLAIN.fullmatch(text) and not text.endswith("[*]") else json.dumps(text, ensure_ascii=True)
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Guess:
+    """Fields of a message that look like those of an object; texts are field paths.
+
+    Attributes:
+        objects: of the list of objects, or None for a single one.
+        position: of a point, or of x and y.
+        size: of length, width and maybe height; or of a radius.
+        others: of further lists whose elements look like objects.
     """
 
     objects: str | None = None
@@ -66,17 +303,17 @@ class Guess:
 
     @property
     def score(self) -> int:
-        """How much of an object it is."""
+        """How many fields of an object there are; a place counts most."""
         parts = (self.polygon, self.size, self.name, self.orientation or self.yaw, self.class_name)
         return 10 * (self.polygon is not None or self.position is not None) + sum(map(bool, parts))
 
 
-def guess_from(message: object) -> Guess | None:
-    """What in a message looks like an object, or a list of them; None if nothing does."""
+def _guess(message: object) -> _Guess | None:
+    """Find an object, or a list of them, in a message; None if nothing looks like one."""
     itself = _object_in(message)
     lists = sorted(
         ((guess, path) for path, guess in _iter_lists(message)),
-        key=lambda found: (-_kinship(found[1]), -found[0].score),
+        key=lambda each: (-_list_rank(each[1]), -each[0].score),
     )
     if lists and (itself is None or itself.polygon is None):
         best, path = lists[0]
@@ -84,34 +321,34 @@ def guess_from(message: object) -> Guess | None:
     return itself
 
 
-def numbers_in(message: object) -> tuple[str, ...]:
-    """The paths of the numbers of a message that stand outside of lists and of its header."""
+def _numbers_in(message: object) -> tuple[str, ...]:
+    """Return the paths of the numbers in a message, except those in lists and in the header."""
     return tuple(
         path
-        for path, value in _iter_fields(message, passed_over=frozenset({"header", "stamp"}))
+        for path, value in _iter_fields(message, skipped=frozenset({"header", "stamp"}))
         if _is_number(value)
     )
 
 
-def frame_of(message: object) -> str | None:
-    """The frame that a message says its coordinates are in."""
-    for path, value in _iter_fields(message, passed_over=frozenset()):
+def _frame_of(message: object) -> str | None:
+    """Return the frame of a message's coordinates, if the message names it."""
+    for path, value in _iter_fields(message, skipped=frozenset()):
         if path.split(".")[-1] == "frame_id" and isinstance(value, str) and value:
             return value.removeprefix("/")
     return None
 
 
-def _iter_lists(message: object) -> Iterator[tuple[str, Guess]]:
+def _iter_lists(message: object) -> Iterator[tuple[str, _Guess]]:
     for path, value in _iter_fields(message):
         if is_list(value) and len(value) and field_names(value[0]):
             guess = _object_in(value[0])
-            # corners of one outline are points, not objects
+            # the corners of an outline are points, not objects
             if guess is not None and not (path.split(".")[-1] in _OUTLINES and guess.score <= 10):
                 yield f"{path}[*]", guess
 
 
-def _object_in(value: object) -> Guess | None:
-    """The object that a message or an element of a list is."""
+def _object_in(value: object) -> _Guess | None:
+    """Find the fields of one object in a message or an element of a list."""
     fields = dict(_iter_fields(value))
     polygon = next((path for path in _named(fields, _OUTLINES) if _is_outline(fields[path])), None)
     position = _position_in(fields)
@@ -119,7 +356,7 @@ def _object_in(value: object) -> Guess | None:
         return None
     yaw = _first(fields, _YAWS, _is_number) if polygon is None else None
     turn = next((path for path in _named(fields, _TURNS) if _has(fields[path], "xyzw")), None)
-    return Guess(
+    return _Guess(
         position=position if polygon is None else None,
         orientation=turn if polygon is None else None,
         yaw=None if turn else yaw,
@@ -162,9 +399,9 @@ def _name_in(fields: dict[str, object]) -> str | None:
 
 
 def _named(fields: dict[str, object], names: tuple[str, ...]) -> list[str]:
-    """The paths that end in one of some names: the shallowest first, then in the order of the names."""
-    found = [path for path in fields if path.split(".")[-1].lower() in names]
-    return sorted(found, key=lambda path: (path.count("."), names.index(path.split(".")[-1].lower())))
+    """Return the paths that end in one of some names, by depth, then in the order of the names."""
+    paths = [path for path in fields if path.split(".")[-1].lower() in names]
+    return sorted(paths, key=lambda path: (path.count("."), names.index(path.split(".")[-1].lower())))
 
 
 def _first(fields: dict[str, object], names: tuple[str, ...], fits: Callable[[object], bool]) -> str | None:
@@ -172,19 +409,19 @@ def _first(fields: dict[str, object], names: tuple[str, ...], fits: Callable[[ob
 
 
 def _iter_fields(
-    value: object, path: str = "", depth: int = 0, *, passed_over: frozenset[str] = _NOT_PLACES
+    value: object, path: str = "", depth: int = 0, *, skipped: frozenset[str] = _NOT_PLACES
 ) -> Iterator[tuple[str, object]]:
-    """Every field of a message, and of those in it, with its path; lists are not entered."""
+    """Iterate over the fields of a message and its parts, with their paths; lists are not entered."""
     for name in field_names(value) if depth < _DEEPEST else ():
         inner = get_field(value, name)
         full = f"{path}.{name}" if path else name
-        if name not in passed_over:
+        if name not in skipped:
             yield full, inner
-            yield from _iter_fields(inner, full, depth + 1, passed_over=passed_over)
+            yield from _iter_fields(inner, full, depth + 1, skipped=skipped)
 
 
-def _kinship(path: str) -> int:
-    """How much a list's name sounds like objects that move."""
+def _list_rank(path: str) -> int:
+    """Return how well the name of a list suits objects that move."""
     last = path.removesuffix("[*]").split(".")[-1].lower()
     return 2 * ("moving" in last or "dynamic" in last) + any(word in last for word in _LISTS)
 
@@ -194,7 +431,7 @@ def _is_number(value: object) -> bool:
 
 
 def _has(value: object, names: str) -> bool:
-    """Whether a message has fields of one letter each, all numbers."""
+    """Return whether a message has numbers as fields with these names of one letter."""
     known = field_names(value)
     return all(name in known and _is_number(get_field(value, name)) for name in names)
 
@@ -203,248 +440,3 @@ def _is_outline(value: object) -> bool:
     if not is_list(value):
         return "points" in field_names(value) and _is_outline(get_field(value, "points"))
     return len(value) >= 3 and _has(value[0], "xy")
-
-
-EXAMPLES = 20
-"""Decoded messages of each topic that are worth a look."""
-
-_RADIUS = "0.5"
-_TOGETHER_NS = 10**9
-_NOT_KNOWN: Mapping[str, int] = MappingProxyType({})
-_MOST_SIGNALS = 8
-_PLAIN = re.compile(r"/?[A-Za-z_][\w/.-]*", re.ASCII)
-_WORDS = frozenset({"true", "false", "null", "yes", "no", "on", "off", "y", "n"})
-"""Words that some readers of YAML take for something else than text."""
-_MIDDLEWARE = frozenset({"rosout", "rosout_agg", "parameter_events", "clock", "diagnostics"})
-"""Topics about programs rather than things, by the last part of their names."""
-
-
-@dataclass(frozen=True, slots=True)
-class TopicSuggestion:
-    """A topic that may be mapped.
-
-    Attributes:
-        entry: what a mapping says of it, in YAML's flow style; empty where nothing looks like an object.
-        remarks: what a reader should know or change.
-        is_transforms: whether its objects are frames, which other topics may need rather than name.
-        frame: the frame that its coordinates are in.
-        numbers: paths of what may be signals.
-    """
-
-    topic: Topic
-    entry: str = ""
-    remarks: tuple[str, ...] = ()
-    is_transforms: bool = False
-    frame: str | None = None
-    numbers: tuple[str, ...] = ()
-
-
-def suggest_topics(
-    topics: Sequence[Topic], examples: Mapping[str, Sequence[object]]
-) -> tuple[TopicSuggestion, ...]:
-    """What each topic could be read as.
-
-    Args:
-        examples: some decoded messages of each topic, by its name.
-    """
-    return tuple(_candidate(topic, examples.get(topic.name, ())) for topic in topics)
-
-
-def suggest_mapping(
-    log: str,
-    topics: Sequence[Topic],
-    examples: Mapping[str, Sequence[object]],
-    first_ns: Mapping[str, int] = _NOT_KNOWN,
-) -> str:
-    """A mapping file with comments, as text; it can be used at once where some topic holds objects.
-
-    Args:
-        log: the log's name.
-        examples: some decoded messages of each topic, by its name.
-        first_ns: log time of the first message of each topic, by its name.
-    """
-    found = suggest_topics(topics, examples)
-    mapped = [each for each in found if each.entry and not each.is_transforms]
-    transforms = [each for each in found if each.is_transforms]
-    active = mapped or [each for each in transforms if each.entry]
-    lines = [f"# How messages of {_comment(log)} become objects: a start, made from the first of them."]
-    lines += [*_frame_lines(active, transforms, examples), *_time_lines(active, first_ns), "topics:"]
-    if not active:
-        lines.append("  # nothing looks like an object; name the fields of a topic that is one, such as")
-        lines.append("  # /robot/state: {name: robot, position: [x, y], yaw: theta, shape: {disc: 0.5}}")
-    for each in active:
-        lines += [f"  # {_described(each.topic)}", *(f"  # {remark}" for remark in each.remarks)]
-        lines.append(f"  {_text(each.topic.name)}: {each.entry}")
-    rest = [each for each in found if each not in active]
-    if rest:
-        lines += ["", "  # not used:", *(line for each in rest for line in _unused(each))]
-    return "\n".join(lines) + "\n"
-
-
-def _candidate(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
-    if topic.name in DERIVED or topic.name.rstrip("/").split("/")[-1] in _MIDDLEWARE:
-        return TopicSuggestion(topic)
-    kind = short_type(topic.type)
-    frame = next((name for each in examples if (name := frame_of(each)) is not None), None)
-    if topic.unreadable is not None:
-        return TopicSuggestion(topic, remarks=(f"cannot be read: {_comment(topic.unreadable)}",))
-    if kind in TRANSFORM_TYPES:
-        return TopicSuggestion(topic, f"{{shape: {{disc: {_RADIUS}}}}}", _SIZELESS, is_transforms=True)
-    if kind in BUILT_IN:
-        reading = BUILT_IN[kind]
-        has_outline = bool(reading.polygon or reading.sizes or reading.solids)
-        entry = "{}" if has_outline else f"{{shape: {{disc: {_RADIUS}}}}}"
-        return TopicSuggestion(topic, entry, () if has_outline else _SIZELESS, frame=frame)
-    guesses = [guess for each in examples if (guess := guess_from(each)) is not None]
-    if not guesses:
-        return TopicSuggestion(topic, numbers=numbers_in(examples[0]) if examples else ())
-    best = max(guesses, key=lambda guess: guess.score)
-    return TopicSuggestion(topic, _entry(topic, best), _remarks(best), frame=frame)
-
-
-_SIZELESS = (f"messages have no size: {_RADIUS} is a guess, {{box: [length, width]}} is another shape",)
-
-
-def _entry(topic: Topic, guess: Guess) -> str:
-    parts: list[tuple[str, str | tuple[str, ...] | None]] = [
-        ("objects", guess.objects),
-        ("name", _name(topic, guess)),
-        ("class", guess.class_name),
-        ("position", guess.position),
-        ("orientation", guess.orientation),
-        ("yaw", guess.yaw),
-        ("polygon", guess.polygon),
-    ]
-    texts = [f"{key}: {_value(key, value)}" for key, value in parts if value is not None]
-    if guess.polygon is None:
-        texts.append(f"shape: {_shape(guess)}")
-    return "{" + ", ".join(texts) + "}"
-
-
-def _value(key: str, value: str | tuple[str, ...]) -> str:
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(_text, value))}]"
-    return f"{{field: {_text(value)}}}" if key == "class" else _text(value)
-
-
-def _shape(guess: Guess) -> str:
-    if not guess.size:
-        return f"{{disc: {_RADIUS}}}"
-    return f"{{disc: {guess.size[0]}}}" if len(guess.size) == 1 else f"{{box: [{', '.join(guess.size)}]}}"
-
-
-def _name(topic: Topic, guess: Guess) -> str:
-    if guess.objects is None:
-        return name_from_topic(topic.name)
-    word = guess.objects.removesuffix("[*]").split(".")[-1].removesuffix("s") or "object"
-    return f"{word}{{{guess.name or 'index'}}}"
-
-
-def _remarks(guess: Guess) -> tuple[str, ...]:
-    sizeless = () if guess.polygon is not None or guess.size else _SIZELESS
-    others = (f"other lists that look like objects: {', '.join(guess.others[:6])}",) if guess.others else ()
-    return sizeless + others
-
-
-def _frame_lines(
-    active: Sequence[TopicSuggestion],
-    transforms: Sequence[TopicSuggestion],
-    examples: Mapping[str, Sequence[object]],
-) -> Iterator[str]:
-    """The fixed frame: needed as soon as coordinates are in more than one."""
-    frames = sorted({each.frame for each in active if each.frame is not None})
-    edges = {
-        edge
-        for each in transforms
-        for message in examples.get(each.topic.name, ())
-        for edge in _edges(message)
-    }
-    roots = sorted({parent for parent, _ in edges} - {child for _, child in edges})
-    if len(frames) > 1:
-        yield f"# coordinates are in the frames {_comment(', '.join(frames))}: bring them into one"
-        known = {name for edge in edges for name in edge}
-        fixed = next((root for root in roots if known.issuperset(frames)), None)
-        yield f"{'' if fixed else '# '}fixed_frame: {_text(fixed or frames[0])}"
-    elif edges:
-        yield "# without a fixed frame, coordinates are taken as they are"
-        yield f"# fixed_frame: {_text((roots or frames or ['map'])[0])}"
-
-
-def _edges(message: object) -> Iterator[tuple[str, str]]:
-    """The frames that a message with transforms joins, parent first."""
-    listed = getattr(message, "transforms", None)
-    if isinstance(message, dict):
-        listed = message.get("transforms")
-    for each in [message] if listed is None else listed:
-        fields = each if isinstance(each, dict) else _Attributes(each)
-        parent = frame_of(each) or fields.get("parent_frame_id")
-        child = fields.get("child_frame_id")
-        if isinstance(parent, str) and isinstance(child, str) and parent and child:
-            yield parent.removeprefix("/"), child.removeprefix("/")
-
-
-class _Attributes:
-    """The attributes of a message, got as the keys of a JSON object are."""
-
-    def __init__(self, message: object) -> None:
-        self._message = message
-
-    def get(self, name: str) -> object:
-        return getattr(self._message, name, None)
-
-
-def _time_lines(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) -> Iterator[str]:
-    yield "clock: log    # when a message was recorded; publish: when it was sent; header: its own stamp"
-    if active:
-        topic = _text(_sampled(active, first_ns).name)
-        yield f"sample: {{topic: {topic}}}    # a sample at each of its messages; or {{every: 100ms}}"
-        yield "max_age: 1s    # after which an object that nothing is heard of is unknown"
-
-
-def _sampled(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) -> Topic:
-    """Where to take samples: at the last of the topics that begin together, so that none is missing."""
-    topics = [each.topic for each in active]
-    begins = [first_ns.get(topic.name, FOREVER) for topic in topics]
-    often = max(topic.count or 0 for topic in topics)
-    together = [
-        (begin, topic)
-        for begin, topic in zip(begins, topics, strict=True)
-        if begin <= min(begins) + _TOGETHER_NS and 2 * (topic.count or 0) >= often
-    ]
-    return max(together, key=itemgetter(0))[1] if together else topics[0]
-
-
-def _unused(each: TopicSuggestion) -> Iterator[str]:
-    topic = _text(each.topic.name)
-    if each.entry:
-        yield f"  # {topic}: {each.entry}    # {_described(each.topic)}"
-    elif each.numbers:
-        path = {number: _text(number.replace(".", "_")) for number in each.numbers[:_MOST_SIGNALS]}
-        signals = ", ".join(f"{_signal_name(each.topic, name)}: {number}" for number, name in path.items())
-        yield f"  # {topic}: {{signals: {{{signals}}}}}    # {_described(each.topic)}"
-    else:
-        remark = "".join(f"; {remark}" for remark in each.remarks)
-        yield f"  # {topic}: {_described(each.topic)}{remark}"
-
-
-def _signal_name(topic: Topic, name: str) -> str:
-    return f"{name_from_topic(topic.name)}_{name}"
-
-
-def _described(topic: Topic) -> str:
-    kind = _comment(topic.type) or "type unknown"
-    return (
-        kind if topic.count is None else f"{kind}, {topic.count:,} message{'' if topic.count == 1 else 's'}"
-    )
-
-
-def _comment(text: str) -> str:
-    """A text that stays on its line."""
-    return " ".join("".join(each if each.isprintable() else " " for each in text).split())[:200]
-
-
-def _text(text: str) -> str:
-    """A text as a YAML scalar."""
-    return (
-        text if _PLAIN.fullmatch(text) and not text.endswith("[*]") else json.dumps(text, ensure_ascii=True)
-    )

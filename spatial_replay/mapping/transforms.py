@@ -1,12 +1,8 @@
-"""Frames: transforms as a log reports them, and between any two frames at any time.
+"""Frames: messages with transforms in, the transform between any two frames at any time out.
 
 A transform places a child frame in its parent. Between two transforms of a child, translation is interpolated
-linearly and rotation along the shorter arc, as tf2 does; there is no extrapolation. A static one holds at
-all times.
-
-Transforms out of messages, into the tree of frames.
-
-Rotations in space, many at a time: quaternions (x, y, z, w) and matrices.
+linearly and rotation along the shorter arc, as tf2 does; there is no extrapolation. A static transform holds
+at all times. Rotations are arrays of many at once: quaternions (x, y, z, w) and matrices.
 """
 
 from __future__ import annotations
@@ -36,9 +32,9 @@ _UPRIGHT = 1e-9
 
 
 def matrices_from_quaternions(quaternions: Floats) -> tuple[Floats, Floats]:
-    """Rotation matrices of quaternions of any length.
+    """Convert quaternions of any length to rotation matrices.
 
-    A quaternion of zeros, as messages have it that were never given an orientation, stands for no rotation.
+    A quaternion of zeros, the default of messages whose orientation was never set, means no rotation.
 
     Args:
         quaternions: (N, 4) x, y, z, w.
@@ -78,18 +74,18 @@ def matrices_from_yaw(yaw: Floats) -> Floats:
 
 
 def yaw_of(matrices: Floats) -> Floats:
-    """(N,) the angle of the x axis seen along z, in radians; NaN where that is a point."""
+    """Return the angle (N,) of the projected x axis in radians; NaN if its projection is a point."""
     x, y = matrices[:, 0, 0], matrices[:, 1, 0]
     return np.asarray(np.where(np.hypot(x, y) > _UPRIGHT, np.arctan2(y, x), np.nan))
 
 
 def is_upright(matrices: Floats) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """(N,) whether the z axis stays the z axis, up or down."""
+    """Return whether (N,) the rotation maps the z axis to itself, up or down."""
     return np.asarray(np.hypot(matrices[:, 0, 2], matrices[:, 1, 2]) <= _UPRIGHT)
 
 
 def slerp(first: Floats, second: Floats, share: Floats) -> Floats:
-    """Quaternions between two, at equal angular speed, on the shorter way.
+    """Interpolate between quaternions at constant angular speed, along the shorter arc.
 
     Args:
         first, second: (N, 4) x, y, z, w, of any length but 0.
@@ -98,9 +94,11 @@ def slerp(first: Floats, second: Floats, share: Floats) -> Floats:
     first = first / np.linalg.norm(first, axis=1, keepdims=True)
     second = second / np.linalg.norm(second, axis=1, keepdims=True)
     dot = np.einsum("ij,ij->i", first, second)
+    # q and -q are one rotation; the arc to the nearer one is the shorter
     second = np.where(dot[:, None] < 0, -second, second)
     angle = np.arccos(np.clip(np.abs(dot), 0.0, 1.0))
     sine = np.sin(angle)
+    # the quotient below is 0 / 0 for equal quaternions, and linear interpolation is exact enough near them
     is_close = sine < _LEAST_NORM
     divisor = np.where(is_close, 1.0, sine)
     one = np.where(is_close, 1.0 - share, np.sin((1.0 - share) * angle) / divisor)
@@ -109,18 +107,18 @@ def slerp(first: Floats, second: Floats, share: Floats) -> Floats:
 
 
 HISTORY_NS = 10 * 10**9
-"""How far transforms may lie from the time that is asked for, before or after it."""
+"""How far the transforms before and after a time may lie from it."""
 
 _LONGEST_CHAIN = 100
 
 
 class Transforms(NamedTuple):
-    """N rigid motions.
+    """N rigid transforms.
 
     Attributes:
         rotation: (N, 3, 3).
         translation: (N, 3).
-        known: (N,) bool; where not, the numbers mean nothing.
+        known: (N,) bool; numbers of unknown transforms have no meaning.
     """
 
     rotation: Floats
@@ -133,7 +131,7 @@ class Transforms(NamedTuple):
         return cls(rotation, np.zeros((count, 3)), np.ones(count, np.bool_))
 
     def after(self, first: Transforms) -> Transforms:
-        """a_from_c of a_from_b (this) and b_from_c (`first`)."""
+        """Return a_from_c for a_from_b (this) and b_from_c (`first`)."""
         return Transforms(
             self.rotation @ first.rotation,
             np.einsum("nij,nj->ni", self.rotation, first.translation) + self.translation,
@@ -141,14 +139,15 @@ class Transforms(NamedTuple):
         )
 
     def inverted(self) -> Transforms:
-        """b_from_a of a_from_b."""
+        """Return b_from_a for a_from_b."""
         rotation = np.swapaxes(self.rotation, 1, 2)
         return Transforms(rotation, -np.einsum("nij,nj->ni", rotation, self.translation), self.known)
 
 
 @dataclass(slots=True)
 class _Child:
-    """Every transform of one child frame: stamp, clock, parent, pose; and the static one, if there is one."""
+    """The transforms of one child frame: stamp, clock, parent and pose of each; and the static one, if
+    any."""
 
     entries: list[tuple[int, int, str, tuple[float, ...]]] = field(default_factory=list)
     parents: dict[str, None] = field(default_factory=dict)
@@ -156,7 +155,7 @@ class _Child:
 
 
 class _Series(NamedTuple):
-    """Transforms of one child, by one of its two times."""
+    """The transforms of one child frame, ordered by stamp or by clock."""
 
     times_ns: Integers
     parents: list[str]
@@ -164,7 +163,7 @@ class _Series(NamedTuple):
 
 
 class FrameTree:
-    """The transforms of a log, as they come."""
+    """The transforms of a log, added as they arrive."""
 
     def __init__(self) -> None:
         self._children: dict[str, _Child] = {}
@@ -180,46 +179,45 @@ class FrameTree:
         clock_ns: int,
         is_static: bool,
     ) -> None:
-        """Take one transform.
+        """Add one transform.
 
         Args:
             pose: x, y, z, then the quaternion x, y, z, w.
             stamp_ns: the time inside the message.
             clock_ns: the time of the message on the clock of the samples.
         """
-        kept = self._children.get(child)
-        if kept is None:
-            kept = self._children[child] = _Child()
+        entry = self._children.get(child)
+        if entry is None:
+            entry = self._children[child] = _Child()
         if is_static:
-            kept.static = (parent, pose)
+            entry.static = (parent, pose)
             return
-        kept.entries.append((stamp_ns, clock_ns, parent, pose))
-        if parent not in kept.parents:
-            kept.parents[parent] = None
-        if self._series:
-            self._series.clear()
+        entry.entries.append((stamp_ns, clock_ns, parent, pose))
+        entry.parents.setdefault(parent)
+        self._series.clear()
 
     def forget_before(self, clock_ns: int) -> None:
-        """Drop transforms of messages before a time, but for the last one of each child."""
+        """Drop the transforms of messages before a time, except the last one of each child."""
         for child in self._children.values():
             keep = [entry for entry in child.entries if entry[1] >= clock_ns]
             if len(keep) < len(child.entries):
+                # the last one names the parent, and may be the start of the next interpolation
                 child.entries = keep or child.entries[-1:]
                 child.parents = dict.fromkeys(entry[2] for entry in child.entries)
         self._series.clear()
 
     @property
     def names(self) -> frozenset[str]:
-        """Every frame that is a child or a parent of some transform."""
+        """All frames that are a child or a parent of a transform."""
         parents = {parent for child in self._children.values() for parent in child.parents}
         static = {child.static[0] for child in self._children.values() if child.static is not None}
         return frozenset(self._children) | parents | static
 
     def between(self, target: str, source: str, times_ns: Integers, *, by_stamp: bool) -> Transforms:
-        """target_from_source at each of N times; not known where the tree does not say.
+        """Return target_from_source at each of N times; unknown where the tree has no transforms.
 
         Args:
-            times_ns: (N,) on the clock of the stamps, or of the messages (`by_stamp=False`).
+            times_ns: (N,) stamps, or times of messages on the clock of the samples (`by_stamp=False`).
         """
         if target == source or not len(times_ns):
             return Transforms.identity(len(times_ns))
@@ -230,13 +228,14 @@ class FrameTree:
             np.zeros((len(times_ns), 3, 3)), np.zeros((len(times_ns), 3)), np.zeros(len(times_ns), np.bool_)
         )
         for part in parts:
-            found = self._in_one_tree(target, source, times_ns[part], by_stamp)
-            for whole, piece in zip(result, found, strict=True):
+            for whole, piece in zip(
+                result, self._in_one_tree(target, source, times_ns[part], by_stamp), strict=True
+            ):
                 whole[part] = piece
         return result
 
     def _stretches(self, times_ns: Integers, by_stamp: bool) -> list[Integers]:
-        """The times in groups between which no frame changes its parent."""
+        """Return the indices of times in groups within which no frame changes its parent."""
         breaks: set[int] = set()
         for name, child in self._children.items():
             if len(child.parents) > 1:
@@ -263,10 +262,11 @@ class FrameTree:
         return common_from_target.inverted().after(common_from_source)
 
     def _ancestors(self, frame: str, time_ns: int, by_stamp: bool) -> list[str]:
-        """A frame, its parent, the parent's parent and so on, around a time."""
+        """Return a frame, its parent, the parent of that and so on, at a time."""
         chain = [frame]
         while len(chain) < _LONGEST_CHAIN:
             parent = self._parent(chain[-1], time_ns, by_stamp)
+            # a log may contain cycles
             if parent is None or parent in chain:
                 break
             chain.append(parent)
@@ -283,14 +283,14 @@ class FrameTree:
         return series.parents[max(at, 0)]
 
     def _climb(self, frames: list[str], times_ns: Integers, by_stamp: bool) -> Transforms:
-        """The transform into the parent of the last of some frames, each the parent of the one before."""
+        """Return the transform from the first frame of a chain into the parent of the last."""
         total = Transforms.identity(len(times_ns))
         for frame in frames:
             total = self._step(frame, times_ns, by_stamp).after(total)
         return total
 
     def _step(self, frame: str, times_ns: Integers, by_stamp: bool) -> Transforms:
-        """parent_from_child at each time."""
+        """Return parent_from_child at each time."""
         child = self._children[frame]
         if child.static is not None:
             poses = np.broadcast_to(np.array(child.static[1], np.float64), (len(times_ns), 7))
@@ -310,6 +310,7 @@ class FrameTree:
         parents = series.parents
         if len(set(parents)) > 1:
             same = [parents[i] == parents[j] for i, j in zip(before.tolist(), after.tolist(), strict=True)]
+            # poses in different parents cannot be interpolated; the earlier one holds
             share = np.where(same, share, 0.0)
         first, second = series.poses[before], series.poses[after]
         translation = first[:, :3] + share[:, None] * (second[:, :3] - first[:, :3])
@@ -321,21 +322,21 @@ class FrameTree:
         return _transforms(translation, rotation, known)
 
     def _series_of(self, frame: str, by_stamp: bool) -> _Series:
-        """The transforms of a child in order; of equal times, the later one counts."""
-        found = self._series.get((frame, by_stamp))
-        if found is None:
+        """Return the transforms of a child in order; of equal times, the later entry counts."""
+        series = self._series.get((frame, by_stamp))
+        if series is None:
             child = self._children[frame]
             times = np.array([entry[0 if by_stamp else 1] for entry in child.entries], np.int64)
             order = np.argsort(times, kind="stable")
             ordered = times[order]
             keep = order[np.append(ordered[1:] != ordered[:-1], True)[: len(ordered)]]
-            found = _Series(
+            series = _Series(
                 times[keep],
                 [child.entries[i][2] for i in keep.tolist()],
                 np.array([child.entries[i][3] for i in keep.tolist()], np.float64).reshape(-1, 7),
             )
-            self._series[frame, by_stamp] = found
-        return found
+            self._series[frame, by_stamp] = series
+        return series
 
 
 def _transforms(translation: Floats, quaternions: Floats, known: NDArray[np.bool_]) -> Transforms:
@@ -345,7 +346,7 @@ def _transforms(translation: Floats, quaternions: Floats, known: NDArray[np.bool
 
 
 def _not_zero(quaternions: Floats) -> Floats:
-    """Quaternions of zeros as no rotation."""
+    """Replace quaternions of zeros by no rotation."""
     zero = np.einsum("ij,ij->i", quaternions, quaternions) == 0.0
     return np.where(zero[:, None], np.array([0.0, 0.0, 0.0, 1.0]), quaternions)
 
@@ -355,17 +356,17 @@ _REST = ("nanosec", "nsec", "nsecs", "nanos")
 
 
 class TransformReader:
-    """Reads the transforms in the messages of one topic, whatever they are called there."""
+    """Reads the transforms in the messages of one topic, in the types of ROS 1, ROS 2 and Foxglove."""
 
     def __init__(self) -> None:
         self._list: Get | None = None
         self._get: Get | None = None
 
     def add(self, tree: FrameTree, message: object, clock_ns: int, *, is_static: bool) -> None:
-        """Put every transform of a message into a tree.
+        """Add the transforms of a message to a tree.
 
         Raises:
-            FieldError, AttributeError, LookupError, TypeError, ValueError: it is no message of transforms.
+            FieldError, AttributeError, LookupError, TypeError, ValueError: the message holds no transforms.
         """
         for transform in self._each(message):
             child, parent, seconds, rest, *pose = self._values(transform)
@@ -379,7 +380,7 @@ class TransformReader:
             )
 
     def stamp(self, message: object) -> int | None:
-        """The stamp of a message's first transform; None where it has no transform."""
+        """Return the stamp of the first transform of a message; None if there is no transform."""
         for transform in self._each(message):
             _, _, seconds, rest, *_ = self._values(transform)
             return _nanoseconds(seconds, rest)
@@ -394,14 +395,13 @@ class TransformReader:
         return iter(self._list(message))
 
     def _values(self, transform: Any) -> Sequence[Any]:
-        if self._get is None:
-            self._get = _getter(transform)
+        self._get = self._get or _getter(transform)
         values: Sequence[Any] = self._get(transform)
         return values
 
 
 def _getter(example: object) -> Get:
-    """Child, parent, seconds, nanoseconds, x, y, z, and the quaternion's x, y, z, w."""
+    """Return a getter for child, parent, seconds, nanoseconds, x, y, z and the quaternion x, y, z, w."""
     names = field_names(example)
     stamp, parent = (
         ("header.stamp", "header.frame_id") if "header" in names else ("timestamp", "parent_frame_id")
@@ -409,12 +409,12 @@ def _getter(example: object) -> Get:
     place = "transform." if "transform" in names else ""
     paths = ["child_frame_id", parent]
     for parts in (_SECONDS, _REST):
-        found = [
+        existing = [
             f"{stamp}.{part}" for part in parts if leads_somewhere(FieldPath.of(f"{stamp}.{part}"), example)
         ]
-        if not found:
-            raise FieldError(f"{stamp} is no time; a transform has a stamp")
-        paths.append(found[0])
+        if not existing:
+            raise FieldError(f"{stamp} is not a time; a transform has a stamp")
+        paths.append(existing[0])
     paths += [f"{place}translation.{axis}" for axis in "xyz"]
     paths += [f"{place}rotation.{axis}" for axis in "xyzw"]
     return tuple_getter([FieldPath.of(path) for path in paths], style_of(example))

@@ -1,7 +1,7 @@
-"""YAML text to plain values with the line of each: no tags, no aliases, no key twice, of bounded size.
+"""Read YAML: text in, plain values with their line numbers out.
 
-Plain scalars are read as YAML 1.2 reads them, so that `no` and `12:30` are texts and a topic or a name never
-becomes a truth value or a number of minutes.
+Size and depth are limited; tags, aliases and repeated keys are errors. Plain scalars follow YAML 1.2, so that
+`no` and `12:30` are texts: a topic or a name never becomes a truth value or a number of minutes.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 Value: TypeAlias = "dict[str, Value] | list[Value] | str | int | float | bool | None"
 Place: TypeAlias = tuple[str | int, ...]
-"""Keys and indices from the top of a document down to a value."""
+"""Keys and indices from the top of a document to a value."""
 
 LARGEST_TEXT = 256 * 1024
-"""Bytes; a mapping is written by hand, and one beyond this is a file of another kind."""
+"""Bytes; mappings are written by hand, so a larger file is something else."""
 
 _DEEPEST = 20
 _INTEGER = re.compile(r"[-+]?[0-9]{1,300}", re.ASCII)
@@ -31,12 +31,12 @@ _SPECIAL = re.compile(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
 
 @dataclass(slots=True)
 class Document:
-    """What a YAML text holds.
+    """The content of a YAML text.
 
     Attributes:
         value: mappings, lists, texts, numbers, truth values, None.
-        lines: the line, from 1, of each value (of a key's value, that of the key).
-        faults: (line, what) of everything that cannot be read.
+        lines: the line of each value, from 1; for the value of a key, the line of the key.
+        faults: (line, text) of each error.
     """
 
     value: Value = None
@@ -44,14 +44,14 @@ class Document:
     faults: list[tuple[int, str]] = field(default_factory=list)
 
     def line_of(self, place: Place) -> int:
-        """The line of a value, or of the nearest one around it."""
+        """Return the line of a value, or of the nearest one around it."""
         while place and place not in self.lines:
             place = place[:-1]
         return self.lines.get(place, 1)
 
 
 def document_from_text(text: str) -> Document:
-    """Read a YAML text; what cannot be read stands in `faults`."""
+    """Read a YAML text; errors are in `faults` of the document."""
     import yaml
 
     document = Document()
@@ -59,25 +59,25 @@ def document_from_text(text: str) -> Document:
         document.faults.append((1, f"the file is larger than {LARGEST_TEXT // 1024} KiB; a mapping is not"))
         return document
     try:
-        if fault := _unwanted(yaml.parse(text, Loader=yaml.SafeLoader)):
+        if fault := _unsupported(yaml.parse(text, Loader=yaml.SafeLoader)):
             document.faults.append(fault)
             return document
         node = yaml.compose(text, Loader=yaml.SafeLoader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         what = error.problem or error.context or "it cannot be read"
-        document.faults.append((mark.line + 1 if mark else 1, f"this is no YAML: {what}"))
+        document.faults.append((mark.line + 1 if mark else 1, f"this is not YAML: {what}"))
         return document
     except yaml.YAMLError as error:
-        document.faults.append((1, f"this is no YAML: {str(error).splitlines()[0]}"))
+        document.faults.append((1, f"this is not YAML: {str(error).splitlines()[0]}"))
         return document
     if node is not None:
         document.value = _value(node, (), document)
     return document
 
 
-def _unwanted(events: Iterable[yaml.Event]) -> tuple[int, str] | None:
-    """The first thing that a mapping does not need, and that could make little text mean much."""
+def _unsupported(events: Iterable[yaml.Event]) -> tuple[int, str] | None:
+    """Find the first feature that mappings do not need and that could make a short text mean much."""
     import yaml
 
     depth = 0
@@ -118,13 +118,9 @@ def _table(node: yaml.MappingNode, place: Place, document: Document) -> dict[str
             continue
         key = key_node.value
         if key in table:
-            document.faults.append(
-                (
-                    line,
-                    f"the key {key[:60]!r} is there twice; the first is in line "
-                    f"{document.lines[(*place, key)]}",
-                )
-            )
+            first = document.lines[(*place, key)]
+            what = f"the key {key[:60]!r} appears twice; the first is in line {first}"
+            document.faults.append((line, what))
             continue
         document.lines[(*place, key)] = line
         table[key] = _value(value_node, (*place, key), document)

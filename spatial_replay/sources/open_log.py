@@ -170,8 +170,7 @@ def _open_messages(path: Path, kind: str, options: ReadOptions) -> Source:
             " does, with --mapping FILE or mapping=FILE"
         )
     # what reads the logs of others is loaded when there is one
-    from spatial_replay.mapping.mapped_source import MappedSource
-    from spatial_replay.mapping.mapping_file import load_mapping
+    from spatial_replay.mapping import MappedSource, load_mapping
 
     return MappedSource(path, load_mapping(options.mapping), kind, options.concave, options.on_time_jump)
 

@@ -1,4 +1,4 @@
-"""Messages of all kinds, handed to an assembler as a reader would hand them over."""
+"""Messages of all types, added to an assembler as a reader would add them."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ from rosbags.typesys.store import Typestore
 
 from spatial_replay.bags import Message
 from spatial_replay.bags.topic import Decoder, Topic
-from spatial_replay.mapping.assemble import Assembler
-from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.reading_plan import ReadingPlan
+from spatial_replay.mapping import Assembler, ReadingPlan, parse_mapping
 from spatial_replay.trace.trace import Trace
 
 SECOND = 10**9
@@ -48,7 +46,7 @@ _DEFINITIONS = {
 
 @cache
 def types() -> Typestore:
-    """The types of ROS 2, and some that come with packages of their own."""
+    """Return the types of ROS 2, with some of further packages."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     for name, text in _DEFINITIONS.items():
         store.register(get_types_from_msg(text, name))
@@ -56,7 +54,7 @@ def types() -> Typestore:
 
 
 def ros(name: str, **values: Any) -> Any:
-    """A ROS message; what is not given is 0, empty, or the same of its parts."""
+    """Make a ROS message; fields that are not given are 0 or empty."""
     package, _, short = name.partition("/")
     kind = types().types[f"{package}/msg/{short}"]
     _, fields = types().fielddefs[f"{package}/msg/{short}"]
@@ -116,7 +114,7 @@ def tf(*transforms: Any) -> Any:
 
 
 def type_of(content: Any) -> str:
-    """What a log would call the type of a message."""
+    """Return the type of a message as logs name it."""
     descriptor = getattr(content, "DESCRIPTOR", None)
     return str(getattr(content, "__msgtype__", "unknown") if descriptor is None else descriptor.full_name)
 
@@ -151,14 +149,14 @@ class Feed:
 
 @dataclass(frozen=True)
 class Made:
-    """What came out."""
+    """A trace with faults and remarks."""
 
     trace: Trace
     faults: tuple[str, ...]
     remarks: tuple[str, ...]
 
     def centre(self, sample: int, name: str) -> tuple[float, float]:
-        """The mean of an object's corners, rounded."""
+        """Return the mean of an object's corners, rounded."""
         vertices = self.footprint_row(sample, name)
         x, y = vertices.mean(axis=0).tolist()
         return round(x, 9), round(y, 9)
@@ -171,7 +169,7 @@ class Made:
         return shapes.vertices[shapes.vertex_start[parts[0]] : shapes.vertex_start[parts[1]]]
 
     def states(self, name: str) -> str:
-        """An object in each sample: + known, ? unknown, - absent."""
+        """Return the state of an object in each sample: + known, ? unknown, - absent."""
         if name not in self.trace.names:
             return "-" * len(self.trace)
         rows = self.trace.rows[:, self.trace.names.index(name)].tolist()
@@ -179,7 +177,7 @@ class Made:
 
 
 def make(mapping: str, feed: Feed, *, batch: int = 1000, **options: Any) -> Made:
-    """The samples of a feed under a mapping."""
+    """Map the messages of a feed to samples."""
     plan = ReadingPlan.of(parse_mapping(mapping, "test.yaml"), feed.topics())
     assembler = Assembler(plan, feed.decoder, name="test.bag", **options)
     raw = [message for message in feed.raw() if message.topic in plan.topics]

@@ -1,4 +1,4 @@
-"""Everything in one fixed frame: by hand, at times in between, and where a transform is missing."""
+"""Transforms into the fixed frame: chains, interpolation, and missing transforms."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_the_fixed_frame_may_be_a_child_and_the_chain_meet_above() -> None:
 
 
 def moving(*stamps: int) -> Feed:
-    """A base that moves at 1 m/s along x and turns by 90 degrees a second."""
+    """Return a base that moves at 1 m/s along x and turns by 90 degrees per second."""
     feed = Feed()
     for stamp in stamps:
         half = stamp / SECOND * pi / 4
@@ -49,7 +49,7 @@ def moving(*stamps: int) -> Feed:
     return feed
 
 
-def test_between_two_transforms_it_is_in_between() -> None:
+def test_transforms_are_interpolated() -> None:
     feed = moving(0, SECOND)
     feed.messages.insert(1, ("/p", SECOND // 3, pose_stamped(1.0, 0.0, "base", time_ns=SECOND // 3)))
     made = make("fixed_frame: map\ntopics: {/p: {}}", feed)
@@ -59,7 +59,7 @@ def test_between_two_transforms_it_is_in_between() -> None:
     assert made.trace.observation(0).yaw == pytest.approx(pi / 6)
 
 
-def test_the_stamp_inside_says_when_not_the_time_of_arrival() -> None:
+def test_an_object_is_placed_by_its_stamp_not_by_its_arrival() -> None:
     feed = moving(0, SECOND, 2 * SECOND)
     feed.add("/p", 2 * SECOND + 5, pose_stamped(0.0, 0.0, "base", time_ns=SECOND // 2))
     assert make("fixed_frame: map\ntopics: {/p: {}}", feed).centre(0, "p") == (0.5, 0.0)
@@ -87,7 +87,7 @@ def test_transforms_farther_apart_than_ten_seconds_do_not_count() -> None:
     assert make("fixed_frame: map\ntopics: {/p: {}}", feed).states("p") == "?"
 
 
-def test_a_frame_that_nobody_knows_makes_its_objects_unknown() -> None:
+def test_objects_in_an_unknown_frame_are_unknown() -> None:
     feed = Feed().add("/p", 0, pose_stamped(1, 1, "camera")).add("/q", 1, pose_stamped(1, 1, ""))
     made = make("fixed_frame: map\nsample: {topic: /q}\ntopics: {/p: {}, /q: {}}", feed)
     assert (made.states("p"), made.states("q")) == ("?", "?")
@@ -124,7 +124,7 @@ def test_a_frame_may_change_its_parent() -> None:
     assert [made.centre(n, "p") for n in range(4)] == [(1, 10), (2, 10), (3, -10), (4, -10)]
 
 
-def test_frames_that_go_round_in_circles_are_no_tree() -> None:
+def test_frames_in_a_cycle_make_objects_unknown() -> None:
     feed = Feed(latched=frozenset({"/tf_static"}))
     feed.add("/tf_static", 0, tf(transform("a", "b", (1, 0, 0)), transform("b", "a", (1, 0, 0))))
     feed.add("/p", 0, pose_stamped(0, 0, "a"))
@@ -159,7 +159,7 @@ def test_a_covariance_turns_with_its_frame() -> None:
     assert make(text, feed).trace.observation(0).uncertainty == pytest.approx(0.5)
 
 
-def test_old_transforms_are_forgotten_but_for_the_last() -> None:
+def test_old_transforms_are_dropped_except_the_last() -> None:
     tree = FrameTree()
     for tick in range(100):
         pose = (float(tick), 0.0, 0.0, *NO_TURN)

@@ -1,4 +1,5 @@
-"""Messages that hold anything at all: what can be read is read, the rest is told, nothing else is raised."""
+"""Messages with arbitrary content: readable ones are read, the others are reported, nothing else is
+raised."""
 
 from __future__ import annotations
 
@@ -78,14 +79,14 @@ anything = st.recursive(
 
 
 def places(value: Any, here: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Every place in a message."""
+    """Return every place in a message."""
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     return [here, *(place for key, each in inner for place in places(each, (*here, key)))]
 
 
 @st.composite
-def spoilt(draw: st.DrawFn, example: Any) -> Any:
-    """A message with something else in one place, or without it."""
+def damaged(draw: st.DrawFn, example: Any) -> Any:
+    """Draw a message with one value replaced or removed."""
     place = draw(st.sampled_from(places(example)))
     if not place:
         return draw(anything)
@@ -104,11 +105,11 @@ def spoilt(draw: st.DrawFn, example: Any) -> Any:
 @pytest.mark.parametrize("head", ["", "fixed_frame: map\n", "clock: header\n"])
 @settings(max_examples=20)
 @given(data=st.data())
-def test_a_spoilt_message_costs_itself_only(kind: str, head: str, data: st.DataObject) -> None:
+def test_a_damaged_message_affects_no_other(kind: str, head: str, data: st.DataObject) -> None:
     example = EXAMPLES[kind]
     feed = Feed(types={"/a": kind})
     feed.add("/a", SECOND, example)
-    feed.add("/a", SECOND + 1, data.draw(spoilt(example)))
+    feed.add("/a", SECOND + 1, data.draw(damaged(example)))
     feed.add("/a", SECOND + 2, example)
     try:
         made = make(f"{head}topics: {{/a: {{{KEYS.get(kind, '')}}}}}", feed)
@@ -126,9 +127,9 @@ def test_a_spoilt_message_costs_itself_only(kind: str, head: str, data: st.DataO
 @pytest.mark.parametrize("kind", EXAMPLES)
 @settings(max_examples=20)
 @given(data=st.data())
-def test_a_first_message_that_is_spoilt_is_told(kind: str, data: st.DataObject) -> None:
+def test_a_damaged_first_message_is_reported(kind: str, data: st.DataObject) -> None:
     feed = (
-        Feed(types={"/a": kind}).add("/a", 0, data.draw(spoilt(EXAMPLES[kind]))).add("/a", 1, EXAMPLES[kind])
+        Feed(types={"/a": kind}).add("/a", 0, data.draw(damaged(EXAMPLES[kind]))).add("/a", 1, EXAMPLES[kind])
     )
     try:
         make(f"topics: {{/a: {{{KEYS.get(kind, '')}}}}}", feed)

@@ -1,4 +1,4 @@
-"""What the documentation says about mapping files can be used, and it says everything."""
+"""The documentation of mapping files is complete, and its examples are valid."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from spatial_replay.mapping.mapping_file import parse_mapping
+from spatial_replay.mapping import parse_mapping
 from spatial_replay.mapping.message_types import BUILT_IN
 
 ROOT = Path(__file__).parents[2]
@@ -18,11 +18,11 @@ EXAMPLES = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
 
 
 @pytest.mark.parametrize("text", EXAMPLES)
-def test_every_example_is_a_mapping(text: str) -> None:
+def test_every_example_is_a_valid_mapping(text: str) -> None:
     assert parse_mapping(text).topics
 
 
-def test_every_key_is_told() -> None:
+def test_every_key_is_documented() -> None:
     schema = json.loads(files("spatial_replay.mapping").joinpath("mapping.schema.json").read_text())
     keys = [
         *schema["properties"],
@@ -32,6 +32,6 @@ def test_every_key_is_told() -> None:
     assert [key for key in keys if not re.search(rf"`{{?{key}[`:]", PAGE)] == []
 
 
-def test_every_type_is_told() -> None:
+def test_every_built_in_type_is_documented() -> None:
     names = [name.rpartition("/")[2] for name in BUILT_IN]
     assert [name for name in names if not re.search(rf"\b{name}`", PAGE)] == []

@@ -1,4 +1,4 @@
-"""Mapping files: what they say, and everything that can be wrong with them, all at once."""
+"""Mapping files: their content, and all their errors reported together."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from jsonschema import Draft202012Validator
 from mapping.feeding import Feed, make, pose_stamped
 from spatial_replay.bags import Topic
 from spatial_replay.errors import MissingFileError, UsageError
+from spatial_replay.mapping import ReadingPlan, load_mapping, parse_mapping
 from spatial_replay.mapping import mapping_file as schema
-from spatial_replay.mapping.mapping_file import load_mapping, parse_mapping
 from spatial_replay.mapping.model import FOREVER_NS, Sampling, ShapeMapping, SignalMapping, Uncertainty
-from spatial_replay.mapping.reading_plan import ReadingPlan
 
 EXAMPLE = """
 fixed_frame: world
@@ -33,7 +32,7 @@ shapes:
 """
 
 
-def test_a_mapping_says_what_is_read_and_how() -> None:
+def test_a_mapping_file_is_parsed_to_values() -> None:
     mapping = parse_mapping(EXAMPLE)
     turtle, tags, odom, battery, plain = mapping.topics
     assert (mapping.fixed_frame, mapping.clock, mapping.max_age_ns) == ("world", "header", 1_500_000_000)
@@ -52,7 +51,7 @@ def test_a_mapping_says_what_is_read_and_how() -> None:
     assert plain.reads_objects
 
 
-def test_its_hash_is_of_what_it_says_not_how_it_is_laid_out() -> None:
+def test_the_hash_ignores_layout_and_comments() -> None:
     one = parse_mapping("topics:\n  /a:\n    name: x  # a comment\n", "one.yaml")
     other = parse_mapping('{"topics": {"/a": {"name": "x"}}}', "other.yaml")
     different = parse_mapping("topics: {/a: {name: y}}")
@@ -60,12 +59,12 @@ def test_its_hash_is_of_what_it_says_not_how_it_is_laid_out() -> None:
 
 
 @pytest.mark.parametrize("word", ["no", "on", "12:30", "2020-01-01", "0x10", "1_000"])
-def test_words_stay_words(word: str) -> None:
+def test_plain_words_stay_texts(word: str) -> None:
     (topic,) = parse_mapping(f"topics: {{/a: {{name: {word}}}}}").topics
     assert topic.name == word
 
 
-def test_every_fault_is_told_with_its_line_and_what_belongs_there() -> None:
+def test_every_error_is_reported_with_its_line_and_what_belongs_there() -> None:
     text = """
 fixed_fram: world
 clock: logs
@@ -81,11 +80,11 @@ shapes:
 """
     with pytest.raises(UsageError) as caught:
         parse_mapping(text, "drive.yaml")
-    told = str(caught.value).splitlines()
+    errors = str(caught.value).splitlines()
     for line in (
         "drive.yaml:2: fixed_fram: unknown key; did you mean 'fixed_frame'?",
         'drive.yaml:3: clock: "logs" where this belongs: one of log, publish, header',
-        "drive.yaml:4: sample.every: '0ms' is no time; give a duration above 0",
+        "drive.yaml:4: sample.every: '0ms' is not a time; give a duration above 0",
         "drive.yaml:5: max_age: 5 where this belongs: a duration above 0 such as 500ms, or forever",
         "drive.yaml:7: topics./a.nam: unknown key; did you mean 'name'?",
         "drive.yaml:7: topics./a.shape.dics: unknown key; did you mean 'disc'?",
@@ -97,18 +96,18 @@ shapes:
         ' "m/s" or "1"',
         "drive.yaml:12: shapes.robot.offset: [0.1] where this belongs: two numbers [x, y]",
     ):
-        assert line in told
-    assert any("topics./b.objects" in line for line in told)
-    assert any("topics./b.name" in line for line in told)
-    assert any("topics./c.uncertainty" in line for line in told)
-    assert any("topics./c.position" in line for line in told)
-    assert any("shapes.robot.box[1]" in line for line in told)
+        assert line in errors
+    assert any("topics./b.objects" in line for line in errors)
+    assert any("topics./b.name" in line for line in errors)
+    assert any("topics./c.uncertainty" in line for line in errors)
+    assert any("topics./c.position" in line for line in errors)
+    assert any("shapes.robot.box[1]" in line for line in errors)
 
 
 @pytest.mark.parametrize(
     ("text", "what"),
     [
-        ("topics: {/a: {}, /a: {}}", "the key '/a' is there twice; the first is in line 1"),
+        ("topics: {/a: {}, /a: {}}", "the key '/a' appears twice; the first is in line 1"),
         ("a: &x [1]\nb: *x", "m.yaml:2: \\*x repeats another part"),
         (
             "topics: !!python/object:os.system {}",
@@ -117,23 +116,23 @@ shapes:
         ('topics: {/a: {class: "\\ud800"}}', "holds half a character"),
         ("topics: !own {}", "the tag !own means nothing"),
         ("[" * 5000, "nested more than 20 deep"),
-        ("topics: [1", "this is no YAML"),
-        ("a: \x00", "this is no YAML"),
+        ("topics: [1", "this is not YAML"),
+        ("a: \x00", "this is not YAML"),
         ("", "null where this belongs"),
         ("topics: {}", "topics"),
         ("topics: {'': {}}", "a name is empty"),
         ("? [a, b]\n: c", "a key is a list or a mapping"),
         ("topics: {/a: {name: '{a b}'}}", "is not a name"),
         ("x" * 300_000, "larger than 256 KiB"),
-        ("a: 1\n---\nb: 2", "this is no YAML"),
+        ("a: 1\n---\nb: 2", "this is not YAML"),
     ],
 )
-def test_what_is_no_mapping_is_refused(text: str, what: str) -> None:
+def test_an_invalid_mapping_is_refused(text: str, what: str) -> None:
     with pytest.raises(UsageError, match=what):
         parse_mapping(text, "m.yaml")
 
 
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+def test_an_unreadable_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MissingFileError, match="no such file"):
         load_mapping(tmp_path / "missing.yaml")
     (tmp_path / "latin.yaml").write_bytes(b"topics:\n  /\xe4: {}\n")
@@ -143,14 +142,14 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     assert load_mapping(tmp_path / "good.yaml").topics[0].topic == "/a"
 
 
-def test_the_published_schema_is_the_one_that_is_used() -> None:
+def test_the_published_schema_is_the_one_in_use() -> None:
     used = files("spatial_replay.mapping").joinpath(schema.SCHEMA_FILE).read_text(encoding="utf-8")
     Draft202012Validator.check_schema(json.loads(used))
     published = Path(__file__).parents[2] / "schemas" / schema.SCHEMA_FILE
     assert published.read_text(encoding="utf-8") == used
 
 
-def test_topics_that_the_log_does_not_have() -> None:
+def test_topics_missing_from_the_log_are_reported_with_a_hint() -> None:
     mapping = parse_mapping("sample: {topic: /tick}\ntopics: {/pse: {}, /other: {type: foo/Bar}}", "m.yaml")
     with pytest.raises(UsageError) as caught:
         ReadingPlan.of(
@@ -163,7 +162,7 @@ def test_topics_that_the_log_does_not_have() -> None:
     ]
 
 
-def test_topics_that_cannot_be_decoded() -> None:
+def test_a_mapped_topic_that_cannot_be_decoded_is_refused() -> None:
     broken = Topic("/pose", "geometry_msgs/msg/PoseStamped", "cdr", unreadable="its definition is missing")
     with pytest.raises(UsageError, match="its messages cannot be decoded: its definition is miss"):
         ReadingPlan.of(parse_mapping("topics: {/pose: {}}"), [broken])
@@ -191,19 +190,19 @@ def test_topics_that_cannot_be_decoded() -> None:
         ("yaw: $.header.stamp.sec", "give a field of the object"),
     ],
 )
-def test_paths_that_lead_nowhere_are_told_with_the_fields_that_are_there(keys: str, what: str) -> None:
+def test_a_path_that_leads_nowhere_is_reported_with_the_existing_fields(keys: str, what: str) -> None:
     feed = Feed().add("/p", 0, pose_stamped(0, 0))
     with pytest.raises(UsageError, match=rf"test.yaml: topics./p: .*({what})"):
         make(f"topics: {{/p: {{{keys}}}}}", feed)
 
 
-def test_one_name_for_objects_of_two_topics_is_refused() -> None:
+def test_two_topics_with_an_object_of_one_name_are_refused() -> None:
     feed = Feed().add("/a", 0, pose_stamped(0, 0)).add("/b", 0, pose_stamped(0, 0))
     with pytest.raises(UsageError, match="both /a and /b have an object 'cup'; give one of them"):
         make("topics: {/a: {name: cup}, /b: {name: cup}}", feed)
 
 
-def test_a_topic_can_be_read_as_a_type_that_is_known() -> None:
+def test_a_topic_can_be_read_as_a_built_in_type() -> None:
     feed = Feed().add("/p", 0, {"pose": {"position": {"x": 1.0, "y": 2.0, "z": 0.0}}, "header": {}})
     with pytest.raises(UsageError, match="has no field 'orientation'"):
         make("topics: {/p: {type: geometry_msgs/PoseStamped}}", feed)

@@ -1,4 +1,4 @@
-"""Field paths and names by template, over messages of every kind."""
+"""Field paths and name templates on messages of every encoding."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ MESSAGES: list[tuple[Any, str, Any]] = [
 
 
 @pytest.mark.parametrize(("message", "text", "value"), MESSAGES)
-def test_a_path_finds_the_same_in_messages_of_every_kind(message: Any, text: str, value: Any) -> None:
+def test_a_path_leads_to_its_value_in_every_encoding(message: Any, text: str, value: Any) -> None:
     path = FieldPath.of(text)
     assert walk(path, message) == value
     assert getter(path, style_of(message))(message) == value
     assert tuple_getter([path, path], style_of(message))(message) == (value, value)
 
 
-def test_every_element_of_lists_in_lists() -> None:
+def test_a_path_iterates_over_nested_lists() -> None:
     message = {"rows": [{"cells": [1, 2]}, {"cells": []}, {"cells": [3]}]}
     assert list(iter_elements(FieldPath.of("rows[*].cells[*]"), message)) == [1, 2, 3]
     entities = iter_elements(FieldPath.of("entities[*]"), scene())
@@ -74,7 +74,7 @@ def test_every_element_of_lists_in_lists() -> None:
         ({"a": 1}, "keys", "has no field 'keys'"),
     ],
 )
-def test_a_path_that_leads_nowhere_says_what_is_there(message: Any, text: str, what: str) -> None:
+def test_a_path_that_leads_nowhere_lists_the_existing_fields(message: Any, text: str, what: str) -> None:
     with pytest.raises(FieldError, match=what):
         walk(FieldPath.of(text), message)
 
@@ -82,12 +82,12 @@ def test_a_path_that_leads_nowhere_says_what_is_there(message: Any, text: str, w
 @pytest.mark.parametrize(
     "text", ["", "a..b", ".a", "a.", "a[", "a[-1]", "a[x]", "1a", "a b", "a()", "$a", "a.$.b"]
 )
-def test_what_is_no_path(text: str) -> None:
+def test_an_invalid_path_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="is not a field path"):
         FieldPath.of(text)
 
 
-def test_fields_of_messages_of_every_kind() -> None:
+def test_the_fields_of_a_message_are_listed_in_every_encoding() -> None:
     assert field_names(pose_stamped(0, 0)) == ("header", "pose")
     assert field_names(scene()) == ("deletions", "entities")
     assert field_names({"a": 1, "b": 2}) == ("a", "b")
@@ -102,7 +102,7 @@ def names(template: str, *things: dict[str, Any], topic: str = "/a/pose") -> lis
     return [texts[code] for code in found]
 
 
-def test_names_by_template() -> None:
+def test_a_template_makes_names() -> None:
     assert names("robot", {}, {}) == ["robot", "robot"]
     assert names("tag{id}", {"id": 3}, {"id": 4}, {"id": 3}) == ["tag3", "tag4", "tag3"]
     assert names("{ns}_{id}", {"ns": "cup", "id": 1.0}) == ["cup_1"]
@@ -121,17 +121,17 @@ def test_names_by_template() -> None:
         ("{id}", {"id": "x" * 999}),
     ],
 )
-def test_names_that_are_none(template: str, thing: dict[str, Any]) -> None:
+def test_an_unusable_name_is_an_error(template: str, thing: dict[str, Any]) -> None:
     with pytest.raises(FieldError):
         names(template, thing)
 
 
 @pytest.mark.parametrize("text", ["{", "}", "a{b", "{}", "{a b}", "{a|}", ""])
-def test_what_is_no_template(text: str) -> None:
+def test_an_invalid_template_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="is not a name"):
         NameTemplate.of(text)
 
 
-def test_names_after_topics() -> None:
+def test_objects_are_named_after_topics() -> None:
     found = [name_from_topic(topic) for topic in ("/turtle1/pose", "/pose", "/a/b/scan", "/", "/robot/odom")]
     assert found == ["turtle1", "pose", "a_b_scan", "object", "robot"]

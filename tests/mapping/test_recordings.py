@@ -1,4 +1,4 @@
-"""Recordings that others made, mapped: the figures that are known of them."""
+"""Public recordings: known figures of their mapped traces."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ import pytest
 
 from spatial_replay.bags import open_messages
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.mapping.assemble import Assembler
-from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.reading_plan import ReadingPlan
+from spatial_replay.mapping import Assembler, ReadingPlan, parse_mapping
 from spatial_replay.trace.trace import Trace
 
 TURTLES = ("two_turtles.bag", "two_turtles_lz4.bag", "two_turtles_mcap", "two_turtles_sqlite3")
@@ -38,7 +36,7 @@ def mapped(path: Path, text: str) -> Trace:
 
 
 def centres(trace: Trace, name: str) -> Floats:
-    """(T, 2) the one vertex of each footprint, NaN where the object is not known."""
+    """Return the one vertex (T, 2) of each footprint; NaN where the object is unknown."""
     rows = trace.rows[:, trace.names.index(name)]
     found = np.full((len(trace), 2), np.nan)
     found[rows >= 0] = trace.footprints.vertices[trace.footprints.part_start[rows[rows >= 0]]]
@@ -46,7 +44,7 @@ def centres(trace: Trace, name: str) -> Floats:
 
 
 @pytest.mark.parametrize("name", TURTLES)
-def test_two_turtles_come_as_close_as_they_did(data_folder: Path, name: str) -> None:
+def test_the_distance_of_two_turtles_is_the_same_in_all_containers(data_folder: Path, name: str) -> None:
     trace = mapped(data_folder / "bags" / name, POSES)
     distance = np.linalg.norm(centres(trace, "turtle1") - centres(trace, "turtle2"), axis=1)
     assert len(trace) == 1344
@@ -64,7 +62,7 @@ def test_poses_and_transforms_agree(data_folder: Path) -> None:
         assert np.allclose(np.nanmax(centres(frames, name), axis=0), np.nanmax(at, axis=0), atol=1e-6)
 
 
-def test_five_tags_by_both_clocks(data_folder: Path) -> None:
+def test_five_tags_are_sampled_by_either_clock(data_folder: Path) -> None:
     text = (
         "topics: {/detector/tags: {objects: 'apriltags[*]', name: 'tag{id}', polygon: corners, class: tag}}"
     )
@@ -77,12 +75,12 @@ def test_five_tags_by_both_clocks(data_folder: Path) -> None:
     assert set(np.diff(by_log.footprints.vertex_start).tolist()) == {4}
 
 
-def test_a_pose_stamped_of_a_second_system(data_folder: Path) -> None:
+def test_a_pose_stamped_topic_makes_one_object(data_folder: Path) -> None:
     trace = mapped(data_folder / "bags/pose_db3", "topics: {/pose: {}}")
     assert (len(trace), trace.names) == (1565, ("pose",))
 
 
-def test_vehicles_live_as_long_as_they_do(data_folder: Path) -> None:
+def test_vehicles_appear_in_their_known_numbers_of_samples(data_folder: Path) -> None:
     text = """
 topics:
   ground_truth:

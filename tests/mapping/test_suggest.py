@@ -1,4 +1,4 @@
-"""Mappings to start from: what is found in messages, and that it can be used as it is."""
+"""Suggested mappings: what is found in messages, and that the text is a valid mapping."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from typing import Any
 import pytest
 
 from spatial_replay.bags import Topic
-from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.model import LogMapping, ShapeMapping
-from spatial_replay.mapping.suggest import suggest_mapping
+from spatial_replay.mapping import LogMapping, parse_mapping, suggest_mapping
+from spatial_replay.mapping.model import ShapeMapping
 
 POINT = {"x": 1.0, "y": 2.0, "z": 0.0}
 TURN = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
@@ -17,7 +16,7 @@ STAMP = {"sec": 0, "nanosec": 0}
 
 
 def suggested(**examples: Any) -> tuple[str, LogMapping]:
-    """What is suggested for topics with one example each, as text and as read."""
+    """Suggest a mapping for topics with one example each; return its text and its values."""
     topics = [Topic(f"/{name}", f"a/msg/{name.title()}", "json") for name in examples]
     text = suggest_mapping("run.bag", topics, {f"/{name}": [each] for name, each in examples.items()})
     return text, parse_mapping(text)
@@ -38,7 +37,7 @@ def test_bare_coordinates_are_a_position() -> None:
     assert (topic.position, topic.yaw, topic.orientation) == (("x", "y"), "theta", None)
 
 
-def test_a_list_of_objects_is_found_wherever_it_is() -> None:
+def test_a_nested_list_of_objects_is_suggested() -> None:
     vehicle = {
         "id": {"value": 7},
         "base": {"position": POINT, "dimension": {"length": 4.0, "width": 2.0, "height": 1.5}},
@@ -84,7 +83,7 @@ def test_classes_are_texts() -> None:
         ("foxglove.PosesInFrame", True),
     ],
 )
-def test_known_types_need_no_fields(kind: str, needs_shape: bool) -> None:
+def test_built_in_types_need_no_fields(kind: str, needs_shape: bool) -> None:
     (topic,) = parse_mapping(suggest_mapping("run", [Topic("/a", kind, "cdr")], {})).topics
     assert (topic.shape is not None) == needs_shape
     assert topic.position is topic.objects is None
@@ -93,7 +92,7 @@ def test_known_types_need_no_fields(kind: str, needs_shape: bool) -> None:
 TRANSFORM = {"header": {"frame_id": "map", "stamp": STAMP}, "child_frame_id": "base"}
 
 
-def test_transforms_are_objects_only_where_nothing_else_is() -> None:
+def test_transforms_are_suggested_as_objects_only_without_other_objects() -> None:
     tf = Topic("/tf", "tf2_msgs/msg/TFMessage", "cdr")
     pose = Topic("/pose", "geometry_msgs/msg/PoseStamped", "cdr")
     (alone,) = parse_mapping(suggest_mapping("run", [tf], {})).topics
@@ -105,7 +104,7 @@ def test_transforms_are_objects_only_where_nothing_else_is() -> None:
     assert "# fixed_frame: map" in text
 
 
-def test_several_frames_are_brought_into_their_root() -> None:
+def test_the_root_frame_is_suggested_for_several_frames() -> None:
     pose = {"position": POINT}
     examples = {
         "/one": [{"header": {"frame_id": "map"}, "pose": pose}],
@@ -115,17 +114,17 @@ def test_several_frames_are_brought_into_their_root() -> None:
     kinds = {"/one": "a/msg/One", "/two": "a/msg/Two", "/tf": "tf2_msgs/msg/TFMessage"}
     topics = [Topic(name, kind, "json") for name, kind in kinds.items()]
     assert parse_mapping(suggest_mapping("run", topics, examples)).fixed_frame == "map"
-    # without the transforms nobody knows how the frames lie
+    # without the transforms the root is not known
     assert parse_mapping(suggest_mapping("run", topics[:2], examples)).fixed_frame is None
 
 
-def test_numbers_are_offered_as_signals() -> None:
+def test_numbers_are_suggested_as_signals() -> None:
     text, mapping = suggested(robot={"position": POINT}, battery={"header": {"seq": 1}, "percentage": 0.8})
     assert len(mapping.topics) == 1
     assert "# /battery: {signals: {battery_percentage: percentage}}" in text
 
 
-def test_what_is_no_object_is_listed() -> None:
+def test_topics_without_objects_are_listed_as_comments() -> None:
     topics = [
         Topic("/rosout", "rcl_interfaces/msg/Log", "cdr", 12),
         Topic("/odd name\n", "b\n: c", "x", unreadable="no\ndefinition"),
@@ -143,7 +142,7 @@ def test_what_is_no_object_is_listed() -> None:
     assert "cannot be read: no definition" in text
 
 
-def test_names_that_need_quotes_get_them() -> None:
+def test_topic_names_are_quoted_if_need_be() -> None:
     topics = [
         Topic(name, "geometry_msgs/msg/PoseStamped", "cdr")
         for name in ("no", "a: b", "#", "ünï", "'", '"', "a\n")
@@ -152,7 +151,7 @@ def test_names_that_need_quotes_get_them() -> None:
     assert [each.topic for each in mapping.topics] == [each.name for each in topics]
 
 
-def test_samples_are_taken_when_everything_has_begun() -> None:
+def test_the_last_topic_to_start_is_sampled() -> None:
     topics = [Topic(name, "geometry_msgs/msg/PoseStamped", "cdr", 100) for name in ("/a", "/b", "/late")]
     begins = {"/a": 10, "/b": 20, "/late": 10**10}
     assert parse_mapping(suggest_mapping("run", topics, {}, begins)).sampling.topic == "/b"

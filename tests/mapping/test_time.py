@@ -1,4 +1,4 @@
-"""When samples are taken, what is valid then, and what becomes of time that does not run as it should."""
+"""When samples are taken, which observations are valid then, and clocks that jump."""
 
 from __future__ import annotations
 
@@ -10,9 +10,7 @@ import pytest
 from mapping.feeding import SECOND, Feed, header, make, pose_stamped, ros
 from spatial_replay.bags.columns import MessageColumns
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.mapping.assemble import Assembler
-from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.reading_plan import ReadingPlan
+from spatial_replay.mapping import Assembler, ReadingPlan, parse_mapping
 from spatial_replay.trace.trace import Trace
 
 MS = 10**6
@@ -40,7 +38,7 @@ def test_each_message_of_the_first_topic_with_objects_is_a_sample() -> None:
     assert len(fast.trace) == 10
 
 
-def test_a_topic_that_carries_nothing_else_can_be_sampled() -> None:
+def test_an_unmapped_topic_can_be_sampled() -> None:
     feed = (
         Feed()
         .add("/a", 0, point(0))
@@ -64,7 +62,7 @@ def test_samples_at_each_multiple_of_a_step_do_not_depend_on_the_window() -> Non
     assert part.trace == whole.trace.slice(2, 7)
 
 
-def test_what_is_too_old_is_there_but_unknown() -> None:
+def test_an_object_with_an_old_observation_exists_but_is_unknown() -> None:
     feed = Feed().add("/b", 0, point(0))
     for tick in range(8):
         feed.add("/a", tick * SECOND // 2, point(tick))
@@ -75,7 +73,7 @@ def test_what_is_too_old_is_there_but_unknown() -> None:
     assert make("topics: {/a: {}, /b: {}}", feed).states("b") == "+++?????"
 
 
-def test_what_a_complete_list_leaves_out_has_left() -> None:
+def test_an_object_that_a_complete_list_leaves_out_is_absent() -> None:
     def listed(*numbers: int) -> dict[str, Any]:
         return {"things": [{"id": number, "x": 0.0, "y": 0.0} for number in numbers]}
 
@@ -207,7 +205,7 @@ def test_a_topic_may_have_objects_and_signals() -> None:
 
 
 @pytest.mark.parametrize("batch", [1, 3, 257])
-def test_however_messages_are_handed_over_they_make_the_same_samples(batch: int) -> None:
+def test_samples_do_not_depend_on_batches_of_messages(batch: int) -> None:
     feed = Feed()
     for tick in range(3000):
         feed.add("/p", tick * 10 * MS + (tick % 7) * MS, point(tick))
@@ -249,7 +247,7 @@ def test_a_window_has_the_samples_of_the_whole_log() -> None:
     assert part.trace == whole.slice(200, 300)
 
 
-def test_messages_that_are_not_as_the_others_are_told_and_left_out() -> None:
+def test_messages_that_do_not_fit_are_reported_and_skipped() -> None:
     feed = (
         Feed()
         .add("/p", 0, point(0))
@@ -265,7 +263,7 @@ def test_messages_that_are_not_as_the_others_are_told_and_left_out() -> None:
     assert {fault.split()[3] for fault in made.faults} == {"1", "2"}
 
 
-def test_a_first_message_with_a_name_that_is_none_costs_itself_only() -> None:
+def test_a_first_message_with_an_unusable_name_affects_no_other() -> None:
     feed = Feed().add("/p", 0, point(0, id="\x00")).add("/p", 1, point(1, id="cup"))
     made = make("topics: {/p: {name: '{id}'}}", feed)
     assert (made.trace.names, len(made.faults)) == (("cup",), 1)

@@ -1,4 +1,4 @@
-"""Objects out of messages of every type that is known by name."""
+"""Objects from messages of every built-in type, and of others by field paths."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_odometry_has_a_covariance() -> None:
     assert objects(content, "uncertainty: 0.25")["thing"].uncertainty == 0.25
 
 
-def test_a_negative_variance_says_that_nothing_is_known() -> None:
+def test_a_negative_variance_makes_the_object_unknown() -> None:
     covariance = np.zeros(36)
     covariance[0] = -1.0
     content = ros(
@@ -236,7 +236,7 @@ def test_foxglove_poses_and_transforms() -> None:
     assert objects(FrameTransforms(transforms=[single]))["arm"].footprint == Footprint.disc(0, 2, 0)
 
 
-def test_the_same_in_json() -> None:
+def test_a_scene_update_in_json_is_read_the_same() -> None:
     content = {
         "deletions": [],
         "entities": [
@@ -262,7 +262,7 @@ def test_the_same_in_json() -> None:
     assert made.trace.observation(0).footprint == Footprint.box(0, -0.5, 2, 0.5)
 
 
-def test_a_turtle_is_found_by_its_fields() -> None:
+def test_a_turtlesim_pose_is_read_by_common_field_names() -> None:
     found = objects(ros("turtlesim/Pose", x=1.0, y=2.0, theta=0.5), "shape: {disc: 0.5}")
     assert found["thing"].footprint == Footprint.disc(1, 2, 0.5)
     assert found["thing"].yaw == 0.5
@@ -311,14 +311,14 @@ def test_a_tilted_box_is_its_outline_from_above() -> None:
     assert found.height == pytest.approx((2 - half, 2 + half))
 
 
-def test_an_outline_that_crosses_itself_costs_its_object_only() -> None:
+def test_an_outline_that_crosses_itself_makes_only_its_object_unknown() -> None:
     content = {"list": [{"id": 1, "p": [0, 0, 1, 1, 1, 0, 0, 1]}, {"id": 2, "p": [0, 0, 1, 0, 1, 1]}]}
     made = one(content, "objects: 'list[*]', name: 'o{id}', polygon: p")
     assert (made.states("o1"), made.states("o2")) == ("?", "+")
     assert "/thing at 1000000000 ns: object 'o1': the polygon's boundary crosses" in made.faults[0]
 
 
-def test_a_name_that_is_there_twice_makes_the_object_unknown() -> None:
+def test_a_name_that_appears_twice_makes_the_object_unknown() -> None:
     content = {"list": [{"id": 1, "x": 0, "y": 0}, {"id": 1, "x": 1, "y": 0}, {"id": 2, "x": 1, "y": 0}]}
     made = one(content, "objects: 'list[*]', name: 'o{id}', position: [x, y]")
     assert (made.states("o1"), made.states("o2")) == ("?", "+")

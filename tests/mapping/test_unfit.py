@@ -1,4 +1,4 @@
-"""Messages that a mapping does not fit: the odd one is lost, and the mapping is to blame if it fits none."""
+"""Messages that do not fit a mapping: a few are lost; if none fits, the mapping is wrong."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ import pytest
 from mapping.feeding import SECOND, Feed, make, pose_stamped
 from spatial_replay.bags import Topic
 from spatial_replay.errors import UsageError
-from spatial_replay.mapping.assemble import Assembler
-from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.reading_plan import ReadingPlan
+from spatial_replay.mapping import Assembler, ReadingPlan, parse_mapping
 
 HUGE = 10**400
 
@@ -18,7 +16,9 @@ HUGE = 10**400
 @pytest.mark.parametrize("odd", [{"v": HUGE, "x": 0, "y": 0}, {"v": "fast", "x": 0, "y": 0}, [], {"x": 1}])
 @pytest.mark.parametrize("place", [0, 1, 2])
 @pytest.mark.parametrize("head", ["", "signals: {s: v}", "position: [v, y], signals: {s: v}"])
-def test_an_odd_message_is_a_fault_wherever_it_stands(odd: object, place: int, batch: int, head: str) -> None:
+def test_a_message_that_does_not_fit_is_a_fault_at_any_place(
+    odd: object, place: int, batch: int, head: str
+) -> None:
     messages: list[object] = [{"v": 1.0, "x": 0.0, "y": 0.0}] * 3
     messages[place] = odd
     feed = Feed(types={"/a": "any/Thing"})
@@ -31,7 +31,7 @@ def test_an_odd_message_is_a_fault_wherever_it_stands(odd: object, place: int, b
 
 @pytest.mark.parametrize("count", [1, 5, 500])
 @pytest.mark.parametrize("entry", ["position: [u, y]", "signals: {s: u}", "signals: {s: y}"])
-def test_a_mapping_that_fits_no_message_is_to_blame(count: int, entry: str) -> None:
+def test_a_mapping_that_fits_no_message_is_an_error(count: int, entry: str) -> None:
     feed = Feed(types={"/a": "any/Thing"})
     for number in range(count):
         feed.add("/a", number * SECOND, {"v": 1.0, "y": HUGE})
@@ -39,7 +39,7 @@ def test_a_mapping_that_fits_no_message_is_to_blame(count: int, entry: str) -> N
         make(f"topics: {{/a: {{{entry}}}}}", feed)
 
 
-def test_a_step_that_is_far_too_short_is_named() -> None:
+def test_a_step_that_is_far_too_short_is_an_error() -> None:
     feed = Feed(types={"/a": "any/Thing"})
     for number in range(300):
         feed.add("/a", number * SECOND // 20, {"x": 0.0, "y": 0.0})
@@ -48,19 +48,19 @@ def test_a_step_that_is_far_too_short_is_named() -> None:
 
 
 @pytest.mark.parametrize(("count", "faults"), [(None, 1), (3, 1), (0, 0)])
-def test_transforms_that_cannot_be_decoded_are_a_loss(count: int | None, faults: int) -> None:
+def test_transforms_that_cannot_be_decoded_are_reported(count: int | None, faults: int) -> None:
     reason = "topic '/tf': the definition is missing"
     lost = Topic("/tf", "tf2_msgs/msg/TFMessage", "cdr", count=count, unreadable=reason)
     topics = [Topic("/p", "geometry_msgs/msg/PoseStamped", "cdr"), lost]
     for head, expected in (("fixed_frame: map\n", faults), ("", 0)):
         plan = ReadingPlan.of(parse_mapping(head + "topics: {/p: {}}"), topics)
         assert "/tf" not in plan.topics
-        told = Assembler(plan, Feed().decoder, name="test.bag").take_faults()
-        assert len(told) == expected
-        assert all(each.count("/tf") == 1 and "definition is missing" in each for each in told)
+        faults_of_log = Assembler(plan, Feed().decoder, name="test.bag").take_faults()
+        assert len(faults_of_log) == expected
+        assert all(each.count("/tf") == 1 and "definition is missing" in each for each in faults_of_log)
 
 
-def test_remarks_are_about_the_window() -> None:
+def test_remarks_count_the_window_only() -> None:
     feed = Feed()
     for number in range(10):
         frame = "map" if number < 5 else "odom"
@@ -68,3 +68,15 @@ def test_remarks_are_about_the_window() -> None:
     text = "fixed_frame: map\ntopics: {/p: {}}"
     assert "5 observations are unknown" in make(text, feed).remarks[0]
     assert make(text, feed, end_ns=4 * SECOND).remarks == ()
+
+
+def test_a_fault_has_the_time_of_its_own_message() -> None:
+    feed = Feed(types={"/a": "any/Thing"})
+    # the second message has a bad signal, the fourth a bad object
+    for number, (v, x) in enumerate([(1.0, 0.0), ("fast", 0.0), (1.0, 0.0), (1.0, [])]):
+        feed.add("/a", number * SECOND, {"v": v, "x": x, "y": 0.0})
+    made = make("topics: {/a: {position: [x, y], signals: {s: v}}}", feed)
+    assert [fault.split(" ns: ")[0] for fault in made.faults] == [
+        f"test.bag: /a at {number * SECOND}" for number in (1, 3)
+    ]
+    assert made.trace.times_ns.tolist() == [0, 2 * SECOND]

@@ -10,7 +10,7 @@ import pytest
 from mcap.writer import Writer
 
 from spatial_replay.bags import MessageReader
-from spatial_replay.mapping.mapping_file import parse_mapping
+from spatial_replay.mapping import parse_mapping
 from spatial_replay.sources.overview import messages_in, survey
 
 Write = Callable[[dict[str, Sequence[object]]], MessageReader]
