@@ -39,7 +39,7 @@ def starts_from_counts(counts: Sequence[int] | Integers) -> Integers:
 
 
 def flat_index(first: Integers, counts: Integers) -> Integers:
-    """Return the flat indices of the elements of rows that begin at `first` (n,) with lengths `counts` (n,)."""
+    """Return the flat indices of the elements of rows starting at `first` (n,) with lengths `counts` (n,)."""
     begins = starts_from_counts(counts)
     return np.asarray(np.repeat(first - begins[:-1], counts) + np.arange(begins[-1], dtype=np.int64))
 

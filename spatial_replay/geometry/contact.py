@@ -43,7 +43,7 @@ def contact(a: Footprint, b: Footprint) -> Contact:
 
 
 def protrusion_contact(inner: Footprint, outer: Footprint) -> Contact:
-    """Return the point of `inner` farthest outside `outer` or least deep in it, and the nearest on its boundary.
+    """Return `inner`'s point farthest outside `outer` or least deep in it, and the nearest on its boundary.
 
     The distance is the protrusion: positive where `inner` sticks out (Prop. 2).
     """
