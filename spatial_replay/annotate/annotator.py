@@ -7,7 +7,7 @@ robustness, automaton states, events and the scene.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from foxglove_schemas_protobuf.Event_pb2 import Event
@@ -44,7 +44,7 @@ from spatial_replay.logs.topics import (
     protobuf_channel,
 )
 from spatial_replay.monitor.instances import Instance
-from spatial_replay.monitor.semantics import Semantics, instance_evaluation
+from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
 from spatial_replay.spec.formula import Outline, Specification, iter_nodes
 from spatial_replay.trace.trace import Trace
@@ -258,9 +258,9 @@ class AnnotatedEvaluation:
         self._compiled_before = compiled_before
         self._known = known
         self._show = show
-        begin = partial(instance_evaluation, semantics=semantics)
+
         self._evaluations = [
-            EvaluationStream(own, file.regions, begin) for own, file in zip(instances, files, strict=True)
+            EvaluationStream(own, file.regions, semantics) for own, file in zip(instances, files, strict=True)
         ]
         self.streams = [stream for evaluation in self._evaluations for stream in evaluation.streams]
         self.trees = reported_trees(files, instances)

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
-from spatial_replay.annotate.specification import ReportedTree
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Channel
 from spatial_replay.logs.schemas.Curves_pb2 import Curves, NodeCurves, SpecificationCurves
 from spatial_replay.logs.topics import CURVES_TOPIC, protobuf_channel
 from spatial_replay.monitor.online.operators import looks_ahead
-from spatial_replay.monitor.stream import SeriesBlock
-from spatial_replay.monitor.verdict import final_verdict
+from spatial_replay.monitor.result import SpecResult
 from spatial_replay.spec.formula import Formula, iter_nodes
 
 MOST_POINTS: Final = 2_000
@@ -23,21 +21,6 @@ MOST_POINTS: Final = 2_000
 _MOST_NUMBERS: Final = 1 << 19
 """Numbers in a message, about: 4 MiB of them."""
 _FEWEST_POINTS: Final = 64
-
-
-class CurvedResult(NamedTuple):
-    """A result over a whole log.
-
-    Attributes:
-        stretch: every sample of it.
-        robustness, lower, upper: of the finished log.
-    """
-
-    tree: ReportedTree
-    stretch: SeriesBlock
-    robustness: float
-    lower: float
-    upper: float
 
 
 class Thinning:
@@ -82,14 +65,14 @@ class Thinning:
         return np.column_stack([first, second]).reshape(-1)
 
 
-def encode_curves(times_ns: Integers, results: Sequence[CurvedResult], first_ns: int) -> bytes:
+def encode_curves(times_ns: Integers, results: Sequence[SpecResult], first_ns: int) -> bytes:
     """The message that shows all of a log at once.
 
     Args:
         times_ns: (T,) int64, of all samples, at least one.
         first_ns: the time that seconds count from.
     """
-    curves = 2 * sum(len(curved_nodes(result.tree.formula)) for result in results)
+    curves = 2 * sum(len(curved_nodes(result.formula)) for result in results)
     most = min(MOST_POINTS, max(_FEWEST_POINTS, _MOST_NUMBERS // max(curves, 1)))
     thinning = Thinning(times_ns, most)
     message = Curves(
@@ -109,23 +92,22 @@ def curved_nodes(formula: Formula) -> dict[int, Formula]:
     }
 
 
-def _result(result: CurvedResult, thinning: Thinning) -> SpecificationCurves:
-    tree, stretch = result.tree, result.stretch
+def _result(result: SpecResult, thinning: Thinning) -> SpecificationCurves:
     return SpecificationCurves(
-        name=tree.name,
-        object=tree.object or "",
-        verdict=str(final_verdict(result.lower, result.upper)),
+        name=result.name,
+        object=result.object or "",
+        verdict=str(result.verdict),
         robustness=result.robustness,
         nodes=[
             NodeCurves(
                 id=identifier,
                 name=node.name or "",
-                value=thinning.points(stretch.times_ns, stretch.series[identifier, 0]),
+                value=thinning.points(result.times_ns, result.series[identifier, 0]),
                 now=()
                 if looks_ahead(node)
-                else thinning.points(stretch.times_ns, stretch.series[identifier, 1]),
+                else thinning.points(result.times_ns, result.series[identifier, 1]),
             )
-            for identifier, node in curved_nodes(tree.formula).items()
+            for identifier, node in curved_nodes(result.formula).items()
         ],
     )
 

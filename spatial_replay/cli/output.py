@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from google.protobuf.message import Message
 
     from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanCandidate, PlanDecision, PlanEdge, PlanTarget
-    from spatial_replay.replay import Replayed, ReplayedSpec
+    from spatial_replay.monitor.result import SpecResult
+    from spatial_replay.replay import Replayed
 
 _COLOURS = {"satisfied": "blue", "violated": "red", "unknown": "yellow"}
 
@@ -29,12 +30,12 @@ def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | Non
     seconds = (replayed.end_ns - replayed.start_ns) / 1e9
     damaged = ", damaged: verdicts are over what could be read" if replayed.faults else ""
     click.echo(f"{replayed.log}: {counted(replayed.samples, 'sample')} over {seconds:.3f} s{damaged}")
-    titles = [_title(result) for result in replayed.results]
+    titles = [result.title for result in replayed.results]
     width = max(map(len, titles), default=0)
     for title, result in zip(titles, replayed.results, strict=True):
         verdict = click.style(f"{result.verdict:<9}", fg=_COLOURS[result.verdict], bold=True)
         click.echo(f"  {title:<{width}}  {verdict}  {_numbers(result, replayed.first_ns)}")
-        if result.verdict == "unknown" and result.inquiry is not None and replayed.semantics == "ltlf":
+        if result.verdict == "unknown" and result.can_explain:
             click.echo(f"  {'':<{width}}  {_why_unknown(result, replayed.first_ns)}")
         if window_ns is not None:
             click.echo(f"  {'':<{width}}  {_over_window(result, replayed.first_ns, window_ns)}")
@@ -63,14 +64,9 @@ def write_document(
         stream.write(text.encode() + b"\n")
 
 
-def _title(result: ReplayedSpec) -> str:
-    return result.name if result.object is None else f"{result.name}({result.object})"
-
-
-def _numbers(result: ReplayedSpec, first_ns: int) -> str:
-    robustness = float(result.robustness[0])
+def _numbers(result: SpecResult, first_ns: int) -> str:
+    robustness, lower, upper = result.robustness, result.lower, result.upper
     parts = [f"robustness {_shown(robustness)}"]
-    lower, upper = result.final[0].tolist()
     if not (lower == upper == robustness or math.isnan(lower)):
         parts.append(f"between {_shown(lower)} and {_shown(upper)}")
     if robustness == 0.0:
@@ -80,21 +76,19 @@ def _numbers(result: ReplayedSpec, first_ns: int) -> str:
     return ", ".join(parts)
 
 
-def _why_unknown(result: ReplayedSpec, first_ns: int) -> str:
+def _why_unknown(result: SpecResult, first_ns: int) -> str:
     """Return the sentence about what was unknown, or too uncertain."""
     from spatial_replay.annotate.sentences import sentences_of
 
-    if result.inquiry is None:
-        return ""
-    _, reason = sentences_of(result.inquiry.witness(), first_ns=first_ns)
+    _, reason = sentences_of(result.witness(), first_ns=first_ns)
     return reason
 
 
-def _over_window(result: ReplayedSpec, first_ns: int, window_ns: int) -> str:
+def _over_window(result: SpecResult, first_ns: int, window_ns: int) -> str:
     """Return how often, and when first, a spec was violated over the sliding window."""
-    if result.inquiry is None:
+    if result.leaves is None:
         return ""
-    values, times_ns = result.inquiry.window_signal(window_ns)[0], result.inquiry.times_ns
+    values, times_ns = result.window_signal(window_ns)[0], result.times_ns
     over = f"over the last {text_from_duration_ns(window_ns)}"
     failing = (values < 0.0).nonzero()[0]
     if not len(failing):

@@ -11,13 +11,13 @@ from typing import NamedTuple
 from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.monitor.evaluate import no_such_node, require_time
-from spatial_replay.monitor.semantics import checked_semantics, live_evaluation
-from spatial_replay.monitor.stream import ROOM
+from spatial_replay.monitor.result import no_such_node
+from spatial_replay.monitor.semantics import LIVE_ROOM, checked_semantics
+from spatial_replay.monitor.stream import LiveStream
 from spatial_replay.monitor.verdict import Verdict, online_verdict, worst_verdict
 from spatial_replay.spec.formula import NamedSpec, Specification, iter_nodes
 from spatial_replay.spec.load import require_specification
-from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.sample import Sample, require_time
 
 
 class NodeUpdate(NamedTuple):
@@ -134,10 +134,11 @@ class Monitor:
         self._names = tuple(tuple(node.name for _, _, node in iter_nodes(s.formula)) for s in self._specs)
         self._places = _places_of_names(self._names)
         compile_ahead()
-        trial = live_evaluation(specification, checked, 0)  # loads what samples would wait for otherwise
-        for time_ns in range(2 * ROOM):
-            trial.take(Sample(time_ns))
-        self._live = live_evaluation(specification, checked, start_ns or 0)
+        # a trial run loads every kernel now, so that no sample has to wait for one
+        trial = LiveStream(specification, checked, 0)
+        for time_ns in range(2 * LIVE_ROOM):
+            trial.extend(Sample(time_ns))
+        self._live = LiveStream(specification, checked, start_ns or 0)
         self._last_ns: int | None = None
 
     def update(self, sample: Sample) -> Update:
@@ -155,7 +156,7 @@ class Monitor:
                 "give samples in the order of their times"
             )
         self._last_ns = sample.time_ns
-        numbers = map(_read_only, self._live.take(sample))
+        numbers = map(_read_only, self._live.extend(sample))
         return Update(sample.time_ns, tuple(map(SpecUpdate, self._specs, numbers, self._names)), self._places)
 
 

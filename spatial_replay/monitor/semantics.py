@@ -1,26 +1,29 @@
-"""The two meanings that a formula can have, by name."""
+"""The two semantics of a formula: the one place that chooses the evaluator by name."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal, TypeAlias, cast, get_args
+from typing import Literal, NamedTuple, Protocol, TypeAlias, cast, get_args
 
 from spatial_replay.errors import UsageError
-from spatial_replay.monitor.instances import Instance
-from spatial_replay.monitor.online.program import compile_formula
-from spatial_replay.monitor.paper.evaluator import PaperRuns, PaperStream, check_operators
-from spatial_replay.monitor.stream import InstanceEvaluation, InstanceStream, LiveEvaluation, LiveRuns
-from spatial_replay.spec.formula import Specification
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.online.program import Program
+from spatial_replay.monitor.online.step import OnlineRun
+from spatial_replay.monitor.paper.evaluator import PaperRun, check_operators, left_out
+from spatial_replay.spec.formula import Formula, Specification
 
 Semantics: TypeAlias = Literal["ltlf", "paper"]
 """Robustness over finite traces, or the paper's Def. 16 to the letter."""
 
+LIVE_ROOM = 64
+"""Recent samples a live run has room for at first: few, so that they stay in the processor's cache."""
+
 
 def checked_semantics(name: str, specifications: Iterable[Specification] = ()) -> Semantics:
-    """The semantics of a name, which has a meaning for all operators of some specifications.
+    """Return a name as semantics that define all operators of some specifications.
 
     Raises:
-        UsageError: there is none of that name, or it lacks an operator.
+        UsageError: an unknown name, or an operator without a meaning.
     """
     if name not in get_args(Semantics):
         known = " and ".join(repr(each) for each in get_args(Semantics))
@@ -31,19 +34,67 @@ def checked_semantics(name: str, specifications: Iterable[Specification] = ()) -
     return cast(Semantics, name)
 
 
-def instance_evaluation(instance: Instance, semantics: Semantics = "ltlf") -> InstanceEvaluation:
-    """An instance before its first sample, to be evaluated in stretches."""
-    return PaperStream(instance) if semantics == "paper" else InstanceStream(instance)
+def require_ltlf(semantics: Semantics, what: str) -> None:
+    """Check that results have signals, windows and witnesses, which only "ltlf" defines.
 
-
-def live_evaluation(specification: Specification, semantics: Semantics, start_ns: int) -> LiveEvaluation:
-    """The results of a specification before the first sample, to be evaluated sample by sample.
-
-    Args:
-        start_ns: samples before this time are only there to be looked back at.
+    Raises:
+        UsageError: other semantics.
     """
-    formulas = [spec.formula for spec in specification.results]
-    programs = [compile_formula(formula) for formula in formulas]
-    if semantics == "paper":
-        return PaperRuns(formulas, programs, specification.regions, start_ns)
-    return LiveRuns(programs, specification.regions, start_ns)
+    if semantics != "ltlf":
+        raise UsageError(f"{what} is not defined under the semantics {semantics!r}; evaluate with 'ltlf'")
+
+
+class Run(Protocol):
+    """One formula on one stream of samples."""
+
+    @property
+    def final(self) -> Floats:
+        """(N, 2): lower and upper end of each node's value if the log ends here."""
+
+    def extend(self, leaves: Floats, times_ns: Integers) -> Floats:
+        """Add samples; return value, now, lower and upper of each node, (N, 4, T)."""
+
+    def __len__(self) -> int:
+        """Return how many samples were added."""
+
+
+class Evaluator(NamedTuple):
+    """A formula with its program, evaluated under some semantics.
+
+    Attributes:
+        program: of the formula; its leaves are evaluated under either semantics.
+    """
+
+    formula: Formula
+    program: Program
+    semantics: Semantics
+
+    @property
+    def has_open_end(self) -> bool:
+        """Whether numbers before the end of a log are about its continuations, too."""
+        return self.semantics == "ltlf"
+
+    def begin(self, *, live: bool = False) -> Run:
+        """Start a run before the first sample.
+
+        Args:
+            live: samples will come one by one.
+        """
+        if self.semantics == "paper":
+            return PaperRun(self.formula, self.program.leaves)
+        return OnlineRun(self.program, room=LIVE_ROOM, tile=1) if live else OnlineRun(self.program)
+
+    def leaves_within_log(
+        self, leaves: Floats, positions: Integers, times_ns: Integers, first_ns: int
+    ) -> Floats:
+        """Return leaves with those that look back to before the log marked as the semantics require.
+
+        Args:
+            leaves: (C, A, T).
+            positions: (T,), how many samples of the log come before each.
+            times_ns: (T,).
+            first_ns: time of the log's first sample.
+        """
+        if self.semantics == "paper":
+            return left_out(leaves, self.program.leaves, positions, times_ns, first_ns)
+        return leaves  # unknown there, which their intervals say

@@ -1,44 +1,41 @@
-"""A specification evaluated over samples as they come, in stretches of any length.
+"""Specifications evaluated over samples as they come, in blocks of any length.
 
-A monitor feeds it sample by sample, a replay block by block, `evaluate` a whole trace at once: all three get
-the same bits.
-
-Formulas evaluated sample by sample, each sample as it comes: what a monitor runs.
+A monitor adds sample by sample, a replay block by block, `evaluate` a whole trace at once: all three get the
+same bits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
-from typing import Protocol
 
 import numpy as np
 
 from spatial_replay.errors import TraceError
 from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.atoms.delays import look_back, tail
 from spatial_replay.monitor.atoms.live import SampleLeaves
-from spatial_replay.monitor.atoms.live_rows import iter_delays
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import in_channels
-from spatial_replay.monitor.online.program import Program
-from spatial_replay.monitor.online.step import OnlineRun
+from spatial_replay.monitor.online.program import compile_formula
+from spatial_replay.monitor.semantics import Evaluator, Semantics
 from spatial_replay.monitor.verdict import Verdict, final_verdict
-from spatial_replay.spec.formula import Formula, Outline
+from spatial_replay.spec.formula import Outline, Specification
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace, window_of
 
 
 @dataclass(frozen=True, eq=False)
 class SeriesBlock:
-    """What one instance says about some samples.
+    """The numbers of one instance in consecutive samples.
 
     Attributes:
         times_ns: (T,) int64; T may be 0.
         series: (N, 4, T): value, now, lower and upper of each node.
-        leaves: (C, A, T), what the numbers were made of: `leaf_values` of the same samples.
+        leaves: (C, A, T), the leaves they follow from: `leaf_values` of the same samples.
     """
 
     times_ns: Integers
@@ -46,63 +43,43 @@ class SeriesBlock:
     leaves: Floats
 
     def between(self, start_ns: int, end_ns: int) -> SeriesBlock:
-        """The samples from the first at or after `start_ns` to the last before `end_ns`."""
+        """Return the samples from `start_ns` to before `end_ns`."""
         begin, end = window_of(self.times_ns, start_ns, end_ns)
         return SeriesBlock(
             self.times_ns[begin:end], self.series[:, :, begin:end], self.leaves[:, :, begin:end]
         )
 
 
-def join_blocks(stretches: Sequence[SeriesBlock]) -> SeriesBlock:
-    """One stretch of one or more of the same instance that follow each other."""
-    channels = max(len(stretch.leaves) for stretch in stretches)
+def join_blocks(blocks: Sequence[SeriesBlock]) -> SeriesBlock:
+    """Join one or more consecutive blocks of the same instance."""
+    channels = max(len(block.leaves) for block in blocks)
     return SeriesBlock(
-        np.concatenate([stretch.times_ns for stretch in stretches]),
-        np.concatenate([stretch.series for stretch in stretches], axis=2),
-        np.concatenate([in_channels(stretch.leaves, channels) for stretch in stretches], axis=2),
+        np.concatenate([block.times_ns for block in blocks]),
+        np.concatenate([block.series for block in blocks], axis=2),
+        np.concatenate([in_channels(block.leaves, channels) for block in blocks], axis=2),
     )
 
 
-class InstanceEvaluation(Protocol):
-    """One instance on its way through the samples, under some semantics."""
-
-    @property
-    def instance(self) -> Instance: ...
-
-    @property
-    def first_satisfied_ns(self) -> int | None:
-        """The first sample with a value of at least 0 at the root."""
-
-    @property
-    def final(self) -> Floats:
-        """(N, 2): lower and upper end of each node's value if the log ends here."""
-
-    @property
-    def robustness(self) -> Floats:
-        """(N,): each node's value on the samples so far."""
-
-    @property
-    def verdict(self) -> Verdict:
-        """The root's verdict if the log ends here; unknown before the first sample."""
-
-    def extend(self, scene: TraceScene) -> SeriesBlock:
-        """Take in the samples of a scene that fall into the instance's window."""
-
-    def __len__(self) -> int:
-        """How many samples it was evaluated over."""
-
-
 class InstanceStream:
-    """One instance on its way through the samples, and what is known of it so far."""
+    """One instance evaluated over the samples so far.
 
-    def __init__(self, instance: Instance) -> None:
+    Attributes:
+        semantics: which of them evaluates it.
+        first_satisfied_ns: the first sample with a value of at least 0 at the root, or None.
+        robustness: (N,): each node's value on the samples so far.
+    """
+
+    def __init__(self, instance: Instance, semantics: Semantics = "ltlf") -> None:
+        """Start before the first sample."""
         self.instance = instance
+        self.semantics: Semantics = semantics
         self.first_satisfied_ns: int | None = None
-        self._run = OnlineRun(instance.program)
-        self._robustness = np.full(len(instance.program.reports), np.nan)
+        self.robustness = np.full(len(instance.program.reports), np.nan)
+        self._evaluator = Evaluator(instance.formula, instance.program, semantics)
+        self._run = self._evaluator.begin()
 
     def __len__(self) -> int:
-        """How many samples it was evaluated over."""
+        """Return the number of samples evaluated."""
         return len(self._run)
 
     @property
@@ -111,26 +88,26 @@ class InstanceStream:
         return self._run.final
 
     @property
-    def robustness(self) -> Floats:
-        """(N,): each node's value on the samples so far."""
-        return self._robustness.copy()
-
-    @property
     def verdict(self) -> Verdict:
         """The root's verdict if the log ends here; unknown before the first sample."""
         return final_verdict(*self.final[0]) if len(self) else Verdict.UNKNOWN
 
     def extend(self, scene: TraceScene) -> SeriesBlock:
-        """Take in the samples of a scene that fall into the instance's window."""
+        """Add the samples of a scene that fall into the instance's window."""
         times = scene.trace.times_ns[scene.skip :]
         begin, end = window_of(times, self.instance.start_ns, self.instance.end_ns)
         times = times[begin:end]
+        program = self.instance.program
         if not len(times):
-            no_leaves = np.empty((1, len(self.instance.program.leaves), 0))
-            return SeriesBlock(times, np.empty((len(self._robustness), 4, 0)), no_leaves)
-        leaves = leaf_values(scene, self.instance.program.leaves, self.instance.bindings)[:, :, begin:end]
+            no_series = np.empty((len(program.reports), 4, 0))
+            return SeriesBlock(times, no_series, np.empty((1, len(program.leaves), 0)))
+        leaves = leaf_values(scene, program.leaves, self.instance.bindings)[:, :, begin:end]
+        # a scene holds all samples that may be looked back at: its first is the log's, or out of reach
+        positions = np.arange(scene.skip + begin, scene.skip + end, dtype=np.int64)
+        first_ns = int(scene.trace.times_ns[0])
+        leaves = self._evaluator.leaves_within_log(leaves, positions, times, first_ns)
         series = self._run.extend(leaves, times)
-        self._robustness = series[:, 0, -1].copy()
+        self.robustness = series[:, 0, -1].copy()
         if self.first_satisfied_ns is None:
             satisfied = np.flatnonzero(series[0, 0] >= 0.0)
             self.first_satisfied_ns = int(times[satisfied[0]]) if len(satisfied) else None
@@ -142,25 +119,21 @@ class EvaluationStream:
 
     def __init__(
         self,
-        instances: Sequence[Instance],
+        instances: Iterable[Instance],
         regions: Mapping[str, Outline],
-        begin: Callable[[Instance], InstanceEvaluation] = InstanceStream,
+        semantics: Semantics = "ltlf",
     ) -> None:
-        """Start before the first sample.
-
-        Args:
-            begin: how each instance is evaluated.
-        """
-        self.streams = tuple(begin(instance) for instance in instances)
+        """Start before the first sample."""
+        self.streams = tuple(InstanceStream(instance, semantics) for instance in instances)
         self._regions = regions
-        self._reach = look_back([instance.formula for instance in instances])
+        self._reach = look_back([stream.instance.formula for stream in self.streams])
         self._before: Trace | None = None
 
     def extend(self, trace: Trace) -> list[SeriesBlock]:
-        """Take in the next samples; one stretch for each of `streams`.
+        """Add the next samples; return one block for each of `streams`.
 
         Raises:
-            TraceError: samples that do not come after those before.
+            TraceError: samples that do not come after the previous ones.
         """
         if not len(trace):
             return [stream.extend(TraceScene(trace, self._regions)) for stream in self.streams]
@@ -181,56 +154,45 @@ class EvaluationStream:
         return [stream.extend(scene) for stream in self.streams]
 
 
-def tail(trace: Trace, samples: int, duration_ns: int) -> Trace:
-    """The samples that the next one may look back at."""
-    begin = len(trace) - samples
-    if duration_ns:
-        at_or_before = (
-            int(np.searchsorted(trace.times_ns, trace.times_ns[-1] - duration_ns, side="right")) - 1
-        )
-        begin = min(begin, at_or_before)
-    return trace.slice(max(begin, 0), len(trace))
+class LiveStream:
+    """The results of a specification, evaluated sample by sample."""
 
+    def __init__(self, specification: Specification, semantics: Semantics, start_ns: int) -> None:
+        """Start before the first sample.
 
-def look_back(formulas: Sequence[Formula]) -> tuple[int, int]:
-    """How far terms look back: the most samples (`a[-3]`) and the longest duration in ns (`a[-2s]`)."""
-    delays = list(iter_delays(formulas))
-    samples = max((delay.samples or 0 for delay in delays), default=0)
-    duration_ns = max((delay.duration_ns or 0 for delay in delays), default=0)
-    return samples, duration_ns
+        Args:
+            start_ns: earlier samples are not evaluated, only looked back at.
+        """
+        formulas = [spec.formula for spec in specification.results]
+        self._evaluators = [Evaluator(each, compile_formula(each), semantics) for each in formulas]
+        self._runs = [evaluator.begin(live=True) for evaluator in self._evaluators]
+        leaves = [evaluator.program.leaves for evaluator in self._evaluators]
+        self._own = [slice(*ends) for ends in pairwise(accumulate(map(len, leaves), initial=0))]
+        self._leaves = SampleLeaves(leaves, specification.regions)
+        self._start_ns = start_ns
+        self._first_ns: int | None = None
+        self._position = -1
 
-
-ROOM = 64
-"""Recent samples that there is room for at first: few, so that they stay in the processor's cache."""
-
-
-class LiveEvaluation(Protocol):
-    """Some formulas under some semantics, on their way through the samples."""
-
-    def take(self, sample: Sample) -> list[Floats | None]:
-        """Take in the next sample, whose time comes after the last one's.
+    def extend(self, sample: Sample) -> list[Floats | None]:
+        """Add the next sample, whose time comes after the last one's.
 
         Returns:
-            (N, 4) for each formula: value, now, lower and upper of each node; None before the start.
+            (N, 4) for each formula: value, now, lower and upper of each node. Before the start, None, or NaN
+            under semantics without continuations to wait for.
         """
-
-
-class LiveRuns:
-    """The programs of some formulas, fed by plans that samples of the same objects share."""
-
-    def __init__(self, programs: Sequence[Program], regions: Mapping[str, Outline], start_ns: int) -> None:
-        """Start before the first sample; those before `start_ns` are only there to be looked back at."""
-        ends = accumulate((len(program.leaves) for program in programs), initial=0)
-        self._runs = [
-            (OnlineRun(program, room=ROOM, tile=1), slice(*ends))
-            for program, ends in zip(programs, pairwise(ends), strict=True)
-        ]
-        self._leaves = SampleLeaves([program.leaves for program in programs], regions)
-        self._start_ns = start_ns
-
-    def take(self, sample: Sample) -> list[Floats | None]:
+        self._position += 1
+        if self._first_ns is None:
+            self._first_ns = sample.time_ns
         samples = self._leaves.look_at(sample)
         if sample.time_ns < self._start_ns:
-            return [None] * len(self._runs)
-        leaves, times_ns = self._leaves.values(samples), np.array([sample.time_ns])
-        return [run.extend(leaves[:, own], times_ns)[:, :, 0] for run, own in self._runs]
+            return [
+                None if each.has_open_end else np.full((len(each.program.reports), 4), np.nan)
+                for each in self._evaluators
+            ]
+        values = self._leaves.values(samples)
+        position, time_ns = np.array([self._position]), np.array([sample.time_ns])
+        numbers: list[Floats | None] = []
+        for evaluator, run, own in zip(self._evaluators, self._runs, self._own, strict=True):
+            leaves = evaluator.leaves_within_log(values[:, own], position, time_ns, self._first_ns)
+            numbers.append(run.extend(leaves, time_ns)[:, :, 0])
+        return numbers

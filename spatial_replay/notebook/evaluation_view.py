@@ -13,7 +13,8 @@ import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.monitor.evaluate import Evaluation, SpecResult
+from spatial_replay.monitor.evaluate import Evaluation
+from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.notebook import html, plot
 from spatial_replay.notebook.figures import (

@@ -17,7 +17,7 @@ from spatial_replay.lazy import loaded_when_used
 if TYPE_CHECKING:
     from spatial_replay.replay.annotated import load_files, run_replay
     from spatial_replay.replay.document import Explanation, document_from_replay, explain_results
-    from spatial_replay.replay.engine import Replay, Replayed, ReplayedSpec
+    from spatial_replay.replay.engine import Replay, Replayed
     from spatial_replay.replay.playback import Playback
     from spatial_replay.replay.selection import ReplayOptions, Window, first_sample_ns, has_samples_from
     from spatial_replay.replay.table import QUANTITIES, export_table
@@ -31,7 +31,6 @@ __all__ = [
     "Replay",
     "ReplayOptions",
     "Replayed",
-    "ReplayedSpec",
     "Tuned",
     "Tuning",
     "Window",
@@ -55,7 +54,6 @@ _HOMES: Mapping[str, str] = MappingProxyType(
         "Replay": "spatial_replay.replay.engine",
         "ReplayOptions": "spatial_replay.replay.selection",
         "Replayed": "spatial_replay.replay.engine",
-        "ReplayedSpec": "spatial_replay.replay.engine",
         "Tuned": "spatial_replay.replay.tuning",
         "Tuning": "spatial_replay.replay.tuning",
         "Window": "spatial_replay.replay.selection",

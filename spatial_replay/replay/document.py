@@ -11,13 +11,12 @@ import numpy as np
 from spatial_replay.annotate.sentences import sentences_of
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.monitor.evaluate import no_such_node
-from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
+from spatial_replay.monitor.result import SpecResult, no_such_node
+from spatial_replay.monitor.verdict import Verdict, online_verdict
 from spatial_replay.monitor.witness.atom import Measured
 from spatial_replay.monitor.witness.witness import Witness
-from spatial_replay.replay.engine import Replayed, ReplayedSpec
-from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import iter_nodes, operator_of
+from spatial_replay.replay.engine import Replayed
+from spatial_replay.spec.formula import iter_nodes
 from spatial_replay.text import json_number
 
 
@@ -52,45 +51,44 @@ def document_from_replay(
     }
 
 
-def _result(result: ReplayedSpec, first_ns: int, signal: bool, window_ns: int | None) -> dict[str, Any]:
-    lower, upper = result.final[0].tolist()
+def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | None) -> dict[str, Any]:
     value: dict[str, Any] = {
         "name": result.name,
         "object": result.object,
         "verdict": str(result.verdict),
-        "robustness": json_number(float(result.robustness[0])),
-        "lower": json_number(lower),
-        "upper": json_number(upper),
+        "robustness": json_number(result.robustness),
+        "lower": json_number(result.lower),
+        "upper": json_number(result.upper),
         "first_satisfied_ns": result.first_satisfied_ns,
         "worst": None,
         "nodes": [
             {
-                "id": identifier,
-                "parent": parent,
-                "operator": operator_of(node),
+                "id": node.id,
+                "parent": node.parent,
+                "operator": node.operator,
                 "name": node.name,
-                "text": format_formula(node),
-                "verdict": str(final_verdict(*result.final[identifier].tolist())),
-                "robustness": json_number(float(result.robustness[identifier])),
-                "lower": json_number(float(result.final[identifier, 0])),
-                "upper": json_number(float(result.final[identifier, 1])),
+                "text": node.text,
+                "verdict": str(node.verdict),
+                "robustness": json_number(node.robustness),
+                "lower": json_number(node.final_lower),
+                "upper": json_number(node.final_upper),
             }
-            for identifier, parent, node in iter_nodes(result.formula)
+            for node in result.nodes
         ],
     }
-    if result.inquiry is not None and result.inquiry.semantics == "ltlf":
-        value["worst"] = witness_document(result.inquiry.witness(), first_ns)
-    if result.series is not None and result.times_ns is not None:
+    if result.can_explain:
+        value["worst"] = witness_document(result.witness(), first_ns)
+    if result.has_series:
         value["series"] = {
             "time_ns": result.times_ns.tolist(),
             **{
                 key: _numbers(result.series[:, k]) for k, key in enumerate(("value", "now", "lower", "upper"))
             },
         }
-        if result.inquiry is not None and signal:
-            value["series"]["signal"] = _numbers(result.inquiry.full_signal())
-        if result.inquiry is not None and window_ns is not None:
-            value["series"]["window"] = _numbers(result.inquiry.window_signal(window_ns))
+        if result.leaves is not None and signal:
+            value["series"]["signal"] = _numbers(result.full_signal())
+        if result.leaves is not None and window_ns is not None:
+            value["series"]["window"] = _numbers(result.window_signal(window_ns))
     return value
 
 
@@ -196,7 +194,7 @@ def explain_results(
     return explanations
 
 
-def _nodes_named(result: ReplayedSpec, name: str | None) -> Iterator[int]:
+def _nodes_named(result: SpecResult, name: str | None) -> Iterator[int]:
     if name is None or name == result.name:
         yield 0
         return
@@ -206,11 +204,11 @@ def _nodes_named(result: ReplayedSpec, name: str | None) -> Iterator[int]:
             return
 
 
-def explain_node(result: ReplayedSpec, node: int = 0, *, first_ns: int, goes_on: bool = False) -> Explanation:
+def explain_node(result: SpecResult, node: int = 0, *, first_ns: int, goes_on: bool = False) -> Explanation:
     """Explain the verdict of one node of a result; see `explain_results`."""
-    if result.inquiry is None or result.series is None or result.times_ns is None:
+    if not result.has_series:
         raise ValueError("the replay did not keep series and leaves")
-    witness = result.inquiry.witness(node)
+    witness = result.witness(node)
     value, _, lower, upper = result.series[node]
     since = _since(value, lower, upper) if witness.verdict is not Verdict.UNKNOWN else None
     since_ns = None if since is None else int(result.times_ns[since])

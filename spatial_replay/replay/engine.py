@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,47 +12,17 @@ from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.certificate import Hashing, MessageHash, ResultHash, SampleHash, certificate
 from spatial_replay.annotate.scene_update import SceneFrames
 from spatial_replay.annotate.specification import logged_specifications, specification_attachments
-from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Attachment, Messages, merge
 from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import REPLAYED_PREFIX
-from spatial_replay.monitor.evaluate import Inquiry
+from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import SeriesBlock, join_blocks
-from spatial_replay.monitor.verdict import Verdict, final_verdict, worst_verdict
+from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.monitor.witness.path import Evidence
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Selection, first_sample_ns
-from spatial_replay.spec.formula import Formula, Specification
+from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.trace import Trace
-
-
-@dataclass(frozen=True, eq=False)
-class ReplayedSpec:
-    """The result of one spec, or of one object's instance of a template.
-
-    Attributes:
-        name: the spec's name; with its file's stem before it where two files have a spec of that name.
-        object: the object that a template's parameter stands for, or None.
-        robustness: (N,), each node's value on the whole log.
-        final: (N, 2), lower and upper end of each node for the finished log.
-        first_satisfied_ns: the first sample with a value of at least 0, or None.
-        times_ns, series: every sample's numbers, (T,) and (N, 4, T), if the replay was to keep them.
-        inquiry: witnesses and signals, computed on request, if the replay was to keep the leaves.
-    """
-
-    name: str
-    object: str | None
-    formula: Formula
-    robustness: Floats
-    final: Floats
-    first_satisfied_ns: int | None
-    times_ns: Integers | None = None
-    series: Floats | None = None
-    inquiry: Inquiry | None = None
-
-    @property
-    def verdict(self) -> Verdict:
-        return final_verdict(*self.final[0].tolist())
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +50,7 @@ class Replayed:
     faults: tuple[str, ...]
     remarks: tuple[str, ...]
     unreadable: int
-    results: tuple[ReplayedSpec, ...]
+    results: tuple[SpecResult, ...]
     certificate: Mapping[str, str]
     semantics: Semantics = "ltlf"
 
@@ -257,7 +227,7 @@ def replayed_specs(
     *,
     has_series: bool = True,
     has_leaves: bool = True,
-) -> tuple[ReplayedSpec, ...]:
+) -> tuple[SpecResult, ...]:
     """Return the results of an evaluation that has taken in all samples.
 
     Args:
@@ -265,22 +235,14 @@ def replayed_specs(
         has_series, has_leaves: whether the stretches hold the numbers, and the atoms.
     """
 
-    def results() -> Iterator[ReplayedSpec]:
-        for tree, stream, stretch in zip(evaluation.trees, evaluation.streams, kept, strict=True):
-            inquiry = None
-            if has_leaves and stretch is not None:
-                evidence = Evidence(stream.instance, files[tree.file].regions, selection.iter_traces)
-                inquiry = Inquiry(evidence, stretch.times_ns, stretch.leaves, selection.options.semantics)
-            yield ReplayedSpec(
-                tree.name,
-                tree.object,
-                tree.formula,
-                stream.robustness,
-                stream.final,
-                stream.first_satisfied_ns,
-                None if stretch is None else stretch.times_ns,
-                stretch.series if stretch is not None and has_series else None,
-                inquiry,
-            )
-
-    return tuple(results())
+    return tuple(
+        SpecResult.from_stream(
+            stream,
+            Evidence(stream.instance, files[tree.file].regions, selection.iter_traces),
+            block,
+            name=tree.name,
+            has_series=has_series,
+            has_leaves=has_leaves,
+        )
+        for tree, stream, block in zip(evaluation.trees, evaluation.streams, kept, strict=True)
+    )

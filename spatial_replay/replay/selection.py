@@ -14,9 +14,9 @@ from spatial_replay.logs.objects.encode import encode_objects
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.source import Source, read_ahead, read_blocks, within
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
+from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.instances import Choice, Instance, find_instances
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
-from spatial_replay.monitor.stream import look_back
 from spatial_replay.spec import check_names
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification

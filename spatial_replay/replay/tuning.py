@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Final
 
 from spatial_replay.annotate.annotator import AnnotatedEvaluation, Annotator
-from spatial_replay.annotate.curves import CurvedResult, encode_curves
+from spatial_replay.annotate.curves import encode_curves
 from spatial_replay.annotate.foxglove_layout import SceneBounds, live_layout_attachment
 from spatial_replay.annotate.scene_update import SceneState
 from spatial_replay.annotate.specification import logged_specifications
@@ -218,13 +218,7 @@ class Tuned:
     @cached_property
     def curves(self) -> bytes:
         """The message of /spatial/curves."""
-        results = [
-            CurvedResult(tree, stretch, float(stream.robustness[0]), *stream.final[0].tolist())
-            for tree, stream, stretch in zip(
-                self.evaluation.trees, self.evaluation.streams, self.stretches, strict=True
-            )
-        ]
-        return encode_curves(self.tuning.inside.times_ns, results, self.tuning.first_ns)
+        return encode_curves(self.tuning.inside.times_ns, self.replayed.results, self.tuning.first_ns)
 
     @cached_property
     def layout(self) -> Attachment:

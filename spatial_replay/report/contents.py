@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.report.automaton_panel import StatePath
@@ -15,7 +15,7 @@ from spatial_replay.report.decision_panel import ReportedDecisions
 from spatial_replay.report.event_panel import ReportedEvent
 from spatial_replay.report.scene_panel import ReportedScene
 from spatial_replay.report.tree_panel import final_text
-from spatial_replay.spec.formula import Formula, Specification
+from spatial_replay.spec.formula import Specification
 
 MOST_DRAWN: Final = 24
 """Results with an explanation, a tree and curves, at most: the worst. All have their verdicts."""
@@ -26,13 +26,8 @@ class ReportedResult:
     """One result of a run, with its explanation and its path through its automaton.
 
     Attributes:
-        name: the name that it is reported under.
-        object: the object that a template's parameter stands for, or None.
         relations: the names of relations that its file may use.
-        robustness: (N,), each node's value on the whole log.
-        final: (N, 2), lower and upper end of each node for the finished log.
-        first_satisfied_ns: the first sample with a value of at least 0, or None.
-        times_ns, series: (T,) and (N, 4, T): value, now, lower, upper of each node.
+
         sentences: the explanation of its verdict; none if the page does not explain it.
         decided_ns: the sample that decided it; None without an explanation.
         automaton: None if it has none.
@@ -40,16 +35,8 @@ class ReportedResult:
         path: the states of the run.
     """
 
-    name: str
-    object: str | None
-    formula: Formula
+    result: SpecResult
     relations: frozenset[str]
-    verdict: Verdict
-    robustness: Floats
-    final: Floats
-    first_satisfied_ns: int | None
-    times_ns: Integers
-    series: Floats
     sentences: tuple[str, ...]
     decided_ns: int | None
     automaton: Automaton | None
@@ -57,18 +44,14 @@ class ReportedResult:
     path: StatePath
 
     @property
-    def title(self) -> str:
-        return self.name if self.object is None else f"{self.name}({self.object})"
-
-    @property
     def fault_ns(self) -> int | None:
         """The sample that made it violated or unknown."""
-        return None if self.verdict is Verdict.SATISFIED else self.decided_ns
+        return None if self.result.verdict is Verdict.SATISFIED else self.decided_ns
 
     @property
     def robustness_text(self) -> str:
         """The root's robustness, or between which numbers it lies."""
-        return final_text(float(self.robustness[0]), *self.final[0].tolist())
+        return final_text(self.result.robustness, self.result.lower, self.result.upper)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +83,7 @@ class RunReport:
 
     @property
     def verdict(self) -> Verdict:
-        return worst_verdict(result.verdict for result in self.results)
+        return worst_verdict(each.result.verdict for each in self.results)
 
     @property
     def drawn(self) -> tuple[ReportedResult, ...]:
@@ -110,7 +93,7 @@ class RunReport:
     @property
     def drawn_numbers(self) -> list[int]:
         """The places of those results: the worst if there are too many."""
-        return worst_results([result.verdict for result in self.results])
+        return worst_results([each.result.verdict for each in self.results])
 
 
 def worst_results(verdicts: Sequence[Verdict]) -> list[int]:

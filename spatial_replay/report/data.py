@@ -128,9 +128,9 @@ def page_data(report: RunReport) -> PageData:
     packing = Packing()
     drawn = report.drawn
     times_ns = np.unique(
-        np.concatenate([report.scene.times_ns, *(result.times_ns for result in drawn)]).astype(np.int64)
+        np.concatenate([report.scene.times_ns, *(each.result.times_ns for each in drawn)]).astype(np.int64)
     )
-    curves = [_curves(each) for each in drawn if len(each.times_ns)]
+    curves = [_curves(each) for each in drawn if len(each.result.times_ns)]
     faults_ns = [each.fault_ns for each in drawn if each.fault_ns is not None]
     room = _room(drawn, len(times_ns)) - len(faults_ns)
     kept = np.union1d(times_ns[choose_samples(times_ns, curves, room)], np.array(faults_ns, np.int64))
@@ -157,7 +157,7 @@ def page_data(report: RunReport) -> PageData:
 
 def _room(results: Sequence[ReportedResult], samples: int) -> int:
     """How many samples there is room for."""
-    values = sum(4 * len(shown_nodes(each.formula)) * len(each.times_ns) for each in results)
+    values = sum(4 * len(shown_nodes(each.result.formula)) * len(each.result.times_ns) for each in results)
     return max(_FEWEST_SAMPLES, MOST_VALUES * max(samples, 1) // max(values, 1))
 
 
@@ -166,40 +166,38 @@ def _places(report: RunReport) -> Mapping[tuple[int, int], tuple[int, int]]:
     return {
         (number, node): (index, place)
         for index, number in enumerate(report.drawn_numbers)
-        for place, node in enumerate(shown_nodes(report.results[number].formula))
+        for place, node in enumerate(shown_nodes(report.results[number].result.formula))
     }
 
 
-def _curves(result: ReportedResult) -> NodeSeries:
-    return NodeSeries(result.times_ns, result.series[list(named_nodes(result.formula))])
+def _curves(each: ReportedResult) -> NodeSeries:
+    return NodeSeries(each.result.times_ns, each.result.series[list(named_nodes(each.result.formula))])
 
 
-def _result_value(
-    result: ReportedResult, kept: Integers, first_ns: int, packing: Packing
-) -> Mapping[str, Any]:
-    samples = np.flatnonzero(np.isin(result.times_ns, kept))
-    here = result.times_ns[samples]
-    series = series_of(result.series, result.formula, samples)
+def _result_value(each: ReportedResult, kept: Integers, first_ns: int, packing: Packing) -> Mapping[str, Any]:
+    samples = np.flatnonzero(np.isin(each.result.times_ns, kept))
+    here = each.result.times_ns[samples]
+    series = series_of(each.result.series, each.result.formula, samples)
     value: dict[str, Any] = {
-        "title": result.title,
-        "name": result.name,
-        "object": result.object,
-        "verdict": str(result.verdict),
-        "fault": None if result.fault_ns is None else (result.fault_ns - first_ns) / 1e9,
+        "title": each.result.title,
+        "name": each.result.name,
+        "object": each.result.object,
+        "verdict": str(each.result.verdict),
+        "fault": None if each.fault_ns is None else (each.fault_ns - first_ns) / 1e9,
         "first": int(np.searchsorted(kept, here[0])) if len(here) else 0,
         "samples": len(here),
-        "nodes": tree_value(result.formula, result.robustness, result.final, result.relations),
-        "requirements": requirement_values(result.formula, result.object),
+        "nodes": tree_value(each.result.formula, each.result.values, each.result.final, each.relations),
+        "requirements": requirement_values(each.result.formula, each.result.object),
         "series": packing.add(singles(series), "f4"),
         "automaton": None,
-        "no_automaton": sentence_parts(result.no_automaton),
+        "no_automaton": sentence_parts(each.no_automaton),
     }
-    if result.automaton is not None:
-        inside = np.searchsorted(result.path.times_ns, here)
+    if each.automaton is not None:
+        inside = np.searchsorted(each.path.times_ns, here)
         value["automaton"] = {
-            **automaton_value(result.automaton, result.path),
-            "sets": result.path.sets,
-            "path": packing.add(result.path.codes[inside], "i4"),
+            **automaton_value(each.automaton, each.path),
+            "sets": each.path.sets,
+            "path": packing.add(each.path.codes[inside], "i4"),
         }
     return value
 
@@ -217,7 +215,7 @@ def _omissions(report: RunReport, samples: int, kept: int, maps: int) -> Iterato
             f"Explanations, trees and curves are of {MOST_DRAWN} of {len(report.results):,} results, "
             "the worst."
         )
-    if any(len(result.robustness) > MOST_NODES for result in report.drawn):
+    if any(len(result.result.values) > MOST_NODES for result in report.drawn):
         yield f"Of trees with more than {MOST_NODES} nodes the uppermost {MOST_NODES} are shown."
     if len(report.events) > MOST_EVENTS:
         yield f"The first {MOST_EVENTS:,} of {len(report.events):,} events are listed."

@@ -128,27 +128,27 @@ def _verdicts(report: RunReport) -> Iterator[Html]:
         yield element("p", "No object was there for a template to stand for.")
     places = {id(result): place for place, result in enumerate(report.drawn)}
     are_many = len(report.results) > _MANY
-    worst = worst_first([result.verdict for result in report.results])
-    for number, result in enumerate(report.results[place] for place in worst):
+    worst = worst_first([each.result.verdict for each in report.results])
+    for number, each in enumerate(report.results[place] for place in worst):
         # which result the page shows when something in the verdict is chosen
-        drawn = {"data-result": str(places[id(result)])} if id(result) in places else {}
-        is_unfolded = result.verdict == report.verdict and not (are_many and number)
-        unfolded = {"open": ""} if result.sentences and is_unfolded else {}
+        drawn = {"data-result": str(places[id(each)])} if id(each) in places else {}
+        is_unfolded = each.result.verdict == report.verdict and not (are_many and number)
+        unfolded = {"open": ""} if each.sentences and is_unfolded else {}
         attributes = {"class": "verdict", **drawn, **unfolded}
-        sentences = [element("p", *_with_code(sentence)) for sentence in result.sentences]
+        sentences = [element("p", *_with_code(sentence)) for sentence in each.sentences]
         yield element(
-            "details" if sentences else "div", _summary(result, report.first_ns), *sentences, **attributes
+            "details" if sentences else "div", _summary(each, report.first_ns), *sentences, **attributes
         )
 
 
-def _summary(result: ReportedResult, first_ns: int) -> Html:
-    numbers = f"robustness {result.robustness_text or 'not determined'}"
-    if result.first_satisfied_ns is not None:
-        numbers += f", first satisfied at {time_text(result.first_satisfied_ns, first_ns)}"
+def _summary(each: ReportedResult, first_ns: int) -> Html:
+    numbers = f"robustness {each.robustness_text or 'not determined'}"
+    if each.result.first_satisfied_ns is not None:
+        numbers += f", first satisfied at {time_text(each.result.first_satisfied_ns, first_ns)}"
     return element(
-        "summary" if result.sentences else "div",
-        _chip(result.verdict),
-        element("span", text(result.title), **{"class": "name"}),
+        "summary" if each.sentences else "div",
+        _chip(each.result.verdict),
+        element("span", text(each.result.title), **{"class": "name"}),
         element("span", text(numbers), **{"class": "numbers"}),
         **{"class": "summary"},
     )

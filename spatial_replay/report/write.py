@@ -10,8 +10,6 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from spatial_replay.logs import topics as log_topics
 from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.output_file import replacing
@@ -115,19 +113,11 @@ def _results(replay: Replay, replayed: Replayed, collector: Collector) -> Iterat
     explained = _explained(replayed)
     for index, result in enumerate(replayed.results):
         tree, compiled = replay.trees[index], replay.automata[index]
-        no_series = np.empty((len(result.robustness), 4, 0))
+
         why = explain_node(result, first_ns=replayed.first_ns) if index in explained else None
         yield ReportedResult(
-            name=result.name,
-            object=result.object,
-            formula=result.formula,
+            result=result,
             relations=RELATION_NAMES | replay.files[tree.file].relations,
-            verdict=result.verdict,
-            robustness=result.robustness,
-            final=result.final,
-            first_satisfied_ns=result.first_satisfied_ns,
-            times_ns=np.empty(0, np.int64) if result.times_ns is None else result.times_ns,
-            series=no_series if result.series is None else result.series,
             sentences=() if why is None else why.sentences,
             decided_ns=None if why is None else why.time_ns,
             automaton=compiled.automaton,

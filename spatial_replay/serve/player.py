@@ -13,8 +13,8 @@ from spatial_replay.annotate.curves import CURVES_CHANNEL
 from spatial_replay.errors import SpatialReplayError
 from spatial_replay.logs.messages import Messages, messages_of, select
 from spatial_replay.logs.topics import CURVES_TOPIC, EVENT_LOG, EVENTS
+from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.replay.engine import ReplayedSpec
 from spatial_replay.replay.playback import Playback
 from spatial_replay.replay.tuning import EditedFiles, Tuned, constant_text, constant_values
 from spatial_replay.serve.pace import PlaybackState
@@ -99,11 +99,9 @@ def verdict_note(tuned: Tuned) -> Note:
     return Note(VERDICT, level, text + _changes(tuned))
 
 
-def _result(result: ReplayedSpec) -> str:
-    title = result.name if result.object is None else f"{result.name}({result.object})"
-    robustness = float(result.robustness[0])
-    number = "not determined" if math.isnan(robustness) else f"{robustness:.6g}"
-    return f"`{title}` is {result.verdict}: robustness {number}"
+def _result(result: SpecResult) -> str:
+    number = "not determined" if math.isnan(result.robustness) else f"{result.robustness:.6g}"
+    return f"`{result.title}` is {result.verdict}: robustness {number}"
 
 
 def _changes(tuned: Tuned) -> str:

@@ -68,7 +68,7 @@ def _evaluate(tuned: Tuned, request: Mapping[str, Any]) -> Mapping[str, Any]:
     changed = request.get("constants", {})
     if changed:
         tuned = tuned.tuning.evaluate({**constant_values(tuned.edited.constants), **changed})
-    results = tuple(replace(result, times_ns=None, series=None) for result in tuned.replayed.results)
+    results = tuple(replace(result, has_series=False) for result in tuned.replayed.results)
     return document_from_replay(replace(tuned.replayed, results=results))
 
 

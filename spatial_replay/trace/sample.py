@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from reprlib import repr as shortened
 from types import MappingProxyType
 
-from spatial_replay.errors import TraceError
+import numpy as np
+
+from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 
 LATEST_NS = 2**63 - 1
@@ -14,6 +17,18 @@ LATEST_NS = 2**63 - 1
 
 FOREVER = LATEST_NS + 1
 """A time after every sample."""
+
+
+def require_time(value: object, name: str) -> None:
+    """Check that a value is None or a time in ns.
+
+    Raises:
+        UsageError: anything else than None or an integer of at least 0.
+    """
+    if value is None:
+        return
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
+        raise UsageError(f"{name} is {shortened(value)}; give integer nanoseconds, 0 or more")
 
 
 @dataclass(frozen=True, slots=True)

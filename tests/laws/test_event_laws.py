@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -19,7 +18,7 @@ from spatial_replay.annotate.verdict_changes import LASTING, SATISFIED, START, N
 from spatial_replay.errors import UsageError
 from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.instances import find_instances
-from spatial_replay.monitor.semantics import Semantics, checked_semantics, instance_evaluation
+from spatial_replay.monitor.semantics import Semantics, checked_semantics
 from spatial_replay.monitor.stream import EvaluationStream
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import parse_specification
@@ -93,8 +92,7 @@ def _all_told(
     """What is told of each result, one after the other, its end included."""
     trace = recording.trace()
     instances = find_instances(spec, _choices(spec), [trace], 0, 2**63 - 1)
-    begin_one = partial(instance_evaluation, semantics=semantics)
-    evaluation = EvaluationStream(instances, spec.regions, begin_one)
+    evaluation = EvaluationStream(instances, spec.regions, semantics)
     trees = reported_trees([spec], [instances])
     tellers = [
         EventReporter(tree, stream.instance, spec, semantics)

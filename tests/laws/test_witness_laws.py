@@ -97,7 +97,7 @@ def test_a_witness_has_the_value_it_claims(specification, recording):
     )
     for result in evaluation:
         for node in result.nodes:
-            witness = result.inquiry.witness(node.id)
+            witness = result.witness(node.id)
             assert witness.verdict is node.verdict
             np.testing.assert_allclose([witness.lower, witness.upper], [node.final_lower, node.final_upper])
             assert len(sentences_of(witness, first_ns=0)) in (2, 3, 4)

@@ -8,8 +8,9 @@ import pytest
 from monitor.scenes import SECOND, numbers, points
 from spatial_replay.errors import TraceError
 from spatial_replay.geometry.footprint import Footprint
+from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.instances import find_instances
-from spatial_replay.monitor.stream import EvaluationStream, look_back
+from spatial_replay.monitor.stream import EvaluationStream
 from spatial_replay.spec.load import parse_specification
 from spatial_replay.trace.sample import FOREVER, Sample
 from spatial_replay.trace.trace import Trace

@@ -152,5 +152,5 @@ def test_results_can_be_inquired_into() -> None:
     tuned = tuning().evaluate({"far": 4.0})
     assert tuned.verdict == "violated"
     [both] = tuned.replayed.results
-    assert both.inquiry is not None
-    assert both.inquiry.witness().verdict == "violated"
+    assert both.can_explain
+    assert both.witness().verdict == "violated"

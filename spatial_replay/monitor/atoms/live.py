@@ -26,16 +26,14 @@ from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.geometry.measure import QUANTITY_CODES
+from spatial_replay.monitor.atoms.delays import NO_DELAY, RecentSamples, iter_delays
 from spatial_replay.monitor.atoms.instructions import LeafCode
 from spatial_replay.monitor.atoms.live_kernel import ABSENT, PlanArrays, leaves_of_sample, packed
 from spatial_replay.monitor.atoms.live_rows import (
-    NO_DELAY,
     Leaves,
     Member,
     PlanContext,
     PlanRows,
-    RecentSamples,
-    iter_delays,
 )
 from spatial_replay.monitor.atoms.measurements import quantity_of
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
@@ -240,7 +238,7 @@ class SampleLeaves:
 
     def look_at(self, sample: Sample) -> list[Sample | None]:
         """Take in the next sample; it and those that it looks back at."""
-        return self._recent.take(sample)
+        return self._recent.add(sample)
 
     def values(self, samples: Sequence[Sample | None]) -> Floats:
         """(C, A, 1), each leaf of each formula.

@@ -19,12 +19,12 @@ from typing import TypeVar
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.atoms.delays import look_back, tail
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.offline import Finished
 from spatial_replay.monitor.online.codes import in_channels
-from spatial_replay.monitor.stream import look_back, tail
 from spatial_replay.spec.formula import (
     Boolean,
     BooleanOperator,

@@ -1,0 +1,232 @@
+"""The result of one spec: its numbers, and on request its signals, windows and witnesses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from spatial_replay.errors import UsageError
+from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
+from spatial_replay.lazy import Displayed
+from spatial_replay.monitor.offline import full_signal, window_signal
+from spatial_replay.monitor.semantics import Semantics, require_ltlf
+from spatial_replay.monitor.stream import InstanceStream, SeriesBlock
+from spatial_replay.monitor.verdict import Verdict, final_verdict
+from spatial_replay.monitor.witness.path import Evidence
+from spatial_replay.monitor.witness.witness import Witness, find_witness
+from spatial_replay.spec.diagnostics import nearest_hint
+from spatial_replay.spec.format import format_formula
+from spatial_replay.spec.formula import Formula, iter_nodes, operator_of
+
+
+@dataclass(frozen=True, eq=False)
+class NodeResult:
+    """One node of a specification's tree over the evaluated samples.
+
+    Attributes:
+        id: its number in the order of the text, from 0 for the root.
+        parent: its parent's id; None for the root.
+        operator: "and", "F", a relation's name, …
+        name: the name of the spec whose root it is, or None.
+        text: its canonical text.
+        value: (T,), its robustness at the first sample, given the samples up to each (NaN: not determined).
+        now: (T,), its robustness at each sample, given the samples up to that one.
+        lower, upper: (T,), the ends of `value` over every continuation and everything unknown.
+        robustness: `value` on the whole log; NaN if not determined.
+        final_lower, final_upper: the ends of its interval for the finished log.
+    """
+
+    id: int
+    parent: int | None
+    operator: str
+    name: str | None
+    text: str
+    value: Floats
+    now: Floats
+    lower: Floats
+    upper: Floats
+    robustness: float
+    final_lower: float
+    final_upper: float
+
+    @property
+    def verdict(self) -> Verdict:
+        return final_verdict(self.final_lower, self.final_upper)
+
+
+@dataclass(frozen=True, eq=False)
+class SpecResult(Displayed):
+    """One spec evaluated over a log, or one object's instance of a template.
+
+    Attributes:
+        name: the spec's name; preceded by its file's stem if two files have a spec of that name.
+        object: the object that a template's parameter stands for, or None.
+        values: (N,), each node's value on the whole log.
+        final: (N, 2), lower and upper end of each node for the finished log.
+        first_satisfied_ns: the first sample with a value of at least 0, even if that is lost later, or None.
+        times_ns: (T,) int64, the samples evaluated; empty if nothing was stored of each sample.
+        series: (N, 4, T): value, now, lower, upper of each node (see `NodeResult`); T = 0 if not stored.
+        leaves: (C, A, T), the instance's leaves, from which the methods compute; None if not stored.
+        evidence: the samples, to be read again.
+    """
+
+    name: str
+    object: str | None
+    formula: Formula
+    semantics: Semantics
+    values: Floats
+    final: Floats
+    first_satisfied_ns: int | None
+    times_ns: Integers
+    series: Floats
+    has_series: bool
+    leaves: Floats | None
+    evidence: Evidence
+
+    @classmethod
+    def from_stream(
+        cls,
+        stream: InstanceStream,
+        evidence: Evidence,
+        block: SeriesBlock | None,
+        *,
+        name: str | None = None,
+        has_series: bool = True,
+        has_leaves: bool = True,
+    ) -> SpecResult:
+        """Collect the result of a stream that has seen all samples.
+
+        Args:
+            block: what was stored of every sample, if anything.
+            name: of the spec, unless it is the instance's.
+            has_series, has_leaves: whether the block holds its series, and its leaves.
+        """
+        instance = stream.instance
+        has_series = has_series and block is not None
+        no_series = np.empty((len(stream.robustness), 4, 0))
+        return cls(
+            instance.name if name is None else name,
+            instance.object,
+            instance.formula,
+            stream.semantics,
+            read_only_floats(stream.robustness),
+            read_only_floats(stream.final),
+            stream.first_satisfied_ns,
+            read_only_integers(block.times_ns if block is not None else []),
+            read_only_floats(block.series if block is not None and has_series else no_series),
+            has_series,
+            block.leaves if block is not None and has_leaves else None,
+            evidence,
+        )
+
+    @property
+    def title(self) -> str:
+        """Its name, with the object it is about."""
+        return self.name if self.object is None else f"{self.name}({self.object})"
+
+    @cached_property
+    def nodes(self) -> tuple[NodeResult, ...]:
+        """All nodes, by id."""
+        series = self.series if self.has_series else np.empty((len(self.final), 4, 0))
+        return tuple(
+            NodeResult(
+                identifier,
+                parent,
+                operator_of(node),
+                node.name,
+                format_formula(node),
+                *series[identifier],
+                *map(float, (self.values[identifier], *self.final[identifier])),
+            )
+            for identifier, parent, node in iter_nodes(self.formula)
+        )
+
+    def node(self, name: str) -> NodeResult:
+        """Return the node of the spec with the given name, within this result's tree.
+
+        Raises:
+            UsageError: no such node.
+        """
+        for node in self.nodes:
+            if node.name == name:
+                return node
+        names = [node.name for node in self.nodes if node.name]
+        raise UsageError(no_such_node(name, names, f" in {self.name!r}"))
+
+    @property
+    def robustness(self) -> float:
+        """The root's value on the whole log; NaN if not determined."""
+        return float(self.values[0])
+
+    @property
+    def lower(self) -> float:
+        """The least possible value of the root, given what is unknown."""
+        return float(self.final[0, 0])
+
+    @property
+    def upper(self) -> float:
+        """The greatest possible value of the root, given what is unknown."""
+        return float(self.final[0, 1])
+
+    @property
+    def verdict(self) -> Verdict:
+        return final_verdict(self.lower, self.upper)
+
+    @property
+    def can_explain(self) -> bool:
+        """Whether it has a witness: the leaves are stored, and the semantics is "ltlf"."""
+        return self.leaves is not None and self.semantics == "ltlf"
+
+    def full_signal(self) -> Floats:
+        """Return each node's robustness at each sample, from there to the end, (N, T); NaN: not determined.
+
+        Raises:
+            UsageError: under the paper's semantics.
+        """
+        leaves = self._leaves("the signal of a whole log")
+        return full_signal(self.formula, self.evidence.instance.program.leaves, leaves, self.times_ns)
+
+    def window_signal(self, width_ns: int) -> Floats:
+        """Return each node's robustness over the samples in (t - width, t], for the sample at each t, (N, T).
+
+        Past operators start where the window does; `a[-3]` may look before it. NaN: not determined.
+
+        Raises:
+            UsageError: a width below 1 ns, or under the paper's semantics.
+        """
+        leaves = self._leaves("a sliding window")
+        order = self.evidence.instance.program.leaves
+        return window_signal(self.formula, order, leaves, self.times_ns, width_ns)
+
+    def witness(self, node: str | int | None = None) -> Witness:
+        """Return what decides the verdict of a node, by name or id, or of the root.
+
+        Raises:
+            UsageError: no such node, or under the paper's semantics.
+        """
+        identifier = self.node(node).id if isinstance(node, str) else node or 0
+        leaves = self._leaves("a witness")
+        if not 0 <= identifier < len(self.final):
+            raise UsageError(f"no node has the id {identifier}; they go from 0 to {len(self.final) - 1}")
+        return find_witness(self.evidence, leaves, self.times_ns, identifier)
+
+    def _leaves(self, what: str) -> Floats:
+        require_ltlf(self.semantics, what)
+        if self.leaves is None:
+            raise UsageError(f"{what} needs the leaves of every sample, which were not stored")
+        return self.leaves
+
+    def __repr__(self) -> str:
+        instance = f" for {self.object}" if self.object is not None else ""
+        return f"<{self.name}{instance}: {self.verdict}, robustness {self.robustness:.6g}>"
+
+
+def no_such_node(name: str, names: Iterable[str], place: str = "") -> str:
+    """Return the message for an unknown node: the nearest name, and all of them."""
+    known = tuple(names)
+    listed = f"there are {', '.join(known)}" if known else "there are none yet"
+    hint = nearest_hint(name, known) if isinstance(name, str) else ""
+    return f"no node is named {name!r}{place}; {f'{hint} ' if hint else ''}{listed}"
