@@ -70,7 +70,7 @@ class MessageColumns:
         return len(self.topics)
 
     def slice(self, begin: int, end: int) -> MessageColumns:
-        """The messages from `begin` up to, not including, `end`."""
+        """Return the messages from `begin` up to, not including, `end`."""
         return MessageColumns(
             self.topics[begin:end],
             self.log_time_ns[begin:end],
@@ -81,7 +81,7 @@ class MessageColumns:
         )
 
     def take(self, places: Integers) -> MessageColumns:
-        """The messages in the given places, in that order."""
+        """Return the messages in the given places, in that order."""
         listed = places.tolist()
         return MessageColumns(
             [self.topics[place] for place in listed],
@@ -93,7 +93,7 @@ class MessageColumns:
         )
 
     def ordered(self) -> MessageColumns:
-        """The same messages by log time, topic and sequence; equal ones stay as they are."""
+        """Return the same messages by log time, topic and sequence; equal ones keep their order."""
         times = self.log_time_ns
         if (times[1:] > times[:-1]).all():
             return self
@@ -102,11 +102,11 @@ class MessageColumns:
         return self.take(np.lexsort((self.sequence, topics, times)))
 
     def count_before(self, time_ns: int) -> int:
-        """How many of the messages, which are in order, are earlier."""
+        """Count the messages, which are in order, before a time."""
         return int(np.searchsorted(self.log_time_ns, time_ns, side="left"))
 
     def messages(self) -> list[Message]:
-        """The messages one by one."""
+        """Return the messages one by one."""
         columns = zip(
             self.topics,
             self.log_time_ns.tolist(),
@@ -122,7 +122,7 @@ Columns: TypeAlias = Iterator[MessageColumns]
 
 
 def joined(several: Sequence[MessageColumns]) -> MessageColumns:
-    """The messages of several columns, one after the other."""
+    """Join the messages of several columns, one after the other."""
     if len(several) == 1:
         return several[0]
     return MessageColumns(
@@ -136,14 +136,14 @@ def joined(several: Sequence[MessageColumns]) -> MessageColumns:
 
 
 def in_pieces(columns: Columns, size: int = _TOGETHER) -> Columns:
-    """The same messages, no more than `size` at a time."""
+    """Yield the same messages, at most `size` at a time."""
     for each in columns:
         for begin in range(0, len(each), size):
             yield each.slice(begin, begin + size)
 
 
 def one_by_one(columns: Columns) -> Iterator[Message]:
-    """The messages themselves."""
+    """Yield the messages one by one."""
     for piece in in_pieces(columns):
         yield from piece.messages()
 
@@ -151,26 +151,26 @@ def one_by_one(columns: Columns) -> Iterator[Message]:
 def unnumbered(
     topics: Sequence[str], times_ns: Integers, payloads: Sequence[bytes], place: Integers
 ) -> MessageColumns:
-    """Messages of a container that knows one time and no sequence."""
+    """Return messages of a container with one time and no sequence."""
     return MessageColumns(topics, times_ns, times_ns, np.zeros(len(times_ns), np.int64), payloads, place)
 
 
 def places_in(part: int, within: Integers) -> Integers:
-    """Places in a log of several parts, such as chunks: in the order of the parts, then within each."""
+    """Return places in a log of several parts, such as chunks, in the order of the parts."""
     return (np.int64(part) << 28) + within
 
 
-def in_order(starts_ns: Sequence[int], stretches: Iterable[MessageColumns]) -> Columns:
-    """The messages of several stretches by log time, topic and sequence.
+def in_order(starts_ns: Sequence[int], chunks: Iterable[MessageColumns]) -> Columns:
+    """Yield the messages of several chunks by log time, topic and sequence.
 
-    No more is held than stretches overlap.
+    It holds no more messages than overlap.
 
     Args:
-        starts_ns: when each stretch begins, in order; a message before that comes late.
+        starts_ns: when each chunk begins, in order; a message before that comes late.
     """
     waiting = MessageColumns()
-    for number, stretch in enumerate(stretches, 1):
-        waiting = joined([waiting, stretch] if len(waiting) else [stretch]).ordered()
+    for number, chunk in enumerate(chunks, 1):
+        waiting = joined([waiting, chunk] if len(waiting) else [chunk]).ordered()
         if number == len(starts_ns):
             break
         ready = waiting.count_before(starts_ns[number])
@@ -183,19 +183,19 @@ def in_order(starts_ns: Sequence[int], stretches: Iterable[MessageColumns]) -> C
 
 @dataclass(frozen=True)
 class TimedColumns:
-    """Messages in order that may be read from a time on."""
+    """Messages in order, with the time from which they may be opened."""
 
     start_ns: int
     read: Callable[[], Columns]
 
 
 _Active = list[tuple[int, int, MessageColumns, Columns]]
-"""A heap: time of the first message, number of the run, messages, and those that come after them."""
+"""A heap: time of the first message, number of the file, messages, and those that follow them."""
 
 
-def merged(runs: Iterable[TimedColumns]) -> Columns:
-    """The messages of several runs by log time; a run is opened when its time has come."""
-    waiting = sorted(runs, key=lambda run: run.start_ns, reverse=True)
+def merged(files: Iterable[TimedColumns]) -> Columns:
+    """Merge the messages of several files by log time; a file is opened when its time has come."""
+    waiting = sorted(files, key=lambda file: file.start_ns, reverse=True)
     active: _Active = []
     opened = 0
     while waiting or active:
@@ -205,8 +205,8 @@ def merged(runs: Iterable[TimedColumns]) -> Columns:
         if not active:
             continue
         _, number, columns, following = heapq.heappop(active)
-        limits = [run.start_ns for run in waiting[-1:]] + [each[0] for each in active[:1]]
-        # equal times come in the order of the runs
+        limits = [file.start_ns for file in waiting[-1:]] + [each[0] for each in active[:1]]
+        # equal times come in the order of the files
         ready = columns.count_before(min(limits) + 1) if limits else len(columns)
         yield columns.slice(0, ready)
         if ready < len(columns):
@@ -237,11 +237,11 @@ def iter_counted(
 
 
 DISORDER_NS = 10**9
-"""How far messages may be out of order."""
+"""How far messages may be out of order: recorders write topics from several threads."""
 
 
 def without_jumps(columns: Columns, name: str) -> Columns:
-    """The messages as they are, in the order of time.
+    """Yield the messages as they are, which are in the order of time.
 
     Raises:
         LogError: those of a topic were not recorded in that order: some of them come more than a second
@@ -275,7 +275,7 @@ def _rows_by_topic(topics: Sequence[str]) -> Iterator[tuple[str, Integers | slic
 
 
 class _Recorded:
-    """How far the recording had come at each of the last messages, a second back and a little more."""
+    """How far the recording had come at each message of the last second and a little more."""
 
     def __init__(self) -> None:
         self._latest: deque[tuple[Integers, Integers]] = deque()
@@ -283,7 +283,7 @@ class _Recorded:
         self._furthest = -1
 
     def first_jump(self, times_ns: Integers, places: Integers) -> int | None:
-        """The first message that was recorded before one of more than a second earlier, or None.
+        """Return the first message recorded before one that is more than a second earlier, or None.
 
         Args:
             times_ns, places: (M,) of messages in the order of time, after those of the call before.
@@ -294,10 +294,10 @@ class _Recorded:
         furthest = places if is_ordered else np.maximum(np.maximum.accumulate(places), self._furthest)
         self._latest.append((times_ns, furthest))
         self._furthest = int(furthest[-1])
-        found = None if is_ordered else self._search(times_ns, places)
+        jump = None if is_ordered else self._search(times_ns, places)
         while self._latest[0][0][-1] < times_ns[-1] - DISORDER_NS:
             self._before = int(self._latest.popleft()[1][-1])
-        return found
+        return jump
 
     def _search(self, times_ns: Integers, places: Integers) -> int | None:
         times = np.concatenate([times for times, _ in self._latest])

@@ -24,7 +24,7 @@ ENCODINGS = ("ros1", "cdr", "protobuf", "json")
 
 
 def decoder_of(topic: Topic, distribution: str | None = None) -> Decoder:
-    """How to decode the messages of a topic.
+    """Return a decoder for the messages of a topic.
 
     Args:
         distribution: the release of ROS that the log names, for types that it does not define.
@@ -46,7 +46,7 @@ def decoder_of(topic: Topic, distribution: str | None = None) -> Decoder:
 
 
 def why_unreadable(topic: Topic, distribution: str | None = None) -> str | None:
-    """Why the messages of a topic cannot be decoded, or None."""
+    """Return why the messages of a topic cannot be decoded, or None."""
     try:
         if topic.encoding not in ("ros1", "cdr"):
             decoder_of(topic)
@@ -54,7 +54,7 @@ def why_unreadable(topic: Topic, distribution: str | None = None) -> str | None:
     except LogError as error:
         return str(error)
     try:
-        # a decoder takes longer to make than its definition to check
+        # making a decoder takes longer than checking its definition
         ros_definitions(topic.type, topic.encoding, topic.schema, distribution)
     except LogError as error:
         return f"topic {topic.name!r}: {error}"
@@ -62,7 +62,7 @@ def why_unreadable(topic: Topic, distribution: str | None = None) -> str | None:
 
 
 def same_definition(one: Topic, other: Topic) -> bool:
-    """Whether one decoder serves two topics of the same type; texts may differ in comments."""
+    """Return whether one decoder serves two topics of the same type; texts may differ in comments."""
     if one.schema == other.schema or one.encoding == "json":
         return True
     if one.encoding not in ("ros1", "cdr"):
@@ -81,7 +81,7 @@ def _protobuf_decoder(type_name: str, message_class: type[Message]) -> Decoder:
         try:
             return from_string(payload)
         except DecodeError as error:
-            raise LogError(f"a message is no {type_name}: {error}") from None
+            raise LogError(f"a message is not a {type_name}: {error}") from None
 
     return decode
 
@@ -103,7 +103,7 @@ def _message_class(type_name: str, schema: Schema | None) -> type[Message]:
 
 
 def _in_order(described: FileDescriptorSet) -> list[FileDescriptorProto]:
-    """The files, each after those that it imports."""
+    """Return the files, each after those that it imports."""
     if len(described.file) > _MOST_FILES:
         raise ValueError(f"it has {len(described.file)} files; at most {_MOST_FILES} are read")
     files = {file.name: file for file in described.file}
@@ -115,7 +115,7 @@ def _in_order(described: FileDescriptorSet) -> list[FileDescriptorProto]:
         for each in imports:
             importers[each].append(name)
     ready = [name for name, count in missing.items() if not count]
-    # the list grows while it is walked: a file is ready when the last of its imports is
+    # the list grows during the loop: a file is ready when the last of its imports is
     for name in ready:
         for importer in importers[name]:
             missing[importer] -= 1
@@ -131,11 +131,11 @@ def _decode_json(payload: bytes) -> object:
     try:
         return json.loads(payload)
     except (ValueError, RecursionError) as error:
-        raise LogError(f"a message is no JSON: {error!s:.200}") from None
+        raise LogError(f"a message is not JSON: {error!s:.200}") from None
 
 
 def topics_by_name(described: Iterable[Topic], distribution: str | None = None) -> tuple[Topic, ...]:
-    """One topic for each name, in order; those that cannot be decoded say why.
+    """Return one topic for each name, in order; those that cannot be decoded say why.
 
     Args:
         distribution: the release of ROS that the log names.
@@ -160,9 +160,9 @@ def _joined(one: Topic, other: Topic) -> Topic:
     )
     for what in ("type", "encoding"):
         if getattr(one, what) != getattr(other, what):
-            said = f"{getattr(one, what)!r} and {getattr(other, what)!r}"
+            both = f"{getattr(one, what)!r} and {getattr(other, what)!r}"
             return replace(
-                joined, unreadable=f"topic {one.name!r} has messages of more than one {what}: {said}"
+                joined, unreadable=f"topic {one.name!r} has messages of more than one {what}: {both}"
             )
     if None not in (one.schema, other.schema) and not same_definition(one, other):
         return replace(

@@ -51,7 +51,7 @@ class BagFolder(MessageReader):
         except OSError as error:
             raise MissingFileError.of(path, error) from None
         except UnicodeDecodeError:
-            what = "is no text in UTF-8"
+            what = "is not UTF-8"
         except LogError as error:
             what = f"cannot be used: {error}"
         self._faults.add(f"{self.name}: {METADATA_FILE} {what}; the files in the folder were read without it")
@@ -73,8 +73,8 @@ class BagFolder(MessageReader):
         opened = [self._opened(self._path / name) for name in listed if (self._path / name).is_file()]
         files = tuple(each for each in opened if each is not None)
         if not files:
-            reason = next(iter(self._faults.take()), "it has no .db3 and no .mcap")
-            raise LogError(f"{self.name} is no ROS 2 bag that can be read: {reason}")
+            reason = next(iter(self._faults.take()), "it has no .db3 and no .mcap file")
+            raise LogError(f"{self.name} is not a ROS 2 bag that can be read: {reason}")
         return files
 
     @cached_property
@@ -84,9 +84,9 @@ class BagFolder(MessageReader):
 
     @cached_property
     def _topics(self) -> tuple[Topic, ...]:
-        found = [topic for file in self._files for topic in self._described(file)]
+        present = [topic for file in self._files for topic in self._described(file)]
         declared = self._metadata
-        named = topics_by_name(found, self._distribution)
+        named = topics_by_name(present, self._distribution)
         if declared is None:
             return named
         absent = [
@@ -98,7 +98,7 @@ class BagFolder(MessageReader):
                 unreadable=f"topic {name!r} is in none of the bag's files",
             )
             for name, count in declared.counts.items()
-            if name not in {topic.name for topic in found}
+            if name not in {topic.name for topic in present}
         ]
         known = [replace(topic, count=declared.counts.get(topic.name, 0)) for topic in named]
         return tuple(sorted([*known, *absent], key=lambda topic: topic.name))
@@ -154,8 +154,8 @@ class BagFolder(MessageReader):
         if as_recorded or len(reads) == 1:
             columns: Columns = (each for read in reads for each in read())
         else:
-            runs = zip(self._files, reads, strict=True)
-            columns = merged(TimedColumns(file.start_ns or 0, read) for file, read in runs)
+            pairs = zip(self._files, reads, strict=True)
+            columns = merged(TimedColumns(file.start_ns or 0, read) for file, read in pairs)
         if self._metadata and self._metadata.compression == "message":
             columns = map(self._unpacked, columns)
         if start_ns or end_ns is not None or self._metadata is None:
@@ -177,11 +177,11 @@ class BagFolder(MessageReader):
             yield replace(each, place=(np.int64(number) << 48) + each.place)
 
     def _opened_files(self) -> Iterable[_File]:
-        """The files that were opened so far."""
+        """Return the files that were opened so far."""
         return self._files if "_files" in self.__dict__ else ()
 
     def _opened(self, path: Path) -> _File | None:
-        """The file by what it holds; None, and a fault, where nothing in it can be read."""
+        """Open a file by its content; None, and a fault, where nothing in it can be read."""
         try:
             with path.open("rb") as stream:
                 head = stream.read(len(SQLITE_MAGIC))
@@ -209,26 +209,26 @@ class BagFolder(MessageReader):
     def _compare_types(self, topics: Collection[str]) -> None:
         declared = self._metadata.types if self._metadata else {}
         for topic in self._topics:
-            said = declared.get(topic.name, topic.type)
-            if topic.name in topics and said != topic.type:
+            type_name = declared.get(topic.name, topic.type)
+            if topic.name in topics and type_name != topic.type:
                 self._faults.add(
-                    f"{self.name}/{METADATA_FILE}: it says that {topic.name!r} has messages of {said!r:.100};"
-                    f" they are of {topic.type!r}"
+                    f"{self.name}/{METADATA_FILE}: it declares messages of {type_name!r:.100} on"
+                    f" {topic.name!r}; they are of {topic.type!r}"
                 )
 
     def _unpacked(self, packed: MessageColumns) -> MessageColumns:
         payloads: list[bytes] = []
-        kept: list[int] = []
+        places: list[int] = []
         for place, payload in enumerate(packed.payloads):
             try:
                 payloads.append(unpacked(payload))
-                kept.append(place)
+                places.append(place)
             except LogError as error:
                 where = f"on {packed.topics[place]!r} at {packed.log_time_ns[place]} ns"
                 self._faults.add(f"{self.name}: {where}: {error}")
-        return replace(packed.take(np.array(kept, np.int64)), payloads=payloads)
+        return replace(packed.take(np.array(places, np.int64)), payloads=payloads)
 
 
 def _rank(name: str) -> tuple[str | int, ...]:
-    """Sorts bag_10.db3 after bag_9.db3."""
+    """Return a key that sorts bag_10.db3 after bag_9.db3."""
     return tuple(int(part) if part.isdecimal() else part for part in re.split(r"([0-9]+)", name)[:80])

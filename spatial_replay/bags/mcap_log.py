@@ -51,7 +51,7 @@ class McapLog(MessageReader):
         statistics = directory.statistics
         counts = statistics.channel_message_counts if statistics else None
         if statistics and not counts and statistics.message_count:
-            # counts of channels are optional
+            # the format leaves counts of channels out at will
             counts = None
         if statistics and counts and sum(counts.values()) != statistics.message_count:
             self._faults.add(
@@ -62,6 +62,11 @@ class McapLog(MessageReader):
             _topic(channel, None if counts is None else counts.get(number, 0))
             for number, channel in sorted(channels.items())
         )
+
+    @property
+    def channel_topics(self) -> frozenset[str]:
+        """The topics of its channels, without a look at their definitions."""
+        return frozenset(channel.topic for channel in self._contents[1].values())
 
     @property
     def start_ns(self) -> int | None:
@@ -91,14 +96,13 @@ class McapLog(MessageReader):
             places.sort(key=lambda ranked: ranked[1].start_ns)
         with self._path.open("rb") as stream:
             self._walked = 0
-            stretches = (self._messages(stream, *ranked, wanted, first, last) for ranked in places)
-            columns = (
-                stretches if as_recorded else in_order([place.start_ns for _, place in places], stretches)
-            )
+            contents = (self._messages(stream, *ranked, wanted, first, last) for ranked in places)
+            columns = contents if as_recorded else in_order([place.start_ns for _, place in places], contents)
             if (first, last) != (0, LATEST_NS + 1):
                 yield from columns
                 return
             yield from self._counted(columns, topics)
+            # without counts of channels, the total is all there is to compare
             statistics = directory.statistics
             total = statistics.message_count if statistics else self._walked
             is_total_only = statistics is not None and not statistics.channel_message_counts
@@ -110,7 +114,7 @@ class McapLog(MessageReader):
     def _messages(
         self, stream: BinaryIO, rank: int, place: ChunkPlace, wanted: dict[int, str], first: int, last: int
     ) -> MessageColumns:
-        """The messages in a place; what is lost of them goes to the faults."""
+        """Read the messages in a place; what is lost of them goes to the faults."""
         span = f"messages between {place.start_ns} and {place.end_ns} ns"
         try:
             content = read_records(stream, place)

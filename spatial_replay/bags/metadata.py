@@ -1,4 +1,4 @@
-"""The metadata.yaml of a ROS 2 bag: what the bag says that it holds."""
+"""The metadata.yaml of a ROS 2 bag, which declares what the bag holds."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class BagMetadata:
         types: of each topic.
         counts: messages of each topic.
         compression: of whole files, of each message, or none.
-        distribution: the release of ROS that wrote it, if it says so.
+        distribution: the ROS release that wrote it, if it is named.
     """
 
     files: tuple[str, ...]
@@ -36,15 +36,15 @@ class BagMetadata:
 
 
 def bag_metadata_from_text(text: str) -> BagMetadata:
-    """What a metadata.yaml says.
+    """Parse a metadata.yaml.
 
     Raises:
-        LogError: it is no YAML, or does not describe a bag.
+        LogError: it is not YAML, or does not describe a bag.
     """
     document = _plain(text)
     about = document.get("rosbag2_bagfile_information", document) if isinstance(document, dict) else None
     if not isinstance(about, dict):
-        raise LogError("it does not describe a bag; 'rosbag2_bagfile_information' belongs there")
+        raise LogError("it does not describe a bag; it has no 'rosbag2_bagfile_information'")
     topics = [_topic(each) for each in _list(about, "topics_with_message_count")]
     files = [_text(each, "relative_file_paths") for each in _list(about, "relative_file_paths")]
     distribution = about.get("ros_distro")
@@ -58,7 +58,7 @@ def bag_metadata_from_text(text: str) -> BagMetadata:
 
 
 def _plain(text: str) -> Any:
-    """The values in a YAML text without aliases, with which a short text could mean a very long one."""
+    """Parse a YAML text without aliases, with which a short text could stand for a very long one."""
     import yaml
 
     if len(text) > LARGEST_METADATA:
@@ -70,9 +70,9 @@ def _plain(text: str) -> Any:
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)
             if isinstance(event, yaml.AliasEvent) or depth > _DEEPEST:
-                raise LogError("it refers to parts of itself, or is nested too deep; no bag's metadata are")
+                raise LogError("it refers to parts of itself, or is nested too deep; no recorder writes that")
         return yaml.load(text, Loader=loader)  # the loader makes plain values only
-    # numbers and dates that are none end in ValueError and its kin
+    # malformed numbers and dates raise ValueError and its kin
     except (yaml.YAMLError, ValueError, OverflowError, TypeError, KeyError) as error:
         raise LogError(f"it is no YAML ({' '.join(str(error).split()):.200})") from None
 
@@ -102,19 +102,19 @@ def _compression(about: dict[str, object]) -> Compression:
 def _list(about: dict[str, object], name: str) -> list[object]:
     value = about.get(name)
     if not isinstance(value, list):
-        raise LogError(f"{name!r} in it is no list")
+        raise LogError(f"{name!r} in it is not a list")
     return value
 
 
 def _text(value: object, name: str) -> str:
     if not isinstance(value, str):
-        raise LogError(f"{name!r} in it is {value!r:.100}; it should be a text")
+        raise LogError(f"{name!r} in it is {value!r:.100}; give a string")
     return value
 
 
 def _base_name(path: str) -> str:
-    """The last part of a path; bags of early releases named the folder too, and none may lead out of it."""
+    """Return the last part of a path; early releases wrote the folder too, and no path may lead out of it."""
     name = PureWindowsPath(PurePosixPath(path).name).name
     if name in ("", "..") or "\x00" in name:
-        raise LogError(f"{path!r:.100} in it is no name of a file")
+        raise LogError(f"{path!r:.100} in it is not a file name")
     return name

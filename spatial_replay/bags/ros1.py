@@ -85,10 +85,8 @@ class Ros1Bag(MessageReader):
         if not as_recorded:
             chunks.sort(key=lambda ranked: ranked[1].start_ns)
         with self._path.open("rb") as stream:
-            stretches = (self._messages(stream, *ranked, wanted, first, last) for ranked in chunks)
-            columns = (
-                stretches if as_recorded else in_order([chunk.start_ns for _, chunk in chunks], stretches)
-            )
+            contents = (self._messages(stream, *ranked, wanted, first, last) for ranked in chunks)
+            columns = contents if as_recorded else in_order([chunk.start_ns for _, chunk in chunks], contents)
             if (first, last) != (0, LATEST_NS + 1) or not self._directory.is_indexed:
                 yield from columns
             else:
@@ -103,7 +101,7 @@ class Ros1Bag(MessageReader):
         first: int,
         last: int,
     ) -> MessageColumns:
-        """The messages of a chunk; what is lost of them goes to the faults."""
+        """Read the messages of a chunk; what is lost of them goes to the faults."""
         span = f"messages between {chunk.start_ns} and {chunk.end_ns} ns"
         try:
             content = read_chunk(stream, chunk.offset)

@@ -1,6 +1,7 @@
-"""What a ROS 1 bag holds and where, by its index or, failing that, by looking.
+"""The directory of a ROS 1 bag: its connections and chunks, by its index or, failing that, by a scan.
 
-Records of ROS 1 bags: heads with named fields, chunks with records inside.
+A bag is a sequence of records, whose heads have named fields; chunks are records with records inside. Every
+length in the file is checked against what is there, so that damage ends in `DamageError` and no more.
 """
 
 from __future__ import annotations
@@ -32,12 +33,12 @@ _C, _I, _O, _P, _T = b"ciopt"
 
 
 class RecordTable(NamedTuple):
-    """N records of a chunk, in the order in which they stand.
+    """N records of a chunk, in their order.
 
     Attributes:
-        opcode, connection, time_ns: (N,) int64; -1 where the head does not say.
+        opcode, connection, time_ns: (N,) int64; -1 where the head has none.
         head: (N,) int64, where the head's fields begin.
-        begin, end: (N,) int64, where the data stand.
+        begin, end: (N,) int64, where the data are.
     """
 
     opcode: Integers
@@ -49,7 +50,7 @@ class RecordTable(NamedTuple):
 
 
 def fields_of(head: bytes) -> dict[str, bytes]:
-    """The fields of a record's head, or of a connection's data, by name.
+    """Parse the fields of a record's head, or of a connection's data, by name.
 
     Raises:
         DamageError: they do not fill it exactly.
@@ -74,7 +75,7 @@ def _iter_fields(head: bytes) -> Iterator[bytes]:
 
 
 def number(fields: dict[str, bytes], name: str, size: int = 4) -> int:
-    """A field that is a little-endian number of so many bytes.
+    """Return a field that is a little-endian number of some bytes.
 
     Raises:
         DamageError: it is missing, or of another size.
@@ -86,12 +87,12 @@ def number(fields: dict[str, bytes], name: str, size: int = 4) -> int:
 
 
 def time_from(value: int) -> int:
-    """Nanoseconds from seconds in the lower and nanoseconds in the upper half of a word."""
+    """Return nanoseconds from seconds in the lower and nanoseconds in the upper half of a word."""
     return (value & 0xFFFFFFFF) * _SECOND_NS + (value >> 32)
 
 
 def decompressed(compression: bytes, data: bytes, size: int) -> bytes:
-    """The records of a chunk.
+    """Decompress the records of a chunk.
 
     Raises:
         DamageError: it does not decompress to `size` bytes.
@@ -117,7 +118,7 @@ def decompressed(compression: bytes, data: bytes, size: int) -> bytes:
 
 
 def record_table(content: bytes) -> tuple[RecordTable, bool]:
-    """The records in a chunk's content, and whether the last of them breaks off."""
+    """Return the records in a chunk's content, and whether the last of them breaks off."""
     view = np.frombuffer(content, np.uint8)
     count, _ = _walk(view, np.empty((6, 0), np.int64))
     table = np.empty((6, count), np.int64)
@@ -127,7 +128,7 @@ def record_table(content: bytes) -> tuple[RecordTable, bool]:
 
 @piece
 def _u32(content: NDArray[np.uint8], at: int) -> int:
-    """A little-endian word."""
+    """Return a little-endian word."""
     word = 0
     for k in range(4):
         word += int(content[at + k]) << (8 * k)
@@ -136,7 +137,7 @@ def _u32(content: NDArray[np.uint8], at: int) -> int:
 
 @piece
 def _head(content: NDArray[np.uint8], head: int, data: int) -> tuple[int, int, int]:
-    """Opcode, connection and time in the fields of a head, each -1 where it is missing."""
+    """Return opcode, connection and time in the fields of a head, each -1 where it is missing."""
     opcode = connection = time_ns = -1
     at = head
     while at + 4 <= data:
@@ -157,7 +158,7 @@ def _head(content: NDArray[np.uint8], head: int, data: int) -> tuple[int, int, i
 
 @kernel
 def _walk(content: NDArray[np.uint8], table: NDArray[np.int64]) -> tuple[int, int]:
-    """Fill in as many records as there is room for; how many there are, and where the last whole one ends."""
+    """Fill in the records that there is room for; return their number, and where the last whole one ends."""
     size = content.shape[0]
     position = 0
     count = 0
@@ -213,11 +214,11 @@ class Connection:
 
 @dataclass(frozen=True, slots=True)
 class BagChunk:
-    """A chunk: where it stands, and what it holds.
+    """A chunk: where it is, and what it holds.
 
     Attributes:
         offset: of its record.
-        counts: how many messages of each connection; None where only its content can tell.
+        counts: how many messages of each connection; None where only its content says.
     """
 
     offset: int
@@ -241,7 +242,7 @@ class BagDirectory:
 
 @dataclass(frozen=True, slots=True)
 class _Record:
-    """A record in the file: the fields of its head, where its data stand, where the next one begins."""
+    """A record in the file: the fields of its head, and where its data are."""
 
     fields: dict[str, bytes]
     data: int
@@ -257,7 +258,7 @@ class _Record:
 
 
 def read_bag_directory(stream: BinaryIO, faults: FaultList, name: str) -> BagDirectory:
-    """The directory of a file that begins as a bag; what is wrong with it goes to `faults`."""
+    """Read the directory of a ROS 1 bag; what is wrong with the file goes to `faults`."""
     size = stream.seek(0, os.SEEK_END)
     try:
         return _from_index(stream, size)
@@ -267,7 +268,7 @@ def read_bag_directory(stream: BinaryIO, faults: FaultList, name: str) -> BagDir
 
 
 def read_chunk(stream: BinaryIO, offset: int) -> bytes:
-    """The content of the chunk at an offset, decompressed.
+    """Read the content of the chunk at an offset, decompressed.
 
     Raises:
         DamageError: it is cut off, no chunk, or does not decompress.
@@ -279,7 +280,7 @@ def read_chunk(stream: BinaryIO, offset: int) -> bytes:
 
 
 def connections_in(content: bytes, table: RecordTable) -> Iterator[Connection]:
-    """The connections that a chunk declares.
+    """Yield the connections that a chunk declares.
 
     Raises:
         DamageError: one cannot be read.
@@ -305,7 +306,7 @@ def _from_index(stream: BinaryIO, size: int) -> BagDirectory:
         elif record.opcode == CHUNK_INFO:
             directory.chunks.append(_chunk_info(record.fields, _data(stream, record)))
         else:
-            raise DamageError(f"the index has a record of another kind (op {record.opcode})")
+            raise DamageError(f"the index has an unexpected record (op {record.opcode})")
         position = record.following
     declared = number(head.fields, "conn_count"), number(head.fields, "chunk_count")
     if declared != (len(directory.connections), len(directory.chunks)):
@@ -319,7 +320,7 @@ def _from_index(stream: BinaryIO, size: int) -> BagDirectory:
 
 def _chunk_info(fields: dict[str, bytes], data: bytes) -> BagChunk:
     if number(fields, "ver") != 1 or number(fields, "count") * 8 != len(data):
-        raise DamageError("the index describes a chunk in a way that is not known")
+        raise DamageError("the index describes a chunk in an unknown version")
     words = [int.from_bytes(data[at : at + 4], "little") for at in range(0, len(data), 4)]
     return BagChunk(
         number(fields, "chunk_pos", 8),
@@ -340,7 +341,7 @@ def _record(stream: BinaryIO, position: int, size: int) -> _Record:
     stream.seek(position)
     head_length = _word(stream)
     if head_length > min(LONGEST_HEAD, size - position):
-        raise DamageError("a record's head makes no sense")
+        raise DamageError("a record's head is inconsistent")
     fields = fields_of(stream.read(head_length))
     length = _word(stream)
     data = stream.tell()
@@ -376,7 +377,7 @@ class _Scan:
         self._size = size
         self._faults = faults
         self._name = name
-        self._found = BagDirectory()
+        self._directory = BagDirectory()
         self._marks = 0
 
     def directory(self) -> BagDirectory:
@@ -393,33 +394,33 @@ class _Scan:
                 if following is None:
                     break
                 position = following
-        return self._found
+        return self._directory
 
     def _take_in(self, position: int) -> int:
-        """Take in the record at a position; where the next one begins."""
+        """Take in the record at a position; return where the next one begins."""
         record = _record(self._stream, position, self._size)
         if record.opcode == CHUNK:
             self._chunk(position, record)
         elif record.opcode == CONNECTION:
             connection = _connection(record.fields, _data(self._stream, record))
-            self._found.connections.setdefault(connection.number, connection)
+            self._directory.connections.setdefault(connection.number, connection)
         elif record.opcode not in (BAG_HEADER, INDEX, CHUNK_INFO):
-            raise DamageError(f"there is no record of a kind that is known (op {record.opcode})")
+            raise DamageError(f"there is no known record (op {record.opcode})")
         return record.following
 
     def _chunk(self, position: int, record: _Record) -> None:
         content = _content(self._stream, record)
         table, _ = record_table(content)
         for connection in connections_in(content, table):
-            self._found.connections.setdefault(connection.number, connection)
+            self._directory.connections.setdefault(connection.number, connection)
         is_message = table.opcode == MESSAGE
         if is_message.any():
             times = table.time_ns[is_message]
             counts = Counter(table.connection[is_message].tolist())
-            self._found.chunks.append(BagChunk(position, int(times.min()), int(times.max()), counts))
+            self._directory.chunks.append(BagChunk(position, int(times.min()), int(times.max()), counts))
 
     def _next_chunk(self, position: int) -> int | None:
-        """Where the next chunk begins whose head is consistent, from a position on."""
+        """Return where the next chunk begins whose head is consistent, from a position on."""
         overlap = max(_CHUNK_HEAD_BYTES) + len(_CHUNK_MARK)
         while position < self._size:
             self._stream.seek(position)

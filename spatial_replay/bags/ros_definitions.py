@@ -1,8 +1,8 @@
-"""Definitions of ROS message types: text to fields, checked before any decoder is made of them.
+"""Definitions of ROS message types, checked before rosbags generates decoders from them.
 
-The decoders are Python code that rosbags writes from names and sizes and then runs. A definition comes with
-the log and is not to be trusted: what gets through here has names that are plain identifiers, references
-that resolve without a cycle, and sizes that cannot blow up.
+The decoders are Python code that rosbags generates from names and sizes and then runs. A definition comes
+with the log and is not trusted: it gets through only if names are plain identifiers, references resolve
+without a cycle, and sizes are bounded.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ LONGEST_TEXT = 2**18
 MOST_TYPES = 1_000
 MOST_FIELDS = 4_000
 MOST_VALUES = 4_000
-"""Values in one message that its definition alone, not its bytes, may ask for: each becomes lines of code."""
+"""Values in one message that its definition alone, not its bytes, asks for: each becomes lines of code."""
 MOST_VALUES_IN_ALL = 12_000
 """The same, over a type and all those that it uses."""
 
@@ -66,18 +66,18 @@ Definitions: TypeAlias = Mapping[str, tuple[Field, ...]]
 
 
 def full_type_name(name: str) -> str:
-    """A ROS type's name with its middle part: geometry_msgs/Pose becomes geometry_msgs/msg/Pose."""
+    """Return a ROS type's name with its middle part: geometry_msgs/Pose becomes geometry_msgs/msg/Pose."""
     parts = name.split("/")
     return "/".join([parts[0], "msg", parts[1]]) if len(parts) == 2 else name
 
 
 def definitions_from_msg(text: str, type_name: str) -> Definitions:
-    """The types in a .msg text, with those that it uses after lines of equals signs.
+    """Parse the types in a .msg text: its own, and those that it uses, after lines of equals signs.
 
     Constants and default values are left out: no message depends on them.
 
     Raises:
-        LogError: a line that is no field, a name that is none.
+        LogError: a line that is not a field, a malformed name.
     """
     sections = list(iter_sections(text, type_name))
     known = {name for name, _ in sections}
@@ -89,7 +89,7 @@ def definitions_from_msg(text: str, type_name: str) -> Definitions:
 
 
 def iter_sections(text: str, type_name: str) -> Iterator[tuple[str, str]]:
-    """Each type's name and text; the first may go without a head line."""
+    """Yield each type's name and text; the first may lack a head line."""
     if len(text) > LONGEST_TEXT:
         raise LogError(
             f"the definition of {type_name!r:.100} has {len(text)} characters;"
@@ -104,13 +104,13 @@ def iter_sections(text: str, type_name: str) -> Iterator[tuple[str, str]]:
 
 
 def checked_type_name(name: str) -> str:
-    """The name, if it is one that a message type may have.
+    """Return the name, if it is one that a message type may have.
 
     Raises:
         LogError: it is not.
     """
     if len(name) > 256 or not _TYPE_NAME.fullmatch(name):
-        raise LogError(f"{name!r:.100} is no name of a message type, such as geometry_msgs/msg/Pose")
+        raise LogError(f"{name!r:.100} is not a name of a message type, such as geometry_msgs/msg/Pose")
     return name
 
 
@@ -121,7 +121,9 @@ def _iter_fields(body: str, owner: str, known: set[str]) -> Iterator[Field]:
             continue
         found = _FIELD.fullmatch(bare)
         if found is None:
-            raise LogError(f"the definition of {owner!r}, line {number}: {line.strip()!r:.100} is no field")
+            raise LogError(
+                f"the definition of {owner!r}, line {number}: {line.strip()!r:.100} is not a field"
+            )
         if found["rest"].startswith("="):
             continue
         limit = found["limit"] or ""
@@ -149,7 +151,7 @@ def _resolved(name: str, owner: str, known: set[str]) -> str:
 
 
 def check_definitions(definitions: Definitions, type_name: str, *, empty_bytes: int) -> Definitions:
-    """The type and those that it uses, if decoders can safely be made of them.
+    """Return the type and those that it uses, if it is safe to generate decoders from them.
 
     Args:
         empty_bytes: what a message without fields takes: 0 in ROS 1, 1 in ROS 2.
@@ -173,7 +175,7 @@ class _Walk:
         self.used: dict[str, tuple[Field, ...]] = {}
 
     def measure(self, name: str, above: tuple[str, ...]) -> tuple[int, int]:
-        """Values and least bytes of a type."""
+        """Return how many values and at least how many bytes a type takes."""
         if name in self._measured:
             return self._measured[name]
         if name not in self._definitions:
@@ -223,7 +225,7 @@ def _check_field_names(name: str, fields: tuple[Field, ...]) -> None:
     seen: set[str] = set()
     for field in fields:
         if len(field.name) > 256 or not _NAME.fullmatch(field.name):
-            raise LogError(f"{field.name!r:.100} is no name of a field; it stands in {name!r}")
+            raise LogError(f"{field.name!r:.100} is not a name of a field; it is in {name!r}")
         if field.name in seen:
             raise LogError(f"the type {name!r} has two fields {field.name!r}")
         seen.add(field.name)
@@ -234,7 +236,7 @@ def _used_by(above: tuple[str, ...]) -> str:
 
 
 def msg_from_definitions(definitions: Definitions, type_name: str) -> str:
-    """A .msg text of a type and those that it uses, as `definitions_from_msg` reads it."""
+    """Write a .msg text of a type and those that it uses, as `definitions_from_msg` reads it."""
     others = [name for name in definitions if name != type_name]
     texts = ["".join(f"{_written(field)} {field.name}\n" for field in definitions[type_name])]
     for name in others:

@@ -1,4 +1,4 @@
-"""Decoders of ROS messages, made by rosbags from definitions that were checked."""
+"""Decoders of ROS messages, which rosbags generates from checked definitions."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ _KINDS: dict[int, Kind] = {3: "array", 4: "sequence"}
 def ros_definitions(
     type_name: str, encoding: RosEncoding, schema: Schema | None, distribution: str | None = None
 ) -> tuple[Definitions, ...]:
-    """The definitions that messages of a type may have: one, or those of each release of ROS.
+    """Return the definitions that messages of a type may have: one, or those of each release of ROS.
 
     Args:
         type_name: in full, such as geometry_msgs/msg/Pose.
-        schema: None where the log has none: the type has to be a standard one.
-        distribution: the release of ROS that the log names.
+        schema: None where the log has none; then the type must be a standard one.
+        distribution: the ROS release that the log names.
 
     Raises:
         LogError: none, or one that cannot be understood.
@@ -65,7 +65,7 @@ def ros_definitions(
             if type_name in standard
         ]
         if not found:
-            raise LogError(f"the log has no definition of {type_name!r}, which is no standard type of ROS")
+            raise LogError(f"the log has no definition of {type_name!r}, which is not a standard ROS type")
         return tuple(each for index, each in enumerate(found) if each not in found[:index])
     own = _parsed(type_name, schema)
     standard = next(iter(_standards(encoding, distribution)))
@@ -76,7 +76,7 @@ def ros_definitions(
 def ros_decoder(
     type_name: str, encoding: RosEncoding, schema: Schema | None, distribution: str | None = None
 ) -> Decoder:
-    """How to decode messages of a type.
+    """Return a decoder for the messages of a type.
 
     Raises:
         LogError: its definition is missing or cannot be understood.
@@ -93,7 +93,7 @@ def _decoder(type_name: str, encoding: RosEncoding, definitions: Definitions) ->
         store = get_typestore(Stores.EMPTY)
         store.register(_described(definitions, store))
         store.get_msgdef(type_name)
-    # what rosbags cannot make code of ends in errors of many types, none of which it declares
+    # rosbags raises errors of many undocumented types if it cannot generate code
     except Exception as error:
         raise LogError(f"the definition of {type_name!r} cannot be used: {_reason(error)}") from None
     return _cdr_decoder(store, type_name) if encoding == "cdr" else _ros1_decoder(store, type_name)
@@ -106,11 +106,11 @@ def _ros1_decoder(store: Typestore, type_name: str) -> Decoder:
     def decode(payload: bytes) -> object:
         try:
             message, end = deserialize(payload, 0, message_class, store)
-        # bytes that do not fit end in errors of many types
+        # bytes that do not fit raise errors of many types
         except Exception as error:
-            raise LogError(f"a message is no {type_name}: {_reason(error)}") from None
+            raise LogError(f"a message is not a {type_name}: {_reason(error)}") from None
         if end != len(payload):
-            raise LogError(f"a message is no {type_name}: it has {len(payload)} bytes; {end} were expected")
+            raise LogError(f"a message is not a {type_name}: it has {len(payload)} bytes, not {end}")
         return message
 
     return decode
@@ -128,10 +128,10 @@ def _cdr_decoder(store: Typestore, type_name: str) -> Decoder:
             else:
                 message, end = big(payload[4:], 0, message_class, store)
         except Exception as error:
-            raise LogError(f"a message is no {type_name}: {_reason(error)}") from None
+            raise LogError(f"a message is not a {type_name}: {_reason(error)}") from None
         if not 4 <= len(payload) - end <= _MOST_AROUND or payload[:2] not in _PLAIN:
             sizes = f"it has {len(payload)} bytes, {end + 4} were expected"
-            raise LogError(f"a message is no {type_name} in plain CDR: {sizes}")
+            raise LogError(f"a message is not a {type_name} in plain CDR: {sizes}")
         return message
 
     return decode
@@ -157,7 +157,7 @@ def _parsed(type_name: str, schema: Schema) -> Definitions:
     try:
         text = schema.data.decode()
     except UnicodeDecodeError:
-        raise LogError(f"the definition of {type_name!r} is no text in UTF-8") from None
+        raise LogError(f"the definition of {type_name!r} is not UTF-8") from None
     if schema.encoding in ("ros1msg", "ros2msg"):
         return definitions_from_msg(text, type_name)
     if schema.encoding == "ros2idl":
@@ -184,7 +184,7 @@ def _from_idl(text: str, type_name: str) -> Definitions:
 
 
 def _check_idl(text: str, type_name: str) -> None:
-    """That a text in IDL can be parsed in seconds.
+    """Check that a text in IDL can be parsed in seconds.
 
     The parser tries nested parentheses in ever more ways, and takes milliseconds for each annotation.
     """
@@ -193,11 +193,11 @@ def _check_idl(text: str, type_name: str) -> None:
     if len(text) > _LONGEST_IDL:
         what = f"has {len(text)} characters; at most {_LONGEST_IDL} are read"
     elif "<<" in bare:
-        what = "shifts numbers; such are not read"
+        what = "shifts numbers; that is not read"
     elif bare.count("(") > len(_IDL_ANNOTATION.findall(bare)):
-        what = "has parentheses outside annotations, or nested ones; such are not read"
+        what = "has parentheses outside annotations, or nested ones; that is not read"
     elif _IDL_NESTED_TYPE.search(bare):
-        what = "nests types deeply; such are not read"
+        what = "nests types deeply; that is not read"
     elif bare.count("@") > _MOST_ANNOTATIONS:
         what = f"has {bare.count('@')} annotations; at most {_MOST_ANNOTATIONS} are read"
     if what is not None:
@@ -205,7 +205,7 @@ def _check_idl(text: str, type_name: str) -> None:
 
 
 def _standards(encoding: RosEncoding, distribution: str | None) -> Iterator[Definitions]:
-    """The standard types, of the release that is named first, else the most likely ones."""
+    """Yield the standard types of each release, first of the release that is named, else of the likeliest."""
     if encoding == "ros1":
         yield _standard("ros1_noetic")
         return
@@ -221,7 +221,7 @@ def _standard(store: str) -> Definitions:
 
 
 def _fields(described: Typesdict) -> dict[str, tuple[Field, ...]]:
-    """Types as rosbags describes them."""
+    """Return types from the form that rosbags describes them in."""
     return {
         full_type_name(name): tuple(_field(field, description) for field, description in fields)
         for name, (_, fields) in described.items()
@@ -230,7 +230,7 @@ def _fields(described: Typesdict) -> dict[str, tuple[Field, ...]]:
 
 def _field(name: str, description: FieldDesc) -> Field:
     kind = _KINDS.get(int(description[0]))
-    # rosbags nests its tuples in a way that types cannot follow
+    # rosbags nests its tuples in a way that its types do not say
     item: Any = description
     size = 0
     if kind:
@@ -241,7 +241,7 @@ def _field(name: str, description: FieldDesc) -> Field:
 
 
 def _described(definitions: Definitions, store: Typestore) -> Typesdict:
-    """The types that a store does not know yet, as rosbags describes them."""
+    """Describe the types that a store does not know yet, in the form of rosbags."""
     return {
         name: ([], [(field.name, _description(field)) for field in fields])
         for name, fields in definitions.items()
@@ -263,10 +263,10 @@ def _description(field: Field) -> FieldDesc:
 
 
 def standard_schema(type_name: str, encoding: RosEncoding, distribution: str | None = None) -> Schema:
-    """The definition of a standard type, for a copy of a log that has none.
+    """Return the definition of a standard type, for a copy of a log that has none.
 
     Raises:
-        LogError: it is no standard type.
+        LogError: it is not a standard type.
     """
     definitions = ros_definitions(type_name, encoding, None, distribution)[0]
     text = msg_from_definitions(definitions, type_name).encode()

@@ -1,4 +1,4 @@
-"""Files that cannot be read in place: decompressed, or without a broken end. Messages compressed each."""
+"""Decompressed copies of files that cannot be read in place, and messages that are compressed each."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LEFT_FREE = 2**26
 
 
 def temporary_folder(owner: object) -> Path:
-    """A folder that goes away with its owner.
+    """Make a folder that is removed with its owner.
 
     Raises:
         OutputError: the machine cannot make it.
@@ -46,7 +46,7 @@ def copy_beginning(path: Path, size: int, folder: Path) -> Path:
 
 
 def unpack_file(packed: Path, folder: Path) -> Path:
-    """Decompress a file into a folder; what its name is there, without the ending of the compression.
+    """Decompress a file into a folder; return its path there, without the suffix of the compression.
 
     Raises:
         LogError: it does not decompress, or to something absurdly large.
@@ -64,12 +64,12 @@ def unpack_file(packed: Path, folder: Path) -> Path:
                 written += len(piece)
                 if written > most:
                     raise LogError(
-                        f"{packed.name} decompresses to more than {most} bytes; no recorder's file does"
+                        f"{packed.name} decompresses to more than {most} bytes; no recorder writes that"
                     )
                 if written > room:
                     raise OutputError(
-                        f"{packed.name} decompresses to more than there is room for in {folder.parent};"
-                        " TMPDIR can name a folder with more"
+                        f"{packed.name} decompresses to more than fits in {folder.parent};"
+                        " set TMPDIR to a folder with more room"
                     )
                 sink.write(piece)
     except zstandard.ZstdError as error:
@@ -80,7 +80,7 @@ def unpack_file(packed: Path, folder: Path) -> Path:
 
 
 def unpacked(payload: bytes) -> bytes:
-    """A message that was compressed by itself.
+    """Decompress a message that was compressed by itself.
 
     Raises:
         LogError: it does not decompress.

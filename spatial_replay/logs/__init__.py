@@ -1,0 +1,57 @@
+"""Our own logs and the track formats: messages, samples, and files of both.
+
+Names are loaded when they are first used: a command that reads a track file needs no MCAP.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+from spatial_replay.lazy import loaded_when_used
+
+if TYPE_CHECKING:
+    from spatial_replay.logs.mcap.reader import McapSource
+    from spatial_replay.logs.mcap.summary import summarise_mcap
+    from spatial_replay.logs.mcap.writer import LogWriter
+    from spatial_replay.logs.messages import Attachment, Block, Channel, MemorySink, Messages, Schema
+    from spatial_replay.logs.objects.decode import decode_objects
+    from spatial_replay.logs.objects.encode import encode_objects
+    from spatial_replay.logs.source import MemorySource, Source
+
+__all__ = [
+    "Attachment",
+    "Block",
+    "Channel",
+    "LogWriter",
+    "McapSource",
+    "MemorySink",
+    "MemorySource",
+    "Messages",
+    "Schema",
+    "Source",
+    "decode_objects",
+    "encode_objects",
+    "summarise_mcap",
+]
+
+_HOMES: Mapping[str, str] = MappingProxyType(
+    {
+        "Attachment": "spatial_replay.logs.messages",
+        "Block": "spatial_replay.logs.messages",
+        "Channel": "spatial_replay.logs.messages",
+        "LogWriter": "spatial_replay.logs.mcap.writer",
+        "McapSource": "spatial_replay.logs.mcap.reader",
+        "MemorySink": "spatial_replay.logs.messages",
+        "MemorySource": "spatial_replay.logs.source",
+        "Messages": "spatial_replay.logs.messages",
+        "Schema": "spatial_replay.logs.messages",
+        "Source": "spatial_replay.logs.source",
+        "decode_objects": "spatial_replay.logs.objects.decode",
+        "encode_objects": "spatial_replay.logs.objects.encode",
+        "summarise_mcap": "spatial_replay.logs.mcap.summary",
+    }
+)
+
+__getattr__, __dir__ = loaded_when_used(globals(), _HOMES)

@@ -1,8 +1,7 @@
-"""What a source yields: a stretch of a log, as samples and as the messages it was made of.
+"""Messages of a log as columns, blocks of samples with their messages, and sinks that take messages.
 
-Messages of several channels in the one order that a log has.
-
-Sinks: where messages go.
+Messages of several channels are merged in an order that depends on what the channels are, not on their
+numbers, so that equal logs give equal files.
 """
 
 from __future__ import annotations
@@ -75,7 +74,7 @@ class Messages:
 
 
 def messages_of(channel: Channel, times_ns: Integers, payloads: Sequence[bytes], first: int) -> Messages:
-    """Messages of one channel, published when they are logged, numbered from `first`."""
+    """Return messages of one channel, published when they are logged, numbered from `first`."""
     return Messages(
         channels={0: channel},
         channel=np.zeros(len(payloads), np.int64),
@@ -88,14 +87,14 @@ def messages_of(channel: Channel, times_ns: Integers, payloads: Sequence[bytes],
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """A stretch of a log.
+    """Some samples of a log with their messages.
 
     Attributes:
-        trace: its samples; `trace.faults` tells what was lost since the block before.
-        messages: what a copy of the log has to contain beside what is derived from the samples; empty for
-            sources that are no log of messages. A copy gets a topic for the samples where they have none.
-        remarks: what whoever evaluates it should know, without anything being lost: how many observations are
-            out of date, which transforms are missing.
+        trace: the samples; `trace.faults` lists what was lost since the previous block.
+        messages: those that a copy of the log must contain beside what is derived from the samples; empty for
+            sources that are not a log of messages. A copy gets a topic for the samples where they have none.
+        remarks: what is worth knowing although nothing was lost: how many observations are out of date, which
+            transforms are missing.
     """
 
     trace: Trace
@@ -104,7 +103,7 @@ class Block:
 
 
 def merge(streams: Sequence[Messages]) -> Messages:
-    """All messages, in the order of time, topic and sequence.
+    """Merge messages in the order of time, topic and sequence.
 
     Numbers of channels mean nothing outside their log, so channels are ordered by what they are: the same
     messages come out in the same order from whichever log they were read.
@@ -114,7 +113,7 @@ def merge(streams: Sequence[Messages]) -> Messages:
 
 
 def join(streams: Sequence[Messages]) -> Messages:
-    """All messages, one stream after the other."""
+    """Join messages, one stream after the other."""
     channels = sorted(
         {
             (_rank(channel), id(channel)): channel
@@ -139,7 +138,7 @@ def join(streams: Sequence[Messages]) -> Messages:
 
 
 def select(messages: Messages, chosen: Integers) -> Messages:
-    """The messages with the given indices, in that order."""
+    """Return the messages with the given indices, in that order."""
     return Messages(
         channels=messages.channels,
         channel=messages.channel[chosen],
@@ -171,7 +170,7 @@ def _joined(arrays: Sequence[Integers]) -> Integers:
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """A file kept in a log."""
+    """A file in a log."""
 
     name: str
     media_type: str
@@ -185,14 +184,14 @@ class Sink(Protocol):
         """Add a metadata record."""
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """Add a file to be kept in the log."""
+        """Add a file to the log."""
 
     def write_messages(self, messages: Messages) -> None:
         """Add messages, in the order given."""
 
 
 class MemorySink:
-    """A log in memory, for tests and for whoever wants messages rather than a file."""
+    """A log in memory, for tests and for callers that need messages rather than a file."""
 
     def __init__(self) -> None:
         self.metadata: list[tuple[str, Mapping[str, str]]] = []

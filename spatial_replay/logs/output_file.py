@@ -1,4 +1,4 @@
-"""Files that appear under their name only when they are whole."""
+"""Output files, which appear under their name only when they are complete."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from spatial_replay.errors import OutputError, UsageError
 
 @contextmanager
 def replacing(output: Path, inputs: Iterable[Path] = ()) -> Iterator[BinaryIO]:
-    """A stream to write `output` with: under another name, moved into place when all went well.
+    """Open a stream to write `output`: under another name, moved into place when all went well.
 
-    Whatever ends the block early, an interruption included, leaves neither a half-written file nor a changed
-    one. Errors of the block's own pass through as they are.
+    If the block ends early, even by an interruption, there is neither a partial file nor a changed one.
+    Errors of the block itself pass through unchanged.
 
     Raises:
         UsageError: the output is one of the inputs, a folder, or in none.
@@ -27,11 +27,11 @@ def replacing(output: Path, inputs: Iterable[Path] = ()) -> Iterator[BinaryIO]:
     """
     refuse_inputs(output, inputs)
     if output.exists() and not output.is_file():
-        # a device or a pipe takes what it gets, and must never be replaced by a file
+        # a device or a pipe is written in place, and must never be replaced by a file
         with open_output(output) as stream:
             yield stream
         return
-    # a link stays a link, to what was written
+    # a link stays a link, to the new content
     output = output.resolve()
     with _writing(output):
         descriptor, partial = tempfile.mkstemp(
@@ -55,7 +55,7 @@ def _move(partial: Path, output: Path) -> None:
 
 
 def open_output(output: Path) -> BinaryIO:
-    """A stream to a file, in place; opening, writing and closing it fail with an OutputError."""
+    """Open a file to write in place; opening, writing and closing it fail with an OutputError."""
     return _stream(output, output)
 
 
@@ -65,13 +65,13 @@ def _stream(file: int | Path, output: Path) -> BinaryIO:
 
 
 class _OutputFile(io.FileIO):
-    """An unbuffered file whose failures are those of an output, whoever writes to it."""
+    """An unbuffered file whose failures become OutputErrors, also under a library that writes to it."""
 
     def __init__(self, file: int | Path, output: Path) -> None:
         super().__init__(file, "wb")
         self._output = output
 
-    # the type of what holds bytes has a name from Python 3.12 on
+    # collections.abc.Buffer exists from Python 3.12 on
     def write(self, data: Any, /) -> int:
         with _writing(self._output):
             return super().write(data)
@@ -90,7 +90,7 @@ def _writing(output: Path) -> Iterator[None]:
 
 
 def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
-    """That an output may be written.
+    """Check that an output may be written.
 
     Raises:
         UsageError: it is one of the inputs or in one, a folder, or in none.
@@ -98,7 +98,7 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
     if output.is_dir():
         raise UsageError(f"{output} is a folder; give the name of a file in it")
     if not output.parent.is_dir():
-        raise UsageError(f"{output} cannot be written: there is no folder {output.parent}; make it first")
+        raise UsageError(f"{output} cannot be written: there is no folder {output.parent}; create it first")
     for each in inputs:
         if output.exists() and each.exists() and output.samefile(each):
             raise UsageError(f"{output} is an input too and would be lost; give the output another name")
@@ -107,6 +107,6 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
 
 
 def output_error(output: Path, error: OSError) -> OutputError:
-    """The error of an output that the machine could not write."""
+    """Return the error of an output that the machine could not write."""
     reason = "no space left on the device" if error.errno == errno.ENOSPC else error.strerror or str(error)
     return OutputError(f"{output} could not be written: {reason}")

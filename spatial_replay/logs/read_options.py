@@ -1,7 +1,4 @@
-"""How a log is to be read, where the log itself does not say.
-
-What was lost while reading, in words: the first ones in full, the others counted.
-"""
+"""Options for reading a log, and the list of faults that reading reports."""
 
 from __future__ import annotations
 
@@ -17,30 +14,30 @@ from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Concave
 
 Lost = Literal["drop", "keep"]
-"""What becomes of rows that say that an object is out of the picture."""
+"""Whether rows marked as out of the picture are dropped."""
 
 OnTimeJump = Literal["error", "split"]
-"""What becomes of a log whose clock jumps back, as that of a simulation that was started again."""
+"""Whether a clock that jumps back, as when a simulation restarts, is an error or ends the log."""
 
 FASTEST_RATE = 10**9
-"""Frames a second; more of them would share a nanosecond."""
+"""Frames a second; at a higher rate, frames would share a nanosecond."""
 
 _CHOICES = {"lost": get_args(Lost), "on_time_jump": get_args(OnTimeJump), "concave": get_args(Concave)}
 
 
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
-    """How a log is to be read; the defaults fit every log.
+    """Options for reading a log; the defaults fit every log.
 
     Attributes:
-        concave: what becomes of polygons that are not convex.
-        mapping: the mapping file that says which topics carry which objects.
-        on_time_jump: what becomes of a log of messages whose clock jumps back.
+        concave: how polygons that are not convex are handled.
+        mapping: the mapping file, which says which topics carry which objects.
+        on_time_jump: whether a clock that jumps back is an error or ends the log.
         rate: frames a second, for formats that count frames.
-        lost: what becomes of rows that say that their object is out of the picture.
+        lost: whether rows marked as out of the picture are dropped or kept.
 
     Raises:
-        UsageError: a value that an option does not have.
+        UsageError: an invalid value.
     """
 
     concave: Concave = "decompose"
@@ -60,7 +57,7 @@ class ReadOptions:
             _check_rate(self.rate)
 
     def given(self) -> dict[str, object]:
-        """The options that differ from their defaults, but for `concave`, which every format takes."""
+        """Return the options that differ from their defaults, but for `concave`, which every format takes."""
         return {
             field.name: getattr(self, field.name)
             for field in fields(self)
@@ -68,10 +65,10 @@ class ReadOptions:
         }
 
     def refuse_except(self, taken: frozenset[str], kind: str, log: str) -> None:
-        """Refuse options that say nothing to a format.
+        """Refuse options that mean nothing to a format.
 
         Raises:
-            UsageError: an option was given that is not among those that are taken.
+            UsageError: an option was given that is not in `taken`.
         """
         for name, value in self.given().items():
             if name not in taken:
@@ -96,24 +93,24 @@ def _check_rate(rate: object) -> None:
 
 
 def frame_times(rate: float) -> Fraction:
-    """Nanoseconds from one frame to the next, exactly; a rate of 29.97 is taken as it is written."""
+    """Return nanoseconds from one frame to the next, exactly; a rate of 29.97 is taken as it is written."""
     return Fraction(10**9) / Fraction(repr(float(rate)))
 
 
-KEPT_IN_FULL = 100
-"""How many faults of one log are told one by one."""
+MOST_FAULTS = 100
+"""How many faults of one log are reported one by one; the others are counted."""
 
 _MORE = re.compile(r"… and (\d+) more faults? of")
 
 
 def count_of(faults: Sequence[str]) -> int:
-    """How many faults are told, those among them that a last line only counts."""
+    """Count faults, with those that a last line only counts."""
     uncounted = _MORE.match(faults[-1]) if faults else None
     return len(faults) + (int(uncounted[1]) - 1 if uncounted else 0)
 
 
 class FaultList:
-    """Faults as they are found; `take` hands over those that nobody has taken yet."""
+    """Faults in the order of discovery; `take` returns each once."""
 
     def __init__(self) -> None:
         self._count = 0
@@ -124,22 +121,23 @@ class FaultList:
         return self._count
 
     def add(self, fault: str) -> None:
+        """Add a fault with its place."""
         self._count += 1
-        if self._count <= KEPT_IN_FULL:
+        if self._count <= MOST_FAULTS:
             self._waiting.append(fault)
 
     def move_to(self, other: FaultList) -> None:
-        """Hand over to another list what nobody has taken yet, counted as here."""
+        """Move the faults not taken yet to another list, with the count of those beyond the limit."""
         for fault in self.take():
             other.add(fault)
-        beyond = max(0, self._count - KEPT_IN_FULL)
+        beyond = max(0, self._count - MOST_FAULTS)
         other._count += beyond - self._moved
         self._moved = beyond
 
     def take(self, *, last: bool = False) -> tuple[str, ...]:
-        """The faults since the last call; with `last`, a line that counts those beyond the limit."""
+        """Return the faults since the last call; with `last`, a line that counts those beyond the limit."""
         taken, self._waiting = self._waiting, []
-        if last and self._count > KEPT_IN_FULL:
-            more = self._count - KEPT_IN_FULL
+        if last and self._count > MOST_FAULTS:
+            more = self._count - MOST_FAULTS
             taken.append(f"… and {more} more fault{'s' if more > 1 else ''} of this kind or another")
         return tuple(taken)

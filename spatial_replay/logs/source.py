@@ -1,7 +1,4 @@
-"""Sources: where samples come from, chosen by what a file holds.
-
-Sources as they are read: how, and what is said when that fails.
-"""
+"""Sources of samples: a log, a track file, or a trace in memory, read in blocks of bounded size."""
 
 from __future__ import annotations
 
@@ -26,31 +23,31 @@ class Source(Protocol):
 
     @property
     def name(self) -> str:
-        """What the log is called: a file's base name."""
+        """The base name of its file."""
 
     @property
     def kind(self) -> str:
         """The format, in a word."""
 
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
-        """The samples from the first at or after `start_ns` to the last before `end_ns`.
+        """Return the samples from the first at or after `start_ns` to the last before `end_ns`.
 
-        What could not be read stands in the blocks' `trace.faults`; the last block may hold nothing else.
+        What could not be read is in the blocks' `trace.faults`; the last block may hold nothing else.
 
         Raises:
             LogError: nothing in the log can be read as a sample.
-            UsageError: a sound log of something else, without any topic for samples.
+            UsageError: a log without damage that has no topic for samples.
         """
 
     def attachments(self) -> tuple[Attachment, ...]:
-        """The files kept in the log."""
+        """Return the attachments of the log."""
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
-        """The metadata records of the log, with their names."""
+        """Return the metadata records of the log, with their names."""
 
 
 class _Bare:
-    """A source that keeps nothing beside its samples."""
+    """A source of samples only."""
 
     def attachments(self) -> tuple[Attachment, ...]:
         """See `Source.attachments`."""
@@ -63,7 +60,7 @@ class _Bare:
 
 @dataclass(frozen=True)
 class MemorySource(_Bare):
-    """A trace, or samples, that are in memory already."""
+    """A trace, or samples, in memory."""
 
     trace: Trace
     name: str = "memory"
@@ -92,7 +89,7 @@ class TrackSource(_Bare):
     """A track file.
 
     Attributes:
-        options: how it is read where that is not the default.
+        options: those with which it is read, where they are not the defaults.
     """
 
     path: Path
@@ -124,7 +121,7 @@ class TrackSource(_Bare):
 
 
 def within(trace: Trace, start_ns: int | None, end_ns: int | None) -> Trace:
-    """The samples of a trace from `start_ns` up to, not including, `end_ns`."""
+    """Return the samples of a trace from `start_ns` up to, not including, `end_ns`."""
     begin, end = window_of(trace.times_ns, start_ns or 0, FOREVER if end_ns is None else end_ns)
     return trace if (begin, end) == (0, len(trace)) else trace.slice(begin, end)
 
@@ -132,10 +129,10 @@ def within(trace: Trace, start_ns: int | None, end_ns: int | None) -> Trace:
 def read_blocks(
     source: Source, start_ns: int | None = None, end_ns: int | None = None
 ) -> Generator[Block, None, None]:
-    """The blocks of a source, as `Source.iter_blocks` gives them.
+    """Yield the blocks of a source, as `Source.iter_blocks` does.
 
     Raises:
-        LogError: what that raises, and when the machine cannot read the source: a disk that fails or is gone.
+        LogError: what that raises, and if the disk fails or is gone.
     """
     try:
         yield from source.iter_blocks(start_ns, end_ns)
@@ -145,9 +142,9 @@ def read_blocks(
 
 
 def read_ahead(blocks: Generator[Block, None, None]) -> Iterator[Block]:
-    """The same blocks, each read on a thread of its own while the one before is worked on.
+    """Yield the same blocks, each read on its own thread while the previous one is processed.
 
-    Most of reading leaves the interpreter to others, so that on two cores it costs a replay little time.
+    Reading mostly runs without the interpreter lock, so on two cores it takes a replay little extra time.
     """
     with ThreadPoolExecutor(1, "reading") as thread:
         try:
@@ -156,13 +153,13 @@ def read_ahead(blocks: Generator[Block, None, None]) -> Iterator[Block]:
                 waiting = thread.submit(next, blocks, None)
                 yield block
         finally:
-            # by the thread that read them, which alone may close a database; after an interruption while that
-            # began, and when the interpreter ends, by whoever drops them last
+            # SQLite lets only the thread that opened a database close it. An interruption while the thread
+            # starts, or the end of the interpreter, may prevent that; then garbage collection closes it
             with suppress(ValueError, RuntimeError):
                 thread.submit(blocks.close).result()
 
 
 def reading_options(source: Source) -> dict[str, object]:
-    """How a source is read, where that is not the default, as a log's metadata says it."""
+    """Return the options of a source that are not the defaults, for a log's metadata."""
     concave = getattr(source, "concave", "decompose")
     return dict(getattr(source, "options", {})) | ({} if concave == "decompose" else {"concave": concave})

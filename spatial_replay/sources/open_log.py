@@ -1,4 +1,4 @@
-"""Opens any log: the content of a file decides its format, and the format decides who reads it."""
+"""Open any log: the content of a file decides its format, and `FORMATS` names the reader of each."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from spatial_replay.logs.formats.csv_tracks import COLUMNS, iter_csv
 from spatial_replay.logs.formats.drone import FRAMES_A_SECOND, is_annotations, iter_annotations
 from spatial_replay.logs.formats.tracks import iter_jsonl, open_text
 from spatial_replay.logs.mcap.chunks import MAGIC
-from spatial_replay.logs.mcap.reader import McapSource, holds_samples
+from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.read_options import Lost, OnTimeJump, ReadOptions, count_of
 from spatial_replay.logs.source import IterTraces, Source, TrackSource
 from spatial_replay.trace.trace import Trace
@@ -27,7 +27,7 @@ from spatial_replay.trace.trace import Trace
 _BAG_FILE = re.compile(r"^metadata\.yaml$|\.(db3|mcap)(\.zstd)?$")
 
 _HEAD = 4096
-"""Bytes by which a file's format is told."""
+"""Bytes by which a file's format is recognised."""
 
 
 def open_source(
@@ -39,19 +39,19 @@ def open_source(
     rate: float | None = None,
     lost: Lost = "drop",
 ) -> Source:
-    """The log in a file, in whatever format it is; the content decides, not the name.
+    """Open the log in a file of any format; the content decides, not the name.
 
     Args:
-        concave: what becomes of polygons that are not convex.
-        mapping: a mapping file: which topics of a log of messages carry which objects.
-        on_time_jump: what becomes of a log of messages whose clock jumps back.
+        concave: how polygons that are not convex are handled.
+        mapping: a mapping file, which says which topics of an external log carry which objects.
+        on_time_jump: whether a clock of an external log that jumps back is an error or ends the log.
         rate: frames a second of annotations that count frames; 30 unless given.
         lost: whether annotations that are marked as lost are dropped or kept.
 
     Raises:
-        UsageError: no path was given, or an option that says nothing to this format.
+        UsageError: no path was given, or an option that means nothing to this format.
         MissingFileError: there is no such file, or it cannot be opened.
-        LogError: the file is none of the known formats.
+        LogError: the file is in none of the known formats.
     """
     _require_path(path)
     options = ReadOptions(concave, mapping, on_time_jump, rate, lost)
@@ -67,7 +67,7 @@ def open_source(
     if not head:
         raise LogError(f"{path.name} is empty; give a log with at least one sample")
     known = ", ".join(FORMATS)
-    raise LogError(f"{path.name} is no log that can be read here; known formats are {known}")
+    raise LogError(f"{path.name} is not a log in a known format; known formats are {known}")
 
 
 def read_trace(
@@ -80,7 +80,7 @@ def read_trace(
     lost: Lost = "drop",
     allow_damage: bool = False,
 ) -> Trace:
-    """A whole log in memory.
+    """Read a whole log into memory.
 
     Args:
         path: a log in any format that `open_source` knows.
@@ -88,9 +88,9 @@ def read_trace(
         allow_damage: return what can be read of a damaged log, with its `faults`.
 
     Raises:
-        UsageError: no path was given, or an option that says nothing to this format.
+        UsageError: no path was given, or an option that means nothing to this format.
         MissingFileError: there is no such file.
-        LogError: the file is no log, or is damaged and `allow_damage` is not set.
+        LogError: the file is not a log, or is damaged and `allow_damage` is not set.
     """
     source = open_source(
         path, concave=concave, mapping=mapping, on_time_jump=on_time_jump, rate=rate, lost=lost
@@ -111,7 +111,7 @@ def _require_path(value: object) -> None:
 
 
 def is_bag_folder(path: Path) -> bool:
-    """Whether a folder holds what a ROS 2 bag is made of."""
+    """Return whether a folder holds what a ROS 2 bag is made of."""
     try:
         return path.is_dir() and any(_BAG_FILE.search(each.name) for each in path.iterdir())
     except (OSError, ValueError):
@@ -119,7 +119,7 @@ def is_bag_folder(path: Path) -> bool:
 
 
 def _head(path: Path) -> bytes:
-    """The first bytes of a file, decompressed; what is missing from a broken one is left out."""
+    """Read the first bytes of a file, decompressed; what is missing from a broken one is left out."""
     try:
         with open_text(path) as stream:
             return stream.read(_HEAD)
@@ -144,7 +144,7 @@ class Format(NamedTuple):
     Attributes:
         recognise: whether a file that begins with the given bytes is of this format.
         open: a source of the file, given what the format is called.
-        options: the names of the `ReadOptions` that it understands, but for `concave`.
+        options: the names of the `ReadOptions` that apply to it, but for `concave`.
     """
 
     recognise: Callable[[bytes], bool]
@@ -163,23 +163,24 @@ def _open_annotations(path: Path, kind: str, options: ReadOptions) -> Source:
 
 
 def _open_messages(path: Path, kind: str, options: ReadOptions) -> Source:
-    """A log of messages that others recorded."""
+    """Open an external log of messages."""
     if options.mapping is None:
         raise UsageError(
             f"{path.name} is a {kind}, which does not say what its objects are; give a mapping file that"
             " does, with --mapping FILE or mapping=FILE"
         )
-    # what reads the logs of others is loaded when there is one
+    # readers of external logs are loaded when there is one
     from spatial_replay.mapping import MappedSource, load_mapping
 
     return MappedSource(path, load_mapping(options.mapping), kind, options.concave, options.on_time_jump)
 
 
 def _open_mcap(path: Path, kind: str, options: ReadOptions) -> Source:
-    """A log of ours, which knows its objects, or one that others recorded, given a mapping."""
+    """Open our own log, which names its objects, or an external one, given a mapping."""
+    source = McapSource(path, kind, options.concave)
     if not options.given():
-        return McapSource(path, kind, options.concave)
-    if holds_samples(path):
+        return source
+    if source.has_samples:
         options.refuse_except(frozenset(), kind, path.name)
     return _open_messages(path, kind, options)
 

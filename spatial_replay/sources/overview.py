@@ -1,7 +1,4 @@
-"""What a log holds, in numbers and names.
-
-A look through a log of messages by others: its topics, and what could be read as objects.
-"""
+"""What a log holds: its objects and signals, or the topics of an external log that could map to objects."""
 
 from __future__ import annotations
 
@@ -30,7 +27,7 @@ from spatial_replay.trace.trace import Trace
 _STEP = 10_000
 """Messages between two reports of progress."""
 _ENOUGH = 1024
-"""Messages of a topic after which nothing new is expected of it."""
+"""Messages of a topic after which nothing new is expected."""
 _LOOKED_AT = frozenset({*range(1, EXAMPLES + 1), *(2**n for n in range(5, 20))})
 """Which messages of a topic are decoded: the first ones, and ever fewer of those that come later."""
 _EXAMPLE_BYTES = 2**22
@@ -39,11 +36,11 @@ _EXAMPLE_BYTES = 2**22
 
 @dataclass(frozen=True, slots=True)
 class TopicSurvey:
-    """A topic by others.
+    """A topic of an external log.
 
     Attributes:
         messages: how many were read.
-        entry: what a mapping could say of it; empty if nothing looks like an object.
+        entry: its entry in a mapping; empty if nothing looks like an object.
     """
 
     topic: Topic
@@ -53,13 +50,13 @@ class TopicSurvey:
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """What is in a log of messages by others.
+    """What an external log holds.
 
     Attributes:
         start_ns, end_ns: log times of the first and the last message; None without messages.
         mapping: a mapping file to start from.
         faults: what is damaged, each with its place.
-        remarks: what was set aside without a loss.
+        remarks: what is worth knowing although nothing was lost.
     """
 
     name: str
@@ -77,7 +74,7 @@ class Survey:
 
 
 def messages_in(path: Path) -> MessageReader | None:
-    """A reader of a log of messages that needs a mapping; None for logs that name their objects themselves.
+    """Return a reader of a log of messages that needs a mapping; None for logs that name their objects.
 
     Raises:
         MissingFileError: there is no such file.
@@ -86,7 +83,7 @@ def messages_in(path: Path) -> MessageReader | None:
         return None
     try:
         reader = open_messages(path)
-        if isinstance(reader, McapLog) and any(topic.name == OBJECTS for topic in reader.topics()):
+        if isinstance(reader, McapLog) and (OBJECTS in reader.channel_topics or not reader.channel_topics):
             return None
     except MissingFileError:
         raise
@@ -98,11 +95,11 @@ def messages_in(path: Path) -> MessageReader | None:
 def survey(
     reader: MessageReader, advance: Callable[[int], object] = lambda messages: None, *, whole: bool = True
 ) -> Survey:
-    """Look through a log.
+    """Survey an external log.
 
     Args:
-        advance: called with the number of messages read, again and again.
-        whole: read all of it, to find what is damaged; else only until enough is known of every topic.
+        advance: called repeatedly with the number of messages read since the last call.
+        whole: read all of it, and so all damage; else only until enough is known about every topic.
 
     Raises:
         LogError: nothing can be read.
@@ -115,7 +112,7 @@ def survey(
             advance(_STEP)
         if not whole and counter.knows_enough:
             break
-    found = suggest_topics(topics, counter.examples)
+    mappable = suggest_topics(topics, counter.examples)
     faults = FaultList()
     reader.move_faults(faults)
     return Survey(
@@ -123,7 +120,7 @@ def survey(
         kind=reader.kind,
         start_ns=counter.start_ns,
         end_ns=counter.end_ns,
-        topics=tuple(TopicSurvey(each.topic, counter.counts[each.topic.name], each.entry) for each in found),
+        topics=tuple(TopicSurvey(e.topic, counter.counts[e.topic.name], e.entry) for e in mappable),
         mapping=suggest_mapping(reader.name, topics, counter.examples, counter.first_ns),
         faults=faults.take(last=True),
         remarks=(*reader.take_remarks(), *counter.take_remarks()),
@@ -181,7 +178,7 @@ class _Counter:
             self._undecodable[topic] = count + 1, first
 
     def take_remarks(self) -> list[str]:
-        """Topics that cannot be decoded, and messages that cannot, of those that were looked at."""
+        """Return remarks on topics, and on messages looked at, that cannot be decoded."""
         return self._remarks + [
             f"{_of_topic(topic, first)} ({count} of {self._looked_at[topic]} messages looked at)"
             for topic, (count, first) in self._undecodable.items()
@@ -198,8 +195,8 @@ class ObjectOverview:
     """One object over a log.
 
     Attributes:
-        classes: the class names it was given, in order of code points.
-        samples: in how many samples it was seen.
+        classes: its class names, in order of code points.
+        samples: in how many samples it was observed.
         unreadable: in how many of them its coordinates were not all finite.
     """
 
@@ -215,9 +212,9 @@ class Overview:
 
     Attributes:
         start_ns, end_ns: times of the first and the last sample; None without samples.
-        faults: what was lost or set aside, in words.
+        faults: what was lost or left out.
         container: channels, metadata and attachments of an MCAP log; None for other formats.
-        remarks: what else there is to know, without anything being lost.
+        remarks: what is worth knowing although nothing was lost.
     """
 
     name: str
@@ -233,18 +230,18 @@ class Overview:
 
 
 def overview_of(source: Source, advance: Callable[[int], object] = lambda samples: None) -> Overview:
-    """Read a log once and say what it holds.
+    """Read a log once and return what it holds.
 
     Args:
-        advance: called with the number of samples read, again and again.
+        advance: called repeatedly with the number of samples read since the last call.
 
     Raises:
         LogError: nothing in the log can be read as a sample.
     """
     tally = _Tally()
     remarks: list[str] = []
-    container = summarise_mcap(source.path) if isinstance(source, McapSource) else None
-    # a log of something else has no samples, and yet something to tell
+    container = summarise_mcap(source) if isinstance(source, McapSource) else None
+    # an external log has no samples, and yet a container to list
     if container is None or container.has_objects:
         try:
             for block in source.iter_blocks():
@@ -252,7 +249,7 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
                 remarks += block.remarks
                 advance(len(block.trace))
         except UsageError as error:
-            # a scenario without objects is sound; a mapping that does not fit is a mistake to be put right
+            # a scenario without objects is not damaged; a mapping that does not fit is a mistake of the user
             if not isinstance(source, TrackSource):
                 raise
             remarks.append(str(error))
@@ -265,7 +262,7 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
         end_ns=tally.end_ns,
         objects=tally.objects(),
         signals=tuple(sorted(tally.signals)),
-        # reading the samples and the rest of the file comes upon the same damage
+        # reading the samples and listing the container report the same damage
         faults=tuple(dict.fromkeys(faults)),
         container=container,
         remarks=tuple(remarks),
@@ -273,8 +270,8 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
 
 
 def overview_of_survey(path: Path, survey: Survey) -> Overview:
-    """What is in a log of messages by others, of which nothing says yet what its samples are."""
-    container = summarise_mcap(path) if survey.kind == McapSource.kind else None
+    """Return what an external log holds, of which nothing says yet what its samples are."""
+    container = summarise_mcap(McapSource(path)) if survey.kind == McapSource.kind else None
     return Overview(
         name=survey.name,
         kind=survey.kind,
@@ -295,7 +292,7 @@ class _Tally:
     samples: int = 0
     start_ns: int | None = None
     end_ns: int | None = None
-    seen: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    samples_with: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     unreadable: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     classes: dict[str, set[str]] = field(default_factory=lambda: defaultdict(set))
     signals: set[str] = field(default_factory=set)
@@ -312,7 +309,7 @@ class _Tally:
         for column, name in enumerate(trace.names):
             rows = trace.rows[:, column]
             readable, unreadable = rows[rows >= 0], -2 - rows[rows <= -2]
-            self.seen[name] += len(readable) + len(unreadable)
+            self.samples_with[name] += len(readable) + len(unreadable)
             self.unreadable[name] += len(unreadable)
             codes = np.unique(trace.class_code[np.concatenate([readable, unreadable])])
             self.classes[name].update(
@@ -321,6 +318,6 @@ class _Tally:
 
     def objects(self) -> tuple[ObjectOverview, ...]:
         return tuple(
-            ObjectOverview(name, tuple(sorted(self.classes[name])), self.seen[name], self.unreadable[name])
-            for name in sorted(self.seen)
+            ObjectOverview(name, tuple(sorted(self.classes[name])), samples, self.unreadable[name])
+            for name, samples in sorted(self.samples_with.items())
         )

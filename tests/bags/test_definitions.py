@@ -16,7 +16,7 @@ from spatial_replay.bags.ros_definitions import (
 )
 from spatial_replay.bags.ros_types import ros_decoder, ros_definitions, standard_schema
 from spatial_replay.errors import LogError
-from spatial_replay.logs.messages import Schema
+from spatial_replay.logs import Schema
 
 SEPARATOR = "=" * 80
 

@@ -8,7 +8,7 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from spatial_replay.bags import Topic
 from spatial_replay.bags.decoders import decoder_of
 from spatial_replay.errors import LogError
-from spatial_replay.logs.messages import Schema
+from spatial_replay.logs import Schema
 
 LINE = "=" * 80
 

@@ -32,9 +32,9 @@ from spatial_replay.annotate.certificate import SampleHash
 from spatial_replay.cli.application import run
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.logs.messages import Block
+from spatial_replay.logs import Block
 from spatial_replay.logs.source import within
-from spatial_replay.sources.open_log import open_source, read_trace
+from spatial_replay.sources import open_source, read_trace
 from spatial_replay.trace.trace import Trace
 
 MAPPING = """\

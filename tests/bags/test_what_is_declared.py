@@ -25,7 +25,7 @@ from bags.bag_files import (
 from spatial_replay.cli.application import run
 from spatial_replay.errors import LogError
 from spatial_replay.logs.read_options import FaultList, count_of
-from spatial_replay.sources.open_log import read_trace
+from spatial_replay.sources import read_trace
 
 MAPPING = "topics: {/a: {position: [x, y], shape: {disc: 0.5}}}"
 

@@ -15,15 +15,19 @@ from hypothesis import strategies as st
 
 from laws.strategies_trace import traces
 from spatial_replay.errors import LogError
-from spatial_replay.logs.mcap.summary import summarise_mcap
-from spatial_replay.logs.mcap.writer import LogWriter
-from spatial_replay.logs.messages import Messages
-from spatial_replay.logs.objects.encode import decode_objects, encode_objects
+from spatial_replay.logs import (
+    LogWriter,
+    McapSource,
+    MemorySource,
+    Messages,
+    decode_objects,
+    encode_objects,
+    summarise_mcap,
+)
 from spatial_replay.logs.objects.wire import WireTemplate
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.source import MemorySource
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
-from spatial_replay.sources.open_log import open_source, read_trace
+from spatial_replay.sources import open_source, read_trace
 from spatial_replay.trace.trace import Trace
 
 CHANNEL = protobuf_channel(OBJECTS, ObjectStates)
@@ -59,7 +63,7 @@ def read(content):
         path = Path(folder, "run.mcap")
         path.write_bytes(content)
         try:
-            summarise_mcap(path)
+            summarise_mcap(McapSource(path))
             return Trace.concatenate([block.trace for block in open_source(path).iter_blocks()])
         except LogError:
             return None

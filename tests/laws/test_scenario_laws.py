@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.monitor.evaluate import evaluate
-from spatial_replay.sources.open_log import read_trace
+from spatial_replay.sources import read_trace
 from spatial_replay.spec.load import parse_specification
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace

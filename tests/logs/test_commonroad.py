@@ -11,7 +11,7 @@ import pytest
 
 from spatial_replay.errors import LogError, SpatialReplayError, UsageError
 from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.sources.open_log import open_source, read_trace
+from spatial_replay.sources import open_source, read_trace
 from spatial_replay.trace.sample import Sample
 
 Write = Callable[..., Path]

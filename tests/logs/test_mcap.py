@@ -15,15 +15,20 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from spatial_replay.errors import LogError, OutputError, UsageError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.logs.mcap.reader import McapSource
-from spatial_replay.logs.mcap.summary import summarise_mcap
-from spatial_replay.logs.mcap.writer import CHUNK_BYTES, LogWriter
-from spatial_replay.logs.messages import BLOCK_SAMPLES, Channel, Messages
-from spatial_replay.logs.objects.encode import encode_objects
+from spatial_replay.logs import (
+    Channel,
+    LogWriter,
+    McapSource,
+    MemorySource,
+    Messages,
+    encode_objects,
+    summarise_mcap,
+)
+from spatial_replay.logs.mcap.writer import CHUNK_BYTES
+from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.source import MemorySource
 from spatial_replay.logs.topics import OBJECTS, ROBUSTNESS, protobuf_channel
-from spatial_replay.sources.open_log import open_source, read_trace
+from spatial_replay.sources import open_source, read_trace
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
@@ -327,7 +332,7 @@ def test_an_attachment_that_is_damaged_is_a_fault(log):
     assert McapSource(path).attachments() == ()
     (fault,) = read_trace(path, allow_damage=True).faults
     assert re.fullmatch(r"run\.mcap: at byte \d+: an attachment's checksum does not fit; .* lost", fault)
-    summary = summarise_mcap(path)
+    summary = summarise_mcap(McapSource(path))
     assert (summary.attachments, summary.faults) == ((), (fault,))
 
 
@@ -336,7 +341,7 @@ def test_metadata_that_is_damaged_is_a_fault(log):
     assert McapSource(path).metadata() == ()
     (fault,) = read_trace(path, allow_damage=True).faults
     assert "the metadata is lost" in fault
-    assert summarise_mcap(path).faults == (fault,)
+    assert summarise_mcap(McapSource(path)).faults == (fault,)
 
 
 def test_a_topic_with_messages_of_another_kind_is_an_error(log):
@@ -350,7 +355,7 @@ def test_a_topic_with_messages_of_another_kind_is_an_error(log):
 def test_info_tells_what_is_in_a_log(log):
     content = log_of(moving_cup(8), messages(Channel("/tf", "cdr", None), [5, 6], [b"", b""]))
     path = log(content)
-    whole = summarise_mcap(path)
+    whole = summarise_mcap(McapSource(path))
     assert (whole.messages, whole.start_ns, whole.end_ns, whole.damaged) == (10, 0, 2_800_000_000, False)
     assert [(each.channel.topic, each.messages) for each in whole.channels] == [(OBJECTS, 8), ("/tf", 2)]
     assert dict(whole.metadata)["spatial_replay"]["seed"] == "4"
@@ -361,7 +366,7 @@ def test_info_tells_what_is_in_a_log(log):
         15,
     )
     assert McapSource(path).attachments()[0].data == b"F (cup in goal)"
-    broken = summarise_mcap(log(content[:-30]))
+    broken = summarise_mcap(McapSource(log(content[:-30])))
     assert broken.damaged
     assert (broken.messages, broken.channels, broken.attachments) == (10, whole.channels, whole.attachments)
 

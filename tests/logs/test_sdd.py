@@ -16,7 +16,7 @@ from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.recording import record_source
-from spatial_replay.sources.open_log import open_source, read_trace
+from spatial_replay.sources import open_source, read_trace
 from spatial_replay.spec.load import parse_specification
 
 Write = Callable[..., Path]

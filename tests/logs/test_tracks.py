@@ -11,8 +11,8 @@ import pytest
 from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.logs.messages import BLOCK_SAMPLES
-from spatial_replay.logs.read_options import KEPT_IN_FULL
-from spatial_replay.sources.open_log import open_source, read_trace
+from spatial_replay.logs.read_options import MOST_FAULTS
+from spatial_replay.sources import open_source, read_trace
 from spatial_replay.trace.trace import Trace
 
 SQUARE = [[0, 0], [1, 0], [1, 1], [0, 1]]
@@ -172,9 +172,9 @@ def test_bytes_that_are_not_utf8_cost_their_line(tmp_path):
 
 
 def test_many_faults_are_counted(jsonl):
-    path = jsonl(line(0), *["{"] * (KEPT_IN_FULL + 50))
+    path = jsonl(line(0), *["{"] * (MOST_FAULTS + 50))
     trace = read_trace(path, allow_damage=True)
-    assert len(trace.faults) == KEPT_IN_FULL + 1
+    assert len(trace.faults) == MOST_FAULTS + 1
     assert "50 more" in trace.faults[-1]
 
 

@@ -11,7 +11,7 @@ from mcap.writer import Writer
 
 from spatial_replay.bags import MessageReader
 from spatial_replay.mapping import parse_mapping
-from spatial_replay.sources.overview import messages_in, survey
+from spatial_replay.sources import messages_in, survey
 
 Write = Callable[[dict[str, Sequence[object]]], MessageReader]
 

@@ -1,6 +1,7 @@
-"""CommonRoad scenarios: traffic, as outlines that move from one time step to the next.
+"""CommonRoad scenarios: traffic as outlines that move from one time step to the next.
 
-Shapes and states of CommonRoad scenarios: where an obstacle is, or may be, at a time step.
+Positions, orientations and times may be exact, intervals or regions. What a scenario leaves open becomes
+uncertainty of the outline, or an unknown object, so that a verdict never claims more than the file says.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ from spatial_replay.trace.trace import Trace
 
 Points = list[tuple[float, float]]
 
-Tell = Callable[[int, str], None]
+ReportFault = Callable[[int, str], None]
+"""Takes what is wrong, with its line."""
 
 _LONGEST_STEP = 15
 """Digits of the number of a time step."""
@@ -32,7 +34,7 @@ _LONGEST_INTERVAL = 100_000
 
 
 class ScenarioError(Exception):
-    """A part of a scenario that makes no sense; its text says why and what to give instead."""
+    """A part of a scenario that cannot be understood; the text says why and what to give instead."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,10 +52,10 @@ class ObstacleState:
     Attributes:
         x, y: in metres.
         angle: of its outline, in radians.
-        oriented: whether its orientation is that angle, rather than anything about it.
+        oriented: whether its orientation is that angle, rather than unknown.
         uncertainty: how far, in metres, its true outline may be from the one given.
         region: an outline in the world that takes the place of the obstacle's own.
-        known: whether anything is known about it but that it is there.
+        known: whether anything but its presence is known.
     """
 
     x: float = 0.0
@@ -65,7 +67,7 @@ class ObstacleState:
     known: bool = True
 
     def report(self, name: str, class_name: str | None, outline: Sequence[OutlinePart]) -> ObjectReport:
-        """The obstacle with its own outline, around its own centre, as it stands here."""
+        """Return the obstacle with its own outline, around its own centre, as it stands here."""
         if not self.known:
             return ObjectReport(name, class_name, [nan, nan], [1], [0.0], invalid=True)
         parts = self.region if self.region is not None else outline
@@ -90,11 +92,148 @@ class ObstacleState:
 UNKNOWN = ObstacleState(known=False)
 
 
-def moving_states(obstacle: Element, outline: Sequence[OutlinePart], tell: Tell) -> dict[int, ObstacleState]:
-    """The states of an obstacle that moves, by time step.
+_OBSTACLES = frozenset(
+    # `obstacle`, with its role inside, is how versions before 2020a write the first two
+    ["staticObstacle", "dynamicObstacle", "obstacle", "environmentObstacle", "phantomObstacle"]
+)
+
+_BLOCK_REPORTS = 2**14
+"""A block is closed when it holds this many obstacles, however few time steps it has."""
+
+
+@dataclass(slots=True)
+class _Obstacle:
+    """One obstacle of a scenario.
+
+    Attributes:
+        parts: its outline, around its own centre.
+        moving: where it is, by time step.
+        fixed: where it is at every time step, if it does not move.
+    """
+
+    name: str
+    class_name: str | None
+    parts: list[OutlinePart]
+    moving: dict[int, ObstacleState] = field(default_factory=dict)
+    fixed: ObstacleState | None = None
+
+    def report(self, step: int) -> ObjectReport | None:
+        """Return the obstacle at a time step; None if it is not there."""
+        state = self.fixed or self.moving.get(step)
+        return None if state is None else state.report(self.name, self.class_name, self.parts)
+
+
+def is_scenario(head: bytes) -> bool:
+    """Return whether a file begins as an XML file does."""
+    return (
+        head.removeprefix(b"\xef\xbb\xbf")
+        .lstrip()
+        .startswith((b"<?xml", b"<!--", b"<!DOCTYPE", b"<commonRoad"))
+    )
+
+
+def iter_scenario(path: Path, faults: FaultList, *, concave: Concave = "decompose") -> Iterator[Trace]:
+    """Yield the time steps of a CommonRoad scenario in blocks.
+
+    A sample is a time step that some moving obstacle has a state for; obstacles that do not move are in each
+    of them. Roads, planning problems and goals are not objects. What is wrong goes to `faults`.
+
+    Raises:
+        LogError: the file is not a scenario.
+        UsageError: a scenario without obstacles.
+    """
+    elements = iter_elements(path, faults, _OBSTACLES)
+    step_s = _step_size(path, next(elements))
+    obstacles = list(_iter_obstacles(path, faults, elements))
+    steps = sorted({step for each in obstacles for step in each.moving}) or ([0] if obstacles else [])
+    if not obstacles and not len(faults):
+        raise UsageError(f"{path.name} is a scenario without obstacles; give one that has some")
+    columns = ReportColumns()
+    held = 0
+    for step in steps:
+        time_ns = round(step * step_s * 10**9)
+        if time_ns > LATEST_NS:
+            faults.add(f"{path.name}: time step {step} lies beyond what a time can be; it is left out")
+            continue
+        reports = [report for each in obstacles if (report := each.report(step)) is not None]
+        columns.add(time_ns, f"{path.name}: time step {step}", reports, {})
+        held += len(reports)
+        if len(columns) == BLOCK_SAMPLES or held >= _BLOCK_REPORTS:
+            yield finished_block(columns, faults, concave)
+            columns, held = ReportColumns(), 0
+    if len(columns):
+        yield finished_block(columns, faults, concave)
+
+
+def _step_size(path: Path, root: Element) -> Fraction:
+    if root.name != "commonRoad":
+        raise LogError(f"{path.name} is XML, but not a scenario: its root is <{root.name}>, not <commonRoad>")
+    text = root.attributes.get("timeStepSize", "")
+    try:
+        size = float(text)
+    except ValueError:
+        size = 0.0
+    if not (isfinite(size) and 1e-9 <= size <= 1e9):
+        raise LogError(
+            f"{path.name}:{root.line}: timeStepSize is {text[:60]!r}; give seconds from 1e-9 to 1e9"
+        )
+    # exactly as written: 0.1 s is 100 ms to the nanosecond
+    return Fraction(repr(size))
+
+
+def _iter_obstacles(path: Path, faults: FaultList, elements: Iterator[Element]) -> Iterator[_Obstacle]:
+    names = set[str]()
+    for element in elements:
+        name = element.attributes.get("id", "")
+        place = f"{path.name}:{element.line}: <{element.name}>"
+        try:
+            if not name or name in names:
+                raise ScenarioError(f"id is {name[:60]!r}; give each obstacle one of its own")
+            place = f"{path.name}:{element.line}: obstacle {name}"
+            obstacle = _obstacle(name, element, partial(_report, faults, path.name, name))
+        except ScenarioError as error:
+            faults.add(f"{place}: {error}; it is left out")
+            continue
+        names.add(name)
+        yield obstacle
+
+
+def _report(faults: FaultList, file: str, obstacle: str, line: int, what: str) -> None:
+    faults.add(f"{file}:{line}: obstacle {obstacle}: {what}")
+
+
+def _obstacle(name: str, element: Element, report: ReportFault) -> _Obstacle:
+    kind = element.child("type")
+    class_name = (kind.text or None) if kind is not None else None
+    if element.name == "phantomObstacle":
+        # it may be there or not: an object of every open group, about which nothing is known
+        return _Obstacle(name, class_name, [], dict.fromkeys(_moving_states(element, [], report), UNKNOWN))
+    shape = element.child("shape")
+    if shape is None:
+        raise ScenarioError("it has no <shape>; give it one")
+    outline = _parts_of(shape)
+    if element.name == "environmentObstacle":
+        return _Obstacle(name, class_name, outline, fixed=ObstacleState())
+    if _is_static(element):
+        initial = element.child("initialState")
+        if initial is None:
+            raise ScenarioError("it has no <initialState>; give it one")
+        return _Obstacle(name, class_name, outline, fixed=_state_or_unknown(initial, outline, report))
+    return _Obstacle(name, class_name, outline, _moving_states(element, outline, report))
+
+
+def _is_static(element: Element) -> bool:
+    role = element.child("role")
+    return element.name == "staticObstacle" or (role is not None and role.text == "static")
+
+
+def _moving_states(
+    obstacle: Element, outline: Sequence[OutlinePart], report: ReportFault
+) -> dict[int, ObstacleState]:
+    """Return the states of an obstacle that moves, by time step.
 
     Args:
-        tell: takes what is wrong with one of them, with its line.
+        report: takes what is wrong with one of the states.
     """
     states: dict[int, ObstacleState] = {}
     initial, trajectory = obstacle.child("initialState"), obstacle.child("trajectory")
@@ -103,30 +242,30 @@ def moving_states(obstacle: Element, outline: Sequence[OutlinePart], tell: Tell)
         try:
             step = _step(_required(each, "time"))
         except ScenarioError as error:
-            tell(each.line, f"{error}; the state is left out")
+            report(each.line, f"{error}; the state is left out")
             continue
         if step in states:
-            tell(each.line, f"time step {step} is there twice; the first state counts")
+            report(each.line, f"time step {step} is there twice; the first state counts")
             continue
-        states[step] = state_of(each, outline, tell)
+        states[step] = _state_or_unknown(each, outline, report)
     occupied = obstacle.child("occupancySet")
     for occupancy in occupied.all("occupancy") if occupied else ():
-        for step, state in _occupied(occupancy, tell):
+        for step, state in _occupied(occupancy, report):
             states.setdefault(step, state)
     return states
 
 
-def state_of(element: Element, outline: Sequence[OutlinePart], tell: Tell) -> ObstacleState:
-    """A state, or that it is unknown, after saying why."""
+def _state_or_unknown(element: Element, outline: Sequence[OutlinePart], report: ReportFault) -> ObstacleState:
+    """Return a state, or `UNKNOWN` after reporting why."""
     try:
         return _state(element, outline)
     except ScenarioError as error:
-        tell(element.line, f"{error}; the obstacle is unknown there")
+        report(element.line, f"{error}; the obstacle is unknown there")
         return UNKNOWN
 
 
-def parts_of(shape: Element) -> list[OutlinePart]:
-    """The rectangles, circles and polygons in an element.
+def _parts_of(shape: Element) -> list[OutlinePart]:
+    """Return the rectangles, circles and polygons in an element.
 
     Raises:
         ScenarioError: there is none, or something else.
@@ -153,21 +292,21 @@ def _part(element: Element) -> OutlinePart:
         corners = ((-length, -width), (length, -width), (length, width), (-length, width))
         c, s = cos(angle) / 2, sin(angle) / 2
         return OutlinePart([(x + a * c - b * s, y + a * s + b * c) for a, b in corners])
-    raise ScenarioError(f"<{element.name}> is no shape; give <rectangle>, <circle> or <polygon>")
+    raise ScenarioError(f"<{element.name}> is not a shape; give <rectangle>, <circle> or <polygon>")
 
 
 def _state(element: Element, outline: Sequence[OutlinePart]) -> ObstacleState:
-    """Position and orientation, each exact or somewhere in a region or interval."""
+    """Return a state from position and orientation, each exact or somewhere in a region or interval."""
     position = _required(element, "position")
     point = position.child("point")
     away = 0.0
     if point is not None:
         x, y = _point(point)
     elif position.child("lanelet") is not None:
-        # somewhere on a lane: the road is not read
+        # somewhere on a lane; roads are not read
         return UNKNOWN
     else:
-        x, y, away = _around(parts_of(position))
+        x, y, away = _around(_parts_of(position))
     low, high = _orientation(element)
     # a point of the outline at a distance r of the centre moves by 2 r sin(h/2) when that turns by h
     reach = max((hypot(*vertex) for part in outline for vertex in part.vertices), default=0.0)
@@ -189,24 +328,24 @@ def _orientation(element: Element) -> tuple[float, float]:
     return low, high
 
 
-def _occupied(occupancy: Element, tell: Tell) -> Iterator[tuple[int, ObstacleState]]:
-    """The time steps of a region that the obstacle is somewhere in."""
+def _occupied(occupancy: Element, report: ReportFault) -> Iterator[tuple[int, ObstacleState]]:
+    """Yield the time steps at which the obstacle is somewhere in a region, each with that state."""
     try:
         steps = _steps(_required(occupancy, "time"))
-        parts = parts_of(_required(occupancy, "shape"))
-        # its outline is within this one, which is nowhere farther from it than it is wide
+        parts = _parts_of(_required(occupancy, "shape"))
+        # the true outline is inside the region, so no point of the region is farther from it than the width
         region = _hull(parts)
         _, _, reach = _around([region])
         state = ObstacleState(uncertainty=2 * reach, region=(region,)) if isfinite(reach) else UNKNOWN
     except ScenarioError as error:
-        tell(occupancy.line, f"{error}; the occupancy is left out")
+        report(occupancy.line, f"{error}; the occupancy is left out")
         return
     for step in steps:
         yield step, state
 
 
 def _hull(parts: Sequence[OutlinePart]) -> OutlinePart:
-    """A convex outline around all of them."""
+    """Return a convex outline around all parts."""
     if len(parts) > 1 and any(part.radius for part in parts):
         x, y, radius = _around(parts)
         return OutlinePart([(x, y)], radius)
@@ -220,14 +359,14 @@ def _hull(parts: Sequence[OutlinePart]) -> OutlinePart:
 
 
 def _around(parts: Sequence[OutlinePart]) -> tuple[float, float, float]:
-    """A disc around all of them: x, y, radius."""
+    """Return a disc around all parts: x, y, radius."""
     vertices = [vertex for part in parts for vertex in part.vertices]
     x, y = (fsum(vertex[axis] for vertex in vertices) / len(vertices) for axis in (0, 1))
     return x, y, max(hypot(a - x, b - y) + part.radius for part in parts for a, b in part.vertices)
 
 
 def _steps(time: Element) -> range:
-    """The time steps of an exact time or an interval."""
+    """Return the time steps of an exact time or an interval."""
     if time.child("intervalStart") is None:
         step = _step(time)
         return range(step, step + 1)
@@ -276,138 +415,3 @@ def _required(element: Element, name: str) -> Element:
     if child is None:
         raise ScenarioError(f"<{element.name}> has no <{name}>; give it one")
     return child
-
-
-_OBSTACLES = frozenset(
-    # `obstacle`, with its role inside, is how versions before 2020a write the first two
-    ["staticObstacle", "dynamicObstacle", "obstacle", "environmentObstacle", "phantomObstacle"]
-)
-
-_BLOCK_REPORTS = 2**14
-"""A block is closed when it holds this many obstacles, however few its time steps are."""
-
-
-@dataclass(slots=True)
-class _Obstacle:
-    """One obstacle of a scenario.
-
-    Attributes:
-        parts: its outline, around its own centre.
-        moving: where it is, by time step.
-        standing: where it is at every time step, if it does not move.
-    """
-
-    name: str
-    class_name: str | None
-    parts: list[OutlinePart]
-    moving: dict[int, ObstacleState] = field(default_factory=dict)
-    standing: ObstacleState | None = None
-
-    def report(self, step: int) -> ObjectReport | None:
-        """The obstacle at a time step; None if it is not there."""
-        state = self.standing or self.moving.get(step)
-        return None if state is None else state.report(self.name, self.class_name, self.parts)
-
-
-def is_scenario(head: bytes) -> bool:
-    """Whether a file begins as an XML file does."""
-    return (
-        head.removeprefix(b"\xef\xbb\xbf")
-        .lstrip()
-        .startswith((b"<?xml", b"<!--", b"<!DOCTYPE", b"<commonRoad"))
-    )
-
-
-def iter_scenario(path: Path, faults: FaultList, *, concave: Concave = "decompose") -> Iterator[Trace]:
-    """The time steps of a CommonRoad scenario in blocks.
-
-    A sample is a time step that some moving obstacle has a state for; obstacles that do not move are in each
-    of them. The road, planning problems and their goals are no objects. What is wrong goes to `faults`.
-
-    Raises:
-        LogError: the file is no scenario.
-        UsageError: a scenario without obstacles.
-    """
-    elements = iter_elements(path, faults, _OBSTACLES)
-    step_s = _step_size(path, next(elements))
-    obstacles = list(_iter_obstacles(path, faults, elements))
-    steps = sorted({step for each in obstacles for step in each.moving}) or ([0] if obstacles else [])
-    if not obstacles and not len(faults):
-        raise UsageError(f"{path.name} is a scenario without obstacles; give one that has some")
-    columns = ReportColumns()
-    held = 0
-    for step in steps:
-        time_ns = round(step * step_s * 10**9)
-        if time_ns > LATEST_NS:
-            faults.add(f"{path.name}: time step {step} lies beyond what a time can be; it is left out")
-            continue
-        reports = [report for each in obstacles if (report := each.report(step)) is not None]
-        columns.add(time_ns, f"{path.name}: time step {step}", reports, {})
-        held += len(reports)
-        if len(columns) == BLOCK_SAMPLES or held >= _BLOCK_REPORTS:
-            yield finished_block(columns, faults, concave)
-            columns, held = ReportColumns(), 0
-    if len(columns):
-        yield finished_block(columns, faults, concave)
-
-
-def _step_size(path: Path, root: Element) -> Fraction:
-    if root.name != "commonRoad":
-        raise LogError(f"{path.name} is XML, but no scenario: its root is <{root.name}>, not <commonRoad>")
-    text = root.attributes.get("timeStepSize", "")
-    try:
-        size = float(text)
-    except ValueError:
-        size = 0.0
-    if not (isfinite(size) and 1e-9 <= size <= 1e9):
-        raise LogError(
-            f"{path.name}:{root.line}: timeStepSize is {text[:60]!r}; give seconds from 1e-9 to 1e9"
-        )
-    # as it is written: 0.1 s are 100 ms to the nanosecond
-    return Fraction(repr(size))
-
-
-def _iter_obstacles(path: Path, faults: FaultList, elements: Iterator[Element]) -> Iterator[_Obstacle]:
-    names = set[str]()
-    for element in elements:
-        name = element.attributes.get("id", "")
-        place = f"{path.name}:{element.line}: <{element.name}>"
-        try:
-            if not name or name in names:
-                raise ScenarioError(f"id is {name[:60]!r}; give each obstacle one of its own")
-            place = f"{path.name}:{element.line}: obstacle {name}"
-            obstacle = _obstacle(name, element, partial(_tell, faults, path.name, name))
-        except ScenarioError as error:
-            faults.add(f"{place}: {error}; it is left out")
-            continue
-        names.add(name)
-        yield obstacle
-
-
-def _tell(faults: FaultList, file: str, obstacle: str, line: int, what: str) -> None:
-    faults.add(f"{file}:{line}: obstacle {obstacle}: {what}")
-
-
-def _obstacle(name: str, element: Element, tell: Tell) -> _Obstacle:
-    kind = element.child("type")
-    class_name = (kind.text or None) if kind is not None else None
-    if element.name == "phantomObstacle":
-        # it may be there or not: a member of every open group that nothing is known about
-        return _Obstacle(name, class_name, [], dict.fromkeys(moving_states(element, [], tell), UNKNOWN))
-    shape = element.child("shape")
-    if shape is None:
-        raise ScenarioError("it has no <shape>; give it one")
-    outline = parts_of(shape)
-    if element.name == "environmentObstacle":
-        return _Obstacle(name, class_name, outline, standing=ObstacleState())
-    if _stands(element):
-        initial = element.child("initialState")
-        if initial is None:
-            raise ScenarioError("it has no <initialState>; give it one")
-        return _Obstacle(name, class_name, outline, standing=state_of(initial, outline, tell))
-    return _Obstacle(name, class_name, outline, moving_states(element, outline, tell))
-
-
-def _stands(element: Element) -> bool:
-    role = element.child("role")
-    return element.name == "staticObstacle" or (role is not None and role.text == "static")

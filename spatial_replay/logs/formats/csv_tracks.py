@@ -1,4 +1,4 @@
-"""Track CSV: one oriented box a line, lines of equal time make a sample."""
+"""Track CSV: one oriented box a line; lines of equal time make a sample."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ COLUMNS = ("time_ns", "name", "class", "x", "y", "yaw", "length", "width")
 
 
 class _NoObjectError(Exception):
-    """A line that is no object; its text says why and what to give instead."""
+    """A line that is not an object; the text says why and what to give instead."""
 
 
 def iter_csv(path: Path, faults: FaultList, *, concave: Concave = "decompose") -> Iterator[Trace]:
-    """The samples of a track CSV in blocks.
+    """Yield the samples of a track CSV in blocks.
 
     A sample with a line that cannot be read is left out as a whole and goes to `faults`.
 
@@ -83,7 +83,7 @@ def _row(line: str, order: list[str]) -> dict[str, str]:
     try:
         cells = next(csv.reader([line], strict=True))
     except (csv.Error, StopIteration) as error:
-        raise _NoObjectError(f"the line is no CSV ({error}); a quoted text ends on its own line") from None
+        raise _NoObjectError(f"the line is not CSV ({error}); a quoted cell ends on its own line") from None
     if len(cells) != len(order):
         raise _NoObjectError(f"the line has {len(cells)} cells; give {len(order)}")
     return dict(zip(order, cells, strict=True))
@@ -121,7 +121,7 @@ def _report(row: dict[str, str]) -> ObjectReport:
 
 
 def _number(row: dict[str, str], column: str) -> float:
-    """The number in a cell; an empty one stands for a number that is not known."""
+    """Return the number in a cell; an empty one stands for an unknown number."""
     text = row[column].strip()
     try:
         return float(text) if text else nan

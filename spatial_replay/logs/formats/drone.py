@@ -33,11 +33,11 @@ _BLOCK_BOXES = 2**16
 
 
 class _NoBoxError(Exception):
-    """A line that is no box; its text says why and what to give instead."""
+    """A line that is not a box; the text says why and what to give instead."""
 
 
 def is_annotations(head: bytes) -> bool:
-    """Whether some whole line at the beginning of a file is a row of annotations."""
+    """Return whether some whole line at the beginning of a file is a row of annotations."""
     lines = head.removeprefix(b"\xef\xbb\xbf").split(b"\n")
     return any(map(_is_row, lines[:1] if len(lines) == 1 else lines[:-1]))
 
@@ -50,17 +50,17 @@ def iter_annotations(
     rate: float = FRAMES_A_SECOND,
     lost: Lost = "drop",
 ) -> Iterator[Trace]:
-    """The frames of an `annotations.txt` in blocks; a frame that the file names is a sample.
+    """Yield the frames of an `annotations.txt` in blocks; a frame that the file names is a sample.
 
-    Files are ordered by object, so that a first frame is known only after the last line: the boxes are read
-    once, as plain columns of 57 bytes a line, and everything else is made block by block.
+    Files are ordered by object, so the first frame is complete only after the last line: all boxes are read
+    first, as plain columns of 57 bytes a line, and everything else is made block by block.
 
     A frame with a line that cannot be read is left out as a whole and goes to `faults`.
 
     Args:
-        concave: of no use here, since boxes are convex.
+        concave: has no effect, since boxes are convex.
         rate: frames a second; frame 0 is at time 0.
-        lost: whether rows that say that their object is out of the picture are dropped or kept.
+        lost: whether rows marked as out of the picture are dropped or kept.
     """
     boxes, broken = _read_boxes(path, faults, _last_frame(rate))
     frames, starts = np.unique(boxes.frame, return_index=True)
@@ -72,8 +72,8 @@ def iter_annotations(
         filled = int(np.searchsorted(ends, starts[first] + _BLOCK_BOXES, side="right"))
         after = min(first + BLOCK_SAMPLES, max(filled, first + 1))
         block = slice(first, after)
-        seen = _observations(boxes, frames[block], starts[block], ends[block], rate, lost)
-        trace, left_out = trace_from_observations(seen, concave=concave)
+        observations = _observations(boxes, frames[block], starts[block], ends[block], rate, lost)
+        trace, left_out = trace_from_observations(observations, concave=concave)
         for index, what in sorted(left_out.items()):
             faults.add(f"{path.name}: frame {frames[first + index]}: {what}")
         yield trace
@@ -92,7 +92,7 @@ class _Boxes:
         self.lost: NDArray[np.bool_] = np.zeros(0, np.bool_)
 
     def add(self, number: int, corners: list[float], frame: int, lost: bool, label: str) -> None:
-        """Take one line."""
+        """Add one line."""
         code = self.labels.setdefault(label, len(self.labels))
         for name, value in (("id", number), ("frame", frame), ("label", code)):
             self._numbers[name].append(value)
@@ -112,7 +112,7 @@ class _Boxes:
 
 
 def _read_boxes(path: Path, faults: FaultList, last_frame: int) -> tuple[_Boxes, set[int]]:
-    """Every line that can be read, and the frames of those that cannot."""
+    """Read every line that can be read; return the boxes, and the frames of the lines that cannot be read."""
     boxes = _Boxes()
     broken = set[int]()
     for number, line in iter_lines(path, faults):
@@ -157,7 +157,7 @@ def _integer(text: str, what: str, last: int) -> int:
 
 
 def _last_frame(rate: float) -> int:
-    """The last one whose time fits a sample."""
+    """Return the last frame whose time fits a sample."""
     last = LATEST_NS // frame_times(rate) - 1
     return min(max(last, 0), _LARGEST)
 
@@ -165,13 +165,13 @@ def _last_frame(rate: float) -> int:
 def _observations(
     boxes: _Boxes, frames: Integers, starts: Integers, ends: Integers, rate: float, lost: Lost
 ) -> Observations:
-    """The boxes of some frames, those from `starts` up to `ends`."""
+    """Return the boxes of some frames, those from `starts` up to `ends`."""
     counts = ends - starts
     sample = np.repeat(np.arange(len(frames), dtype=np.int64), counts)
     rows = np.concatenate([np.zeros(0, np.int64), *map(np.arange, starts, ends)])
     if lost == "drop":
-        kept = ~boxes.lost[rows]
-        sample, rows = sample[kept], rows[kept]
+        visible = ~boxes.lost[rows]
+        sample, rows = sample[visible], rows[visible]
     numbers, name = np.unique(boxes.id[rows], return_inverse=True)
     period = frame_times(rate)
     return Observations(
@@ -190,7 +190,7 @@ def _observations(
 
 
 def _shapes(corners: Floats) -> FootprintBatch:
-    """(R, 4) xmin, ymin, xmax, ymax → boxes, counter-clockwise where y grows upwards."""
+    """Return boxes from (R, 4) xmin, ymin, xmax, ymax, counter-clockwise where y grows upwards."""
     count = len(corners)
     return FootprintBatch(
         part_start=np.arange(count + 1, dtype=np.int64),

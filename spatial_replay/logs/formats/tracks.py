@@ -1,8 +1,7 @@
-"""Track files: one sample a line as JSON, or one object a line as CSV.
+"""Track JSONL, one sample a line, and what every text format shares: lines, reported objects, columns.
 
-Lines of a text file, plain or gzip, that may be damaged anywhere.
-
-Objects collected one by one into columns.
+A text file may be plain or gzip, and damaged anywhere. A line that cannot be read costs its own sample only,
+so each is checked by itself.
 """
 
 from __future__ import annotations
@@ -29,18 +28,18 @@ from spatial_replay.trace.trace import Trace
 
 GZIP_MAGIC = b"\x1f\x8b"
 LONGEST_LINE = 16 * 2**20
-"""Bytes; a line beyond this is no sample but a file of another kind, or damage."""
+"""Bytes; a line beyond this is a file of another kind, or damage."""
 
 
 def open_text(path: Path) -> BinaryIO:
-    """The file's bytes, decompressed if it begins as a gzip file does, whatever its name."""
+    """Open a file for its bytes, decompressed if it begins as a gzip file does, whatever its name."""
     with path.open("rb") as stream:
         magic = stream.read(len(GZIP_MAGIC))
     return cast(BinaryIO, gzip.open(path, "rb")) if magic == GZIP_MAGIC else path.open("rb")
 
 
 def iter_lines(path: Path, faults: FaultList) -> Iterator[tuple[int, str]]:
-    """Each line that is not blank with its number, counted from 1; what cannot be read goes to `faults`."""
+    """Yield each line that is not blank, numbered from 1; what cannot be read goes to `faults`."""
     number = 0
     with open_text(path) as stream:
         while True:
@@ -69,7 +68,7 @@ def iter_lines(path: Path, faults: FaultList) -> Iterator[tuple[int, str]]:
 
 @dataclass(slots=True)
 class ObjectReport:
-    """One object as a line of a log reports it, unchecked; the defaults stand for what it does not say.
+    """One object as a line of a log reports it, unchecked; the defaults stand for missing fields.
 
     Attributes:
         vertices: x, y, x, y … of all parts.
@@ -90,7 +89,7 @@ class ObjectReport:
 
 
 class ReportColumns:
-    """Samples as they come, and the trace of them when there are enough."""
+    """Collects samples for the trace of a block."""
 
     def __init__(self) -> None:
         self.times: list[int] = []
@@ -103,7 +102,7 @@ class ReportColumns:
         return len(self.times)
 
     def add(self, time_ns: int, place: str, reports: list[ObjectReport], signals: dict[str, float]) -> None:
-        """Take one sample; `place` says where it stands in its file."""
+        """Add one sample; `place` says where it is in its file."""
         self.times.append(time_ns)
         self.places.append(place)
         self._reports += reports
@@ -111,7 +110,7 @@ class ReportColumns:
         self._signals.append(signals)
 
     def trace(self, *, concave: Concave) -> tuple[Trace, list[str]]:
-        """The samples that can be used, and what is wrong with the others, each with its place."""
+        """Return the samples that can be used, and what is wrong with the others, each with its place."""
         trace, faults = trace_from_observations(self._observations(), concave=concave)
         return trace, [f"{self.places[index]}: {what}" for index, what in sorted(faults.items())]
 
@@ -156,11 +155,11 @@ _PART_KEYS = {"vertices", "radius"}
 
 
 class _NoSampleError(Exception):
-    """A line that is no sample; its text says why and what to give instead."""
+    """A line that is not a sample; the text says why and what to give instead."""
 
 
 def iter_jsonl(path: Path, faults: FaultList, *, concave: Concave = "decompose") -> Iterator[Trace]:
-    """The samples of a `.jsonl` file in blocks; lines that are no sample go to `faults`."""
+    """Yield the samples of a `.jsonl` file in blocks; lines without a sample go to `faults`."""
     columns = ReportColumns()
     latest = -1
     for number, line in iter_lines(path, faults):
@@ -182,7 +181,7 @@ def iter_jsonl(path: Path, faults: FaultList, *, concave: Concave = "decompose")
 
 
 def finished_block(columns: ReportColumns, faults: FaultList, concave: Concave) -> Trace:
-    """The trace of the collected samples; what had to be left out goes to `faults`."""
+    """Return the trace of the collected samples; those that had to be left out go to `faults`."""
     trace, left_out = columns.trace(concave=concave)
     for fault in left_out:
         faults.add(fault)
@@ -195,7 +194,7 @@ def _sample(line: str) -> tuple[int, list[ObjectReport], dict[str, float]]:
     except RecursionError:
         raise _NoSampleError("the line is nested too deeply for a sample") from None
     except ValueError as error:
-        raise _NoSampleError(f"the line is no JSON ({error})") from None
+        raise _NoSampleError(f"the line is not JSON ({error})") from None
     if not isinstance(sample, dict):
         raise _NoSampleError(f'the line is {_kind(sample)}; give {{"time_ns": …, "objects": […]}}')
     _check_keys(sample, _SAMPLE_KEYS, "the sample")
@@ -216,12 +215,12 @@ def _report(entry: Any) -> ObjectReport:
         raise _NoSampleError(f'an object is {_kind(entry)}; give {{"name": …, "polygon": […]}}')
     name = entry.get("name")
     if not isinstance(name, str) or not _is_text(name):
-        raise _NoSampleError(f"an object's name is {_short(name)}; give a text that is not empty")
+        raise _NoSampleError(f"an object's name is {_short(name)}; give a string that is not empty")
     what = f"object {name!r}"
     _check_keys(entry, _OBJECT_KEYS, what)
     class_name = entry.get("class")
     if class_name is not None and not (isinstance(class_name, str) and _is_text(class_name, empty=True)):
-        raise _NoSampleError(f"{what}: class is {_short(class_name)}; give a text or leave it out")
+        raise _NoSampleError(f"{what}: class is {_short(class_name)}; give a string or leave it out")
     report = ObjectReport(name, class_name)
     if ("polygon" in entry) == ("parts" in entry):
         raise _NoSampleError(f"{what}: give one of polygon and parts")
@@ -267,12 +266,12 @@ def _signals(entry: Any) -> dict[str, float]:
         raise _NoSampleError(f'signals are {_kind(entry)}; give {{"name": number}}')
     for name in entry:
         if not _is_text(name):
-            raise _NoSampleError(f"a signal's name is {_short(name)}; give a text that is not empty")
+            raise _NoSampleError(f"a signal's name is {_short(name)}; give a string that is not empty")
     return {name: _number(value, f"signal {name!r}") for name, value in entry.items()}
 
 
 def _number(value: Any, what: str) -> float:
-    """The number; null, like NaN, stands for one that is not known."""
+    """Return the number; null, like NaN, stands for an unknown one."""
     if value is None:
         return nan
     if type(value) is not int and type(value) is not float:
@@ -287,7 +286,7 @@ def _number(value: Any, what: str) -> float:
 
 def _list(value: Any, what: str) -> list[Any]:
     if not isinstance(value, list):
-        raise _NoSampleError(f"{what}: {_short(value)} where a list belongs")
+        raise _NoSampleError(f"{what}: {_short(value)}; give a list")
     return value
 
 
@@ -300,14 +299,14 @@ def _check_keys(entry: dict[str, Any], known: set[str], what: str) -> None:
 
 
 def _is_text(text: str, *, empty: bool = False) -> bool:
-    """Whether a text can be written as UTF-8: JSON can spell halves of surrogate pairs, which cannot."""
+    """Return whether a text fits UTF-8, unlike the halves of surrogate pairs that JSON can spell."""
     if not text:
         return empty
     return text.isascii() or not any("\ud800" <= character <= "\udfff" for character in text)
 
 
 def _kind(value: Any) -> str:
-    kinds = {dict: "an object", list: "a list", str: "a text", bool: "a truth value", type(None): "null"}
+    kinds = {dict: "an object", list: "a list", str: "a string", bool: "a boolean", type(None): "null"}
     return kinds.get(type(value), "a number")
 
 

@@ -1,4 +1,8 @@
-"""Elements of an XML file that nobody vouches for, piece by piece."""
+"""Elements of an untrusted XML file, parsed in pieces.
+
+Entities could fetch other files or expand without bound, so a file that declares a document type is refused,
+and size, depth and number of elements are limited.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,7 @@ from spatial_replay.logs.read_options import FaultList
 LARGEST_FILE = 512 * 2**20
 """Bytes, decompressed."""
 MOST_ELEMENTS = 500_000
-"""Elements inside one that is kept."""
+"""Elements inside one that is wanted."""
 DEEPEST = 64
 LONGEST_TEXT = 4096
 _PIECE = 2**16
@@ -24,7 +28,7 @@ _PIECE = 2**16
 
 @dataclass(slots=True)
 class Element:
-    """An element with what is in it.
+    """An element with its content.
 
     Attributes:
         line: where it begins, counted from 1.
@@ -38,40 +42,38 @@ class Element:
     text: str = ""
 
     def child(self, name: str) -> Element | None:
-        """The first child of a name."""
+        """Return the first child of a name."""
         return next(self.all(name), None)
 
     def all(self, name: str) -> Iterator[Element]:
-        """Every child of a name."""
+        """Return every child of a name."""
         return (child for child in self.children if child.name == name)
 
 
 def iter_elements(path: Path, faults: FaultList, wanted: frozenset[str]) -> Iterator[Element]:
-    """The root, without its content, then each of its children that has a wanted name.
+    """Yield the root, without its content, then each of its children that has a wanted name.
 
-    Of a file that is broken somewhere, the children before that place are given, and the rest goes to
-    `faults`. Documents that declare a type of their own are refused: with them entities, and whatever those
-    would fetch or blow up to.
+    Of a broken file, the children before the damage are yielded, and the rest goes to `faults`.
 
     Raises:
-        LogError: there is no root to give, the file declares a type, or it is beyond the limits above.
+        LogError: there is no root, the file declares a document type, or it exceeds the limits above.
     """
     collector = _Collector(path.name, wanted)
     with open_text(path) as stream:
-        given = False
+        any_element = False
         for problem in _parse(stream, collector):
             for element in collector.take():
-                given = True
+                any_element = True
                 yield element
             if problem is not None:
                 what = f"{path.name}:{collector.line}: {problem}"
-                if not given:
+                if not any_element:
                     raise LogError(f"{what}; give a well-formed XML file")
                 faults.add(f"{what}; what follows is left out")
 
 
 def _parse(stream: BinaryIO, collector: _Collector) -> Iterator[str | None]:
-    """Parse a piece a step; the last step may yield what is wrong with the file."""
+    """Parse one piece each step; the last step may yield what is wrong with the file."""
     read = 0
     while True:
         try:
@@ -84,7 +86,7 @@ def _parse(stream: BinaryIO, collector: _Collector) -> Iterator[str | None]:
             yield f"the XML is broken ({expat.ErrorString(error.code)})"
             return
         except (EOFError, zlib.error, LookupError, ValueError) as error:
-            # broken compression, an encoding nobody knows
+            # broken compression, or an unknown encoding
             yield f"the file cannot be read ({error})"
             return
         yield None
@@ -93,13 +95,13 @@ def _parse(stream: BinaryIO, collector: _Collector) -> Iterator[str | None]:
 
 
 class _Collector:
-    """What a parser hands over, as elements."""
+    """Builds elements from the events of a parser."""
 
     def __init__(self, name: str, wanted: frozenset[str]) -> None:
         self.name = name
         self._wanted = wanted
         self._open: list[Element] = []
-        self._depth = self._kept = 0
+        self._depth = self._inside = 0
         self._done: list[Element] = []
         self.parser = expat.ParserCreate()
         self.parser.buffer_text = True
@@ -113,7 +115,7 @@ class _Collector:
         return self.parser.CurrentLineNumber
 
     def take(self) -> list[Element]:
-        """The elements that were finished since the last call."""
+        """Return the elements that were finished since the last call."""
         done, self._done = self._done, []
         return done
 
@@ -132,11 +134,11 @@ class _Collector:
         if self._depth == 1:
             self._done.append(Element(name, attributes, self.line))
         elif self._open or (self._depth == 2 and name in self._wanted):
-            self._keep(Element(name, attributes, self.line))
+            self._begin(Element(name, attributes, self.line))
 
-    def _keep(self, element: Element) -> None:
-        self._kept = self._kept + 1 if self._open else 0
-        if self._kept > MOST_ELEMENTS:
+    def _begin(self, element: Element) -> None:
+        self._inside = self._inside + 1 if self._open else 0
+        if self._inside > MOST_ELEMENTS:
             first = self._open[0]
             raise LogError(
                 f"{self.name}:{first.line}: <{first.name}> has more than {MOST_ELEMENTS} elements; split it"

@@ -1,6 +1,7 @@
-"""What an MCAP file holds and where, by its summary or, failing that, by looking.
+"""The directory of an MCAP file: its chunks and attachments, by its summary or, failing that, by a scan.
 
-What an MCAP log keeps beside its messages: attachments and metadata.
+Summaries are optional, and an interrupted recorder writes none. Then the file is scanned from its beginning;
+a damaged part is skipped up to the next chunk that is consistent in itself.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _BEFORE_COMPRESSION = RECORD_HEAD.size + 28
 
 @dataclass(slots=True)
 class Directory:
-    """Places in a file, and what the summary says of them.
+    """Places in a file, and what its summary declares.
 
     Attributes:
         header: None where it cannot be read.
@@ -56,7 +57,7 @@ class Directory:
 
 
 def read_directory(stream: BinaryIO, faults: FaultList, name: str) -> Directory:
-    """The directory of a file that begins as an MCAP file; what is wrong with it goes to `faults`."""
+    """Read the directory of an MCAP file; what is wrong with the file goes to `faults`."""
     size = stream.seek(0, os.SEEK_END)
     try:
         return _from_summary(stream, size)
@@ -71,11 +72,11 @@ def read_directory(stream: BinaryIO, faults: FaultList, name: str) -> Directory:
 
 
 class _NoSummaryError(Exception):
-    """A file that has no summary, or not one that tells everything, as other writers may make it."""
+    """A file without a summary, or with an incomplete one, as other writers may make it."""
 
 
 def _from_summary(stream: BinaryIO, size: int) -> Directory:
-    """The directory that a file's own summary gives.
+    """Read the directory from a file's own summary.
 
     Raises:
         _NoSummaryError: there is no summary, or one that leaves something out.
@@ -155,7 +156,7 @@ def _take_in(directory: Directory, opcode: int, body: bytes) -> None:
 
 
 def _indexed_channels(body: bytes, length: int) -> frozenset[int] | None:
-    """The channels for which a chunk has an index of messages; None without any such index."""
+    """Return the channels for which a chunk has a message index; None without any such index."""
     entries = body[_CHUNK_INDEX.size : _CHUNK_INDEX.size + length]
     if not entries or len(entries) != length or length % _MESSAGE_INDEX.size:
         return None
@@ -163,7 +164,7 @@ def _indexed_channels(body: bytes, length: int) -> frozenset[int] | None:
 
 
 def _check_complete(directory: Directory, end: int) -> None:
-    """That a summary tells everything; other writers may leave out parts of theirs."""
+    """Check that a summary is complete; other writers may leave out parts of theirs."""
     statistics = directory.statistics
     if statistics is None or (
         statistics.chunk_count != len(directory.chunks)
@@ -187,7 +188,7 @@ class _Scan:
         self._size = size
         self._faults = faults
         self._name = name
-        self._found = Directory()
+        self._directory = Directory()
         self._loose: ChunkPlace | None = None
         self._ended = False
 
@@ -206,13 +207,13 @@ class _Scan:
                 if following is None:
                     break
                 position = following
-            if self._found.chunks and self._found.chunks[-1].compressed:
-                sound = max(sound, self._found.chunks[-1].offset + self._found.chunks[-1].length)
+            if self._directory.chunks and self._directory.chunks[-1].compressed:
+                sound = max(sound, self._directory.chunks[-1].offset + self._directory.chunks[-1].length)
         self._end_loose()
-        return self._found
+        return self._directory
 
     def _record(self, position: int) -> int:
-        """Take in the record at a position; where the next one begins."""
+        """Take in the record at a position; return where the next one begins."""
         self._stream.seek(position)
         beginning = self._stream.read(_CHUNK_HEAD_BYTES)
         if len(beginning) < RECORD_HEAD.size:
@@ -225,7 +226,7 @@ class _Scan:
             raise DamageError("the file breaks off in a record")
         if opcode == Opcode.CHUNK:
             self._end_loose()
-            self._found.chunks.append(chunk_place(position, beginning, RECORD_HEAD.size + length))
+            self._directory.chunks.append(chunk_place(position, beginning, RECORD_HEAD.size + length))
         elif opcode == Opcode.MESSAGE:
             self._message(position, beginning, following)
         elif opcode in (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL):
@@ -234,17 +235,17 @@ class _Scan:
             self._stream.seek(position + RECORD_HEAD.size)
             body = self._stream.read(length)
             if opcode == Opcode.HEADER:
-                self._found.header = decoded(records.Header.read, body)
+                self._directory.header = decoded(records.Header.read, body)
             else:
-                _take_in(self._found, opcode, body)
+                _take_in(self._directory, opcode, body)
         elif opcode == Opcode.ATTACHMENT:
-            self._found.attachments.append((position, following - position))
+            self._directory.attachments.append((position, following - position))
         elif opcode == Opcode.METADATA:
-            self._found.metadata.append((position, following - position))
+            self._directory.metadata.append((position, following - position))
         elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
             if self._next_chunk(following) is not None:
                 raise DamageError("the data end before the last chunk")
-            # what follows repeats what was seen already
+            # what follows repeats what was read already
             self._ended = True
         return following
 
@@ -268,11 +269,11 @@ class _Scan:
 
     def _end_loose(self) -> None:
         if self._loose:
-            self._found.chunks.append(self._loose)
+            self._directory.chunks.append(self._loose)
             self._loose = None
 
     def _next_chunk(self, position: int) -> int | None:
-        """Where the next chunk begins that is consistent in itself, from a position on."""
+        """Return where the next chunk begins that is consistent in itself, from a position on."""
         overlap = _BEFORE_COMPRESSION + _CHUNK_HEAD_BYTES
         while position < self._size:
             self._stream.seek(position)
@@ -292,18 +293,18 @@ class _Scan:
 
 
 def _iter_places(window: bytes, mark: bytes) -> Iterator[int]:
-    """Where a chunk would begin, by the name of its compression, in order."""
-    found = window.find(mark)
-    while found >= 0:
-        if found >= _BEFORE_COMPRESSION:
-            yield found - _BEFORE_COMPRESSION
-        found = window.find(mark, found + 1)
+    """Yield where a chunk would begin, by the name of its compression, in order."""
+    at = window.find(mark)
+    while at >= 0:
+        if at >= _BEFORE_COMPRESSION:
+            yield at - _BEFORE_COMPRESSION
+        at = window.find(mark, at + 1)
 
 
 def iter_attachments(
     stream: BinaryIO, directory: Directory, faults: FaultList, name: str
 ) -> Iterator[Attachment]:
-    """The attachments of a file that can be read; the others go to `faults`."""
+    """Yield the attachments of a file that can be read; the others go to `faults`."""
     for offset, length in directory.attachments:
         stream.seek(offset + RECORD_HEAD.size)
         body = stream.read(length - RECORD_HEAD.size)
@@ -321,7 +322,7 @@ def iter_attachments(
 def iter_metadata(
     stream: BinaryIO, directory: Directory, faults: FaultList, name: str
 ) -> Iterator[tuple[str, Mapping[str, str]]]:
-    """The metadata records of a file that can be read, with their names; the others go to `faults`."""
+    """Yield the metadata records of a file that can be read, with their names; the others go to `faults`."""
     for offset, length in directory.metadata:
         stream.seek(offset + RECORD_HEAD.size)
         try:
@@ -332,8 +333,8 @@ def iter_metadata(
         yield record.name, MappingProxyType(record.metadata)
 
 
-def check_kept(stream: BinaryIO, directory: Directory, faults: FaultList, name: str) -> None:
-    """Tell `faults` what cannot be read: whoever copies the log loses it."""
-    for kept in (iter_attachments, iter_metadata):
-        for _ in kept(stream, directory, faults, name):
+def check_attachments(stream: BinaryIO, directory: Directory, faults: FaultList, name: str) -> None:
+    """Report to `faults` the attachments and metadata that cannot be read: copies of the log lose them."""
+    for iter_records in (iter_attachments, iter_metadata):
+        for _ in iter_records(stream, directory, faults, name):
             pass

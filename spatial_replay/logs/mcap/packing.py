@@ -1,6 +1,8 @@
-"""Messages packed into chunks of an MCAP log.
+"""Messages packed into chunks of an MCAP log, and the summary that ends the log.
 
-The summary section that ends an MCAP log.
+The writer is our own because chunks have to be the same bytes for the same messages, however these were
+divided among calls, and because the library packs messages one by one, where whole columns are ten times
+as fast.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ _INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 
 @dataclass(frozen=True, slots=True)
 class PackedChunk:
-    """A chunk ready to be written, and what the summary has to know of it."""
+    """A chunk ready to be written, with its entry of the summary."""
 
     record: bytes
     index: bytes
@@ -58,7 +60,7 @@ class Batch:
 
     @classmethod
     def of(cls, messages: Messages, numbers: Integers, declared: Mapping[int, bytes]) -> Batch:
-        """Messages with their channels' numbers in this log (M,), and declarations before some."""
+        """Return messages as records, with channel numbers (M,) and declarations before some."""
         payloads = list(messages.payloads)
         sizes = np.fromiter(map(len, payloads), np.int64, len(payloads))
         heads = np.zeros(len(payloads), _MESSAGE)
@@ -76,13 +78,14 @@ class Batch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MessageRange:
-    """The messages begin up to stop of a batch."""
+    """The messages of a batch from `begin` up to, not including, `stop`."""
 
     batch: Batch
     begin: int
     stop: int
 
     def parts(self) -> list[bytes]:
+        """Return heads and payloads in turn, with declarations before the heads that they precede."""
         batch, begin, stop = self.batch, self.begin, self.stop
         heads = batch.heads[begin:stop].tobytes()
         width = _MESSAGE.itemsize
@@ -95,11 +98,12 @@ class MessageRange:
         return parts
 
 
-def pack(stretches: list[MessageRange], compressor: zstandard.ZstdCompressor) -> PackedChunk:
-    content = b"".join([part for stretch in stretches for part in stretch.parts()])
-    heads = np.concatenate([stretch.batch.heads[stretch.begin : stretch.stop] for stretch in stretches])
-    sizes = np.concatenate([stretch.batch.sizes[stretch.begin : stretch.stop] for stretch in stretches])
-    before = np.concatenate([stretch.batch.before[stretch.begin : stretch.stop] for stretch in stretches])
+def pack(ranges: list[MessageRange], compressor: zstandard.ZstdCompressor) -> PackedChunk:
+    """Pack messages into a compressed chunk with its index."""
+    content = b"".join([part for each in ranges for part in each.parts()])
+    heads = np.concatenate([each.batch.heads[each.begin : each.stop] for each in ranges])
+    sizes = np.concatenate([each.batch.sizes[each.begin : each.stop] for each in ranges])
+    before = np.concatenate([each.batch.before[each.begin : each.stop] for each in ranges])
     entries = np.zeros(len(heads), _INDEX_ENTRY)
     entries["log_time"] = heads["log_time"]
     entries["offset"] = np.cumsum(sizes) - sizes + before
@@ -142,7 +146,7 @@ class McapSummary:
             self.counts[channel] = self.counts.get(channel, 0) + count
 
     def section(self, offset: int) -> bytes:
-        """The section and the footer, for a place in the file."""
+        """Encode the section and the footer for a place in the file."""
         groups: tuple[tuple[Opcode, Sequence[records.McapRecord]], ...] = (
             (Opcode.SCHEMA, self.schemas),
             (Opcode.CHANNEL, self.channels),
@@ -182,7 +186,7 @@ _INDEX_OFFSET = struct.Struct("<HQ")
 
 
 def _chunk_index(index: records.ChunkIndex) -> bytes:
-    """A chunk index as `encoded` writes it, in a tenth of the time: long logs have very many."""
+    """Encode a chunk index as `encoded` does, in a tenth of the time: long logs have very many."""
     offsets = b"".join(_INDEX_OFFSET.pack(*each) for each in index.message_index_offsets.items())
     compression = index.compression.encode()
     rest = struct.pack("<QI", index.message_index_length, len(compression)) + compression

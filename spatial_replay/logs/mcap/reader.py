@@ -1,9 +1,13 @@
-"""MCAP logs of spatial-replay, whole or damaged, in blocks."""
+"""Read our own MCAP logs, whole or damaged, in blocks of samples with their messages.
+
+Chunks may overlap in time. So they are read in the order of their first message, and a message is handed
+out only when no later chunk can hold an earlier one.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -28,7 +32,7 @@ from spatial_replay.logs.mcap.chunks import (
 )
 from spatial_replay.logs.mcap.index import (
     Directory,
-    check_kept,
+    check_attachments,
     iter_attachments,
     iter_metadata,
     read_directory,
@@ -49,7 +53,7 @@ _CHANNEL, _PAYLOAD = itemgetter(1), itemgetter(4)
 
 @dataclass(frozen=True)
 class McapSource:
-    """An MCAP log with the topic /spatial/objects."""
+    """An MCAP log with the topic /spatial/objects; its index is read once for all uses of the source."""
 
     path: Path
     kind: str = "MCAP"
@@ -64,14 +68,13 @@ class McapSource:
 
         Only chunks that reach into the window are read, if the log has an index.
         """
-        directory, faults = self._index[0], deepcopy(self._index[1])
-        with self.path.open("rb") as stream:
-            walk = ChunkWalk(stream, directory, faults, self.name)
+        with self.open_walk() as walk:
+            faults = walk.faults
             window = (0 if start_ns is None else start_ns, AFTER_ALL_NS if end_ns is None else end_ns)
-            decoder = _BlockDecoder(self, walk, faults)
+            decoder = _BlockDecoder(self, walk)
             for messages in _blocks(walk, window, _is_copied):
                 yield decoder.block(messages)
-            check_kept(stream, walk.directory, faults, self.name)
+            check_attachments(walk.stream, walk.directory, faults, self.name)
             rest = faults.take(last=True)
             if not decoder.any_sample and not walk.sees_objects:
                 raise self._without_objects(walk, decoder.first_fault or next(iter(rest), None))
@@ -83,13 +86,11 @@ class McapSource:
                 yield Block(replace(Trace.from_samples(()), faults=rest))
 
     def iter_payloads(self, topic: str) -> Iterator[tuple[list[bytes], tuple[str, ...]]]:
-        """The messages of one topic as they are, in order, in lists of bounded size; and what was lost."""
-        directory, faults = self._index[0], deepcopy(self._index[1])
-        with self.path.open("rb") as stream:
-            walk = ChunkWalk(stream, directory, faults, self.name)
+        """Yield the payloads of one topic in order, in lists of bounded size, each with what was lost."""
+        with self.open_walk() as walk:
             for messages in _blocks(walk, (0, AFTER_ALL_NS), topic.__eq__):
-                yield [payload for *_, payload in messages], faults.take()
-            yield [], faults.take(last=True)
+                yield [payload for *_, payload in messages], walk.faults.take()
+            yield [], walk.faults.take(last=True)
 
     def attachments(self) -> tuple[Attachment, ...]:
         """See `Source.attachments`; those that are damaged are left out."""
@@ -99,12 +100,25 @@ class McapSource:
         """See `Source.metadata`; records that are damaged are left out."""
         return self._beside[1]
 
+    @property
+    def has_samples(self) -> bool:
+        """Whether the log has the topic of our samples."""
+        with self.open_walk() as walk:
+            return any(
+                channel.topic == OBJECTS and channel.schema is not None and channel.schema.name == _SAMPLES
+                for channel in walk.channels.values()
+            )
+
+    @contextmanager
+    def open_walk(self) -> Iterator[ChunkWalk]:
+        """Open the file for a walk over its chunks, whose faults begin with those of the index."""
+        directory, faults = self._index
+        with self.path.open("rb") as stream:
+            yield ChunkWalk(stream, directory, deepcopy(faults), self.name)
+
     @cached_property
     def _index(self) -> tuple[Directory, FaultList]:
-        """The directory, and the faults in it.
-
-        Finding it in a log that has lost its summary takes a scan of the whole file, so it is done only once.
-        """
+        """The directory and its faults, read once: without a summary, it takes a scan of the whole file."""
         faults = FaultList()
         with self.path.open("rb") as stream:
             return read_directory(stream, faults, self.name), faults
@@ -127,23 +141,12 @@ class McapSource:
         return UsageError(f"{what}; a mapping file says which of them carry objects")
 
 
-def holds_samples(path: Path) -> bool:
-    """Whether a log has the topic of our samples."""
-    with path.open("rb") as stream:
-        faults = FaultList()
-        walk = ChunkWalk(stream, read_directory(stream, faults, path.name), faults, path.name)
-        return any(
-            channel.topic == OBJECTS and channel.schema is not None and channel.schema.name == _SAMPLES
-            for channel in walk.channels.values()
-        )
-
-
 class ChunkWalk:
     """The messages of a log by chunk, with the channels that have been declared so far."""
 
     def __init__(self, stream: BinaryIO, directory: Directory, faults: FaultList, name: str) -> None:
-        self._stream = stream
-        self._faults = faults
+        self.stream = stream
+        self.faults = faults
         self._name = name
         self.directory = directory
         self._schemas = dict(directory.schemas)
@@ -162,14 +165,14 @@ class ChunkWalk:
     def iter_messages(
         self, places: Sequence[ChunkPlace], is_wanted: Callable[[str], bool] = lambda topic: True
     ) -> Iterator[tuple[ChunkPlace, list[RawMessage]]]:
-        """The messages in each place; what is lost of them goes to the faults.
+        """Yield the messages in each place; what is lost of them goes to the faults.
 
         Args:
             is_wanted: which topics matter; messages of others may be left out.
         """
-        for place, content in iter_contents(self._stream, places):
-            passed_over = {number for number, each in self.channels.items() if not is_wanted(each.topic)}
-            yield place, self._messages(place, content, frozenset(passed_over))
+        for place, content in iter_contents(self.stream, places):
+            passed_over = frozenset(n for n, each in self.channels.items() if not is_wanted(each.topic))
+            yield place, self._messages(place, content, passed_over)
 
     def _messages(
         self, place: ChunkPlace, read: Callable[[], bytes], passed_over: frozenset[int]
@@ -184,17 +187,17 @@ class ChunkWalk:
             self._fault(place, f"{content.damage}; of the {span}, {len(content.messages)} could be read")
         self._take_in(content.declarations)
         channels = self.channels
-        found = [m for m in content.messages if m[1] in channels and m[0] <= LATEST_NS]
-        if lost := len(content.messages) - len(found):
+        usable = [m for m in content.messages if m[1] in channels and m[0] <= LATEST_NS]
+        if lost := len(content.messages) - len(usable):
             self._fault(place, f"{lost} of the {span} have no channel, or a time beyond 2**63 - 1 ns")
-        return found
+        return usable
 
     def _find_channels(self) -> None:
         """Declare all channels of a log without a summary: chunks need not come in the order of time."""
         for place in sorted(self.places, key=lambda each: each.offset):
-            # the chunk is read again for its messages, and its damage told then
+            # the chunk is read again for its messages, and its damage reported then
             with suppress(DamageError):
-                self._take_in(split_records(read_records(self._stream, place)).declarations)
+                self._take_in(split_records(read_records(self.stream, place)).declarations)
 
     def _take_in(self, declarations: Iterable[Declaration]) -> None:
         for record in declarations:
@@ -215,7 +218,7 @@ class ChunkWalk:
         )
 
     def _fault(self, place: ChunkPlace, what: str) -> None:
-        self._faults.add(f"{self._name}: at byte {place.offset}: {what}")
+        self.faults.add(f"{self._name}: at byte {place.offset}: {what}")
 
 
 def _is_copied(topic: str) -> bool:
@@ -225,7 +228,7 @@ def _is_copied(topic: str) -> bool:
 def _blocks(
     walk: ChunkWalk, window: tuple[int, int], is_wanted: Callable[[str], bool]
 ) -> Iterator[list[RawMessage]]:
-    """The messages of the topics wanted, in order, in lists of bounded size."""
+    """Yield the messages of the topics wanted, in order, in lists of bounded size."""
     start_ns, end_ns = window
     places = [place for place in walk.places if place.start_ns < end_ns and place.end_ns >= start_ns]
     waiting: list[RawMessage] = []
@@ -252,7 +255,7 @@ def _blocks(
 
 
 def _count_before(messages: list[RawMessage], time_ns: int) -> int:
-    """How many of the messages, which are in order, are earlier."""
+    """Count the messages, which are in order, before a time."""
     count = len(messages)
     while count and messages[count - 1][0] >= time_ns:
         count -= 1
@@ -260,17 +263,17 @@ def _count_before(messages: list[RawMessage], time_ns: int) -> int:
 
 
 class _BlockDecoder:
-    """Messages to blocks; remembers the latest sample, after which the next one has to come."""
+    """Decodes messages to blocks; remembers the latest sample, after which the next one has to come."""
 
-    def __init__(self, source: McapSource, walk: ChunkWalk, faults: FaultList) -> None:
+    def __init__(self, source: McapSource, walk: ChunkWalk) -> None:
         self._source = source
         self._walk = walk
-        self._faults = faults
         self._latest_ns = -1
         self.any_sample = False
         self.first_fault: str | None = None
 
     def block(self, messages: list[RawMessage]) -> Block:
+        """Decode the samples among some messages."""
         columns = self._columns(messages)
         samples = [number for number, channel in columns.channels.items() if self._is_objects(channel)]
         own = np.flatnonzero(np.isin(columns.channel, samples))
@@ -284,7 +287,7 @@ class _BlockDecoder:
         for fault in faults:
             self._fault(fault)
         self.any_sample = self.any_sample or len(trace) > 0
-        lost = self._faults.take()
+        lost = self._walk.faults.take()
         self.first_fault = self.first_fault or next(iter(lost), None)
         return Block(replace(trace, faults=lost), columns)
 
@@ -295,7 +298,7 @@ class _BlockDecoder:
         if (channel.encoding, schema) != ("protobuf", _SAMPLES):
             raise LogError(
                 f"{self._source.name}: {OBJECTS!r} has messages of the schema {schema!r}, encoded as"
-                f" {channel.encoding!r}; {_SAMPLES} in protobuf belong there"
+                f" {channel.encoding!r}; give {_SAMPLES} in protobuf"
             )
         return True
 
@@ -316,4 +319,4 @@ class _BlockDecoder:
         )
 
     def _fault(self, what: str) -> None:
-        self._faults.add(f"{self._source.name}: {what}")
+        self._walk.faults.add(f"{self._source.name}: {what}")

@@ -1,4 +1,7 @@
-"""MCAP logs written in chunks whose bounds depend on bytes and log time alone."""
+"""Write MCAP logs.
+
+The bounds of chunks depend on bytes and log time alone, so that equal messages make equal files.
+"""
 
 from __future__ import annotations
 
@@ -144,7 +147,7 @@ class LogWriter:
             self._worker.shutdown(cancel_futures=True)
 
     def _numbers(self, messages: Messages) -> tuple[Integers, dict[int, bytes]]:
-        """(M,) numbers in this log, and the records that declare a channel, before which message."""
+        """Return (M,) channel numbers, and declarations of channels by the message that they precede."""
         known, first = np.unique(messages.channel, return_index=True)
         number = np.zeros(int(known.max()) + 1, np.int64)
         declared: dict[int, bytes] = {}
@@ -236,7 +239,7 @@ class LogWriter:
             self._flush_stream()
 
     def _write_record(self, record: records.McapRecord) -> tuple[int, int]:
-        """Write a record; where it stands and how long it is."""
+        """Write a record; return its place and length."""
         offset, content = self._offset, encoded(record)
         self._write(content)
         return offset, len(content)

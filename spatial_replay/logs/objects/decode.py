@@ -1,6 +1,7 @@
-"""Messages of /spatial/objects to traces, many samples at a time.
+"""Decode messages of /spatial/objects to traces, many samples at a time.
 
-Where the numbers stand in ObjectStates messages of one layout.
+Most messages of a log differ only in their numbers. So one message of a layout is parsed by the protobuf
+library, and the numbers of all others are read at its offsets (see `wire`).
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ from spatial_replay.trace.observations import Observations, trace_from_observati
 from spatial_replay.trace.trace import Trace
 
 UNKNOWN, ZERO = -2, -1
-"""Places of numbers that a message does not hold, after the last slot: they are NaN and 0."""
+"""Slots of numbers that a message does not hold, after its last slot: they read as NaN and 0."""
 
 
 class WrongMessageError(Exception):
-    """Bytes that are no ObjectStates message; its text says why."""
+    """Bytes that are not an ObjectStates message; the text says why."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,16 +63,16 @@ class SlotLayout:
 
 
 def parsed(payload: bytes) -> ObjectStates:
-    """The message, or a piece of one, in an encoding.
+    """Parse a message, or a piece of one.
 
     Raises:
-        WrongMessageError: it is none, an object has no name or a vertex no y.
+        WrongMessageError: it is not one, an object has no name or a vertex no y.
     """
     message = ObjectStates()
     try:
         message.ParseFromString(payload)
     except DecodeError:
-        raise WrongMessageError("the message is no ObjectStates") from None
+        raise WrongMessageError("the message is not an ObjectStates message") from None
     for state in message.objects:
         if not state.name:
             raise WrongMessageError("an object has no name")
@@ -81,7 +82,7 @@ def parsed(payload: bytes) -> ObjectStates:
 
 
 def layout_of(message: ObjectStates) -> SlotLayout:
-    """Where `WireTemplate.of(message)` has its slots.
+    """Return where `WireTemplate.of(message)` has its slots.
 
     Raises:
         WrongMessageError: a signal without a name, or with one that another has.
@@ -126,7 +127,7 @@ class _ObjectSlots(NamedTuple):
 
 
 def _object_slots(state: ObjectState, slots: _Slots) -> _ObjectSlots:
-    """The slots of one object, taken in the order of the fields."""
+    """Return the slots of one object, taken in the order of the fields."""
     coordinates, radius = list[int](), list[int]()
     for part in state.parts:
         coordinates += [slots.next_if(True, UNKNOWN) for _ in part.coordinates]
@@ -149,7 +150,7 @@ class _Slots:
         self._next = 0
 
     def next_if(self, present: bool, otherwise: int) -> int:
-        """The next slot for a number that is present, the given place for one that is not."""
+        """Return the next slot for a number that is present, the given place for one that is not."""
         if not present:
             return otherwise
         self._next += 1
@@ -190,7 +191,7 @@ class _Pieces:
 def decode_objects(
     payloads: Sequence[bytes], times_ns: Integers, *, concave: Concave = "decompose"
 ) -> tuple[Trace, list[str]]:
-    """The trace in encoded ObjectStates messages.
+    """Decode ObjectStates messages to a trace.
 
     Args:
         payloads: T messages.
@@ -206,17 +207,16 @@ def decode_objects(
     trace, wrong = trace_from_observations(_observations(groups, times_ns), concave=concave)
     faults = wrong | faults
     if faults.keys() - wrong.keys():
-        kept = np.ones(len(times_ns), np.bool_)
-        kept[list(faults)] = False
-        trace = trace.take(np.searchsorted(trace.times_ns, times_ns[kept]))
-    told = [f"sample at {times_ns[index]} ns: {what}" for index, what in sorted(faults.items())]
-    return trace, told
+        sound = np.ones(len(times_ns), np.bool_)
+        sound[list(faults)] = False
+        trace = trace.take(np.searchsorted(trace.times_ns, times_ns[sound]))
+    return trace, [f"sample at {times_ns[index]} ns: {what}" for index, what in sorted(faults.items())]
 
 
 def _groups(payloads: Sequence[bytes], faults: dict[int, str]) -> list[_Group]:
-    """All numbers of all messages, by layout; messages that are none go to `faults`.
+    """Group all numbers of all messages by layout; payloads that are not messages go to `faults`.
 
-    Where most messages have a layout of their own, their objects do not: those are read piece by piece.
+    Where most messages have a layout of their own, their objects do not: these are read piece by piece.
     """
     whole = _Pieces(np.arange(len(payloads), dtype=np.int64), payloads)
     groups, left = _grouped(whole, faults, SAMPLES_PER_LAYOUT)
@@ -229,7 +229,7 @@ def _groups(payloads: Sequence[bytes], faults: dict[int, str]) -> list[_Group]:
 
 
 def _grouped(pieces: _Pieces, faults: dict[int, str], worth: int) -> tuple[list[_Group], _Pieces]:
-    """Pieces by layout, and what is left over once layouts serve fewer pieces each than they should.
+    """Group pieces by layout; return also those left over once layouts serve too few pieces each.
 
     Args:
         worth: how many pieces a layout should serve on average, the first few layouts aside.
@@ -260,7 +260,7 @@ def _grouped(pieces: _Pieces, faults: dict[int, str], worth: int) -> tuple[list[
 def _first_group(
     first: _Pieces, rows: Bytes, faults: dict[int, str]
 ) -> tuple[_Group | None, NDArray[np.bool_]]:
-    """The group of the first of some rows (n, L), if it can be read, and (n,) which rows that settles."""
+    """Return the group of the first of some rows (n, L), or None, and (n,) the rows that it settles."""
     alone = np.zeros(len(rows), np.bool_)
     alone[0] = True
     try:
@@ -272,13 +272,13 @@ def _first_group(
     same = template.matches(rows) if len(template) == rows.shape[1] else ~alone
     if same[0]:
         return _Group(first.samples, layout, _padded(template.words(rows[same]))), same
-    # another encoder's order of fields: the library's own bytes say the same
+    # another encoder's order of fields: the library's own bytes mean the same
     row = rows_of([message.SerializeToString(deterministic=True)])
     return _Group(first.samples, layout, _padded(template.words(row))), alone
 
 
 def _fields(payload: bytes) -> list[bytes] | None:
-    """The fields of a message, each as a message of its own; None if it is not made of known fields once."""
+    """Split a message into its fields, each a message of its own; None if a field is unknown or repeated."""
     pieces: list[bytes] = []
     begin, end, times = 0, len(payload), 0
     while begin < end:
@@ -370,7 +370,7 @@ def _observations(groups: Sequence[_Group], times_ns: Integers) -> Observations:
 
 
 def _invalid(group: _Group) -> NDArray[np.bool_]:
-    """(K * J,) where an orientation or a height is stated, but is no number."""
+    """Return (K * J,) where an orientation or a height is stated, but not finite."""
     layout = group.layout
     invalid = np.zeros((len(group.samples), len(layout.names)), np.bool_)
     for slot, owner in zip(layout.stated.tolist(), layout.stated_by.tolist(), strict=True):

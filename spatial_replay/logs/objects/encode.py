@@ -1,7 +1,4 @@
-"""Traces to messages of /spatial/objects, many samples at a time.
-
-Traces to and from the messages of /spatial/objects.
-"""
+"""Encode traces as messages of /spatial/objects, many samples at a time."""
 
 from __future__ import annotations
 
@@ -12,18 +9,16 @@ from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
-from spatial_replay.logs.objects.decode import decode_objects
 from spatial_replay.logs.objects.wire import WireTemplate, payloads_of
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.trace.trace import ABSENT, Trace
 
 
 def encode_objects(trace: Trace) -> list[bytes]:
-    """One encoded ObjectStates message for each sample of a trace.
+    """Encode each sample of a trace as one ObjectStates message.
 
-    Two encodings side by side are the encoding of both messages' fields together. So a sample is put
-    together from pieces: its time, each of its objects and each of its signals, and all pieces of one layout
-    are made at once.
+    Two encodings side by side are the encoding of both messages' fields. So a sample is joined from pieces:
+    its time, each of its objects and each of its signals, and all pieces of one layout are encoded at once.
     """
     times = _pieces(ObjectStates(time_ns=0), trace.times_ns.view(np.float64)[:, None])
     objects = _object_pieces(trace)
@@ -38,7 +33,7 @@ def encode_objects(trace: Trace) -> list[bytes]:
 
 
 def _object_pieces(trace: Trace) -> list[bytes]:
-    """Every object of every sample, by sample and name."""
+    """Encode every object of every sample, by sample and name."""
     present = trace.rows != ABSENT
     marked = trace.rows[present]
     rows = np.where(marked < 0, -2 - marked, marked)
@@ -55,7 +50,7 @@ def _object_pieces(trace: Trace) -> list[bytes]:
 
 
 def _signal_pieces(name: str, values: Floats) -> list[bytes]:
-    """A signal in every sample: nothing where its value is not known."""
+    """Encode a signal in every sample: nothing where its value is not known."""
     message = ObjectStates()
     message.signals.add(name=name, value=0.0)
     pieces = _pieces(message, values[:, None])
@@ -65,12 +60,12 @@ def _signal_pieces(name: str, values: Floats) -> list[bytes]:
 
 
 def _pieces(message: Message, numbers: Floats) -> list[bytes]:
-    """Encodings of a message with other numbers (n, W)."""
+    """Encode a message with other numbers (n, W)."""
     return payloads_of(WireTemplate.of(message).fill(np.ascontiguousarray(numbers).view(np.uint64)))
 
 
 def _row_layout(trace: Trace) -> Integers:
-    """(R,) a number that is equal for observations whose messages differ in numbers alone, name aside."""
+    """Return (R,) a number that is equal for observations whose messages differ only in numbers and name."""
     shapes = trace.footprints
     counts = np.diff(shapes.part_start)
     vertex_counts = np.diff(shapes.vertex_start)
@@ -84,7 +79,7 @@ def _row_layout(trace: Trace) -> Integers:
 
 
 def _combined(columns: Iterable[NDArray[np.generic]], length: int) -> Integers:
-    """(length,) a number that is equal exactly where all columns are."""
+    """Return (length,) a number that is equal exactly where all columns are."""
     code = np.zeros(length, np.int64)
     for column in columns:
         if length and (column != column[0]).any():
@@ -94,16 +89,16 @@ def _combined(columns: Iterable[NDArray[np.generic]], length: int) -> Integers:
 
 
 def _equal(code: Integers) -> Iterator[Integers]:
-    """The places (K,) of each value."""
+    """Yield the places (K,) of each value."""
     order = np.argsort(code, kind="stable")
     edges = np.flatnonzero(np.diff(code[order])) + 1
     return (places for places in np.split(order, edges) if len(places))
 
 
 def _message(trace: Trace, name: int, row: int, *, unreadable: bool) -> ObjectStates:
-    """A message of one observation with everything but its numbers.
+    """Return a message of one observation with everything but its numbers.
 
-    An unreadable one states orientation and height in any case: it may be one of them that is not finite.
+    An unreadable one always has orientation and height: either may be what is not finite.
     """
     shapes = trace.footprints
     message = ObjectStates()
@@ -122,7 +117,7 @@ def _message(trace: Trace, name: int, row: int, *, unreadable: bool) -> ObjectSt
 
 
 def _numbers(trace: Trace, message: ObjectStates, rows: Integers) -> Floats:
-    """(K, W) the numbers of observations of one layout, in the order of the message's fields."""
+    """Return (K, W) the numbers of observations of one layout, in the order of the message's fields."""
     (state,) = message.objects
     shapes = trace.footprints
     columns: list[Floats] = []
@@ -138,6 +133,3 @@ def _numbers(trace: Trace, message: ObjectStates, rows: Integers) -> Floats:
         columns += [shapes.bottom[rows, None], shapes.top[rows, None]]
     columns.append(trace.uncertainty[rows, None])
     return np.concatenate(columns, axis=1)
-
-
-__all__ = ["decode_objects", "encode_objects"]

@@ -1,6 +1,6 @@
 """Many messages of one layout at once.
 
-In protobuf's encoding, numbers of a fixed width stand at the same place in every message that has the
+In protobuf's encoding, numbers of a fixed width are at the same place in every message that has the
 same fields, texts and list lengths. So one message, encoded by the protobuf library, serves as a template
 for all of its layout: only the slots differ, and those of many messages are filled or read together.
 """
@@ -45,7 +45,7 @@ class WireTemplate:
     Attributes:
         payload: (L,) uint8, an encoded message with every slot 0.
         word_offsets: (W,) int64, where the words begin.
-        mark_offsets: (M,) int64, where the marks stand.
+        mark_offsets: (M,) int64, where the marks are.
     """
 
     payload: Bytes
@@ -54,10 +54,10 @@ class WireTemplate:
 
     @classmethod
     def of(cls, message: Message) -> WireTemplate:
-        """The layout of a message; numbers that shall be slots must be present in it.
+        """Return the layout of a message; numbers that shall be slots must be present in it.
 
         Raises:
-            LayoutError: a layout with fields that the schema does not know.
+            LayoutError: a message with fields that the schema does not have.
         """
         first, second = (_encoded(message, *sentinels) for sentinels in _SENTINELS)
         if len(first) != len(second):
@@ -88,7 +88,7 @@ class WireTemplate:
         return rows
 
     def matches(self, rows: Bytes) -> NDArray[np.bool_]:
-        """(n,) which of n encoded messages (n, L) have this layout."""
+        """Return (n,) which of n encoded messages (n, L) have this layout."""
         fixed = np.ones(len(self), np.bool_)
         fixed[self.mark_offsets] = False
         for offset in self.word_offsets.tolist():
@@ -98,14 +98,14 @@ class WireTemplate:
         return result
 
     def words(self, rows: Bytes) -> Words:
-        """(n, W) the words of n messages (n, L) of this layout."""
+        """Return (n, W) the words of n messages (n, L) of this layout."""
         contents = np.empty((len(rows), 8 * len(self.word_offsets)), np.uint8)
         for offset, word, count in self._runs():
             contents[:, 8 * word : 8 * (word + count)] = rows[:, offset : offset + 8 * count]
         return contents.view("<u8")
 
     def _runs(self) -> Iterator[tuple[int, int, int]]:
-        """Offset, number of the first word and count of words that stand side by side."""
+        """Yield offset, number of the first word and count of adjacent words."""
         breaks = np.flatnonzero(np.diff(self.word_offsets, prepend=-9) != 8).tolist()
         for word, after in pairwise([*breaks, len(self.word_offsets)]):
             yield int(self.word_offsets[word]), word, after - word
@@ -113,7 +113,7 @@ class WireTemplate:
 
 @kernel
 def _scatter(payload: Bytes, contents: Bytes, offsets: NDArray[np.int64], rows: Bytes) -> None:
-    """Copies of a payload (L,) as rows (n, L), with the words of contents (n, 8 W) at the offsets (W,)."""
+    """Copy a payload (L,) to rows (n, L), with the words of contents (n, 8 W) at the offsets (W,)."""
     for i in range(rows.shape[0]):
         for k in range(rows.shape[1]):
             rows[i, k] = payload[k]
@@ -124,7 +124,7 @@ def _scatter(payload: Bytes, contents: Bytes, offsets: NDArray[np.int64], rows: 
 
 @kernel
 def _compare(payload: Bytes, places: NDArray[np.int64], rows: Bytes, result: NDArray[np.bool_]) -> None:
-    """Which rows (n, L) agree with a payload (L,) in all the places given; into result (n,)."""
+    """Set result (n,) to which rows (n, L) agree with a payload (L,) in all the places given."""
     for i in range(rows.shape[0]):
         agrees = True
         for k in places:
@@ -135,12 +135,12 @@ def _compare(payload: Bytes, places: NDArray[np.int64], rows: Bytes, result: NDA
 
 
 def rows_of(payloads: list[bytes]) -> Bytes:
-    """n payloads of one length L → (n, L) uint8."""
+    """Return n payloads of one length L as (n, L) uint8."""
     return np.frombuffer(b"".join(payloads), np.uint8).reshape(len(payloads), -1)
 
 
 def payloads_of(rows: Bytes) -> list[bytes]:
-    """(n, L) uint8 → n payloads."""
+    """Return (n, L) uint8 as n payloads."""
     count, length = rows.shape
     if not length:
         return [b""] * count
@@ -149,7 +149,7 @@ def payloads_of(rows: Bytes) -> list[bytes]:
 
 
 def _encoded(message: Message, word: int, mark: int) -> Bytes:
-    """The message's encoding with sentinels in all slots."""
+    """Encode a message with sentinels in all slots."""
     copy = type(message)()
     copy.CopyFrom(message)
     _write_sentinels(copy, word, mark)
@@ -171,7 +171,7 @@ def _write_sentinels(message: Message, word: int, mark: int) -> None:
 
 
 def _slot_widths(message: Message) -> Iterator[int]:
-    """The widths in bytes of all slots, in the order in which the library encodes fields."""
+    """Yield the widths in bytes of all slots, in the order in which the library encodes fields."""
     for field, value in message.ListFields():
         single = isinstance(value, Message | int | float)
         if field.type == FieldDescriptor.TYPE_MESSAGE:
