@@ -1,4 +1,4 @@
-"""Small logs of messages, written by the tools of others."""
+"""Small logs of messages, written with other libraries."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def text(words: str) -> Any:
 
 
 def drive(count: int = 60, step_ns: int = SECOND // 10) -> list[Sent]:
-    """Two points that move, and texts that nobody needs."""
+    """Two points that move, and strings that no object needs."""
     sent = []
     for index in range(count):
         time_ns = START_NS + index * step_ns

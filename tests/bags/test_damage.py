@@ -1,4 +1,4 @@
-"""Damaged logs of messages: what is left is read, what is lost is told, and nothing else happens."""
+"""Damaged logs of messages: what is left is read, and what is lost is reported."""
 
 from __future__ import annotations
 
@@ -56,17 +56,17 @@ LOGS = {
 
 class Outcome(NamedTuple):
     messages: list[Message]
-    told: tuple[str, ...]
+    reported: tuple[str, ...]
 
 
 def read(path: Path, *, decodes: bool = True) -> Outcome:
-    """Everything that can be read and decoded, and all that is said of the rest."""
+    """Return everything that can be read and decoded, and all that is reported about the rest."""
     reader = open_messages(path)
     try:
         topics = reader.topics()
-        told = [topic.unreadable for topic in topics if topic.unreadable]
+        reported = [topic.unreadable for topic in topics if topic.unreadable]
         messages = list(reader.iter_messages([topic.name for topic in topics]))
-        told += reader.take_faults()
+        reported += reader.take_faults()
         decodable = [topic.name for topic in topics if decodes and not topic.unreadable]
         decoders = {topic: reader.decoder(topic) for topic in decodable}
     except LogError as error:
@@ -76,33 +76,31 @@ def read(path: Path, *, decodes: bool = True) -> Outcome:
             if message.topic in decoders:
                 decoders[message.topic](message.payload)
         except LogError as error:
-            told.append(str(error))
-    return Outcome(messages, tuple(told))
+            reported.append(str(error))
+    return Outcome(messages, tuple(reported))
 
 
 @pytest.fixture(scope="module", params=LOGS.values(), ids=LOGS)
 def sound(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Log]:
     log: Log = request.param
     path = log.write(tmp_path_factory.mktemp("sound"))
-    assert read(path).told == ()
+    assert read(path).reported == ()
     return path, log
 
 
-def test_a_log_cut_anywhere_is_told(sound: tuple[Path, Log], tmp_path: Path) -> None:
+def test_a_log_cut_anywhere_is_reported(sound: tuple[Path, Log], tmp_path: Path) -> None:
     path, _ = sound
     data, whole = path.read_bytes(), read(path).messages
     randomly = random.Random(1)
     cut = tmp_path / path.name
     for size in {randomly.randrange(16, len(data)) for _ in range(200)}:
         cut.write_bytes(data[:size])
-        messages, told = read(cut)
-        assert told, f"cut after {size} bytes"
+        messages, reported = read(cut)
+        assert reported, f"cut after {size} bytes"
         assert set(messages) <= set(whole), f"cut after {size} bytes"
 
 
-def test_a_flipped_bit_is_told_or_changes_no_more_than_itself(
-    sound: tuple[Path, Log], tmp_path: Path
-) -> None:
+def test_a_flipped_bit_is_reported_or_changes_only_itself(sound: tuple[Path, Log], tmp_path: Path) -> None:
     path, log = sound
     data, whole = path.read_bytes(), read(path).messages
     randomly = random.Random(2)
@@ -112,33 +110,33 @@ def test_a_flipped_bit_is_told_or_changes_no_more_than_itself(
         changed = bytearray(data)
         changed[position] ^= 1 << bit
         flipped.write_bytes(changed)
-        messages, told = read(flipped)
+        messages, reported = read(flipped)
         where = f"bit {bit} of byte {position}"
-        if not told:
+        if not reported:
             assert len(messages) == len(whole), where
             differing = len(set(messages) - set(whole))
             assert differing == 0 if log.is_checked else differing <= 60, where
 
 
-def test_a_damaged_stretch_costs_no_more_than_itself(tmp_path: Path) -> None:
+def test_a_damaged_chunk_of_a_bag_costs_only_itself(tmp_path: Path) -> None:
     path = write_ros1(tmp_path / "drive.bag", SENT, compression="bz2")
     data = bytearray(path.read_bytes())
     middle = data.index(b"BZh9", len(data) // 2)
     data[middle + 20] ^= 0xFF
     path.write_bytes(data)
-    messages, told = read(path)
+    messages, reported = read(path)
     assert 150 < len(messages) < 180
-    assert "are lost" in told[0] and "at byte" in told[0]
-    assert any("declares 60 messages on '/a'" in each for each in told)
+    assert "are lost" in reported[0] and "at byte" in reported[0]
+    assert any("declares 60 messages on '/a'" in each for each in reported)
 
 
 def test_a_bag_without_its_index_is_read(tmp_path: Path) -> None:
     path = write_ros1(tmp_path / "drive.bag", SENT)
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * 0.6)])
-    messages, told = read(path)
+    messages, reported = read(path)
     assert len(messages) > 60
-    assert "no index" in told[0] and "cannot be read" in told[1]
+    assert "no index" in reported[0] and "cannot be read" in reported[1]
 
 
 def test_a_damaged_database_is_read_up_to_the_damage(tmp_path: Path) -> None:
@@ -147,14 +145,14 @@ def test_a_damaged_database_is_read_up_to_the_damage(tmp_path: Path) -> None:
     for page in range(len(data) // 3 // 4096 * 4096, len(data) // 3 // 4096 * 4096 + 2 * 4096, 4096):
         data[page : page + 8] = b"\xff" * 8
     path.write_bytes(data)
-    messages, told = read(path)
+    messages, reported = read(path)
     assert 100 < len(messages) < 600
     assert messages == sorted(messages, key=lambda each: each.log_time_ns)
-    assert "the database is damaged" in told[0] and f"read up to row {len(messages)}" in told[0]
-    assert any("declares 600 messages on '/a'" in each for each in told)
+    assert "the database is damaged" in reported[0] and f"read up to row {len(messages)}" in reported[0]
+    assert any("declares 600 messages on '/a'" in each for each in reported)
 
 
-def test_changed_metadata_are_told_or_make_no_difference(tmp_path: Path) -> None:
+def test_changed_metadata_are_reported_or_harmless(tmp_path: Path) -> None:
     folder = write_ros2(tmp_path / "drive", SENT[:9])
     metadata = folder / "metadata.yaml"
     said, whole = metadata.read_bytes(), read(folder).messages
@@ -168,28 +166,28 @@ def test_changed_metadata_are_told_or_make_no_difference(tmp_path: Path) -> None
         metadata.write_bytes(
             changed[: randomly.randrange(len(changed))] if randomly.random() < 0.2 else changed
         )
-        messages, told = read(folder, decodes=False)
-        assert told or messages == whole
+        messages, reported = read(folder, decodes=False)
+        assert reported or messages == whole
 
 
-def test_little_that_decompresses_to_much_is_refused(tmp_path: Path) -> None:
+def test_a_decompression_bomb_is_refused(tmp_path: Path) -> None:
     nothing = b" " * 2**27
     log = write_mcap(tmp_path / "a.mcap", [("/a", "json", "", "", b"")], [("/a", START_NS, nothing)])
     assert log.stat().st_size < 2**16
-    messages, told = read(log)
+    messages, reported = read(log)
     assert not messages
-    assert "claims to hold" in told[0]
+    assert "claims to hold" in reported[0]
     bag = write_ros1(tmp_path / "a.bag", [Sent("/a", TEXT, START_NS, text(" " * 2**27))], compression="bz2")
     assert bag.stat().st_size < 2**16
-    messages, told = read(bag)
+    messages, reported = read(bag)
     assert not messages
-    assert "claims to hold" in told[0]
+    assert "claims to hold" in reported[0]
 
 
 @pytest.mark.parametrize("junk", [b"", b"\x00" * 5_000, b"\xff" * 5_000, bytes(range(256)) * 20])
 @pytest.mark.parametrize("magic", [b"#ROSBAG V2.0\n", b"SQLite format 3\x00", b"\x89MCAP0\r\n"])
-def test_junk_after_a_good_beginning_is_told(tmp_path: Path, magic: bytes, junk: bytes) -> None:
+def test_junk_after_a_good_beginning_is_reported(tmp_path: Path, magic: bytes, junk: bytes) -> None:
     path = tmp_path / "junk"
     path.write_bytes(magic + junk)
-    messages, told = read(path)
-    assert not messages and told
+    messages, reported = read(path)
+    assert not messages and reported

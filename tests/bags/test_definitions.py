@@ -65,7 +65,7 @@ def test_a_definition_written_out_reads_as_itself() -> None:
 
 
 @pytest.mark.parametrize("store", [Stores.ROS1_NOETIC, Stores.ROS2_HUMBLE], ids=["ros1", "ros2"])
-def test_standard_types_are_understood_as_by_others(store: Stores) -> None:
+def test_standard_types_are_understood_as_by_rosbags(store: Stores) -> None:
     typestore = get_typestore(store)
     encoding: Any = "ros1" if store is Stores.ROS1_NOETIC else "cdr"
     for name in (
@@ -94,18 +94,18 @@ def test_a_standard_type_can_be_written_into_a_copy() -> None:
         ("own_msgs/srv/Ask_Event", "own_msgs/srv/Ask_Event"),
     ],
 )
-def test_names_of_types_are_brought_into_one_form(short: str, full: str) -> None:
+def test_names_of_types_are_normalised(short: str, full: str) -> None:
     assert full_type_name(short) == full
 
 
 HOSTILE = {
-    "code as a name": ("float64 __import__('os').system('false')", "is no field"),
-    "code as a type": ("a/b);import\tos x", "is no field"),
+    "code as a name": ("float64 __import__('os').system('false')", "is not a field"),
+    "code as a type": ("a/b);import\tos x", "is not a field"),
     "code as a nested type": (
         f"float64 x\n{SEPARATOR}\nMSG: a/B');evil('\nfloat64 y",
-        "is no name of a message",
+        "is not a name of a message",
     ),
-    "a dunder": ("float64 __class__", "is no field"),
+    "a dunder": ("float64 __class__", "is not a field"),
     "two fields of a name": ("float64 x\nint8 x", "two fields 'x'"),
     "itself": ("Evil evil", "contains itself"),
     "itself, round a corner": (f"Other o\n{SEPARATOR}\nMSG: a/Other\na/Evil[] e", "contains itself"),
@@ -119,36 +119,36 @@ HOSTILE = {
         f"A[] a\n{SEPARATOR}\nMSG: a/A\nint8 X=1",
         "a sequence of items that take no bytes",
     ),
-    "nothing but noise": ("\x00\x01", "is no field"),
-    "not even text": (b"\xff\xfe", "no text in UTF-8"),
+    "nothing but noise": ("\x00\x01", "is not a field"),
+    "not even text": (b"\xff\xfe", "is not UTF-8"),
     "too much text": ("# " + "x" * 2**21, "characters; at most 262144 are read"),
 }
 
 
-@pytest.mark.parametrize(("definition", "told"), HOSTILE.values(), ids=HOSTILE)
-def test_hostile_definitions_are_refused(definition: str | bytes, told: str) -> None:
+@pytest.mark.parametrize(("definition", "reported"), HOSTILE.values(), ids=HOSTILE)
+def test_hostile_definitions_are_refused(definition: str | bytes, reported: str) -> None:
     data = definition if isinstance(definition, bytes) else definition.encode()
     with pytest.raises(LogError, match=r".") as caught:
         ros_decoder("a/msg/Evil", "ros1", Schema("a/Evil", "ros1msg", data))
-    assert told in str(caught.value)
+    assert reported in str(caught.value)
     assert len(str(caught.value)) < 500
 
 
 @pytest.mark.parametrize("name", ["", "Pose", "a/b/c/d/e", "a/../b", "a/msg/B'", "a/msg/é", "a" * 300 + "/B"])
 def test_hostile_names_of_types_are_refused(name: str) -> None:
-    with pytest.raises(LogError, match="is no name of a message type"):
+    with pytest.raises(LogError, match="is not a name of a message type"):
         ros_decoder(name, "cdr", Schema(name, "ros2msg", b"float64 x"))
 
 
 @pytest.mark.parametrize("word", ["class", "None", "self", "cls", "pos", "numpy"])
-def test_fields_may_be_called_as_python_calls_things(word: str) -> None:
+def test_fields_may_have_names_of_python_keywords(word: str) -> None:
     schema = Schema("a/msg/B", "ros2msg", f"float64 {word}\nfloat64 x".encode())
     decode = ros_decoder("a/msg/B", "cdr", schema)
     decoded: Any = decode(b"\x00\x01\x00\x00" + bytes(8) + b"\x00\x00\x00\x00\x00\x00\xf0\x3f")
     assert decoded.x == 1.0
 
 
-def test_definitions_in_another_language_say_so() -> None:
+def test_a_definition_in_another_language_is_refused() -> None:
     with pytest.raises(LogError, match="in 'omgidl'; ros1msg, ros2msg and ros2idl are read"):
         ros_decoder("a/msg/B", "cdr", Schema("a/msg/B", "omgidl", b"struct B {}"))
 

@@ -1,4 +1,4 @@
-"""MCAP logs of others in every encoding."""
+"""External MCAP logs in every encoding."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_protobuf_is_decoded_by_the_descriptors_in_the_log(
     decode: Callable[[bytes], Any] = reader.decoder("/poses")
     found = [decode(message.payload).poses[0].position.x for message in reader.iter_messages(["/poses"])]
     assert found == [0.5 * index for index in range(20)]
-    with pytest.raises(LogError, match=r"a message is no foxglove\.PosesInFrame"):
+    with pytest.raises(LogError, match=r"a message is not a foxglove\.PosesInFrame"):
         decode(b"\xff\xff\xff")
 
 
@@ -61,7 +61,7 @@ def test_files_of_descriptors_may_come_in_any_order(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("schema", "told"),
+    ("schema", "reported"),
     [
         (b"", "cannot be used"),
         (b"\xff\xff", "cannot be used"),
@@ -69,9 +69,11 @@ def test_files_of_descriptors_may_come_in_any_order(tmp_path: Path) -> None:
         (POSES[: len(POSES) // 2], "cannot be used"),
     ],
 )
-def test_descriptors_that_do_not_describe_the_type_are_told(tmp_path: Path, schema: bytes, told: str) -> None:
+def test_descriptors_that_do_not_describe_the_type_are_reported(
+    tmp_path: Path, schema: bytes, reported: str
+) -> None:
     (topic,) = open_messages(poses_log(tmp_path / "poses.mcap", schema)).topics()
-    assert topic.unreadable is not None and told in topic.unreadable
+    assert topic.unreadable is not None and reported in topic.unreadable
 
 
 def test_json_needs_no_schema(tmp_path: Path) -> None:
@@ -82,11 +84,11 @@ def test_json_needs_no_schema(tmp_path: Path) -> None:
     decode = reader.decoder("/a")
     assert [decode(message.payload) for message in reader.iter_messages(["/a"])] == [{"x": 1.5}, [1]]
     for bad in (b"{", b"\xff", b"[" * 100_000):
-        with pytest.raises(LogError, match="a message is no JSON"):
+        with pytest.raises(LogError, match="a message is not JSON"):
             decode(bad)
 
 
-def test_ros1_messages_may_stand_in_mcap(tmp_path: Path) -> None:
+def test_ros1_messages_in_mcap_are_read(tmp_path: Path) -> None:
     text, _ = ROS1.generate_msgdef(POINT)
     payload = bytes(ROS1.serialize_ros1(point(1.0, 2.0), POINT))
     log = write_mcap(
@@ -104,7 +106,7 @@ def test_ros1_messages_may_stand_in_mcap(tmp_path: Path) -> None:
     assert (message.log_time_ns, message.publish_time_ns) == (START_NS, START_NS - 1_000)
 
 
-def test_events_of_services_do_not_keep_a_log_from_being_read(tmp_path: Path) -> None:
+def test_service_events_do_not_prevent_reading_a_log(tmp_path: Path) -> None:
     """Nor does a profile that is not that of ROS 2."""
     text, _ = ROS2.generate_msgdef(POINT, ros_version=2)
     payload = bytes(ROS2.serialize_cdr(point(1.0, 2.0), POINT))
@@ -138,17 +140,17 @@ def test_what_cannot_be_decoded_says_why_and_hides_nothing_else(tmp_path: Path) 
     reader = open_messages(log)
     reasons = {topic.name: topic.unreadable for topic in reader.topics()}
     assert reasons.pop("/json") is None
-    told = [str(reason).split(";")[0] for reason in reasons.values()]
-    assert told == [
+    reported = [str(reason).split(";")[0] for reason in reasons.values()]
+    assert reported == [
         "topic '/cbor': the encoding 'cbor' is not known",
         "topic '/flat': the encoding 'flatbuffer' is not known",
-        "topic '/nothing': '' is no name of a message type, such as geometry_msgs/msg/Pose",
+        "topic '/nothing': '' is not a name of a message type, such as geometry_msgs/msg/Pose",
         "topic '/protobuf': the definition of '' is missing",
     ]
     assert [message.payload for message in reader.iter_messages(["/json"])] == [b"{}"]
 
 
-def test_a_topic_of_two_types_is_not_guessed_at(tmp_path: Path) -> None:
+def test_a_topic_of_two_types_is_unreadable(tmp_path: Path) -> None:
     text, _ = ROS2.generate_msgdef(POINT, ros_version=2)
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
@@ -175,7 +177,7 @@ def test_a_log_without_summary_is_read(tmp_path: Path) -> None:
     assert "breaks off" in reader.take_faults()[0]
 
 
-def test_a_log_by_others_is_read_whole(data_folder: Path) -> None:
+def test_an_external_log_is_read_whole(data_folder: Path) -> None:
     reader = open_messages(data_folder / "osi" / "osi_centerline_example.mcap")
     (topic,) = reader.topics()
     assert (topic.type, topic.count) == ("osi3.GroundTruth", 91)

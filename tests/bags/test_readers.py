@@ -137,7 +137,7 @@ def test_parts_that_overlap_in_time_are_merged(tmp_path: Path) -> None:
     assert times == [each.time_ns for each in sent]
 
 
-def test_a_missing_part_is_told(tmp_path: Path) -> None:
+def test_a_missing_part_is_reported(tmp_path: Path) -> None:
     sent = drive()
     parts = [
         write_ros2(tmp_path / f"part{index}", sent[begin : begin + 90]) for index, begin in enumerate((0, 90))
@@ -170,14 +170,14 @@ def test_a_recorder_that_was_killed_leaves_files_without_metadata(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "told"),
+    ("before", "after", "reported"),
     [
         ("message_count: 60", "message_count: 61", "declares 61 messages on '/a'; 60 could be read"),
         ("message_count: 60", "message_count: many", "the message_count of topic '/a' is 'many'"),
         (POINT, "a/msg/B", "says that '/a' has messages of 'a/msg/B'; they are of 'geometry_msgs/msg/Point'"),
         ("drive.mcap", "../drive.mcap", None),
         ("drive.mcap", "gone.mcap", "its file 'gone.mcap' is missing"),
-        ("rosbag2_bagfile_information", "a", "'topics_with_message_count' in it is no list"),
+        ("rosbag2_bagfile_information", "a", "'topics_with_message_count' in it is not a list"),
         ("relative_file_paths:", "relative_file_paths: &a [*a]\n  x:", "it refers to parts of itself"),
         ("ros_distro: rosbags", "ros_distro: *a", "it refers to parts of itself"),
         ("topic_metadata", "topic", "has no 'topic_metadata'"),
@@ -185,7 +185,7 @@ def test_a_recorder_that_was_killed_leaves_files_without_metadata(tmp_path: Path
         ("version: 9", "version: !!python/object/apply:os.system ['false']", "it is no YAML"),
     ],
 )
-def test_metadata_that_lie_are_told(tmp_path: Path, before: str, after: str, told: str | None) -> None:
+def test_wrong_metadata_are_reported(tmp_path: Path, before: str, after: str, reported: str | None) -> None:
     folder = write_ros2(tmp_path / "drive", [each for each in drive() if each.topic == "/a"])
     metadata = folder / "metadata.yaml"
     said = metadata.read_text()
@@ -199,7 +199,7 @@ def test_metadata_that_lie_are_told(tmp_path: Path, before: str, after: str, tol
         faults = "\n".join(reader.take_faults())
     except LogError as error:
         faults = str(error)
-    assert told in faults if told else not faults
+    assert reported in faults if reported else not faults
 
 
 def test_a_topic_that_no_file_has_cannot_be_read(tmp_path: Path) -> None:
@@ -307,12 +307,12 @@ def test_messages_out_of_order_come_in_order_within_reach(tmp_path: Path) -> Non
         assert [each[0] for each in points_of(reader, "/a")] == sorted(times), name
 
 
-def test_what_is_no_log_is_said(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_log_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MissingFileError):
         open_messages(tmp_path / "gone.bag")
     (tmp_path / "text.bag").write_text("hello")
     with pytest.raises(LogError, match="neither a ROS bag nor an MCAP log"):
         open_messages(tmp_path / "text.bag")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(LogError, match="no ROS 2 bag that can be read"):
+    with pytest.raises(LogError, match="not a ROS 2 bag that can be read"):
         open_messages(tmp_path / "empty").topics()

@@ -118,7 +118,7 @@ def test_a_log_holds_the_trace(trace):
 
 
 @given(traces(), st.lists(st.integers(0, 6), max_size=3))
-def test_how_samples_are_handed_over_does_not_change_the_bytes(trace, cuts):
+def test_dividing_samples_among_calls_does_not_change_the_bytes(trace, cuts):
     bounds = [0, *sorted(min(cut, len(trace)) for cut in cuts), len(trace)]
     pieces = [trace.slice(begin, end) for begin, end in pairwise(bounds)]
     assert write(pieces) == write([trace])

@@ -66,7 +66,7 @@ def assert_within(scenario: Trace, truth: Footprint) -> None:
     SHARES,
     SHARES,
 )
-def test_an_open_position_and_orientation(
+def test_an_open_position_and_orientation_widen_the_interval(
     length: float,
     width: float,
     x: float,
@@ -92,7 +92,7 @@ def test_an_open_position_and_orientation(
 
 @settings(max_examples=60)
 @given(LENGTHS, LENGTHS, PLACES, PLACES, SHARES, SHARES, SHARES, SHARES)
-def test_an_obstacle_somewhere_in_an_occupancy(
+def test_an_obstacle_anywhere_in_an_occupancy_is_within_the_interval(
     length: float, width: float, x: float, y: float, long: float, wide: float, along: float, across: float
 ) -> None:
     region = (

@@ -1,4 +1,4 @@
-"""CommonRoad scenarios: obstacles as objects, and files that nobody vouches for."""
+"""CommonRoad scenarios: obstacles as objects, and untrusted files."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_a_scenario_of_standing_obstacles_is_one_sample(write: Write) -> None:
     assert found.objects["7"].yaw is None
 
 
-def test_the_older_way_to_write_obstacles(write: Write) -> None:
+def test_obstacles_of_older_versions_are_read(write: Write) -> None:
     moving = car(1, state(0), state(1), kind="obstacle", inside="<role>dynamic</role>")
     standing = car(2, state(0), kind="obstacle", inside="<role>static</role>")
     assert [sorted(sample.objects) for sample in samples(write(scenario(moving, standing)))] == [
@@ -128,7 +128,7 @@ def test_what_is_not_exact_is_uncertain(write: Write) -> None:
     assert anyhow.yaw is None
 
 
-def test_what_nobody_knows_is_unknown(write: Write) -> None:
+def test_what_a_scenario_leaves_open_is_unknown(write: Write) -> None:
     occupancy = (
         f"<occupancySet><occupancy><shape>{BOX}</shape><time>{exact(1)}</time></occupancy></occupancySet>"
     )
@@ -156,13 +156,13 @@ def test_an_occupancy_is_an_outline_that_the_obstacle_is_within(write: Write) ->
 
 
 @pytest.mark.parametrize(
-    ("bad", "told"),
+    ("bad", "reported"),
     [
         (car(2, state(1), state(2)).replace('id="2"', ""), "id is ''; give each obstacle one of its own"),
         (car(1, state(1)), "id is '1'"),
         (car(2, state(1)).replace("<shape>", "<form>").replace("</shape>", "</form>"), "no <shape>"),
         (car(2, state(1), shape=""), "<shape> is empty"),
-        (car(2, state(1), shape="<sphere/>"), "<sphere> is no shape"),
+        (car(2, state(1), shape="<sphere/>"), "<sphere> is not a shape"),
         (car(2, state(1), shape="<circle><radius>-1</radius></circle>"), "radius is -1"),
         (car(2, state(1), shape="<polygon/>"), "no <point>"),
         (car(2, kind="staticObstacle"), "no <initialState>"),
@@ -179,18 +179,18 @@ def test_an_occupancy_is_an_outline_that_the_obstacle_is_within(write: Write) ->
         ),
     ],
 )
-def test_what_makes_no_sense_is_told(write: Write, bad: str, told: str) -> None:
+def test_an_impossible_obstacle_is_reported(write: Write, bad: str, reported: str) -> None:
     path = write(scenario(car(1, state(0), state(1), state(2)), bad))
     trace = read_trace(path, allow_damage=True)
     assert len(trace) == 3
     (fault,) = trace.faults
     assert fault.startswith("scenario.xml:4: ")
-    assert told in fault
+    assert reported in fault
     with pytest.raises(LogError, match=r"scenario\.xml:4: "):
         read_trace(path)
 
 
-def test_an_outline_that_makes_none_is_told(write: Write) -> None:
+def test_an_impossible_outline_is_reported(write: Write) -> None:
     crossing = f"<polygon>{point(0, 0)}{point(2, 2)}{point(2, 0)}{point(0, 1)}</polygon>"
     with pytest.raises(LogError, match=r"holds no sample: .*time step 0: .*cross"):
         read_trace(write(scenario(car(1, state(0), shape=crossing))))
@@ -205,7 +205,7 @@ OUTSIDE = (
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         (BOMB, "document type"),
         (OUTSIDE, "document type"),
@@ -220,8 +220,8 @@ OUTSIDE = (
         ('<commonRoad timeStepSize="0.1"><obstacle>' + "<a/>" * 500_002, "more than 500000 elements"),
     ],
 )
-def test_files_that_are_refused(write: Write, text: str, told: str) -> None:
-    with pytest.raises(LogError, match=told):
+def test_a_file_that_cannot_be_trusted_is_refused(write: Write, text: str, reported: str) -> None:
+    with pytest.raises(LogError, match=reported):
         read_trace(write(text))
 
 
@@ -238,7 +238,7 @@ def test_what_comes_before_the_damage_is_read(write: Write) -> None:
     assert fault.startswith("scenario.xml:4: the XML is broken")
 
 
-def test_damage_anywhere_is_told_or_harmless(write: Write) -> None:
+def test_damage_anywhere_is_reported_or_harmless(write: Write) -> None:
     """Cut or changed anywhere, a file gives what can be read and says what cannot, or is refused."""
     content = scenario(car(1, state(0), state(1)), car(2, state(0), state(1), shape=BOX + BOX)).encode()
     chance = random.Random(7)
@@ -255,7 +255,7 @@ def test_damage_anywhere_is_told_or_harmless(write: Write) -> None:
         assert trace.names or trace.faults
 
 
-def test_published_scenarios(data_folder: Path) -> None:
+def test_published_scenarios_are_read(data_folder: Path) -> None:
     folder = data_folder / "commonroad"
     source = open_source(folder / "ZAM_Tutorial-1_2_T-1.xml")
     assert source.kind == "CommonRoad scenario"

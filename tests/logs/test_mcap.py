@@ -69,7 +69,7 @@ def log(tmp_path):
     return write
 
 
-def test_the_stock_reader_finds_everything():
+def test_the_mcap_library_reads_everything():
     trace = moving_cup(10)
     reader = make_reader(io.BytesIO(log_of(trace)), decoder_factories=[DecoderFactory()], validate_crcs=True)
     decoded = [(message.log_time, states) for _, _, message, states in reader.iter_decoded_messages()]
@@ -140,7 +140,7 @@ def test_a_log_that_fails_midway_raises_once():
         writer.flush()
 
 
-def test_truncated_anywhere_it_gives_a_prefix(log):
+def test_a_log_truncated_anywhere_gives_a_prefix(log):
     trace = moving_cup(5)
     content = log_of(trace)
     lengths = []
@@ -211,7 +211,7 @@ def test_an_index_lets_a_window_skip_the_rest(log):
     assert not part.faults
 
 
-def test_messages_are_handed_over_as_they_were_but_for_derived_ones(log):
+def test_all_messages_but_derived_ones_are_copied_as_they_are(log):
     trace = moving_cup(3)
     camera = Channel("/camera", "json", None)
     derived = Channel(ROBUSTNESS, "json", None)
@@ -243,7 +243,7 @@ def test_samples_of_other_writers_are_read(log):
 
 
 @pytest.mark.parametrize("use_chunking", [True, False])
-def test_a_log_by_the_stock_writer_is_read(log, use_chunking):
+def test_a_log_by_the_mcap_library_is_read(log, use_chunking):
     trace = moving_cup(50)
     stream = io.BytesIO()
     writer = Writer(stream, chunk_size=1000, use_chunking=use_chunking)
@@ -273,7 +273,7 @@ def test_times_that_repeat_or_disagree_are_faults(log):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "reported"),
     [
         (lambda m: m.objects[0].parts[0].coordinates.append(1), "odd number"),
         (lambda m: m.objects[0].parts[0].ClearField("coordinates"), "without vertices"),
@@ -290,7 +290,7 @@ def test_times_that_repeat_or_disagree_are_faults(log):
         ),
     ],
 )
-def test_messages_that_make_no_sample_are_faults(log, change, told):
+def test_a_message_that_is_not_a_sample_is_a_fault(log, change, reported):
     trace = moving_cup(3)
     payloads = encode_objects(trace)
     message = ObjectStates.FromString(payloads[1])
@@ -303,14 +303,14 @@ def test_messages_that_make_no_sample_are_faults(log, change, told):
     assert part == trace.take(np.array([0, 2]))
     (fault,) = part.faults
     assert fault.startswith("run.mcap: sample at 400000000 ns: ")
-    assert told in fault
+    assert reported in fault
 
 
-def test_bytes_that_are_no_message_are_a_fault(log):
+def test_bytes_that_are_not_a_message_are_a_fault(log):
     stream = io.BytesIO()
     with LogWriter(stream) as writer:
         writer.write_messages(messages(SAMPLES, [0, 1], [*encode_objects(moving_cup(1)), b"\xff\xff"]))
-    assert "no ObjectStates" in read_trace(log(stream.getvalue()), allow_damage=True).faults[0]
+    assert "not an ObjectStates" in read_trace(log(stream.getvalue()), allow_damage=True).faults[0]
 
 
 def test_a_log_without_samples_says_what_it_has(log):
@@ -319,7 +319,7 @@ def test_a_log_without_samples_says_what_it_has(log):
         writer.write_messages(messages(Channel("/tf", "cdr", None), [0], [b""]))
     with pytest.raises(UsageError, match=r"no topic '/spatial/objects' in run\.mcap; it has '/tf'"):
         read_trace(log(stream.getvalue()))
-    # of a damaged one nobody knows what it had
+    # the content of a damaged one is unknown
     with pytest.raises(LogError, match=r"it has '/tf': run\.mcap: .*without its index"):
         read_trace(log(stream.getvalue()[:-30]))
     with pytest.raises(LogError, match="no message"):
@@ -352,7 +352,7 @@ def test_a_topic_with_messages_of_another_kind_is_an_error(log):
         read_trace(log(stream.getvalue()))
 
 
-def test_info_tells_what_is_in_a_log(log):
+def test_a_summary_lists_what_a_log_holds(log):
     content = log_of(moving_cup(8), messages(Channel("/tf", "cdr", None), [5, 6], [b"", b""]))
     path = log(content)
     whole = summarise_mcap(McapSource(path))

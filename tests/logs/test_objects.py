@@ -38,25 +38,25 @@ def motley():
     return Trace.from_samples(samples)
 
 
-def test_samples_may_all_have_a_layout_of_their_own(motley):
+def test_every_sample_may_have_its_own_layout(motley):
     assert decode_objects(encode_objects(motley), motley.times_ns) == (motley, [])
 
 
 @pytest.mark.parametrize(
-    ("extra", "told"),
+    ("extra", "reported"),
     [
         (ObjectStates(time_ns=150), None),
         (ObjectStates(time_ns=3), "time_ns is 3"),
-        (b"\x12\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff", "no ObjectStates"),
-        (b"\x12\x02\xff\xff", "no ObjectStates"),
-        (b"\x12\x80", "no ObjectStates"),
-        (b"\x09\x00", "no ObjectStates"),
+        (b"\x12\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff", "not an ObjectStates"),
+        (b"\x12\x02\xff\xff", "not an ObjectStates"),
+        (b"\x12\x80", "not an ObjectStates"),
+        (b"\x09\x00", "not an ObjectStates"),
         (ObjectStates(signals=[{"name": "u"}, {"name": "u"}]), "signal"),
         (ObjectStates(objects=[{}]), "no name"),
         (b"\xa2\x06\x01x", None),
     ],
 )
-def test_what_is_appended_to_one_message_concerns_it_alone(motley, extra, told):
+def test_bytes_appended_to_one_message_affect_only_that_message(motley, extra, reported):
     """Among messages of one layout or of many; a message may come in pieces, and the last one counts."""
     uniform = Trace.from_samples(
         Sample(i, {"a": Footprint.box(i, 0, i + 1, 1)}, {"u": 1.0, "v": 2.0, "w": 3.0}) for i in range(200)
@@ -65,16 +65,16 @@ def test_what_is_appended_to_one_message_concerns_it_alone(motley, extra, told):
         payloads = encode_objects(trace)
         payloads[150] += extra if isinstance(extra, bytes) else extra.SerializeToString()
         decoded, faults = decode_objects(payloads, trace.times_ns)
-        if told is None:
+        if reported is None:
             assert (decoded, faults) == (trace, [])
         else:
             assert decoded == trace.take(np.delete(np.arange(200), 150))
             (fault,) = faults
             assert fault.startswith("sample at 150 ns: ")
-            assert told in fault
+            assert reported in fault
 
 
-def test_a_message_without_time_among_many(motley):
+def test_a_message_without_time_among_many_is_a_fault(motley):
     payloads = encode_objects(motley)
     message = ObjectStates.FromString(payloads[42])
     message.ClearField("time_ns")

@@ -1,4 +1,4 @@
-"""Outputs: they appear when they are whole, and only their own errors are told as theirs."""
+"""Output files appear when they are complete, and only their own errors are output errors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from spatial_replay.errors import OutputError, UsageError
 from spatial_replay.logs.output_file import open_output, refuse_inputs, replacing
 
 
-def test_an_output_appears_when_it_is_whole(tmp_path: Path) -> None:
+def test_an_output_appears_when_it_is_complete(tmp_path: Path) -> None:
     output = tmp_path / "out"
     with replacing(output) as stream:
         stream.write(b"whole")
@@ -19,7 +19,7 @@ def test_an_output_appears_when_it_is_whole(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [output]
 
 
-def test_an_error_of_the_block_is_not_the_output_s_and_changes_nothing(tmp_path: Path) -> None:
+def test_an_error_of_the_block_is_not_an_output_error(tmp_path: Path) -> None:
     output = tmp_path / "out"
     output.write_bytes(b"before")
     with pytest.raises(FileNotFoundError, match="absent"), replacing(output) as stream:
@@ -31,7 +31,7 @@ def test_an_error_of_the_block_is_not_the_output_s_and_changes_nothing(tmp_path:
 
 @pytest.mark.parametrize("size", [1, 1 << 22], ids=["when it is closed", "while it is written"])
 @pytest.mark.parametrize("opened", [replacing, open_output])
-def test_a_full_disk_is_the_output_s_error(opened: type, size: int) -> None:
+def test_a_full_disk_is_an_output_error_from_any_writer(opened: type, size: int) -> None:
     full = Path("/dev/full")
     if not full.is_char_device():
         pytest.skip("no /dev/full here")
@@ -42,7 +42,7 @@ def test_a_full_disk_is_the_output_s_error(opened: type, size: int) -> None:
         stream.write(bytes(size))
 
 
-def test_what_cannot_be_opened_is_the_output_s_error(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_opened_is_an_output_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="absent/out could not be written: "):
         open_output(tmp_path / "absent" / "out")
 

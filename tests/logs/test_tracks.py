@@ -1,4 +1,4 @@
-"""Track files: what is read, and what a reader is told about the rest."""
+"""Track files: what is read, and what is reported about the rest."""
 
 from __future__ import annotations
 
@@ -59,9 +59,9 @@ def test_a_sample_says_everything_about_an_object(jsonl):
 
 
 @pytest.mark.parametrize(
-    ("bad", "told"),
+    ("bad", "reported"),
     [
-        ("{", "no JSON"),
+        ("{", "not JSON"),
         ("[" * 100_000, "nested too deeply"),
         ("[1]", "a list"),
         (line(1.5), "time_ns is 1.5"),
@@ -95,13 +95,13 @@ def test_a_sample_says_everything_about_an_object(jsonl):
         (line(1, signals=[1]), "signals are a list"),
     ],
 )
-def test_a_line_that_is_no_sample_is_left_out_and_told(jsonl, bad, told):
+def test_a_line_that_is_not_a_sample_is_left_out_and_reported(jsonl, bad, reported):
     path = jsonl(line(0, cup()), bad, line(9, cup()))
     trace = read_trace(path, allow_damage=True)
     assert trace.times_ns.tolist() == [0, 9]
     (fault,) = trace.faults
     assert fault.startswith("run.jsonl:2: ")
-    assert told in fault
+    assert reported in fault
     with pytest.raises(LogError, match=r"run\.jsonl:2: "):
         read_trace(path)
 
@@ -155,7 +155,7 @@ def test_a_truncated_gzip_file_gives_what_came_before(tmp_path):
     assert "breaks off" in trace.faults[-1]
 
 
-def test_gzip_is_told_by_content(tmp_path):
+def test_gzip_is_recognised_by_content(tmp_path):
     path = tmp_path / "run.jsonl"
     path.write_bytes(gzip.compress(line(0, cup()).encode()))
     assert len(read_trace(path)) == 1
@@ -189,7 +189,7 @@ def test_a_file_without_a_sample_is_an_error(tmp_path, jsonl):
         open_source(empty)
     other = tmp_path / "picture.png"
     other.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
-    with pytest.raises(LogError, match=r"no log that can be read"):
+    with pytest.raises(LogError, match=r"not a log in a known format"):
         open_source(other)
     with pytest.raises(LogError, match=r"holds no sample: run\.jsonl:1"):
         read_trace(jsonl('{"a": 1}'))
@@ -252,23 +252,23 @@ def test_columns_of_a_csv_come_in_any_order(csv):
 
 
 @pytest.mark.parametrize(
-    ("bad", "told"),
+    ("bad", "reported"),
     [
         ("5,car", "2 cells"),
         ("5,car,vehicle,1,2,0,-4,2", "at least 0"),
         ("5,,vehicle,1,2,0,4,2", "name is empty"),
         ("5,car,vehicle,one,2,0,4,2", "x is 'one'"),
         ("-5,car,vehicle,1,2,0,4,2", "time_ns is '-5'"),
-        ('5,"car,vehicle,1,2,0,4,2', "no CSV"),
+        ('5,"car,vehicle,1,2,0,4,2', "not CSV"),
     ],
 )
-def test_a_csv_line_that_is_no_object_costs_its_sample(csv, bad, told):
+def test_a_csv_line_that_is_not_an_object_costs_its_sample(csv, bad, reported):
     path = csv(HEADER, "0,car,vehicle,1,2,0,4,2", bad, "9,car,vehicle,1,2,0,4,2")
     trace = read_trace(path, allow_damage=True)
     assert trace.times_ns.tolist() == [0, 9]
     (fault,) = trace.faults
     assert fault.startswith("run.csv:3: ")
-    assert told in fault
+    assert reported in fault
 
 
 def test_a_csv_number_may_be_unknown(csv):
@@ -282,6 +282,6 @@ def test_a_csv_without_its_columns_is_an_error(csv):
 
 
 @pytest.mark.parametrize("given", [None, 3, [Footprint.box(0, 0, 1, 1)]])
-def test_something_else_than_a_path_is_refused(given):
+def test_a_value_that_is_not_a_path_is_refused(given):
     with pytest.raises(UsageError, match=r"^path is .*; give the path of a log; Trace\.from_samples"):
         read_trace(given)

@@ -1,4 +1,4 @@
-"""A look through logs of messages by others: what is found, and how much of it is looked at."""
+"""Surveys of external logs: what they report, and how much they decode."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_topics_are_counted_and_timed(log: Write) -> None:
 
 
 @pytest.mark.parametrize("whole", [True, False])
-def test_objects_that_appear_later_are_found(log: Write, whole: bool) -> None:
+def test_objects_that_appear_later_are_listed(log: Write, whole: bool) -> None:
     found = survey(log({"/tags": [{"tags": []}] * 300 + [{"tags": [TAG]}] * 800}), whole=whole)
     (topic,) = parse_mapping(found.mapping).topics
     assert (topic.objects, topic.name) == ("tags[*]", "tag{id}")
@@ -76,13 +76,13 @@ def test_large_messages_are_looked_at_once(log: Write) -> None:
     assert [each.topic for each in parse_mapping(found.mapping).topics] == ["/pose"]
 
 
-def test_messages_that_cannot_be_decoded_are_told(log: Write) -> None:
+def test_messages_that_cannot_be_decoded_are_remarks(log: Write) -> None:
     found = survey(log({"/a": [{"x": 1.0, "y": 2.0}], "/list": [[1, 2]]}))
     assert [each.messages for each in found.topics] == [1, 1]
     assert all("'/list'" in remark for remark in found.remarks)
 
 
-def test_a_later_message_that_cannot_be_decoded_is_told_once(tmp_path: Path) -> None:
+def test_a_later_message_that_cannot_be_decoded_is_remarked_once(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -102,7 +102,7 @@ def test_a_later_message_that_cannot_be_decoded_is_told_once(tmp_path: Path) -> 
     assert all(remark.count("topic '/b': ") <= 1 for remark in survey(reader).remarks)
 
 
-def test_logs_that_name_their_objects_need_no_look(tmp_path: Path) -> None:
+def test_logs_that_name_their_objects_need_no_survey(tmp_path: Path) -> None:
     tracks = tmp_path / "run.jsonl"
     tracks.write_text('{"time_ns": 0}\n')
     assert messages_in(tracks) is None

@@ -1,4 +1,4 @@
-"""Logs of messages as sources of samples, whatever they are kept in."""
+"""Logs of messages as sources of samples, in every container."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def hash_of(trace: Trace) -> str:
     return samples.hexdigest()
 
 
-def test_a_drive_is_the_same_whatever_it_is_kept_in(tmp_path: Path, mapping: Path) -> None:
+def test_a_drive_is_the_same_in_every_container(tmp_path: Path, mapping: Path) -> None:
     sent = drive()
     parts = [
         write_ros2(tmp_path / f"part{index}", sent[begin : begin + 90]) for index, begin in enumerate((0, 90))
@@ -252,7 +252,7 @@ def test_a_mapped_topic_that_cannot_be_decoded_is_damage(
     assert "topic '/a'" in capsys.readouterr().err
 
 
-def test_messages_that_cannot_be_decoded_are_told_one_by_one(tmp_path: Path, mapping: Path) -> None:
+def test_messages_that_cannot_be_decoded_are_reported_one_by_one(tmp_path: Path, mapping: Path) -> None:
     good = b'{"x": 1, "y": 2}'
     log = write_mcap(
         tmp_path / "a.mcap",
@@ -266,13 +266,13 @@ def test_messages_that_cannot_be_decoded_are_told_one_by_one(tmp_path: Path, map
     trace = read_trace(log, mapping=mapping, allow_damage=True)
     assert len(trace) >= 8
     assert len(trace.faults) == 2
-    assert all("no JSON" in fault for fault in trace.faults)
+    assert all("not JSON" in fault for fault in trace.faults)
 
 
-def test_any_damage_ends_in_a_report(
+def test_any_damage_is_reported_without_a_traceback(
     tmp_path: Path, mapping: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Never in a traceback; what is told about is code 3."""
+    """Not in a traceback; reported damage is exit code 3."""
     (tmp_path / "near.spatial").write_text("G (a dist b <= 100)")
     randomly = random.Random(4)
     logs = [
@@ -324,7 +324,7 @@ def test_a_clock_that_jumps_back_is_refused_or_ends_the_log(
     assert first == read_trace(write_ros2(tmp_path / "once", drive(60)), mapping=mapping)
 
 
-def test_a_jump_in_a_later_part_of_a_split_bag_is_seen(tmp_path: Path, mapping: Path) -> None:
+def test_a_jump_in_a_later_part_of_a_split_bag_is_detected(tmp_path: Path, mapping: Path) -> None:
     sent = restarted()
     cuts = (0, 90, 210, len(sent))
     parts = [

@@ -45,12 +45,12 @@ def test_a_definition_that_makes_too_much_code_is_refused(text: str) -> None:
         idl("") + "// " + "x" * 2**17,
     ],
 )
-def test_a_definition_in_idl_that_takes_long_to_parse_is_refused(text: str) -> None:
+def test_an_idl_definition_that_takes_long_to_parse_is_refused(text: str) -> None:
     with pytest.raises(LogError, match=r"are (not )?read"):
         decoder_of(Topic("/a", "p/msg/T", "cdr", schema=Schema("p/msg/T", "ros2idl", text.encode())))
 
 
-def test_comments_and_texts_in_idl_may_hold_parentheses() -> None:
+def test_comments_and_strings_in_idl_may_hold_parentheses() -> None:
     text = idl('// ((\n @verbatim (language="comment", text="in m ((up))") sequence<string<9>, 4> s; // ((\n')
     topic = Topic("/a", "p/msg/T", "cdr", schema=Schema("p/msg/T", "ros2idl", text.encode()))
     assert decoder_of(topic) is not None

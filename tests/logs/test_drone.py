@@ -1,4 +1,4 @@
-"""Annotations of drone videos: what is read of them, and what a reader is told about the rest."""
+"""Annotations of drone videos: what is read, and what is reported about the rest."""
 
 from __future__ import annotations
 
@@ -58,28 +58,28 @@ def test_files_are_ordered_by_object_and_samples_by_time(annotations: Write) -> 
 
 
 @pytest.mark.parametrize(("rate", "second_ns"), [(25, 40_000_000), (29.97, 33_366_700), (0.1, 10**10)])
-def test_the_rate_may_be_another(annotations: Write, rate: float, second_ns: int) -> None:
+def test_another_rate_scales_the_times(annotations: Write, rate: float, second_ns: int) -> None:
     assert read_trace(annotations(row(0, 0), row(0, 1)), rate=rate).times_ns.tolist() == [0, second_ns]
 
 
 @pytest.mark.parametrize("rate", [0, -1, float("nan"), float("inf"), 1e10, "30"])
-def test_a_rate_that_is_none_is_refused(annotations: Write, rate: float) -> None:
+def test_an_impossible_rate_is_refused(annotations: Write, rate: float) -> None:
     with pytest.raises(UsageError, match="frames a second"):
         read_trace(annotations(row(0, 0)), rate=rate)
 
 
-def test_lost_rows_are_dropped_or_kept_and_their_frame_stays(annotations: Write) -> None:
+def test_the_frame_of_lost_rows_stays(annotations: Write) -> None:
     path = annotations(row(0, 0), row(0, 1, flags="1 0 0"), row(0, 2, flags="0 1 1"))
-    dropped, kept = read_trace(path), read_trace(path, lost="keep")
-    assert len(dropped) == len(kept) == 3
+    dropped, with_lost = read_trace(path), read_trace(path, lost="keep")
+    assert len(dropped) == len(with_lost) == 3
     assert dropped.rows[:, 0].tolist() == [0, -1, 1]
-    assert (kept.rows >= 0).all()
+    assert (with_lost.rows >= 0).all()
     with pytest.raises(UsageError, match="drop, keep"):
         read_trace(path, lost="maybe")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
-    ("bad", "told"),
+    ("bad", "reported"),
     [
         (row("x", 1), "id is 'x'"),
         (row(-1, 1), "id is '-1'"),
@@ -89,13 +89,13 @@ def test_lost_rows_are_dropped_or_kept_and_their_frame_stays(annotations: Write)
         (row(1, 1, flags="2 0 0"), "lost is '2'"),
     ],
 )
-def test_a_bad_row_costs_its_frame(annotations: Write, bad: str, told: str) -> None:
+def test_a_bad_row_costs_its_frame(annotations: Write, bad: str, reported: str) -> None:
     path = annotations(row(0, 0), row(0, 1), row(0, 2), bad)
     trace = read_trace(path, allow_damage=True)
     assert trace.times_ns.tolist() == [0, 66_666_667]
     (fault,) = trace.faults
     assert fault.startswith("annotations.txt:4: ")
-    assert told in fault
+    assert reported in fault
     assert fault.endswith("frame 1 is left out")
     with pytest.raises(LogError, match=r"annotations\.txt:4"):
         read_trace(path)
@@ -104,7 +104,7 @@ def test_a_bad_row_costs_its_frame(annotations: Write, bad: str, told: str) -> N
 @pytest.mark.parametrize(
     "bad", ["", "hello", row(1, "x"), row(1, -1), row(1, "1" * 25), row(1, "1.5"), "0 0 0 0 0 0"]
 )
-def test_a_row_of_no_frame_costs_itself(annotations: Write, bad: str) -> None:
+def test_a_row_without_a_frame_costs_only_itself(annotations: Write, bad: str) -> None:
     trace = read_trace(annotations(row(0, 0), bad, row(0, 1)), allow_damage=True)
     assert len(trace) == 2
     assert len(trace.faults) == (bad != "")
@@ -122,12 +122,12 @@ def test_numbers_that_are_not_known_make_the_object_unknown(annotations: Write) 
     assert (trace.unreadable_count, trace.faults) == (1, ())
 
 
-def test_annotations_are_told_by_content(annotations: Write, tmp_path: Path) -> None:
+def test_annotations_are_recognised_by_content(annotations: Write, tmp_path: Path) -> None:
     packed = tmp_path / "video.csv"
     packed.write_bytes(gzip.compress((row(0, 0) + "\n").encode()))
     assert len(read_trace(packed)) == 1
     assert open_source(annotations("damaged", row(0, 0))).kind == "drone annotations"
-    with pytest.raises(LogError, match="no log that can be read"):
+    with pytest.raises(LogError, match="not a log in a known format"):
         open_source(annotations("0 0 0 0 0 0 0 0 0", "a b c d e f g h i j"))
 
 
@@ -141,7 +141,7 @@ def test_options_of_other_formats_are_refused(annotations: Write, tmp_path: Path
             open_source(tracks, **options)  # type: ignore[arg-type]
 
 
-def test_blocks_and_windows(annotations: Write) -> None:
+def test_blocks_are_bounded_and_windows_are_exact(annotations: Write) -> None:
     path = annotations(*(row(frame // 5000, frame) for frame in range(20_000)))
     blocks = [block.trace for block in open_source(path, rate=1000).iter_blocks()]
     assert max(map(len, blocks)) <= BLOCK_SAMPLES
@@ -150,7 +150,7 @@ def test_blocks_and_windows(annotations: Write) -> None:
     assert window.times_ns.tolist() == list(range(10**7, 3 * 10**7, 10**6))
 
 
-def test_a_recording_says_how_they_were_read(annotations: Write, tmp_path: Path) -> None:
+def test_a_recording_says_how_annotations_were_read(annotations: Write, tmp_path: Path) -> None:
     log = tmp_path / "run.mcap"
     path = annotations(row(0, 0), row(0, 1, flags="1 0 0"))
     record_source(open_source(path, rate=25, lost="keep"), log)
@@ -161,14 +161,14 @@ def test_a_recording_says_how_they_were_read(annotations: Write, tmp_path: Path)
 
 def test_the_dataset_is_read_whole(data_folder: Path) -> None:
     path = data_folder / "sdd" / "quad_video1_annotations.txt"
-    trace, kept = read_trace(path), read_trace(path, lost="keep")
+    trace, with_lost = read_trace(path), read_trace(path, lost="keep")
     assert (len(trace), len(trace.names), trace.classes) == (509, 17, ("Biker", "Pedestrian"))
-    assert np.count_nonzero(kept.rows >= 0) == 7153
+    assert np.count_nonzero(with_lost.rows >= 0) == 7153
     assert np.count_nonzero(trace.rows >= 0) == 7153 - 949
 
 
 @pytest.mark.parametrize("name", ["close_dist15", "ovlp", "respond_dist", "F60_notovlp"])
-def test_published_values_over_the_dataset(data_folder: Path, name: str) -> None:
+def test_published_values_over_the_dataset_are_reproduced(data_folder: Path, name: str) -> None:
     """Every object as ego, against the union of all others in view, on each prefix that was published."""
     published = json.loads((data_folder / "sdd" / "quad1_0_200.json").read_text())
     formula = published["specs"][name].replace("others", "(anyone except ego)")
@@ -184,7 +184,7 @@ def test_published_values_over_the_dataset(data_folder: Path, name: str) -> None
         np.testing.assert_allclose(found[ego][samples], list(values.values()), atol=1e-6, err_msg=ego)
 
 
-def test_damage_anywhere_is_told_or_harmless(annotations: Write) -> None:
+def test_damage_anywhere_is_reported_or_harmless(annotations: Write) -> None:
     """Changed anywhere, a file gives the frames that can be read and says which cannot, or is refused."""
     path = annotations(
         *(row(number, frame, f"{frame} 0 {frame + 9} 20") for number in (1, 2) for frame in range(9))
