@@ -193,11 +193,11 @@ def _check_idl(text: str, type_name: str) -> None:
     if len(text) > _LONGEST_IDL:
         what = f"has {len(text)} characters; at most {_LONGEST_IDL} are read"
     elif "<<" in bare:
-        what = "shifts numbers; that is not read"
+        what = "shifts numbers; shifts are not read"
     elif bare.count("(") > len(_IDL_ANNOTATION.findall(bare)):
-        what = "has parentheses outside annotations, or nested ones; that is not read"
+        what = "has parentheses outside annotations, or nested ones; they are not read"
     elif _IDL_NESTED_TYPE.search(bare):
-        what = "nests types deeply; that is not read"
+        what = "nests types deeply; such types are not read"
     elif bare.count("@") > _MOST_ANNOTATIONS:
         what = f"has {bare.count('@')} annotations; at most {_MOST_ANNOTATIONS} are read"
     if what is not None:

@@ -174,7 +174,7 @@ def test_a_recorder_that_was_killed_leaves_files_without_metadata(tmp_path: Path
     [
         ("message_count: 60", "message_count: 61", "declares 61 messages on '/a'; 60 could be read"),
         ("message_count: 60", "message_count: many", "the message_count of topic '/a' is 'many'"),
-        (POINT, "a/msg/B", "says that '/a' has messages of 'a/msg/B'; they are of 'geometry_msgs/msg/Point'"),
+        (POINT, "a/msg/B", "declares messages of 'a/msg/B' on '/a'; they are of 'geometry_msgs/msg/Point'"),
         ("drive.mcap", "../drive.mcap", None),
         ("drive.mcap", "gone.mcap", "its file 'gone.mcap' is missing"),
         ("rosbag2_bagfile_information", "a", "'topics_with_message_count' in it is not a list"),
