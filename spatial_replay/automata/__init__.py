@@ -1,1 +1,40 @@
-"""Specifications as automata: which runs satisfy them, and what is still to be done or to be avoided."""
+"""Specifications as automata: which runs satisfy them, and what must still happen or be avoided.
+
+`spatial_replay.automaton` compiles one; this package has what goes with it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from spatial_replay.lazy import loaded_when_used
+
+if TYPE_CHECKING:
+    from spatial_replay.automata.automaton import TransitionTable
+    from spatial_replay.automata.compile import Compiler, automaton_from, chosen_spec, stored_text
+    from spatial_replay.automata.dot_hoa import dot_text, hoa_text, svg_text, words_text
+    from spatial_replay.automata.guards import Transition
+
+__all__ = [
+    "Compiler",
+    "Transition",
+    "TransitionTable",
+    "automaton_from",
+    "chosen_spec",
+    "dot_text",
+    "hoa_text",
+    "stored_text",
+    "svg_text",
+    "words_text",
+]
+
+_HOMES = {
+    **dict.fromkeys(("Compiler", "automaton_from", "chosen_spec", "stored_text"), "compile"),
+    **dict.fromkeys(("dot_text", "hoa_text", "svg_text", "words_text"), "dot_hoa"),
+    "Transition": "guards",
+    "TransitionTable": "automaton",
+}
+
+__getattr__, __dir__ = loaded_when_used(
+    globals(), {name: f"spatial_replay.automata.{home}" for name, home in _HOMES.items()}
+)

@@ -1,14 +1,11 @@
-"""The automaton of a specification, as a value.
-
-Runs of an automaton over many samples at once.
-"""
+"""The automaton of a specification: a frozen value, and its runs over many samples at once."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,19 +68,9 @@ class Automaton(Displayed):
 
         Raises:
             NoAutomatonError: finding them takes more than `MAX_VISITS`, or their guards too many cubes; never
-                of what `automaton` gives.
+                for an automaton from `automaton()`, which checks that.
         """
         return transitions_of(self._moves, self.successors)
-
-    def with_transitions(self) -> Self:
-        """This automaton, with transitions that are found.
-
-        Raises:
-            NoAutomatonError: as `transitions`.
-        """
-        # what finds them keeps them
-        _ = self.transitions
-        return self
 
     @cached_property
     def successors(self) -> tuple[tuple[int, ...], ...]:
@@ -106,11 +93,11 @@ class Automaton(Displayed):
 
     @cached_property
     def can_reject(self) -> frozenset[int]:
-        """The states from which a run can still end in violation; the others accept for good."""
+        """The states from which a run can still end in violation; the others accept permanently."""
         return self._leading_to(frozenset(self.states) - self.accepting)
 
     def step(self, state: int, symbol: Sequence[bool]) -> int:
-        """The state after a sample.
+        """Return the state after a sample.
 
         Args:
             symbol: for each proposition, whether it is true.
@@ -126,7 +113,7 @@ class Automaton(Displayed):
         return ~place
 
     def step_set(self, states: Collection[int], symbol: Sequence[bool | None]) -> frozenset[int]:
-        """The states that may be reached after a sample from any of some states.
+        """Return the states that may be reached after a sample from any of some states.
 
         Args:
             symbol: for each proposition, whether it is true; None where that is not known.
@@ -138,7 +125,7 @@ class Automaton(Displayed):
         for state in states:
             self._check(state, symbol)
             places.append(self.entries[state])
-        seen = set(places)
+        visited = set(places)
         reached = set()
         while places:
             place = places.pop()
@@ -148,13 +135,13 @@ class Automaton(Displayed):
             proposition, low, high = self.decisions[place]
             value = symbol[proposition]
             for after in (low, high) if value is None else (high,) if value else (low,):
-                if after not in seen:
-                    seen.add(after)
+                if after not in visited:
+                    visited.add(after)
                     places.append(after)
         return frozenset(reached)
 
     def accepts(self, symbols: Sequence[Sequence[bool]]) -> bool:
-        """Whether a run of at least one sample satisfies the formula.
+        """Return whether a run of at least one sample satisfies the formula.
 
         Raises:
             UsageError: no symbol, or one of another length.
@@ -167,15 +154,15 @@ class Automaton(Displayed):
         return state in self.accepting
 
     def transition(self, source: int, target: int) -> Transition | None:
-        """The move from one state to another, if one sample can lead there."""
+        """Return the move from one state to another, if one sample can lead there."""
         return self._transitions_by_ends.get((source, target))
 
     def paths(
         self, state: int, without: Collection[tuple[int, int]] = ()
     ) -> Iterator[tuple[Transition, ...]]:
-        """The shortest ways from a state to an accepting one, one after the other as they are asked for.
+        """Yield the shortest paths from a state to an accepting one, each worked out when it is consumed.
 
-        From an accepting state that is the empty way; there is none from a trap.
+        From an accepting state that is the empty path; there is none from a trap.
 
         Args:
             without: moves (source, target) that cannot be taken.
@@ -188,35 +175,35 @@ class Automaton(Displayed):
         distances = self._distances(self.accepting, left_out)
         if state not in distances:
             return
-        ways: list[tuple[Transition, ...]] = [()]
-        while ways:
-            way = ways.pop()
-            here = way[-1].target if way else state
+        paths: list[tuple[Transition, ...]] = [()]
+        while paths:
+            path = paths.pop()
+            here = path[-1].target if path else state
             if distances[here] == 0:
-                yield way
+                yield path
                 continue
             nearer = [
                 target
                 for target in self.successors[here]
                 if (here, target) not in left_out and distances.get(target) == distances[here] - 1
             ]
-            ways.extend((*way, self._transitions_by_ends[here, target]) for target in reversed(nearer))
+            paths.extend((*path, self._transitions_by_ends[here, target]) for target in reversed(nearer))
 
     def guard_words(self, transition: Transition) -> str:
-        """What lets a transition be taken, as a sentence of the specification language."""
+        """Return a transition's guard as a sentence of the specification language."""
         return guard_words(transition.guard, self.propositions)
 
     def _repr_svg_(self) -> str | None:
         return drawn_as_svg(self)
 
     def to_dot(self) -> str:
-        """The automaton in the language of Graphviz; see `drawing.dot_text`."""
+        """Return the automaton in the language of Graphviz; see `dot_hoa.dot_text`."""
         from spatial_replay.automata.dot_hoa import dot_text
 
         return dot_text(self)
 
     def to_hoa(self) -> str:
-        """The automaton in the Hanoi format for tools of automata theory; see `drawing.hoa_text`."""
+        """Return the automaton in the Hanoi format for tools of automata theory; see `dot_hoa.hoa_text`."""
         from spatial_replay.automata.dot_hoa import hoa_text
 
         return hoa_text(self)
@@ -230,7 +217,7 @@ class Automaton(Displayed):
         return moves_of(self.entries, self.decisions)
 
     def _distances(self, goal: Collection[int], without: Collection[tuple[int, int]] = ()) -> dict[int, int]:
-        """For each state that can reach a goal, how many samples that takes."""
+        """Return for each state that can reach a goal, how many samples that takes."""
         before: dict[int, list[int]] = {}
         for source, targets in enumerate(self.successors):
             for target in targets:
@@ -246,7 +233,7 @@ class Automaton(Displayed):
         return distances
 
     def _leading_to(self, goal: frozenset[int]) -> frozenset[int]:
-        """The states from which the end of a run can be in the goal."""
+        """Return the states from which the end of a run can be in the goal."""
         if not self.has_returns:
             goal -= {self.initial}
         return frozenset(self._distances(goal))
@@ -264,7 +251,7 @@ class Automaton(Displayed):
 
 
 def automaton_of(machine: Machine, name: str, propositions: Sequence[Proposition]) -> Automaton:
-    """The value of a machine that is `least`."""
+    """Return a machine that is `least` as a value."""
     decisions: list[tuple[int, int, int]] = []
     places: dict[int, int] = {}
 
@@ -305,12 +292,12 @@ class TransitionTable:
 
     @classmethod
     def of(cls, automaton: Automaton) -> TransitionTable:
-        """The table of an automaton."""
+        """Return the table of an automaton."""
         decisions = np.array(automaton.decisions, np.int64).reshape(-1, 3)
         return cls(np.array(automaton.entries, np.int64), decisions)
 
     def states(self, state: int, values: Flags) -> Integers:
-        """The state (T,) after each sample, where every proposition is known.
+        """Return the state (T,) after each sample, where every proposition is known.
 
         Args:
             state: that before the first sample.
@@ -321,7 +308,7 @@ class TransitionTable:
         return result
 
     def state_sets(self, states: StateSet, values: Flags) -> NDArray[np.bool_]:
-        """The states (T, S) that are possible after each sample.
+        """Return the states (T, S) that are possible after each sample.
 
         Args:
             states: (S,), those before the first sample.
@@ -346,7 +333,8 @@ def _walk(entries: Integers, decisions: Integers, state: int, values: Flags, res
 def _spread(
     entries: Integers, decisions: Integers, states: StateSet, values: Flags, result: NDArray[np.bool_]
 ) -> None:
-    seen = np.full(decisions.shape[0], -1, np.int64)
+    # the sample at which each decision was last visited: states share decisions, each is followed once
+    visited = np.full(decisions.shape[0], -1, np.int64)
     stack = np.empty(decisions.shape[0] + 2, np.int64)
     before = states
     for t in range(values.shape[1]):
@@ -362,9 +350,9 @@ def _spread(
                 if place < 0:
                     after[~place] = True
                     continue
-                if seen[place] == t:
+                if visited[place] == t:
                     continue
-                seen[place] = t
+                visited[place] = t
                 value = values[decisions[place, 0], t]
                 if value != 1:
                     stack[height] = decisions[place, 1]

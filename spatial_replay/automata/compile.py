@@ -1,6 +1,6 @@
-"""From a specification to its automaton.
+"""Compile a spec to its automaton, by this package or by MONA; read and write compiled automata.
 
-Automata as files, so that one compiled before need not be compiled again.
+MONA is slow and may not be installed where a log is replayed, so a compiled automaton can be stored.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from spatial_replay.spec.load import require_specification
 
 _VERSION = 1
 _LONGEST = 16 * 2**20
-"""Bytes of a file that is read."""
+"""Bytes of a stored automaton that are read at most."""
 
 
 def stored_text(automaton: Automaton, specification: Specification, spec: NamedSpec) -> str:
-    """An automaton as a file (JSON), with the formula that it is of."""
+    """Return an automaton as JSON, with the formula that it was compiled from."""
     return json.dumps(
         {
             "version": _VERSION,
@@ -44,7 +44,7 @@ def stored_text(automaton: Automaton, specification: Specification, spec: NamedS
 
 
 def automaton_from(data: bytes, specification: Specification, spec: NamedSpec) -> Automaton | None:
-    """The automaton of a spec out of a file; None if the file is of another formula, or is no such file."""
+    """Return the automaton of a spec from its JSON; None if that is of another formula, or is not one."""
     if len(data) > _LONGEST:
         return None
     try:
@@ -83,7 +83,7 @@ def _decisions(value: object) -> tuple[tuple[int, int, int], ...] | None:
 
 
 def _is_sound(automaton: Automaton) -> bool:
-    """Whether every decision leads on to later ones and, in the end, to states that there are."""
+    """Return whether every decision leads on to later ones and, in the end, to states that there are."""
     states, propositions = len(automaton.entries), len(automaton.propositions)
 
     def leads(place: int, rows: Sequence[tuple[int, int, int]], row: int, after: int) -> bool:
@@ -113,7 +113,7 @@ def _has_guards(automaton: Automaton) -> bool:
 
 
 Compiler: TypeAlias = Literal["own", "mona"]
-"""Who compiles: this package, or MONA."""
+"""This package, or MONA."""
 
 _NAMES: MappingProxyType[Compiler, str] = MappingProxyType({"own": "this package", "mona": "MONA"})
 
@@ -125,7 +125,7 @@ def automaton(
     compiler: Compiler | None = None,
     stored: Iterable[bytes] = (),
 ) -> Automaton:
-    """The automaton of a spec: which runs satisfy it, sample by sample.
+    """Return the automaton of a spec: which runs satisfy it, sample by sample.
 
     It accepts a run that is fully observed and has a robustness above 0, and none with one below 0.
 
@@ -160,7 +160,7 @@ def _compiled(
     compilers: Sequence[Compiler],
     stored: Iterator[Automaton],
 ) -> Automaton:
-    """The automaton of the first compiler that gives one; the first that is stored, rather than ask MONA.
+    """Return the automaton of the first compiler that succeeds; a stored one rather than calling MONA.
 
     Raises:
         NoAutomatonError: why none does.
@@ -178,20 +178,20 @@ def _compiled(
         except NoAutomatonError as error:
             reasons.append(f"{_NAMES[each]}: {error}")
         else:
-            return _kept(automaton_of(least(machine), spec.name, propositions.all))
+            return _checked(automaton_of(least(machine), spec.name, propositions.all))
     raise NoAutomatonError("; ".join(reasons))
 
 
 def _read(stored: Iterable[bytes], specification: Specification, spec: NamedSpec) -> Iterator[Automaton]:
-    """Those of files that are of a spec, read when they are asked for."""
+    """Yield those of files that are of a spec, read when they are asked for."""
     for data in stored:
         found = automaton_from(data, specification, spec)
         if found is not None:
             yield found
 
 
-def _kept(automaton: Automaton) -> Automaton:
-    """An automaton that is small enough, and knows its guards.
+def _checked(automaton: Automaton) -> Automaton:
+    """Return an automaton that is small enough, its transitions worked out.
 
     Raises:
         NoAutomatonError: it is too large.
@@ -199,11 +199,13 @@ def _kept(automaton: Automaton) -> Automaton:
     rows = max(len(automaton.entries), len(automaton.decisions))
     if rows > MAX_ROWS:
         raise NoAutomatonError(f"it takes {rows} states or decisions, at most {MAX_ROWS} are kept")
-    return automaton.with_transitions()
+    # a cached property: computed here, so that its error is raised here
+    _ = automaton.transitions
+    return automaton
 
 
 def chosen_spec(specification: Specification, name: str | None) -> NamedSpec:
-    """The spec of a file that has a name; without one, its only result.
+    """Return the spec of a file that has a name; without one, its only result.
 
     Raises:
         UsageError: no such spec, several to choose from.

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from spatial_replay.errors import NoAutomatonError
 
 LEAF = 1 << 60
-"""Stands where a leaf has no variable: after all of them."""
+"""The variable of a leaf: it orders after all others."""
 
 
 class Decision(NamedTuple):
@@ -53,19 +53,19 @@ class Diagrams:
         return self._nodes[node]
 
     def leaf(self, number: int) -> int:
-        """The node of a leaf."""
+        """Return the node of a leaf."""
         return self._add(Decision(LEAF, number, number))
 
     def decide(self, variable: int, low: int, high: int) -> int:
-        """The node that decides on a variable, which comes before those that `low` and `high` decide on."""
+        """Return the node that decides on a variable, which orders before those of `low` and `high`."""
         return low if low == high else self._add(Decision(variable, low, high))
 
     def variable(self, variable: int) -> int:
-        """Whether a variable is true."""
+        """Return the function that is true where a variable is."""
         return self._add(Decision(variable, NO, YES))
 
     def choose(self, condition: int, then: int, otherwise: int) -> int:
-        """One function where a condition holds, another where it does not."""
+        """Return the function that is `then` where a condition holds, and `otherwise` elsewhere."""
         if condition == YES or then == otherwise:
             return then
         if condition == NO:
@@ -82,19 +82,19 @@ class Diagrams:
         return result
 
     def both(self, first: int, second: int) -> int:
-        """The conjunction."""
+        """Return the conjunction."""
         return self.choose(first, second, NO)
 
     def either(self, first: int, second: int) -> int:
-        """The disjunction."""
+        """Return the disjunction."""
         return self.choose(first, YES, second)
 
     def complement(self, node: int) -> int:
-        """The negation."""
+        """Return the negation."""
         return self.choose(node, NO, YES)
 
     def branches(self, node: int, variable: int) -> tuple[int, int]:
-        """What is left of a function with a variable false, and true; none before it may matter."""
+        """Return the cofactors of a function: with a variable false, and true. None before it may matter."""
         decision = self._nodes[node]
         return decision[1:] if decision.variable == variable else (node, node)
 
@@ -111,11 +111,11 @@ class Diagrams:
 def copied(
     source: Diagrams, target: Diagrams, variables: int, leaf: Callable[[int], int]
 ) -> Callable[[int], int]:
-    """A function that copies nodes from one collection into another, with other leaves.
+    """Return a function that copies nodes from one collection into another, with other leaves.
 
     Args:
-        variables: what decides on none of the first so many counts as a leaf.
-        leaf: the number of the leaf that stands for such a node of the source.
+        variables: nodes that decide on none of the first so many variables count as leaves.
+        leaf: the number of the leaf in the target for such a node of the source.
     """
     known: dict[int, int] = {}
 

@@ -1,4 +1,4 @@
-"""Automata for people and for other tools: as text, for Graphviz, in the Hanoi format, drawn."""
+"""Automata as text: in words, for Graphviz (and drawn by it), and in the Hanoi format."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from spatial_replay.automata.automaton import Automaton
 
 _DRAWING_S = 120.0
-"""How long Graphviz may take."""
+"""Seconds that Graphviz may take."""
 _LONGEST_LABEL = 12
 """Characters of a proposition that stands on an arrow as it is."""
 _WIDTH = 20
@@ -28,7 +28,7 @@ _LEGEND_WIDTH = 100
 
 
 def words_text(automaton: Automaton) -> str:
-    """States, what they mean, and their moves in words."""
+    """Describe states, what they mean, and their moves in words."""
     lines = [f"automaton of {automaton.name}: {size_words(automaton)}"]
     lines += [f"  {each.name} means {each.text}" for each in automaton.propositions if each.name is not None]
     for state, transitions in enumerate(_by_source(automaton)):
@@ -40,32 +40,32 @@ def words_text(automaton: Automaton) -> str:
 
 
 def size_words(automaton: Automaton) -> str:
-    """How large it is: "33 states, 6 propositions"."""
+    """Return its size: "33 states, 6 propositions"."""
     return f"{counted(len(automaton.states), 'state')}, {counted(len(automaton.propositions), 'proposition')}"
 
 
 def state_words(automaton: Automaton, state: int) -> str:
-    """What a run that ends in a state is, and what it can become."""
+    """Return the verdict of a run that ends in a state, and whether it can change."""
     begins = "start, " if state == automaton.initial else ""
     if state == automaton.initial and not automaton.has_returns:
         return f"{begins}before the first sample"
     now = "accepting" if state in automaton.accepting else "not accepting"
     if state not in automaton.can_reject:
-        now = "accepting for good"
+        now = "accepting permanently"
     elif state not in automaton.can_accept:
         now = "a trap: acceptance is lost"
     return begins + now
 
 
 def state_colour(automaton: Automaton, state: int) -> str:
-    """What a state is filled with: light blue if it accepts for good, light vermillion if it is a trap."""
+    """Return a state's fill: light blue if it accepts permanently, light vermillion if it is a trap."""
     if state not in automaton.can_reject:
         return hexadecimal(light(POSITIVE))
     return "#ffffff" if state in automaton.can_accept else hexadecimal(light(NEGATIVE))
 
 
 def abbreviated(automaton: Automaton) -> Automaton:
-    """The automaton with short names for long propositions, as fit on arrows."""
+    """Return the automaton with short names for long propositions, as fit on arrows."""
     taken = {each.label for each in automaton.propositions}
     names = (name for number in range(2 * len(taken) + 1) if (name := f"p{number}") not in taken)
     return replace(
@@ -78,14 +78,14 @@ def abbreviated(automaton: Automaton) -> Automaton:
 
 
 def meanings(automaton: Automaton) -> list[str]:
-    """What the names of propositions stand for: "p0: cup leftof plate"."""
+    """Return the text of each named proposition: "p0: cup leftof plate"."""
     return [f"{each.name}: {each.text}" for each in automaton.propositions if each.name is not None]
 
 
 def dot_text(automaton: Automaton) -> str:
-    """The automaton in the language of Graphviz, with guards in words and long propositions told below.
+    """Return the automaton for Graphviz, with guards in words and long propositions in a legend.
 
-    Accepting states have a double outline; those that accept for good are blue, traps are vermillion.
+    Accepting states have a double outline; those that accept permanently are blue, traps are vermillion.
     """
     short = abbreviated(automaton)
     return _digraph(short, meanings(short))
@@ -101,8 +101,8 @@ def _digraph(automaton: Automaton, legend: Sequence[str] = ()) -> str:
         f"  start -> {automaton.initial};",
     ]
     if legend:
-        told = "".join(f"{_escaped(line)}\\l" for each in legend for line in _legend_lines(each))
-        lines.append(f'  graph [fontname="Helvetica", fontsize=11, labelloc=b, labeljust=l, label="{told}"];')
+        text = "".join(f"{_escaped(line)}\\l" for each in legend for line in _legend_lines(each))
+        lines.append(f'  graph [fontname="Helvetica", fontsize=11, labelloc=b, labeljust=l, label="{text}"];')
     for state in automaton.states:
         shape = "doublecircle" if state in automaton.accepting else "circle"
         colour = state_colour(automaton, state)
@@ -115,7 +115,7 @@ def _digraph(automaton: Automaton, legend: Sequence[str] = ()) -> str:
 
 
 def hoa_text(automaton: Automaton) -> str:
-    """The automaton in the Hanoi omega-automata format, version 1.
+    """Return the automaton in the Hanoi omega-automata format, version 1.
 
     That format is about infinite runs and has no acceptance for finite ones. So the accepting states are
     written as the acceptance set 0 of a Büchi automaton: a finite run is accepted iff it ends in a state of
@@ -142,7 +142,7 @@ def hoa_text(automaton: Automaton) -> str:
 
 
 def svg_text(automaton: Automaton) -> str:
-    """The automaton drawn by Graphviz.
+    """Return the automaton drawn by Graphviz.
 
     Raises:
         UsageError: Graphviz is not installed.
@@ -152,7 +152,7 @@ def svg_text(automaton: Automaton) -> str:
 
 
 def layout_text(automaton: Automaton) -> str:
-    """Where Graphviz puts states and arrows, without what is told below, as JSON.
+    """Return the places of states and arrows, without a legend, as JSON.
 
     Raises:
         UsageError, OutputError: as `svg_text`.
@@ -187,7 +187,7 @@ def _graphviz(automaton: Automaton, text: str, form: str) -> str:
 
 
 def _by_source(automaton: Automaton) -> list[list[Transition]]:
-    """For each state, the moves from it."""
+    """Return for each state, the moves from it."""
     moves: list[list[Transition]] = [[] for _ in automaton.states]
     for each in automaton.transitions:
         moves[each.source].append(each)
@@ -203,7 +203,7 @@ def _hoa_guard(transition: Transition) -> str:
 
 
 def _broken(text: str) -> list[str]:
-    """A sentence in lines, broken before `and` and `or`."""
+    """Return a sentence in lines, broken before `and` and `or`."""
     lines = [""]
     for word in text.split(" "):
         if word in ("and", "or") and len(lines[-1]) > _WIDTH:

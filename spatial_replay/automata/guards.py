@@ -1,6 +1,6 @@
 """The moves of an automaton: which states lead to which others, and under what guards.
 
-Guards: what lets a transition be taken, as a few cubes.
+A guard is a disjunction of few cubes, computed from the diagram of a state's moves.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ MAX_CUBES = 100_000
 
 
 class Covers:
-    """Functions as disjunctions of cubes, of which none can be left out and no literal of one.
+    """Functions as irredundant disjunctions of cubes: no cube and no literal of one can be left out.
 
-    They are those of Minato and Morreale (1992): equal functions have equal cubes.
+    The algorithm is that of Minato and Morreale (1992): equal functions have equal cubes.
     """
 
     def __init__(self, diagrams: Diagrams) -> None:
-        """Of functions that are nodes of some diagrams."""
+        """Take functions from some diagrams."""
         self._diagrams = diagrams
         self._known: dict[tuple[int, int], tuple[tuple[Cube, ...], int]] = {}
         self._cubes = 0
 
     def guard(self, node: int) -> Guard:
-        """The cubes of a function.
+        """Return the cubes of a function.
 
         Raises:
             NoAutomatonError: they, and those before, are more than `MAX_CUBES`.
@@ -56,7 +56,7 @@ class Covers:
             raise NoAutomatonError(f"the guards of the automaton take more than {MAX_CUBES} cubes")
 
     def _between(self, lower: int, upper: int) -> tuple[tuple[Cube, ...], int]:
-        """Cubes that hold at least where `lower` does and at most where `upper` does, and their function."""
+        """Return cubes that hold where `lower` does and at most where `upper` does, and their function."""
         if lower == NO:
             return (), NO
         if upper == YES:
@@ -73,6 +73,7 @@ class Covers:
         high_0, high_1 = diagrams.branches(upper, variable)
         cubes_0, covered_0 = self._between(diagrams.both(low_0, diagrams.complement(high_1)), high_0)
         cubes_1, covered_1 = self._between(diagrams.both(low_1, diagrams.complement(high_0)), high_1)
+        # what the cubes with this variable leave open is left to cubes without it
         left = diagrams.either(
             diagrams.both(low_0, diagrams.complement(covered_0)),
             diagrams.both(low_1, diagrams.complement(covered_1)),
@@ -90,7 +91,7 @@ class Covers:
 
 
 def guard_words(guard: Guard, propositions: Sequence[Proposition]) -> str:
-    """A guard as a sentence of the specification language."""
+    """Return a guard as a sentence of the specification language."""
     if guard == ((),):
         return "true"
     return " or ".join(_cube_words(cube, propositions, alone=len(guard) == 1) for cube in guard)
@@ -102,7 +103,7 @@ def _cube_words(cube: Cube, propositions: Sequence[Proposition], *, alone: bool)
 
 
 MAX_VISITS = 25_000_000
-"""How many decisions are looked at to find all moves, each for every state that it may matter to."""
+"""Decisions visited to find all moves, each once for every state that it may matter to."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,7 @@ class Moves(NamedTuple):
 
 
 def moves_of(entries: Sequence[int], decisions: Sequence[tuple[int, int, int]]) -> Moves:
-    """The moves of an automaton with such `entries` and `decisions`."""
+    """Return the moves of an automaton with such `entries` and `decisions`."""
     diagrams = Diagrams()
     nodes: list[int] = []
 
@@ -144,7 +145,7 @@ def moves_of(entries: Sequence[int], decisions: Sequence[tuple[int, int, int]]) 
 
 
 def successors_of(moves: Moves) -> tuple[tuple[int, ...], ...]:
-    """For each state, those that one sample can lead to.
+    """Return for each state, those that one sample can lead to.
 
     Raises:
         NoAutomatonError: finding them takes more than `MAX_VISITS`.
@@ -162,7 +163,7 @@ def successors_of(moves: Moves) -> tuple[tuple[int, ...], ...]:
 
 
 def transitions_of(moves: Moves, successors: Sequence[Sequence[int]]) -> tuple[Transition, ...]:
-    """All transitions, by source and target.
+    """Return all transitions, by source and target.
 
     Args:
         successors: those of the moves.
@@ -191,10 +192,10 @@ class _Leading:
         self._visits = 0
 
     def to(self, target: int, node: int) -> int:
-        """Where a node leads to a state.
+        """Return the function that is true where a node leads to a state.
 
         Raises:
-            NoAutomatonError: that, and what was asked before, takes more than `MAX_VISITS`.
+            NoAutomatonError: that, and all calls before, take more than `MAX_VISITS`.
         """
         known = self._known.setdefault(target, {})
         before = len(known)

@@ -1,6 +1,6 @@
 """The temporal skeleton of a formula: LTLf over propositions, in negation normal form, bounds unrolled.
 
-What keeps a formula from having an automaton, told with its place.
+A formula without an automaton is refused here, with the place of the operator that is to blame.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from spatial_replay.spec.formula import (
 
 
 def refuse_operators(formula: Formula, source: SourceText | None) -> None:
-    """That no operator looks back or counts seconds.
+    """Refuse operators that look back or count seconds.
 
     Raises:
         NoAutomatonError: with every operator that does.
@@ -42,12 +42,13 @@ def refuse_operators(formula: Formula, source: SourceText | None) -> None:
             message = f"`{written(node)}` counts seconds, an automaton counts samples"
             faults.append(obstacle(source, node, message, "for an automaton, bound it in samples"))
     if faults:
-        told, reasons = dict.fromkeys(map(str, faults)), dict.fromkeys(fault.reason for fault in faults)
-        raise NoAutomatonError("\n".join(told), "; ".join(reasons))
+        messages = dict.fromkeys(map(str, faults))
+        reasons = dict.fromkeys(fault.reason for fault in faults)
+        raise NoAutomatonError("\n".join(messages), "; ".join(reasons))
 
 
 def no_automaton(spec: NamedSpec, source: SourceText | None, reason: str) -> NoAutomatonError:
-    """The error for a spec that no compiler is up to; its widest window is blamed, or else all of it."""
+    """Return the error for a spec that no compiler can compile, at its widest window or at all of it."""
     place = max(_temporal(spec.formula), key=_width, default=spec.formula)
     if not _width(place):
         place = _unnamed(spec.formula)
@@ -59,7 +60,7 @@ def no_automaton(spec: NamedSpec, source: SourceText | None, reason: str) -> NoA
 def obstacle(
     source: SourceText | None, node: Formula | None, message: str, remedy: str = ""
 ) -> NoAutomatonError:
-    """The error for what stands at a node; where the source is known, with its place."""
+    """Return the error for a node, with its place if the source is known."""
     hint = f"it is evaluated all the same{'; ' if remedy else ''}{remedy}"
     if source is None or node is None:
         return NoAutomatonError(f"{message}; {hint}", message)
@@ -67,23 +68,23 @@ def obstacle(
 
 
 def written(node: Formula) -> str:
-    """An operator with its bound, as in the canonical text."""
+    """Return an operator with its bound, as in the canonical text."""
     bound = node.bound if isinstance(node, Temporal) else None
     return operator_of(node) + ("" if bound is None else format_bound(bound))
 
 
 def _temporal(formula: Formula) -> Iterator[Temporal]:
-    """Its temporal operators, in the order of the text."""
+    """Yield the temporal operators of a formula, in the order of the text."""
     return (node for _, _, node in iter_nodes(formula) if isinstance(node, Temporal))
 
 
 def _counts_seconds(bound: Bound) -> bool:
-    """Whether the bound depends on times: not if it is only this sample, or all from this one on."""
+    """Return whether the bound depends on times: not if it is only this sample, or all from this one on."""
     return bound.unit == "ns" and (bound.lower > 0 or bound.upper not in (0, None))
 
 
 def _width(node: Formula) -> int:
-    """How many samples ahead a node's bound reaches."""
+    """Return the number of samples ahead that a node's bound reaches."""
     bound = node.bound if isinstance(node, Temporal) else None
     return 0 if bound is None else bound.upper or bound.lower
 
@@ -123,8 +124,8 @@ class Skeleton:
     Attributes:
         nodes: by number.
         root: the number of the whole formula.
-        chains: for a subformula over a bounded window, the same over a window longer by one sample; with it,
-            whether it is an until, from which the longer one follows, or a release, which follows from that.
+        chains: for a subformula over a bounded window, and whether it is an until (which implies the longer
+            one) or a release (which is implied by it): the same over a window longer by one sample.
     """
 
     def __init__(
@@ -193,7 +194,7 @@ class Skeleton:
         return self._within(left, operands[-1], formula.bound, strong)
 
     def _within(self, left: int, right: int, bound: Bound | None, strong: bool) -> int:
-        """Until, or release where not `strong`, over a window."""
+        """Unroll an until, or a release where not `strong`, over a window."""
         lower, upper = (0, None) if bound is None else (bound.lower, bound.upper)
         if max(lower, upper or 0) > MAX_NODES:
             raise self._too_large()

@@ -1,4 +1,4 @@
-"""Automata as compilers give them, and the least one that accepts the same runs."""
+"""Minimisation: automata as compilers produce them, and the smallest one that accepts the same runs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Machine:
 
 
 def least(machine: Machine) -> Machine:
-    """The automaton with the fewest states, one of them, 0, for a run that has not begun.
+    """Return the automaton with the fewest states, one of them, 0, for a run that has not begun.
 
     Two machines that accept the same runs of at least one sample give equal ones: states are numbered by
     their distance from the first one. No run is empty, so that may be any state with the same moves, and one
@@ -48,10 +48,10 @@ def least(machine: Machine) -> Machine:
 
 
 def _classes(machine: Machine) -> list[int]:
-    """For each state the number of its class: which runs from it on are accepted, the empty one included.
+    """Return the class of each state: states of one class accept the same runs, the empty one included.
 
     Classes are split until the moves of all members lead to the same ones. The largest part of a class keeps
-    its number, so that few states have to be looked at again (Hopcroft, 1971).
+    its number, so that few states have to be checked again (Hopcroft, 1971).
     """
     classes = [int(accepts) for accepts in machine.accepting]
     # the members of each class, by where their moves lead to
@@ -59,23 +59,23 @@ def _classes(machine: Machine) -> list[int]:
     leading: dict[int, int] = {}
     before = _before(machine)
     diagrams = Diagrams()
-    unsure: Collection[int] = range(len(classes))
-    while unsure:
+    pending: Collection[int] = range(len(classes))
+    while pending:
         copy = _relabelled(machine, diagrams, classes)
-        for state in unsure:
+        for state in pending:
             own = parts[classes[state]]
             if state in leading:
-                _take(own, leading[state], state)
+                _remove(own, leading[state], state)
             leading[state] = copy(machine.moves[state])
             own.setdefault(leading[state], set()).add(state)
-        moved = _split(parts, classes, dict.fromkeys(classes[state] for state in unsure))
-        unsure = dict.fromkeys(source for state in moved for source in before[state])
+        moved = _split(parts, classes, dict.fromkeys(classes[state] for state in pending))
+        pending = dict.fromkeys(source for state in moved for source in before[state])
     numbers: dict[int, int] = {}
     return [numbers.setdefault(each, len(numbers)) for each in classes]
 
 
-def _take(parts: dict[int, set[int]], node: int, state: int) -> None:
-    """Take a state out of its part of a class."""
+def _remove(parts: dict[int, set[int]], node: int, state: int) -> None:
+    """Remove a state from its part of a class."""
     parts[node].remove(state)
     if not parts[node]:
         del parts[node]
@@ -97,7 +97,7 @@ def _split(parts: list[dict[int, set[int]]], classes: list[int], touched: Iterab
 
 
 def _before(machine: Machine) -> list[list[int]]:
-    """For each state those from which a sample can lead to it."""
+    """Return for each state those from which a sample can lead to it."""
     before: list[list[int]] = [[] for _ in machine.moves]
     for state, node in enumerate(machine.moves):
         for target in leaves_of(machine.diagrams, node):
@@ -106,7 +106,7 @@ def _before(machine: Machine) -> list[list[int]]:
 
 
 def _first(moves: list[int], accepting: list[bool], start: int) -> int:
-    """A state that moves as a run begins, one more if there is none."""
+    """Return a state that moves as a run begins, one more if there is none."""
     same = [state for state, node in enumerate(moves) if node == start]
     if not same:
         moves.append(start)
@@ -116,7 +116,7 @@ def _first(moves: list[int], accepting: list[bool], start: int) -> int:
 
 
 def _reachable(machine: Machine, start: int) -> list[int]:
-    """The states that a node leads to in the end: the nearer ones first, then as false comes before true."""
+    """Return the states that can be reached from a node: nearer ones first, then false before true."""
     order = dict.fromkeys(leaves_of(machine.diagrams, start))
     waiting = list(order)
     for state in waiting:
@@ -128,7 +128,7 @@ def _reachable(machine: Machine, start: int) -> list[int]:
 
 
 def _renumbered(machine: Machine, states: Sequence[int]) -> Machine:
-    """Only some states, in the order given; no move leads to another."""
+    """Return only some states, in the order given; no move leads to another."""
     numbers = {state: number for number, state in enumerate(states)}
     diagrams = Diagrams()
     copy = _relabelled(machine, diagrams, numbers)
@@ -143,25 +143,25 @@ def _renumbered(machine: Machine, states: Sequence[int]) -> Machine:
 def _relabelled(
     machine: Machine, diagrams: Diagrams, numbers: Mapping[int, int] | Sequence[int]
 ) -> Callable[[int], int]:
-    """A function that copies nodes into other diagrams, with other numbers for the states."""
+    """Return a function that copies nodes into other diagrams, with other numbers for the states."""
     return copied(machine.diagrams, diagrams, LEAF, lambda node: numbers[machine.diagrams[node].low])
 
 
 def leaves_of(diagrams: Diagrams, node: int) -> list[int]:
-    """The leaves below a node, in the order of the decisions, false before true."""
+    """Return the leaves below a node, in the order of the decisions, false before true."""
     return [diagrams[each].low for each in nodes_of(diagrams, node) if diagrams[each].variable == LEAF]
 
 
 def nodes_of(diagrams: Diagrams, node: int) -> list[int]:
-    """A node and those below it, in the order of the decisions, false before true."""
-    seen: dict[int, None] = {}
+    """Return a node and those below it, in the order of the decisions, false before true."""
+    visited: dict[int, None] = {}
     stack = [node]
     while stack:
         each = stack.pop()
-        if each in seen:
+        if each in visited:
             continue
-        seen[each] = None
+        visited[each] = None
         variable, low, high = diagrams[each]
         if variable != LEAF:
             stack += [high, low]
-    return list(seen)
+    return list(visited)

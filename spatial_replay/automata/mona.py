@@ -1,6 +1,6 @@
-"""The compiler by others: MONA, which runs as a process of its own.
+"""The external compiler: MONA, as a separate process, on programs that ltlf2dfa writes.
 
-Formulas in the language of MONA, into which ltlf2dfa translates LTLf; the only importer of ltlf2dfa.
+This is the only module that imports ltlf2dfa.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from spatial_replay.automata.minimise import Machine
 from spatial_replay.errors import NoAutomatonError
 
 _MAX_DEPTH = 220
-"""How many operators may stand within one another: ltlf2dfa recurses, and fails beyond 243."""
+"""Nested operators at most: ltlf2dfa recurses, and fails beyond 243."""
 _MAX_SIZE = 20_000
-"""How many subformulas are translated, each as often as it is written: about two seconds of work."""
+"""Subformulas translated at most, each as often as it is written: about two seconds of work."""
 
 _SIGNS: MappingProxyType[Kind, str] = MappingProxyType({"and": "&", "or": "|", "U": "U", "R": "R"})
 
 
 def require_translatable(skeleton: Skeleton) -> None:
-    """That a formula is small enough for ltlf2dfa.
+    """Refuse a formula that is too large for ltlf2dfa.
 
     Raises:
         NoAutomatonError: it is not.
@@ -48,7 +48,7 @@ def require_translatable(skeleton: Skeleton) -> None:
 
 
 def mona_program(skeleton: Skeleton) -> str:
-    """The program whose automaton accepts the runs that satisfy a formula that is small enough.
+    """Return the program whose automaton accepts the runs that satisfy a formula that is small enough.
 
     Proposition 3 is the set `P3`; one that the formula does not depend on is left out.
     """
@@ -58,7 +58,7 @@ def mona_program(skeleton: Skeleton) -> str:
 
 
 def _depth_and_size(skeleton: Skeleton) -> tuple[int, int]:
-    """How many operators stand within one another, and how many subformulas its program is made of."""
+    """Return the depth of a formula, and the number of subformulas that its program is made of."""
     depths: list[int] = []
     sizes: list[int] = []
     for node in skeleton.nodes:
@@ -69,7 +69,7 @@ def _depth_and_size(skeleton: Skeleton) -> tuple[int, int]:
 
 
 def _operands(node: Node) -> tuple[int, ...]:
-    """Their numbers, each as often as it stands in a program."""
+    """Return the numbers of a node's operands, each as often as it occurs in a program."""
     match node.kind:
         case "false" | "true" | "literal":
             return ()
@@ -90,7 +90,7 @@ def _translated(skeleton: Skeleton) -> str:
 
 
 def _text(nodes: Sequence[Node], number: int) -> str:
-    """A subformula as ltlf2dfa reads LTLf: propositions are `p0`, `p1` …, operands in brackets."""
+    """Return a subformula as ltlf2dfa reads LTLf: propositions are `p0`, `p1` …, operands in brackets."""
     kind, first, second = nodes[number]
     match kind:
         case "false" | "true":
@@ -108,7 +108,7 @@ class _Parser(Protocol):
 
 @cache
 def _parser() -> _Parser:
-    """The parser of LTLf, which takes longer to make than to use."""
+    """Return the parser of LTLf, which takes longer to make than to use."""
     from ltlf2dfa.parser.ltlf import LTLfParser
 
     parser: _Parser = LTLfParser()
@@ -132,7 +132,7 @@ _MOVE = re.compile(r"State (\d+): ([01X]*) -> state (\d+)")
 
 
 def compiled_by_mona(skeleton: Skeleton, propositions: int) -> Machine:
-    """The automaton of a skeleton over so many propositions.
+    """Return the automaton of a skeleton over so many propositions.
 
     Raises:
         NoAutomatonError: MONA is not installed, fails or takes too long; a formula too large for it.
@@ -148,7 +148,7 @@ def compiled_by_mona(skeleton: Skeleton, propositions: int) -> Machine:
 
 
 def _executable() -> str:
-    """Where MONA is, looked for before anything is loaded to write a program for it."""
+    """Find MONA."""
     executable = shutil.which("mona")
     if executable is None:
         raise NoAutomatonError("it is not installed, and may still compile it: apt-get install mona")
@@ -156,16 +156,16 @@ def _executable() -> str:
 
 
 def _output(executable: str, program: str) -> str:
-    """What MONA prints of a program.
+    """Run MONA on a program and return what it prints.
 
-    The program goes through a pipe and nothing through a shell or a file, so any number may run at once.
+    The program goes through a pipe, not through a shell or a file, so any number may run at once.
     """
     command = [executable, "-q", "-u", "-w", "/dev/stdin"]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
     ) as process:
         with suppress(OSError):
-            # it may have ended already, or the machine forbid to limit it
+            # it may have ended already, or limits may not be allowed here
             resource.prlimit(process.pid, resource.RLIMIT_AS, (_MAX_MEMORY, _MAX_MEMORY))
         timer = Timer(_TIMEOUT_S, process.kill)
         timer.start()
@@ -185,14 +185,14 @@ def _output(executable: str, program: str) -> str:
 
 
 def _exchanged(process: subprocess.Popen[bytes], program: bytes) -> bytes:
-    """Hand over the program, which MONA reads to its end first, and take what it prints."""
+    """Send the program, which MONA reads to its end first, and read what it prints."""
     if process.stdin is None or process.stdout is None:
         return b""
     try:
         process.stdin.write(program)
         process.stdin.close()
     except BrokenPipeError:
-        # it ended before; its code and what it printed say why
+        # it has ended; its exit code and output say why
         pass
     printed = process.stdout.read(_MAX_OUTPUT + 1)
     if len(printed) <= _MAX_OUTPUT:
@@ -208,7 +208,7 @@ class _Cube(NamedTuple):
 
 
 def _machine(printed: str, propositions: int) -> Machine:
-    """The automaton that MONA printed; its state 0 only leads to the one in which a run begins."""
+    """Return the automaton that MONA printed; its state 0 only leads to the one in which a run begins."""
     header, accepting, count = (pattern.search(printed) for pattern in (_HEADER, _ACCEPTING, _COUNT))
     if header is None or accepting is None or count is None:
         raise NoAutomatonError(f"it printed no automaton: {printed.strip()[:200]!r}")
@@ -233,7 +233,7 @@ def _machine(printed: str, propositions: int) -> Machine:
 
 
 def _node(diagrams: Diagrams, cubes: list[_Cube], variable: int) -> int:
-    """The diagram of disjoint cubes that together cover everything, from a variable on."""
+    """Return the diagram of disjoint cubes that together cover everything, from a variable on."""
     symbol, target = cubes[0]
     if len(cubes) == 1:
         return diagrams.leaf(target)
@@ -241,6 +241,6 @@ def _node(diagrams: Diagrams, cubes: list[_Cube], variable: int) -> int:
     if not low or not high:
         raise NoAutomatonError(f"it printed moves that leave {symbol!r} open")
     when_false = _node(diagrams, low, variable + 1)
-    # a variable that is free in every cube is not to double the work
+    # without this, a variable that is free in every cube would double the work
     when_true = when_false if low == high else _node(diagrams, high, variable + 1)
     return diagrams.decide(variable, when_false, when_true)

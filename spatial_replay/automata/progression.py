@@ -1,16 +1,13 @@
-"""The compiler of our own: what a formula asks of the samples still to come, state by state.
+"""The built-in compiler: formula progression, one state for each distinct remainder of a formula.
 
-A state is what is left to hold from the next sample on: a monotone combination of *obligations*, each a
-subformula that must hold there, or (weak) must hold unless the run has ended. As a decision diagram over
-obligations, equal ones are one state. Reading a sample replaces each obligation by what its subformula says
-of that sample and, in obligations, of the next.
+A state is what has to hold from the next sample on: a monotone combination of *obligations*, each a
+subformula that must hold in the next sample or, if weak, only if there is a next sample. States are decision
+diagrams over obligations, so equal ones are one. Reading a sample replaces each obligation by what its
+subformula requires of that sample and, as obligations, of the next.
 
-Obligations as variables of diagrams.
-
-An *obligation* is a subformula that has to hold in the next sample; a weak one, only if there is a next
-sample. Obligations of which each follows from the one before, as those of one unrolled window do, are a
-*chain*. Of a chain it is enough to know how many do not hold. That number in binary takes a few variables
-where each obligation would take one, and no two diagrams say the same.
+Obligations of which each implies the next one, as those of one unrolled window do, are a *chain*. Of a chain
+it is enough to know how many do not hold. That number in binary takes a few variables where each obligation
+would take one, and different diagrams mean different functions.
 """
 
 from __future__ import annotations
@@ -28,7 +25,7 @@ Obligation: TypeAlias = tuple[int, bool]
 
 
 class Chain(NamedTuple):
-    """Obligations, each of which follows from the one before.
+    """Obligations, each of which is implied by the one before.
 
     Attributes:
         members: numbers of their subformulas.
@@ -44,13 +41,13 @@ class Chain(NamedTuple):
 
 
 class Obligations:
-    """The variables of obligations, given to a chain when the first of its members is asked for."""
+    """The variables of obligations, allotted to a chain when the first of its members is needed."""
 
     def __init__(self, diagrams: Diagrams, first: int, longer: Mapping[Obligation, int]) -> None:
-        """Before any obligation.
+        """Begin without obligations.
 
         Args:
-            first: the first variable to give away.
+            first: the first variable to allot.
             longer: as `chains` of a skeleton.
         """
         self._diagrams = diagrams
@@ -60,26 +57,27 @@ class Obligations:
         self._places: dict[Obligation, tuple[Chain, int]] = {}
 
     def diagram(self, obligation: Obligation) -> int:
-        """Whether an obligation is to be met."""
+        """Return the diagram of an obligation: true where it is met."""
         if obligation not in self._places:
             self._begin(obligation)
         chain, index = self._places[obligation]
         node = YES
         for bit in range(chain.bits):
-            # it holds iff no more than those before it do not
+            # it holds iff at most the members before it do not: the count in the bits is at most its index
             branches = (YES, node) if index >> bit & 1 else (node, NO)
             node = self._diagrams.decide(chain.first + chain.bits - 1 - bit, *branches)
         return node
 
     def chain(self, variable: int) -> Chain:
-        """The chain that a variable is one of."""
+        """Return the chain that a variable is one of."""
         return self._chains[variable - self._first]
 
     def cases(self, chain: Chain, node: int) -> list[tuple[int, int]]:
-        """What is left of a function that decides on a chain first.
+        """Split a function that decides on a chain first into cases.
 
-        Gives pairs: fewer than so many of the chain's members do not hold, and not as few as in the pair
-        before; what then is left.
+        Returns:
+            Pairs of a count and the function that is left where fewer than so many of the chain's members do
+            not hold, and not as few as in the pair before.
         """
         found: list[tuple[int, int]] = []
         below = 0
@@ -91,7 +89,7 @@ class Obligations:
         return found
 
     def _rests(self, chain: Chain, node: int, bit: int) -> Iterator[tuple[int, int]]:
-        """What is left for so many numbers, one stretch of numbers after the other."""
+        """Yield the functions that are left, each with the number of counts in a row that it holds for."""
         if self._diagrams[node].variable >= chain.first + chain.bits:
             yield 1 << (chain.bits - bit), node
             return
@@ -108,7 +106,7 @@ class Obligations:
 
 
 def _members(longer: Mapping[Obligation, int]) -> dict[Obligation, tuple[int, ...]]:
-    """For each obligation that is in a chain, the chain's members."""
+    """Return for each obligation that is in a chain, the chain's members."""
     later = {(number, strong) for (_, strong), number in longer.items()}
     chains: dict[Obligation, tuple[int, ...]] = {}
     for begin, strong in longer:
@@ -117,21 +115,21 @@ def _members(longer: Mapping[Obligation, int]) -> dict[Obligation, tuple[int, ..
         members = [begin]
         while (after := longer.get((members[-1], strong))) is not None and (after, strong) not in chains:
             members.append(after)
-        # a sooner deadline implies a later one, a longer time without fail a shorter one
+        # until by a sooner deadline implies until by a later one; holding longer implies holding shorter
         ordered = tuple(members if strong else reversed(members))
         chains.update({(each, strong): ordered for each in members})
     return chains
 
 
 MAX_STATES = 5000
-"""How many states are followed at most, before equivalent ones are joined."""
+"""States explored at most, before equivalent ones are merged."""
 
 MAX_DECISIONS = 150_000
 """How many nodes the decision diagrams may have."""
 
 
 def progressed(skeleton: Skeleton, propositions: int) -> Machine:
-    """The automaton of a skeleton over so many propositions.
+    """Return the automaton of a skeleton over so many propositions.
 
     Raises:
         NoAutomatonError: it would take more than `MAX_STATES` or `MAX_DECISIONS`.
@@ -143,7 +141,7 @@ def progressed(skeleton: Skeleton, propositions: int) -> Machine:
 
 
 class _Progression:
-    """The states of a skeleton, as they are found."""
+    """The states of a skeleton, explored from the first one."""
 
     def __init__(self, skeleton: Skeleton, propositions: int) -> None:
         self._skeleton = skeleton
@@ -168,12 +166,12 @@ class _Progression:
         result = Diagrams()
         copy = copied(self._diagrams, result, self._propositions, number)
         start = copy(self._read(self._skeleton.root))
-        # the list grows as moves lead to states that are new
+        # the list grows while it is iterated: moves lead to new states
         moves = tuple(copy(self._after(node)) for node in waiting)
         return Machine(result, moves, tuple(map(self._accepts, waiting)), start)
 
     def _read(self, number: int) -> int:
-        """What a subformula says of this sample and, in obligations, of the next."""
+        """Return what a subformula requires of this sample and, as obligations, of the next."""
         if number not in self._now:
             self._now[number] = self._reading(number)
         return self._now[number]
@@ -200,7 +198,7 @@ class _Progression:
         raise ValueError(kind)
 
     def _after(self, node: int) -> int:
-        """What is left of a state after a sample: the states, under decisions on propositions."""
+        """Return the states that follow a state, under decisions on propositions."""
         if node not in self._next:
             chain = self._obligations.chain(self._diagrams[node].variable)
             *cases, (_, rest) = self._obligations.cases(chain, node)
@@ -212,9 +210,9 @@ class _Progression:
         return self._next[node]
 
     def _accepts(self, node: int) -> bool:
-        """Whether nothing is left to hold if the run has ended."""
+        """Return whether nothing is left to hold if the run has ended."""
         while node not in (NO, YES):
             variable, low, high = self._diagrams[node]
-            # of strong obligations none is met then, of weak ones each
+            # at the end strong obligations fail, and weak ones hold
             node = high if self._obligations.chain(variable).strong else low
         return node == YES

@@ -1,4 +1,4 @@
-"""What an automaton reads: the subformulas without temporal operators, as propositions."""
+"""The propositions that an automaton reads: the subformulas without temporal operators."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class Proposition:
 
     @property
     def label(self) -> str:
-        """What it is called: its name or, without one, its text."""
+        """Its name or, without one, its text."""
         return self.name or self.text
 
     def literal(self, value: bool) -> str:
-        """In words, that it is true, or that it is not."""
+        """Return the sentence that it is true, or that it is not."""
         if self.name is not None:
             return self.name if value else f"not {self.name}"
         if isinstance(self.formula, Boolean) and self.formula.operator == "not":
@@ -52,7 +52,7 @@ def _bracketed(formula: Formula) -> str:
 
 
 def is_spatial(formula: Formula) -> bool:
-    """Whether a formula is about one sample: no operator in it looks ahead or back."""
+    """Return whether a formula is about one sample: no operator in it looks ahead or back."""
     return not isinstance(formula, Temporal) and all(is_spatial(each) for each in operands_of(formula))
 
 
@@ -94,7 +94,7 @@ class Propositions:
 
 
 def _maximal(formula: Formula) -> Iterator[Formula]:
-    """The largest subformulas about one sample, in the order of the text; constants are none."""
+    """Yield the largest subformulas about one sample, in the order of the text; constants are none."""
     if isinstance(formula, Truth):
         return
     if is_spatial(formula):
@@ -105,7 +105,7 @@ def _maximal(formula: Formula) -> Iterator[Formula]:
 
 
 class _Shapes:
-    """What spatial formulas have in common but for the way they are written: equal ones have one number."""
+    """Numbers of spatial formulas: one for all that are equal up to the way they are written."""
 
     def __init__(self) -> None:
         self._interned: dict[tuple[object, ...], int] = {}
@@ -113,7 +113,7 @@ class _Shapes:
         self._joined: dict[tuple[bool, int], frozenset[int]] = {}
 
     def of(self, formula: Formula, positive: bool) -> int:
-        """The number of a formula, or of its negation, in negation normal form."""
+        """Return the number of a formula, or of its negation, in negation normal form."""
         formula = expand(formula)
         key = (id(formula), positive)
         if key not in self._known:
@@ -136,10 +136,10 @@ class _Shapes:
                 is_every = (formula.quantifier == "forall") == positive
                 return self._intern("members", is_every, formula.variables, formula.group, body)
             case Temporal():
-                raise ValueError(f"{formula.operator} is no operator about one sample")
+                raise ValueError(f"{formula.operator} is not an operator about one sample")
 
     def _join(self, is_both: bool, *operands: int) -> int:
-        """A conjunction or disjunction, whatever the order, repetition and bracketing of its operands."""
+        """Return the number of a conjunction or disjunction; order, repetition and brackets do not count."""
         chosen = frozenset[int]().union(
             *(self._joined.get((is_both, each), frozenset({each})) for each in operands)
         )

@@ -5,8 +5,6 @@ Names are loaded when they are first used: values of formulas need no parser.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from spatial_replay.lazy import loaded_when_used
@@ -27,17 +25,12 @@ __all__ = [
     "signal_names",
 ]
 
-_HOMES: Mapping[str, str] = MappingProxyType(
-    {
-        "check_names": "spatial_replay.spec.checks",
-        "format_formula": "spatial_replay.spec.format",
-        "format_specification": "spatial_replay.spec.format",
-        "instantiate": "spatial_replay.spec.checks",
-        "load_specification": "spatial_replay.spec.load",
-        "object_names": "spatial_replay.spec.checks",
-        "parse_specification": "spatial_replay.spec.load",
-        "signal_names": "spatial_replay.spec.checks",
-    }
-)
+_HOMES = {
+    **dict.fromkeys(("check_names", "instantiate", "object_names", "signal_names"), "checks"),
+    **dict.fromkeys(("format_formula", "format_specification"), "format"),
+    **dict.fromkeys(("load_specification", "parse_specification"), "load"),
+}
 
-__getattr__, __dir__ = loaded_when_used(globals(), _HOMES)
+__getattr__, __dir__ = loaded_when_used(
+    globals(), {name: f"spatial_replay.spec.{home}" for name, home in _HOMES.items()}
+)

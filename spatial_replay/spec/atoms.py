@@ -1,4 +1,4 @@
-"""Relations and comparisons as written to atoms: what they measure, in which canonical words."""
+"""Atoms from relations and comparisons as written: their expression and their canonical text."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _AXES: tuple[str, ...] = get_args(Axis)
 
 
 def parameters_of(name: str, relation: Relation) -> tuple[inspect.Parameter, ...]:
-    """The parameters that are written in brackets behind a relation's name.
+    """Return the parameters that are written in brackets behind a relation's name.
 
     Raises:
         UsageError: for a function that cannot be written as a relation.
@@ -66,7 +66,7 @@ class AtomBuilder:
     faults: Faults
 
     def relation(self, written: RelationSyntax, scope: Scope) -> Atom | None:
-        """An atom of a relation; None, and a fault, where its parameters do not fit."""
+        """Return an atom of a relation; None, and a fault, where its parameters do not fit."""
         terms = tuple([self.resolver.term(term, scope) for term in written.terms])
         parameters = self._parameters(written, scope)
         if parameters is None:
@@ -74,12 +74,14 @@ class AtomBuilder:
         try:
             expression = as_expression(self.relations[written.relation](*terms, *parameters))
         except TypeError as error:
-            raise UsageError(f"relations: {written.relation!r} gives no expression: {error}") from error
+            raise UsageError(
+                f"relations: {written.relation!r} does not return an expression: {error}"
+            ) from error
         self._check(expression, written, scope)
         return self._atom(written.relation, expression, terms, parameters, written, scope)
 
     def distance(self, written: DistanceSyntax, scope: Scope) -> Atom:
-        """`a dist b <= c`: c - sd(a, b); of a chain, the lesser of both comparisons."""
+        """Return the atom of `a dist b <= c`, c - sd(a, b); of a chain, the lesser of both comparisons."""
         terms = (self.resolver.term(written.first, scope), self.resolver.term(written.second, scope))
         limits = [(sign, self.resolver.number(limit, scope)) for sign, limit in written.comparisons]
         quantity = SignedDistance(*terms)
@@ -91,7 +93,7 @@ class AtomBuilder:
         return self._atom("dist", minimum(*comparisons), terms, parameters, written, scope)
 
     def comparison(self, written: ComparisonSyntax, scope: Scope) -> Atom:
-        """`signal >= c`: signal - c."""
+        """Return the atom of `signal >= c`, signal - c."""
         name, limit = written.signal, self.resolver.number(written.limit, scope)
         defined = self.resolver.names.definitions.get(name.text)
         if name.text in scope.values:

@@ -1,4 +1,4 @@
-"""Parsed rules to syntax nodes: one method for each rule of grammar.lark."""
+"""Syntax nodes from parsed rules: one method for each rule of grammar.lark."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 from decimal import Decimal
 from math import isfinite
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any
 
 from lark import Token
 
@@ -55,7 +55,7 @@ _NS = MappingProxyType({"s": Decimal(10**9), "ms": Decimal(10**6)})
 
 
 class StatementError(Exception):
-    """A fault that is seen while rules are put together."""
+    """A fault found while a rule is built."""
 
     def __init__(self, span: Span, message: str, hint: str = "") -> None:
         super().__init__(message)
@@ -87,15 +87,8 @@ def _chain_hint(below: str, above: str) -> str:
     return "write it as c1 <= a dist b <= c2, or as two comparisons joined by and"
 
 
-_Kind = TypeVar("_Kind")
-
-
-def _all_of(kind: type[_Kind], children: list[Any]) -> tuple[_Kind, ...]:
-    return tuple(child for child in children if isinstance(child, kind))
-
-
 def read_number(text: str, span: Span) -> float | Duration:
-    """The value of a number or a duration as written.
+    """Return the value of a number or a duration as written.
 
     Raises:
         StatementError: for one too large, or a duration of less than whole nanoseconds.
@@ -110,15 +103,15 @@ def read_number(text: str, span: Span) -> float | Duration:
         return value
     seconds = Decimal(digits)
     if seconds and not -40 < seconds.adjusted() < 40:
-        raise StatementError(span, f"{text} is no usable duration", "durations go from 1e-9s to 9e9s")
+        raise StatementError(span, f"{text} is not a usable duration", "durations go from 1e-9s to 9e9s")
     ns = seconds * _NS[unit]
     if ns != int(ns) or ns > MAX_DURATION_NS:
-        raise StatementError(span, f"{text} is no usable duration", "give whole nanoseconds, at most 9e9s")
+        raise StatementError(span, f"{text} is not a usable duration", "give whole nanoseconds, at most 9e9s")
     return Duration(int(ns))
 
 
 class TreeBuilder:
-    """Called by the parser with the pieces of each rule, tokens included."""
+    """Builds a node from the pieces of each rule, tokens included; lark calls a method by the rule's name."""
 
     # ------------------------------------------------------------------------------------ statements
 
@@ -147,7 +140,7 @@ class TreeBuilder:
         return SpecStatement(children[1], children[3] or (), children[6])
 
     def names(self, children: list[Any]) -> tuple[Name, ...]:
-        return _all_of(Name, children)
+        return tuple(child for child in children if isinstance(child, Name))
 
     def name(self, children: list[Token]) -> Name:
         return Name(children[0].value, span_of(children[0]))
@@ -162,8 +155,10 @@ class TreeBuilder:
     def circle(self, children: list[Any]) -> Shape:
         return Shape("circle", (children[2],), children[4], _cover(children))
 
-    def points(self, children: list[Any]) -> tuple[Point, ...]:
+    def points(self, children: list[Any]) -> tuple[Any, ...]:
         return tuple(child for child in children if not isinstance(child, Token))
+
+    parameters = arguments = points
 
     def point(self, children: list[Any]) -> Point:
         return (children[1], children[3])
@@ -216,9 +211,6 @@ class TreeBuilder:
     def call(self, children: list[Any]) -> Call:
         return Call(children[0], children[2] or (), _cover(children))
 
-    def arguments(self, children: list[Any]) -> tuple[Any, ...]:
-        return tuple(child for child in children if not isinstance(child, Token))
-
     def bracketed(self, children: list[Any]) -> Any:
         inner = children[1]
         if isinstance(inner, BooleanSyntax):
@@ -238,9 +230,6 @@ class TreeBuilder:
         first, token, parameters, _, second, _, third, _ = children
         terms = (first, second, third)
         return RelationSyntax("between", span_of(token), terms, parameters or (), _cover(children))
-
-    def parameters(self, children: list[Any]) -> tuple[Any, ...]:
-        return tuple(child for child in children if not isinstance(child, Token))
 
     def distance(self, children: list[Any]) -> DistanceSyntax:
         first, _, second, token, limit = children

@@ -1,7 +1,4 @@
-"""What is legal, and may not mean what its author thinks.
-
-Names a specification takes from a log: objects and signals, and templates put in place.
-"""
+"""Checks of a specification: warnings about its text, and its names against those of a log."""
 
 from __future__ import annotations
 
@@ -47,7 +44,7 @@ class _Level:
 
 
 def reach_warnings(tokens: Sequence[Token], source: SourceText, published: bool) -> Iterator[Diagnostic]:
-    """Operators that, without brackets, reach further or elsewhere than a reader may think.
+    """Yield a warning for each operator that, without brackets, reaches further than a reader may expect.
 
     Args:
         published: warn too wherever the published grammar groups otherwise. It knows no precedence:
@@ -103,7 +100,7 @@ def _differs(first: Token, second: Token) -> bool:
 
 
 def past_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterator[Diagnostic]:
-    """Past operators outside any future one: at the first sample, where there is no past, they stay."""
+    """Yield a warning for each past operator outside any future one: it only sees the first sample."""
     warned: set[Span] = set()
     for spec in specs:
         stack: list[Formula] = [spec.formula] if spec.is_result else []
@@ -122,7 +119,7 @@ def past_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterator[Di
 
 
 def unused_warnings(names: Namespace, source: SourceText) -> Iterator[Diagnostic]:
-    """Definitions that nothing refers to; a spec is a result by itself."""
+    """Yield a warning for each definition that nothing refers to; a spec is a result by itself."""
     for name, statement in names.definitions.items():
         if isinstance(statement, (SpecStatement, BrokenStatement)) or name in names.used:
             continue
@@ -131,7 +128,7 @@ def unused_warnings(names: Namespace, source: SourceText) -> Iterator[Diagnostic
 
 
 def object_names(specification: Specification) -> tuple[str, ...]:
-    """Tracked objects that the specs are about, members of groups included, in the order of the text."""
+    """Return the tracked objects that the specs are about, members of groups included, as in the text."""
     found: dict[str, None] = {}
     for atom in _atoms(specification):
         for term in terms_of(atom.expression):
@@ -145,7 +142,7 @@ def object_names(specification: Specification) -> tuple[str, ...]:
 
 
 def signal_names(specification: Specification) -> tuple[str, ...]:
-    """Numeric signals that the specs compare, in the order of the text."""
+    """Return the numeric signals that the specs compare, in the order of the text."""
     found: dict[str, None] = {}
     for atom in _atoms(specification):
         for part in iter_expressions(atom.expression):
@@ -155,11 +152,12 @@ def signal_names(specification: Specification) -> tuple[str, ...]:
 
 
 def _atoms(specification: Specification) -> Iterable[Atom]:
-    seen: set[int] = set()
+    # specs share formulas
+    visited: set[int] = set()
     for spec in specification.results:
         for formula in iter_formulas(spec.formula):
-            if isinstance(formula, Atom) and id(formula) not in seen:
-                seen.add(id(formula))
+            if isinstance(formula, Atom) and id(formula) not in visited:
+                visited.add(id(formula))
                 yield formula
 
 
@@ -171,7 +169,7 @@ def check_names(
     Args:
         known: names of the log's objects.
         signals: names of its numeric signals.
-        where: what has them, if it is no log.
+        where: what has them, if not a log.
 
     Returns:
         An error for each object and signal that the log never has, with the nearest that it has; a
@@ -209,7 +207,7 @@ def _listing(kind: str, names: tuple[str, ...]) -> str:
 
 
 def _places(specification: Specification, source: SourceText) -> tuple[dict[str, Span], dict[str, Span]]:
-    """Where each name first occurs in the source, and where each definition stands."""
+    """Return the first place of each name in the source, and the place of each definition."""
     relations = RELATION_NAMES | specification.relations
     tokens = tokenize(specification.source, relations, Faults(source))
     places: dict[str, Span] = {}
@@ -224,15 +222,15 @@ def _places(specification: Specification, source: SourceText) -> tuple[dict[str,
 
 
 def instantiate(spec: NamedSpec, parameter_value: str) -> Formula:
-    """The formula of a template about one object.
+    """Return the formula of a template about one object.
 
     Args:
         spec: a spec with an object parameter.
         parameter_value: the name of the object.
 
     Raises:
-        UsageError: for a spec that is no template.
+        UsageError: for a spec without a parameter.
     """
     if spec.parameter is None:
-        raise UsageError(f"spec {spec.name!r} is no template; evaluate it as it is")
+        raise UsageError(f"spec {spec.name!r} is not a template; evaluate it as it is")
     return substitute(spec.formula, {spec.parameter: TrackedName(parameter_value)})

@@ -1,6 +1,7 @@
-"""Statements to a `Specification`: names resolved, macros and named quantifiers expanded.
+"""Formulas from statements: names resolved, macros expanded, quantifiers written out or bound.
 
-Quantifiers to formulas: written out for the members of a named group, one node over an open group.
+A quantifier over a named group is written out for its members; over an open group it is one node, because
+the members are known only sample by sample.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class QuantifierBuilder:
 
     Attributes:
         words: every name that occurs in the text; variables that must be renamed avoid them.
-        elaborate: what a formula means in a scope, for bodies.
+        elaborate: elaborates a body in a scope.
     """
 
     names: Namespace
@@ -63,7 +64,7 @@ class QuantifierBuilder:
     elaborate: Callable[[FormulaSyntax, Scope], Formula]
 
     def formula(self, written: QuantifierSyntax, scope: Scope, span: Span) -> Formula:
-        """What a quantifier means; `true` in the place of one with faults."""
+        """Return the formula of a quantifier; `true` in place of one with faults."""
         doubled = first_repeated(written.variables)
         if doubled is not None:
             self.resolver.fault(doubled.span, scope, f"the variable {doubled.text!r} is given twice")
@@ -79,7 +80,7 @@ class QuantifierBuilder:
             self.resolver.fault(written.group.span, scope, message, hint)
         elif not self._is_unknown(written.group, scope):
             hint = 'define it: group NAME = a, b, or group NAME = class "name"'
-            message = f"{written.quantifier} runs over a group, and this is none"
+            message = f"{written.quantifier} runs over a group, and this is not one"
             self.resolver.fault(written.group.span, scope, message, hint)
         self._body_of_any(written, scope)
         return Truth(True)
@@ -92,7 +93,7 @@ class QuantifierBuilder:
         return isinstance(local, Anything) or (local is None and broken)
 
     def _body_of_any(self, written: QuantifierSyntax, scope: Scope) -> None:
-        """Look for faults in a body that no member is put into."""
+        """Check a body for faults although it has no members."""
         values = dict(scope.values) | {name.text: TrackedName(name.text) for name in written.variables}
         self.elaborate(written.body, replace(scope.deeper(), values=values))
 
@@ -131,7 +132,7 @@ class QuantifierBuilder:
         temporal = next((each for each in iter_formulas(body) if isinstance(each, Temporal)), None)
         if temporal is not None:
             message = f"{temporal.operator!r} inside {written.quantifier} over an open group"
-            hint = "who belongs to it changes from sample to sample; use a template: spec name(object) = ..."
+            hint = "its members change from sample to sample; use a template: spec name(object) = ..."
             self.resolver.fault(temporal.span, scope, message, hint)
         quantified = Quantified(written.quantifier, tuple(variables), group, body, span=span)
         return self._without_clash(quantified, scope)
@@ -159,12 +160,12 @@ class QuantifierBuilder:
 
 
 def first_repeated(names: Sequence[Name]) -> Name | None:
-    """The first of some names that an earlier one is equal to."""
-    seen: set[str] = set()
+    """Return the first of some names that an earlier one is equal to."""
+    texts: set[str] = set()
     for name in names:
-        if name.text in seen:
+        if name.text in texts:
             return name
-        seen.add(name.text)
+        texts.add(name.text)
     return None
 
 
@@ -177,7 +178,7 @@ class TooLargeError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class _Known:
-    """A spec that is done: its size and depth count again wherever it is named."""
+    """An elaborated spec; its size and depth count again wherever it is named."""
 
     spec: NamedSpec
     order: int
@@ -216,7 +217,7 @@ class Elaborator:
     # ----------------------------------------------------------------------------------------- specs
 
     def specs(self, statements: Sequence[SpecStatement]) -> tuple[NamedSpec, ...]:
-        """Every spec, in the order of the text.
+        """Return every spec, in the order of the text.
 
         Raises:
             TooLargeError: where the text expands to more than `MAX_SIZE` nodes.
@@ -272,7 +273,7 @@ class Elaborator:
             self.faults.add(parameter.span, message, "give the parameter another name")
 
     def _check_macro(self, definition: DefStatement) -> None:
-        """Read the body of a macro that nothing uses, whatever its arguments may be."""
+        """Check the body of a macro that nothing uses, for any arguments."""
         doubled = first_repeated(definition.parameters)
         if doubled is not None:
             self.faults.add(doubled.span, f"the parameter {doubled.text!r} is given twice")
@@ -284,7 +285,7 @@ class Elaborator:
     # -------------------------------------------------------------------------------------- formulas
 
     def formula(self, written: FormulaSyntax, scope: Scope) -> Formula:
-        """What a formula means; `true` in the place of one with faults."""
+        """Return the formula that was written; `true` in place of one with faults."""
         span = scope.call or written.span
         self._count(span, scope)
         match written:
@@ -318,7 +319,7 @@ class Elaborator:
     def _reach(self, depth: int, span: Span) -> None:
         self.deepest = max(self.deepest, depth)
         if depth > MAX_DEPTH:
-            message = f"more than {MAX_DEPTH} operators within one another, counting what names stand for"
+            message = f"more than {MAX_DEPTH} operators within one another, counting what names refer to"
             self.faults.add(span, message, "nest specs and macros less deeply")
             raise TooLargeError
 
@@ -389,7 +390,7 @@ class Elaborator:
             return Truth(True)
         self.names.used.add(name)
         if name in scope.macros:
-            message = f"def {name!r} is defined by way of itself"
+            message = f"def {name!r} is defined in terms of itself"
             self.faults.add(written.span, message, "a macro is written out where it is used, so it must end")
             return Truth(True)
         if len(written.arguments) != len(macro.parameters):

@@ -1,10 +1,8 @@
-"""Formula to text: the canonical way of writing a specification.
+"""The canonical text of terms, formulas and specifications, and the lines of a formula's tree.
 
 Constants, macros and quantifiers over named groups are written out; every operand that is not a
 name or `true` or `false` stands in brackets; numbers keep every digit. Reading the text back gives
 an equal specification.
-
-The tree of a formula, as it is shown: line by line.
 """
 
 from __future__ import annotations
@@ -39,19 +37,19 @@ _LARGEST_PLAIN = 1e16
 
 
 def format_number(value: float) -> str:
-    """A number with all of its digits, without a fraction where it has none."""
+    """Return a number with all of its digits, without a fraction where it has none."""
     if value.is_integer() and abs(value) < _LARGEST_PLAIN:
         return str(int(value))
     return repr(value)
 
 
 def format_duration(ns: int) -> str:
-    """Nanoseconds as seconds, exactly."""
+    """Return nanoseconds as exact seconds: "2.5s"."""
     return f"{Decimal(ns).scaleb(-9).normalize():f}s"
 
 
 def format_bound(bound: Bound | None) -> str:
-    """A window as written behind its operator; "" for none."""
+    """Return a window as written behind its operator; "" for none."""
     if bound is None:
         return ""
     write = format_duration if bound.unit == "ns" else str
@@ -63,7 +61,7 @@ def format_bound(bound: Bound | None) -> str:
 
 
 def format_term(term: Term, relations: frozenset[str] = RELATION_NAMES) -> str:
-    """A term as written; `relations` are names that need quotes."""
+    """Return a term as written; `relations` are names that need quotes."""
     match term:
         case Enlarged():
             return f"enlarge({format_term(term.term, relations)}, {format_number(term.radius)})"
@@ -94,7 +92,7 @@ def format_relation(
     parameters: Sequence[float | str],
     relations: frozenset[str] = RELATION_NAMES,
 ) -> str:
-    """An atom as written, of its relation, terms and parameters (see `Atom`)."""
+    """Return an atom as written, of its relation, terms and parameters (see `Atom`)."""
     names = [format_term(term, relations) for term in terms]
     values = [format_number(value) if isinstance(value, float) else value for value in parameters]
     if not terms:
@@ -117,11 +115,11 @@ def format_relation(
 def format_formula(
     formula: Formula, *, references: bool = False, relations: frozenset[str] = RELATION_NAMES
 ) -> str:
-    """The canonical text of a formula.
+    """Return the canonical text of a formula.
 
     Args:
         references: write the named specs below the root by their names, as in a file, instead of
-            what they stand for.
+            what they refer to.
         relations: names that need quotes.
     """
 
@@ -157,7 +155,7 @@ def format_formula(
 
 
 def format_specification(specification: Specification) -> str:
-    """The canonical text of a specification, every `spec` on a line of its own."""
+    """Return the canonical text of a specification, every `spec` on a line of its own."""
     relations = RELATION_NAMES | specification.relations
     lines = [f"use {specification.profile}"]
     for name, outline in specification.regions.items():
@@ -193,7 +191,7 @@ class Branch(NamedTuple):
 
     Attributes:
         id: its number, from the root, 0, in the order of the text.
-        stem: what leads to it from the nodes above: "│  ├─ ".
+        stem: the lines that lead to it from the nodes above: "│  ├─ ".
     """
 
     id: int
@@ -202,7 +200,7 @@ class Branch(NamedTuple):
 
 
 def iter_branches(formula: Formula) -> Iterator[Branch]:
-    """Every node, from the root, in the order of the text."""
+    """Yield every node, from the root, in the order of the text."""
     stack = [("", "", formula)]
     identifier = 0
     while stack:
@@ -217,7 +215,7 @@ def iter_branches(formula: Formula) -> Iterator[Branch]:
 
 
 def title_of(node: Formula) -> str:
-    """What a node is, without its name and what stands below it: "F[0, 10]", "a ovlp b"."""
+    """Return a node's operator or atom, without its name and operands: "F[0, 10]", "a ovlp b"."""
     match node:
         case Atom() | Quantified() | Truth():
             return format_formula(node)
@@ -228,5 +226,5 @@ def title_of(node: Formula) -> str:
 
 
 def label_of(node: Formula) -> str:
-    """The same with its name: "reach = F[0, 10]"."""
+    """Return the same with its name: "reach = F[0, 10]"."""
     return title_of(node) if node.name is None else f"{node.name} = {title_of(node)}"

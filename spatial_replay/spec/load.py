@@ -49,8 +49,8 @@ def parse_specification(
 
     Raises:
         SpecificationError: with every fault of the text.
-        UsageError: no text, an unknown profile, a relation that cannot be one, a constant the text does
-            not have.
+        UsageError: no text, an unknown profile, a relation that does not take terms and numbers, a
+            constant the text does not have.
     """
     _require_text(text)
     given = dict(relations or {})
@@ -123,7 +123,7 @@ def load_specification(
     except UnicodeDecodeError as error:
         before = content[: error.start].decode("utf-8")
         source = SourceText.of(before + "\ufffd", path.name)
-        message = f"byte 0x{content[error.start]:02x} is no UTF-8 text"
+        message = f"byte 0x{content[error.start]:02x} is not UTF-8 text"
         hint = "save the file as UTF-8"
         place = Span(len(before), len(before) + 1)
         raise SpecificationError([source.diagnostic("error", place, message, hint)]) from error
@@ -133,9 +133,10 @@ def load_specification(
 
 
 def require_specification(value: object) -> None:
-    """
+    """Refuse anything but a specification.
+
     Raises:
-        UsageError: for anything else than a specification.
+        UsageError: it is something else.
     """
     if not isinstance(value, Specification):
         remedy = "give a Specification, from parse_specification(text) or load_specification(path)"
@@ -157,7 +158,7 @@ def _require_path(value: object) -> None:
 def _check_relations(relations: Mapping[str, Relation]) -> None:
     for name, relation in relations.items():
         if not isinstance(name, str) or not _RELATION_NAME.match(name):
-            raise UsageError(f"relations: {name!r} is no name; use letters, digits and _")
+            raise UsageError(f"relations: {name!r} is not a name; use letters, digits and _")
         if is_reserved(name, RELATION_NAMES):
             raise UsageError(f"relations: {name!r} is already part of the language; choose another name")
         if not callable(relation):

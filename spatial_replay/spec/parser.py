@@ -41,7 +41,7 @@ class TokenGroup:
 
 
 def parse_statements(tokens: Sequence[Token], relations: Collection[str], faults: Faults) -> list[Statement]:
-    """The statements of a text that can be read; the rest is reported.
+    """Return the statements of a text that can be read; the rest is reported.
 
     A bare formula comes back as a `spec` of the name `FORMULA_NAME`.
     """
@@ -106,7 +106,7 @@ def _begins_statement(token: Token, last: Token, in_bracket: bool, continues: bo
 
 
 def _step(token: Token, before: Sequence[Token], brackets: list[tuple[Token, bool]]) -> bool:
-    """Follow the brackets over one token; tell whether a line that ends in it goes on in the next."""
+    """Update the open brackets for a token; return whether a line that ends in it goes on in the next."""
     if token.type in _OPENING:
         brackets.append((token, bool(before) and before[-1].type in ("PREFIX", "INFIX")))
         return True
@@ -223,7 +223,7 @@ def _parse_group(group: TokenGroup, relations: Collection[str], faults: Faults) 
 
 
 def _too_deep(tokens: Sequence[Token]) -> Token | None:
-    """The bracket that goes past the bound on nesting, if one does."""
+    """Return the bracket that goes past the bound on nesting, if one does."""
     depth = 0
     for token in tokens:
         if token.type in _OPENING:
@@ -289,7 +289,7 @@ def _place(token: Token, tokens: Sequence[Token]) -> Span:
 def _report(
     token: Token, tokens: Sequence[Token], accepted: set[str], relations: Collection[str], faults: Faults
 ) -> None:
-    """Say what is wrong with a token that cannot stand where it does."""
+    """Report a token that cannot stand where it does."""
     position = next((index for index, other in enumerate(tokens) if other is token), len(tokens))
     before = tokens[position - 1] if position else None
     span = _place(token, tokens)

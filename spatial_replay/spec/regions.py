@@ -1,4 +1,4 @@
-"""Regions: shapes as written to outlines, refused where they enclose nothing."""
+"""Outlines of regions from shapes as written; shapes that enclose nothing are refused."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ Corner: TypeAlias = tuple[float, float]
 
 @dataclass(slots=True)
 class Effort:
-    """How many pairs of edges may still be compared, for all polygons of one text."""
+    """The pairs of edges that may still be compared, for all polygons of one text."""
 
     left: int = 100_000
 
 
 class OutlineError(Exception):
-    """What is wrong with a shape, and what to do about it."""
+    """A fault of a shape, and its remedy."""
 
     def __init__(self, message: str, hint: str) -> None:
         super().__init__(message)
@@ -27,7 +27,8 @@ class OutlineError(Exception):
 
 
 def polygon(corners: Sequence[Corner], effort: Effort) -> Outline:
-    """
+    """Return the outline of a polygon.
+
     Raises:
         OutlineError: no corner, or a boundary that crosses or touches itself. Corners on one line
             are accepted: they make a point or a segment.
@@ -47,7 +48,8 @@ def polygon(corners: Sequence[Corner], effort: Effort) -> Outline:
 
 
 def box(xmin: float, ymin: float, xmax: float, ymax: float) -> Outline:
-    """
+    """Return the outline of a box.
+
     Raises:
         OutlineError: a least coordinate above the greatest.
     """
@@ -59,7 +61,8 @@ def box(xmin: float, ymin: float, xmax: float, ymax: float) -> Outline:
 
 
 def circle(centre: Corner, radius: float) -> Outline:
-    """
+    """Return the outline of a disc.
+
     Raises:
         OutlineError: a negative radius.
     """
@@ -69,7 +72,7 @@ def circle(centre: Corner, radius: float) -> Outline:
 
 
 def _turn(a: Corner, b: Corner, c: Corner) -> float:
-    """Positive where a, b, c turn left, negative where they turn right, 0 on one line."""
+    """Return twice the signed area of a triangle: positive where a, b, c turn left, 0 on one line."""
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
@@ -80,12 +83,12 @@ def _is_collinear(ring: Sequence[Corner]) -> bool:
 
 
 def _within(a: Corner, b: Corner, c: Corner) -> bool:
-    """Whether c, on the line through a and b, lies between them."""
+    """Return whether c, on the line through a and b, lies between them."""
     return min(a[0], b[0]) <= c[0] <= max(a[0], b[0]) and min(a[1], b[1]) <= c[1] <= max(a[1], b[1])
 
 
 def _meet(a: Corner, b: Corner, c: Corner, d: Corner) -> bool:
-    """Whether the segments ab and cd have a point in common."""
+    """Return whether the segments ab and cd have a point in common."""
     c_side, d_side, a_side, b_side = _turn(a, b, c), _turn(a, b, d), _turn(c, d, a), _turn(c, d, b)
     if ((c_side > 0 > d_side) or (c_side < 0 < d_side)) and ((a_side > 0 > b_side) or (a_side < 0 < b_side)):
         return True
@@ -94,18 +97,19 @@ def _meet(a: Corner, b: Corner, c: Corner, d: Corner) -> bool:
 
 
 def _fold_back(a: Corner, b: Corner, c: Corner) -> bool:
-    """Whether the edge bc runs back over ab."""
+    """Return whether the edge bc runs back over ab."""
     forward = (b[0] - a[0]) * (c[0] - b[0]) + (b[1] - a[1]) * (c[1] - b[1])
     return _turn(a, b, c) == 0.0 and forward < 0.0
 
 
 def _crossing(ring: Sequence[Corner], effort: Effort) -> tuple[Corner, Corner] | None:
-    """The first corners of two edges that meet where they should not."""
+    """Return the first corners of two edges that meet where they should not."""
     count = len(ring)
     edges = [(ring[index], ring[(index + 1) % count]) for index in range(count)]
     for index in range(count):
         if _fold_back(*edges[index - 1], edges[index][1]):
             return edges[index - 1][0], edges[index][0]
+    # a sweep along x: only edges that overlap in x are compared
     by_left = sorted(range(count), key=lambda index: min(edges[index][0][0], edges[index][1][0]))
     for place, first in enumerate(by_left):
         right = max(edges[first][0][0], edges[first][1][0])

@@ -39,7 +39,7 @@ THREE_TERM_RELATIONS: frozenset[str] = frozenset({"closer", "between"})
 
 
 def compare(quantity: Expression, operator: str, limit: float) -> Expression:
-    """How far a quantity is on the right side of a limit; strict comparisons are no different."""
+    """Return the margin by which a quantity keeps a limit; strict comparisons have the same."""
     match operator:
         case "<=" | "<":
             return limit - quantity

@@ -1,7 +1,4 @@
-"""Names in formulas to terms, numbers and windows: objects, regions and groups, constants, parameters.
-
-What the names of a text stand for: one namespace of constants, regions, groups, macros and specs.
-"""
+"""Names resolved: the definitions of a text, and the terms, numbers and windows that names refer to."""
 
 from __future__ import annotations
 
@@ -66,7 +63,7 @@ _DURATION = re.compile(r"-?\d+(\.\d*)?([eE][+-]?\d{1,3})?m?s")
 
 
 def kind_of(statement: Statement) -> str:
-    """What a statement defines, with its article."""
+    """Return the kind of thing that a statement defines, with its article."""
     return KIND_OF[type(statement)]
 
 
@@ -90,7 +87,7 @@ class Namespace:
     constants: dict[str, float | Duration | None] = field(default_factory=dict)
 
     def declare(self, statements: Sequence[Statement]) -> None:
-        """Take in the definitions of a text, and work out constants, regions and groups."""
+        """Add the definitions of a text, and compute constants, regions and groups."""
         for statement in statements:
             if not isinstance(statement, UseStatement):
                 self._declare(statement)
@@ -122,7 +119,7 @@ class Namespace:
             _overriding(name, value)
 
     def constant(self, name: str) -> float | Duration | None:
-        """The value of a constant; None, and a fault, for one that is defined by way of itself."""
+        """Return the value of a constant; None, and a fault, for one that is defined in terms of itself."""
         if name in self.constants:
             return self.constants[name]
         chain: dict[str, ConstStatement] = {}
@@ -145,7 +142,7 @@ class Namespace:
     def _one_constant(
         self, name: str, statement: ConstStatement
     ) -> tuple[float | Duration | None, str | None]:
-        """The value of a constant, or the name of the constant that it repeats."""
+        """Return the value of a constant, or the name of the constant that it repeats."""
         if name in self.overrides:
             return _overriding(name, self.overrides[name]), None
         if isinstance(statement.value, Name):
@@ -160,13 +157,13 @@ class Namespace:
             return
         user = list(chain.values())[-1]
         if name in chain:
-            message = f"const {name!r} is defined by way of itself"
+            message = f"const {name!r} is defined in terms of itself"
             self.faults.add(user.value.span, message, "give it a number")
         else:
-            self.report_no_number(Name(name, user.value.span), statement)
+            self.report_not_a_number(Name(name, user.value.span), statement)
 
-    def report_no_number(self, name: Name, statement: Statement | None) -> None:
-        """Say that a name, and the statement that defines it if one does, gives no number."""
+    def report_not_a_number(self, name: Name, statement: Statement | None) -> None:
+        """Report that a name, and the statement that defines it if one does, is not a number."""
         if statement is None:
             consts = (each for each, what in self.definitions.items() if isinstance(what, ConstStatement))
             hint = self.faults.nearest(name.text, consts) or f"define it: const {name.text} = 1.0"
@@ -175,13 +172,13 @@ class Namespace:
             self.faults.add(name.span, f"{name.text!r} is {kind_of(statement)}; a number is expected here")
 
     def plain_number(self, quantity: Quantity) -> float:
-        """A number written outside of formulas; 0 after a fault."""
+        """Return a number written outside of formulas; 0 after a fault."""
         value: float | Duration | None
         if isinstance(quantity, Name):
             self.used.add(quantity.text)
             statement = self.definitions.get(quantity.text)
             if not isinstance(statement, ConstStatement):
-                self.report_no_number(quantity, statement)
+                self.report_not_a_number(quantity, statement)
                 return 0.0
             value = self.constant(quantity.text)
         else:
@@ -239,7 +236,7 @@ class Namespace:
 
 
 def _overriding(name: str, value: object) -> float | Duration:
-    """The value given for a constant from outside.
+    """Return the value given for a constant from outside.
 
     Raises:
         UsageError: it is neither a finite number nor the text of a duration.
@@ -257,12 +254,12 @@ def _overriding(name: str, value: object) -> float | Duration:
 
 
 def class_of(group: OpenGroup) -> str:
-    """The `class_name` of an open group."""
+    """Return the `class_name` of an open group."""
     return ANY_CLASS if group.class_name is None else group.class_name
 
 
 MAX_SAMPLES = 2**53
-
+"""Integers up to here are exact as floating-point numbers."""
 
 MAX_SIZE = 20_000
 """Operators, atoms and terms of one text, with macros, quantifiers and named specs written out."""
@@ -270,7 +267,7 @@ MAX_SIZE = 20_000
 
 @dataclass(frozen=True, slots=True)
 class Anything:
-    """The argument of a macro that nothing uses: whatever fits, so that its body can be checked."""
+    """The argument of a macro that nothing uses: fits any place, so that the body can be checked."""
 
 
 Value: TypeAlias = Term | float | Duration | Anything
@@ -278,7 +275,7 @@ Value: TypeAlias = Term | float | Duration | Anything
 
 @dataclass(frozen=True, slots=True)
 class Scope:
-    """What local names mean at one place, and how deep it lies.
+    """The local names at one place, and its depth.
 
     Attributes:
         values: parameters and variables.
@@ -296,13 +293,13 @@ class Scope:
     order: int = 0
 
     def deeper(self) -> Scope:
-        """The scope of an operand: one operator further in."""
+        """Return the scope of an operand: one operator further in."""
         return replace(self, depth=self.depth + 1)
 
 
 @dataclass(slots=True)
 class Resolver:
-    """Turns what is written in places of objects and numbers into values; faults are collected."""
+    """Resolves what is written in places of objects and numbers; faults are collected."""
 
     names: Namespace
     faults: Faults
@@ -318,7 +315,7 @@ class Resolver:
     # ----------------------------------------------------------------------------------------- terms
 
     def term(self, written: TermSyntax, scope: Scope) -> Term:
-        """What a term stands for; some tracked object after a fault."""
+        """Return the term that was written; some tracked object after a fault."""
         self.size += 1
         match written:
             case Name():
@@ -366,11 +363,11 @@ class Resolver:
             if isinstance(term, (TrackedName, Variable)):
                 left_out[term] = None
             else:
-                self.fault(name.span, scope, f"except leaves out one object; {name.text!r} is none")
+                self.fault(name.span, scope, f"except leaves out one object; {name.text!r} is not an object")
         return replace(group, excluded=tuple(left_out))
 
     def _is_open_question(self, written: TermSyntax, scope: Scope) -> bool:
-        """Whether a name stands for nothing known: a parameter of `Anything`, a broken definition."""
+        """Return whether a name is of unknown meaning: a parameter of `Anything`, a broken definition."""
         if not isinstance(written, Name):
             return False
         if isinstance(scope.values.get(written.text), Anything):
@@ -404,7 +401,7 @@ class Resolver:
     # --------------------------------------------------------------------------------------- numbers
 
     def quantity(self, written: Quantity, scope: Scope) -> float | Duration:
-        """The number or duration that stands somewhere; 0 after a fault."""
+        """Return the number or duration that stands somewhere; 0 after a fault."""
         if isinstance(written, NumberSyntax):
             return written.value
         value = scope.values.get(written.text)
@@ -418,12 +415,12 @@ class Resolver:
         self.names.used.add(written.text)
         statement = self.names.definitions.get(written.text)
         if not isinstance(statement, ConstStatement):
-            self.names.report_no_number(written, statement)
+            self.names.report_not_a_number(written, statement)
             return 0.0
         return self.names.constant(written.text) or 0.0
 
     def number(self, written: Quantity, scope: Scope) -> float:
-        """A plain number; a duration in its place is a fault."""
+        """Return a plain number; a duration in its place is a fault."""
         value = self.quantity(written, scope)
         if isinstance(value, Duration):
             hint = "leave out its unit"
@@ -433,7 +430,7 @@ class Resolver:
 
     def _samples(self, value: float, written: Quantity, scope: Scope) -> int:
         if value < 0.0 or not value.is_integer() or value > MAX_SAMPLES:
-            message = f"{format_number(value)} is no number of samples"
+            message = f"{format_number(value)} is not a whole number of samples"
             hint = "write a whole number of samples, at least 0, or a time such as 0.5s"
             self.fault(written.span, scope, message, hint)
             return 0
@@ -442,7 +439,7 @@ class Resolver:
     # --------------------------------------------------------------------------------------- windows
 
     def bound(self, written: BoundSyntax | None, scope: Scope) -> Bound | None:
-        """The window of a temporal operator; None for none, and after a fault."""
+        """Return the window of a temporal operator; None for none, and after a fault."""
         if written is None:
             return None
         lower = self._end(written.lower, scope)
@@ -471,7 +468,7 @@ class Resolver:
         return Bound(first, last, unit)
 
     def _end(self, written: Quantity, scope: Scope) -> float | Duration | None:
-        """One end of a window; None for inf."""
+        """Return an end of a window; None for inf."""
         is_inf = isinstance(written, Name) and written.text == "inf"
         if is_inf and "inf" not in scope.values and "inf" not in self.names.definitions:
             return None

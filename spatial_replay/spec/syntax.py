@@ -1,4 +1,4 @@
-"""What stands in a text, before names mean anything: statements, formulas and terms with their places."""
+"""Statements, formulas and terms as written, with their places, before names are resolved."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Duration:
 
 @dataclass(frozen=True, slots=True)
 class Name:
-    """A name: of an object or a definition, whichever stands there."""
+    """The name of an object or of a definition."""
 
     text: str
     span: Span
@@ -95,7 +95,7 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class RelationSyntax:
-    """`first relation[parameters] others`; `operator` is where the relation's name stands."""
+    """`first relation[parameters] others`; `operator` is the place of the relation's name."""
 
     relation: str
     operator: Span
@@ -150,7 +150,7 @@ class BoundSyntax:
 
 @dataclass(frozen=True, slots=True)
 class TemporalSyntax:
-    """A temporal operator; `keyword` is where the operator itself stands."""
+    """A temporal operator; `keyword` is the place of the operator itself."""
 
     operator: str
     keyword: Span
@@ -186,7 +186,7 @@ FormulaSyntax: TypeAlias = (
 
 
 def depth_of(formula: FormulaSyntax) -> int:
-    """Operators above the deepest atom, counting that atom."""
+    """Return the number of operators above the deepest atom, counting that atom."""
     return formula.depth if isinstance(formula, (BooleanSyntax, TemporalSyntax, QuantifierSyntax)) else 1
 
 
@@ -264,7 +264,7 @@ class SpecStatement:
 
 @dataclass(frozen=True, slots=True)
 class BrokenStatement:
-    """A statement that could not be read, but whose name is known: using it is no further fault."""
+    """A statement that could not be read, but whose name is known: using it is not another fault."""
 
     name: Name
 

@@ -1,4 +1,4 @@
-"""Text to tokens: the words, numbers and signs of the language, with their places.
+"""Tokens of a text: the words, numbers and signs of the language, with their places.
 
 A token is lark's `Token`: `type` as declared in grammar.lark, `value` (of a quoted name, the name
 itself), `start_pos`, `end_pos` and `line`.
@@ -76,25 +76,25 @@ _STARTS_FORMULA = frozenset(
 
 
 def is_reserved(word: str, relations: Iterable[str]) -> bool:
-    """Whether a word is part of the language, given the names of its relations."""
+    """Return whether a word is part of the language, given the names of its relations."""
     return word in KEYWORDS or word in relations
 
 
 def written_name(name: str, relations: Iterable[str]) -> str:
-    """A name as it is written: in quotes unless it is an identifier that is not reserved."""
+    """Return a name as written in a text: in quotes unless it is an identifier that is not reserved."""
     if _IDENTIFIER.match(name) and not is_reserved(name, relations):
         return name
     return quoted(name)
 
 
 def quoted(name: str) -> str:
-    """A name in quotes."""
+    """Return a name in quotes."""
     escaped = name.replace("\\", "\\\\").replace('"', '\\"')
     return f'"{escaped}"'
 
 
 def span_of(token: Token) -> Span:
-    """The place of a token of `tokenize`."""
+    """Return the place of a token of `tokenize`."""
     return Span(token.start_pos or 0, token.end_pos or 0)
 
 
@@ -103,7 +103,7 @@ MAX_TOKENS = 40_000
 
 
 def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token]:
-    """The tokens of a text; what is none is reported, and becomes a token of type ERROR.
+    """Return the tokens of a text; anything else is reported, and becomes a token of type ERROR.
 
     Of a text of more than `MAX_TOKENS`, those up to the bound, which is reported.
     """

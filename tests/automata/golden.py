@@ -8,9 +8,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.compile import automaton
-from spatial_replay.spec.load import parse_specification
+from spatial_replay import Automaton, automaton, parse_specification
 
 FILE = Path(__file__).with_name("golden.json")
 FORMULAS = (

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.compile import automaton
-from spatial_replay.automata.dot_hoa import dot_text, hoa_text, words_text
-from spatial_replay.automata.guards import Transition
-from spatial_replay.errors import UsageError
-from spatial_replay.spec.load import parse_specification
+from spatial_replay import Automaton, UsageError, automaton, parse_specification
+from spatial_replay.automata import Transition, dot_text, hoa_text, words_text
 
 TASK = """\
 spec safe = not (robot ovlp hand)
@@ -39,7 +35,7 @@ def test_a_run_steps_from_state_to_state(done: Automaton) -> None:
     assert state not in done.can_accept
 
 
-def test_what_is_not_known_leaves_several_states(done: Automaton) -> None:
+def test_an_unknown_proposition_leaves_several_states_possible(done: Automaton) -> None:
     after = done.step_set({done.initial}, (True, None, False))
     assert after == {
         done.step(done.initial, (True, False, False)),
@@ -48,7 +44,7 @@ def test_what_is_not_known_leaves_several_states(done: Automaton) -> None:
     assert done.step_set(after, (False, None, None)) == {done.step(done.initial, (False, True, True))}
 
 
-def test_the_shortest_way_is_found_and_another_when_it_is_barred(done: Automaton) -> None:
+def test_paths_yields_the_shortest_path_and_another_if_it_is_excluded(done: Automaton) -> None:
     (way,) = done.paths(done.initial)
     assert [done.guard_words(each) for each in way] == ["safe and first and second"]
     barred = {(each.source, each.target) for each in way}
@@ -71,7 +67,7 @@ def test_a_transition_is_found_by_its_ends(done: Automaton) -> None:
 
 
 @pytest.mark.parametrize("call", ["step", "step_set", "paths"])
-def test_a_state_that_is_none_is_told(done: Automaton, call: str) -> None:
+def test_an_unknown_state_is_a_usage_error(done: Automaton, call: str) -> None:
     with pytest.raises(UsageError, match="no state 99; there are 0 to"):
         match call:
             case "step":
@@ -82,14 +78,14 @@ def test_a_state_that_is_none_is_told(done: Automaton, call: str) -> None:
                 list(done.paths(99))
 
 
-def test_a_symbol_of_another_length_is_told(done: Automaton) -> None:
+def test_a_symbol_of_the_wrong_length_is_a_usage_error(done: Automaton) -> None:
     with pytest.raises(UsageError, match="2 values; there are 3 propositions"):
         done.step(0, (True, True))
     with pytest.raises(UsageError, match="at least one sample"):
         done.accepts([])
 
 
-def test_in_words() -> None:
+def test_an_automaton_is_described_in_words() -> None:
     machine = automaton(parse_specification("G ((p >= 0) -> F q >= 0)"))
     assert words_text(machine).splitlines() == [
         "automaton of spec: 2 states, 2 propositions",
@@ -102,23 +98,23 @@ def test_in_words() -> None:
     ]
 
 
-def test_in_words_names_are_explained_and_ends_are_told(done: Automaton) -> None:
+def test_the_description_explains_names_and_final_states(done: Automaton) -> None:
     text = words_text(done)
     assert "  safe means not (robot ovlp hand)\n" in text
     assert "a trap: acceptance is lost" in text
     later = words_text(automaton(parse_specification("X p >= 0")))
     assert "state 0: start, before the first sample" in later
-    assert "accepting for good" in later
+    assert "accepting permanently" in later
 
 
-def test_for_graphviz() -> None:
+def test_the_graphviz_text_lists_states_and_transitions() -> None:
     text = dot_text(automaton(parse_specification('spec "a \\"b\\"" = F p >= 0')))
     assert text.splitlines()[0] == 'digraph "a \\"b\\"" {'
-    assert '  1 [shape=doublecircle, fillcolor="#b2d5e8", tooltip="accepting for good"];' in text
+    assert '  1 [shape=doublecircle, fillcolor="#b2d5e8", tooltip="accepting permanently"];' in text
     assert '  0 -> 1 [label="p >= 0"];' in text
 
 
-def test_for_graphviz_long_propositions_are_told_below() -> None:
+def test_the_graphviz_text_explains_long_propositions_in_a_legend() -> None:
     near = "(cup dist plate <= 0.25) and (cup dist fork <= 0.25) and (fork dist plate <= 0.25)"
     text = dot_text(automaton(parse_specification(f"spec p0 = q >= 0\nspec t = (F ({near})) and G p0")))
     assert '[label="p1 and p0"]' in text
@@ -128,7 +124,7 @@ def test_for_graphviz_long_propositions_are_told_below() -> None:
     assert "(cup dist plate" not in text.replace(below, "")
 
 
-def test_in_the_hanoi_format(done: Automaton) -> None:
+def test_the_hanoi_text_lists_states_and_transitions(done: Automaton) -> None:
     lines = hoa_text(automaton(parse_specification("G ((p >= 0) -> F q >= 0)"))).splitlines()
     assert lines == [
         "HOA: v1",

@@ -8,11 +8,8 @@ import pytest
 
 import spatial_replay as sr
 from automata.golden import FILE, FORMULAS, as_values
-from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.compile import automaton
-from spatial_replay.errors import NoAutomatonError, UsageError
+from spatial_replay import Automaton, NoAutomatonError, UsageError, automaton, parse_specification
 from spatial_replay.simulation.worlds import default_specification
-from spatial_replay.spec.load import parse_specification
 
 GOLDEN = json.loads(FILE.read_text())
 
@@ -26,7 +23,7 @@ def test_automata_are_those_that_mona_gives(text: str) -> None:
     assert as_values(automaton(parse_specification(text), compiler="own")) == GOLDEN[text]
 
 
-def test_it_can_be_used_from_the_package_itself() -> None:
+def test_automata_are_available_from_the_package_root() -> None:
     machine = sr.automaton(sr.parse_specification("F p >= 0"))
     assert isinstance(machine, sr.Automaton)
     assert machine.accepts([[False], [True]]) and not machine.accepts([[False], [False]])
@@ -50,7 +47,7 @@ def test_propositions_are_the_largest_parts_about_one_sample() -> None:
     ]
 
 
-def test_a_named_proposition_goes_by_its_name() -> None:
+def test_a_named_proposition_is_labelled_by_its_name() -> None:
     machine = automaton(parse_specification("spec near = a closeto[1] b\nspec done = F near"), "done")
     assert [(each.label, each.text) for each in machine.propositions] == [("near", "a closeto[1] b")]
     assert machine.guard_words(machine.transitions[0]) == "not near"
@@ -68,7 +65,7 @@ def test_a_named_proposition_goes_by_its_name() -> None:
         ("forall x in all: x ovlp a", "not (exists x in all: not (x ovlp a))"),
     ],
 )
-def test_what_says_the_same_is_one_proposition(first: str, second: str) -> None:
+def test_equivalent_texts_are_one_proposition(first: str, second: str) -> None:
     machine = machine_of(f"(F ({first})) and (G ({second}))")
     assert [each.formula for each in machine.propositions] == [
         parse_specification(f"F ({first})").specs[0].formula.operands[0]
@@ -97,21 +94,21 @@ def test_a_template_has_one_automaton_for_all_objects() -> None:
 # ------------------------------------------------------------------------------------------ what has none
 
 
-def test_every_operator_that_has_no_automaton_is_told_with_its_place() -> None:
+def test_every_operator_without_an_automaton_is_reported_with_its_place() -> None:
     with pytest.raises(NoAutomatonError) as raised:
         machine_of("spec done = (F[0, 2s] a ovlp b) and\n  (G (O a ovlp b))")
-    told = str(raised.value)
-    assert "task.spatial:1:13: error: `F[0s, 2s]` counts seconds" in told
-    assert "task.spatial:2:6: error: `O` looks back" in told
+    message = str(raised.value)
+    assert "task.spatial:1:13: error: `F[0s, 2s]` counts seconds" in message
+    assert "task.spatial:2:6: error: `O` looks back" in message
 
 
-def test_seconds_that_bound_nothing_are_no_obstacle() -> None:
+def test_bounds_in_seconds_that_bound_nothing_are_accepted() -> None:
     assert machine_of("F[0s, inf] a ovlp b") == machine_of("F a ovlp b")
     assert machine_of("G[0s, 0s] a ovlp b").accepting == machine_of("G[0, 0] a ovlp b").accepting
 
 
 @pytest.mark.parametrize("bound", ["[0, 9999]", "[10000, inf]", "[999999999, 9999999999]"])
-def test_a_bound_of_too_many_samples_is_told(bound: str) -> None:
+def test_a_bound_of_too_many_samples_is_reported(bound: str) -> None:
     with pytest.raises(NoAutomatonError, match="unrolled into steps, there are more than 10000") as raised:
         machine_of(f"G{bound} a ovlp b")
     assert "task.spatial:1:1" in str(raised.value)
@@ -128,11 +125,11 @@ def test_deadlines_of_many_samples_take_a_state_for_each(samples: int) -> None:
     assert len(machine_of(f"G (a ovlp b -> F[0, {samples}] c ovlp d)").states) == samples + 2
 
 
-def test_steps_within_one_another_are_followed() -> None:
+def test_deeply_nested_next_operators_compile() -> None:
     assert len(machine_of(f"{'X ' * 90} a ovlp b").states) == 93
 
 
-def test_what_is_too_large_is_told_with_its_widest_window_and_every_reason() -> None:
+def test_a_formula_that_is_too_large_is_reported_with_its_widest_window_and_every_reason() -> None:
     text = "spec done = F (a ovlp b and F[0, 9] c ovlp d)\nspec slow = G (a ovlp b -> F[20, 20] c ovlp d)"
     with pytest.raises(NoAutomatonError) as raised:
         automaton(parse_specification(text, filename="task.spatial"), "slow", compiler="own")
@@ -155,36 +152,36 @@ def test_what_is_too_large_is_told_with_its_widest_window_and_every_reason() -> 
         ("G " * 16 + "a ovlp b", "G", "the formula has more than 20000 subformulas to translate"),
     ],
 )
-def test_what_is_too_large_to_translate_for_mona_is_told(text: str, operator: str, reason: str) -> None:
+def test_a_formula_too_large_to_translate_for_mona_is_reported(text: str, operator: str, reason: str) -> None:
     with pytest.raises(NoAutomatonError) as raised:
         automaton(parse_specification(text, filename="task.spatial"), compiler="mona")
-    told = str(raised.value)
-    assert f"task.spatial:1:1: error: `{operator}` leaves " in told
-    assert f"MONA: with its bounds unrolled {reason}" in told
-    assert "for an automaton, write smaller bounds" in told
+    message = str(raised.value)
+    assert f"task.spatial:1:1: error: `{operator}` leaves " in message
+    assert f"MONA: with its bounds unrolled {reason}" in message
+    assert "for an automaton, write smaller bounds" in message
 
 
 @pytest.mark.parametrize("value", ["F a ovlp b", None, b"F a ovlp b"])
-def test_what_is_no_specification_is_told(value: object) -> None:
+def test_anything_but_a_specification_is_a_usage_error(value: object) -> None:
     with pytest.raises(
         UsageError, match=r"specification is .*; give a Specification, from parse_specification"
     ):
         automaton(value)  # type: ignore[arg-type]
 
 
-def test_too_many_propositions_are_told() -> None:
+def test_too_many_propositions_are_reported() -> None:
     text = " and ".join(f"(F p{number} >= 0)" for number in range(65))
     with pytest.raises(NoAutomatonError, match=r"`and` leaves .* 65 propositions, an automaton at most 64"):
         machine_of(text)
 
 
-def test_guards_that_nobody_could_read_are_told() -> None:
+def test_guards_with_too_many_cubes_are_reported() -> None:
     text = " xor ".join(f"(X p{number} >= 0)" for number in range(24))
     with pytest.raises(NoAutomatonError, match="guards"):
         automaton(parse_specification(text), compiler="own")
 
 
-def test_which_spec_must_be_clear() -> None:
+def test_an_ambiguous_choice_of_spec_is_a_usage_error() -> None:
     specification = parse_specification("spec reach = F p >= 0\nspec stay = G p >= 0")
     with pytest.raises(UsageError, match="several results; choose one with name=: reach, stay"):
         automaton(specification)

@@ -23,7 +23,7 @@ def test_a_drawing_has_every_state_and_names_long_propositions():
     ax.figure.canvas.draw()
 
 
-def test_short_names_are_none_that_a_specification_has():
+def test_short_names_differ_from_names_of_the_specification():
     text = "spec p0 = cup ovlp fork\nspec task = F (p0) and F (cup closeto[0.1] plate)"
     labels = [text.get_text() for text in automaton(text).plot().texts]
     assert "p0: cup ovlp fork\np1: cup closeto[0.1] plate" in labels

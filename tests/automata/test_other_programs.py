@@ -15,13 +15,17 @@ from hypothesis import given, settings
 
 from automata.golden import FORMULAS
 from laws.strategies_automaton import compiled, formulas_with_automata
-from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.compile import automaton, automaton_from, stored_text
-from spatial_replay.automata.dot_hoa import svg_text
-from spatial_replay.errors import NoAutomatonError, OutputError, UsageError
-from spatial_replay.recording import Recorder
-from spatial_replay.spec.load import parse_specification
-from spatial_replay.trace.sample import Sample
+from spatial_replay import (
+    Automaton,
+    NoAutomatonError,
+    OutputError,
+    Recorder,
+    Sample,
+    UsageError,
+    automaton,
+    parse_specification,
+)
+from spatial_replay.automata import automaton_from, stored_text, svg_text
 
 needs_mona = pytest.mark.skipif(shutil.which("mona") is None, reason="MONA is not installed")
 needs_graphviz = pytest.mark.skipif(shutil.which("dot") is None, reason="Graphviz is not installed")
@@ -30,7 +34,7 @@ needs_graphviz = pytest.mark.skipif(shutil.which("dot") is None, reason="Graphvi
 @needs_mona
 @settings(max_examples=60)
 @given(formulas_with_automata)
-def test_both_compilers_give_one_automaton(formula) -> None:
+def test_both_compilers_give_equal_automata(formula) -> None:
     assert compiled(formula, "own") == compiled(formula, "mona")
 
 
@@ -47,7 +51,7 @@ def test_mona_compiles_what_nests_220_deep_however_deep_its_caller_is(text: str)
 
 
 @needs_mona
-def test_of_many_propositions_a_state_may_look_at_any_one() -> None:
+def test_a_state_may_depend_on_any_of_many_propositions() -> None:
     text = "p39 >= 0"
     for number in reversed(range(39)):
         text = f"(p{number} >= 0) and X ({text})"
@@ -60,7 +64,7 @@ def _through_mona(text: str) -> Automaton:
 
 
 @needs_mona
-def test_any_number_of_processes_compile_at_once() -> None:
+def test_several_processes_compile_at_once() -> None:
     texts = [FORMULAS[number % len(FORMULAS)] for number in range(100)]
     with ProcessPoolExecutor(4) as pool:
         results = list(pool.map(_through_mona, texts))
@@ -88,7 +92,7 @@ def _program(folder: Path, name: str, script: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("script", "told"),
+    ("script", "message"),
     [
         ("cat >/dev/null; echo 'out of memory'; exit 3", "code 3: out of memory"),
         ("exit 1", "code 1"),
@@ -96,12 +100,12 @@ def _program(folder: Path, name: str, script: str) -> None:
         ("kill -9 $$", "ended after"),
     ],
 )
-def test_what_goes_wrong_in_mona_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, told: str
+def test_failures_of_mona_are_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, message: str
 ) -> None:
     _program(tmp_path, "mona", script)
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
-    with pytest.raises(NoAutomatonError, match=told):
+    with pytest.raises(NoAutomatonError, match=message):
         _through_mona("F p >= 0")
 
 
@@ -115,7 +119,7 @@ def test_a_recording_compiles_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 @needs_mona
-def test_an_automaton_that_is_too_large_is_told() -> None:
+def test_an_automaton_that_is_too_large_is_reported() -> None:
     # 2^11 sets of what has been seen already
     text = " and ".join(f"(F p{number} >= 0)" for number in range(11))
     with pytest.raises(NoAutomatonError, match=r"MONA: .* states and more than 100000 moves"):
@@ -140,7 +144,7 @@ def test_without_graphviz_the_error_says_what_to_do(tmp_path: Path, monkeypatch:
         svg_text(machine)
 
 
-def test_what_goes_wrong_in_graphviz_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failures_of_graphviz_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _program(tmp_path, "dot", "cat >/dev/null; echo 'no fonts' >&2; exit 2")
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     with pytest.raises(OutputError, match="code 2: no fonts"):

@@ -7,8 +7,9 @@ import json
 import pytest
 
 from automata.golden import FORMULAS
-from spatial_replay.automata.compile import MAX_ROWS, automaton, automaton_from, stored_text
-from spatial_replay.spec.load import parse_specification
+from spatial_replay import automaton, parse_specification
+from spatial_replay.automata import automaton_from, stored_text
+from spatial_replay.automata.compile import MAX_ROWS
 
 SPECIFICATION = parse_specification("G ((p >= 0) -> F q >= 0)")
 SPEC = SPECIFICATION.specs[0]
@@ -31,7 +32,7 @@ def test_a_file_of_another_formula_is_not() -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"{", b"[]", b"null", b"\xff", b"[" * 100_000, b'{"version": 1}'])
-def test_what_is_no_such_file_is_not_read(data: bytes) -> None:
+def test_a_file_of_another_kind_is_not_read(data: bytes) -> None:
     assert automaton_from(data, SPECIFICATION, SPEC) is None
 
 
@@ -63,7 +64,7 @@ def test_a_file_that_was_tampered_with_is_not_read(changed: dict[str, object]) -
 
 
 @pytest.mark.parametrize("text", FORMULAS)
-def test_whatever_compiles_is_read_back(text: str) -> None:
+def test_a_stored_automaton_is_read_back(text: str) -> None:
     specification = parse_specification(text)
     result = automaton(specification)
     data = stored_text(result, specification, specification.specs[0]).encode()

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 from hypothesis import strategies as st
 
+from spatial_replay import parse_specification
 from spatial_replay.spec.formula import Formula
-from spatial_replay.spec.load import parse_specification
 
 OBJECTS = ("a", "b", "c")
 PARAMETER_RELATIONS = ("closeto", "farfrom", "touch", "moved")

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from laws.reference import Prefix
 from laws.strategies_automaton import compiled, formulas_and_symbols, formulas_with_automata
 from laws.strategies_monitor import leaf_runs
-from spatial_replay.automata.automaton import Automaton, TransitionTable
-from spatial_replay.automata.compile import automaton, automaton_from, stored_text
-from spatial_replay.spec.formula import NamedSpec, Specification
+from spatial_replay import Automaton, Specification, automaton
+from spatial_replay.automata import TransitionTable, automaton_from, stored_text
+from spatial_replay.spec.formula import NamedSpec
 
 known = st.booleans()
 perhaps_unknown = st.sampled_from([False, True, None])
@@ -43,7 +43,7 @@ def _known(cells):
 
 
 @given(formulas_and_symbols(perhaps_unknown, max_size=3))
-def test_what_is_not_known_leaves_the_states_of_everything_that_it_may_be(given_symbols):
+def test_unknown_propositions_leave_the_states_of_all_their_values(given_symbols):
     machine, symbols = given_symbols
     possible = frozenset({machine.initial})
     for symbol in symbols:
@@ -57,7 +57,7 @@ def test_what_is_not_known_leaves_the_states_of_everything_that_it_may_be(given_
 
 
 @given(formulas_and_symbols(perhaps_unknown))
-def test_many_samples_at_once_are_as_one_by_one(given_symbols):
+def test_the_table_steps_many_samples_as_the_automaton_steps_one(given_symbols):
     machine, symbols = given_symbols
     values = np.array([[-1 if each is None else int(each) for each in symbol] for symbol in symbols], np.int8)
     values = values.reshape(len(symbols), len(machine.propositions)).T.copy()
@@ -74,7 +74,7 @@ def test_many_samples_at_once_are_as_one_by_one(given_symbols):
 
 
 @given(formulas_and_symbols(known))
-def test_of_the_guards_of_a_state_one_holds_and_leads_where_the_step_does(given_symbols):
+def test_exactly_one_guard_of_a_state_holds_and_leads_where_the_step_does(given_symbols):
     machine, symbols = given_symbols
     state = machine.initial
     for symbol in symbols:
@@ -100,7 +100,7 @@ def test_no_literal_of_a_guard_can_be_left_out(formula):
 
 
 @given(formulas_with_automata)
-def test_no_two_states_are_alike(formula):
+def test_no_two_states_are_equivalent(formula):
     machine = compiled(formula)
     assert len(_classes(machine)) == len(machine.states)
 
@@ -147,7 +147,7 @@ def _reached(machine: Automaton, state: int) -> set[int]:
 
 
 @given(formulas_with_automata)
-def test_traps_and_acceptance_for_good_are_where_nothing_can_change(formula):
+def test_traps_and_permanent_acceptance_are_where_nothing_can_change(formula):
     machine = compiled(formula)
     for state in machine.states:
         ends = _reached(machine, state) | ({state} if state != machine.initial else set())

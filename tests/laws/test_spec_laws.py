@@ -8,15 +8,8 @@ import hypothesis.strategies as st
 from hypothesis import given, settings
 
 from laws.strategies_spec import Vocabulary, formula_texts, noise, specification_texts
-from spatial_replay.errors import SpecificationError
-from spatial_replay.spec import (
-    check_names,
-    format_formula,
-    format_specification,
-    instantiate,
-    object_names,
-    parse_specification,
-)
+from spatial_replay import SpecificationError, parse_specification
+from spatial_replay.spec import check_names, format_formula, format_specification, instantiate, object_names
 from spatial_replay.spec.formula import Formula, Variable, operands_of
 from spatial_replay.spec.walks import base_of, iter_formulas
 
@@ -27,7 +20,7 @@ def formula_of(text: str) -> Formula:
 
 @given(specification_texts())
 @settings(max_examples=60)
-def test_what_is_written_out_is_read_back(text: str) -> None:
+def test_reading_a_canonical_text_gives_an_equal_specification(text: str) -> None:
     specification = parse_specification(text)
     canonical = format_specification(specification)
     assert parse_specification(canonical) == specification
@@ -36,7 +29,7 @@ def test_what_is_written_out_is_read_back(text: str) -> None:
 
 @given(specification_texts())
 @settings(max_examples=60)
-def test_every_node_is_a_formula_of_its_own(text: str) -> None:
+def test_the_text_of_a_node_means_that_node(text: str) -> None:
     """The text of a node, which tools show by itself, means that node."""
     specification = parse_specification(text)
     definitions = [line for line in format_specification(specification).splitlines() if line[:5] != "spec "]
@@ -107,7 +100,7 @@ def test_a_prefix_reaches_up_to_the_closing_bracket(a: str, b: str) -> None:
 
 @given(specification_texts())
 @settings(max_examples=60)
-def test_names_of_the_log_are_exactly_those_asked_for(text: str) -> None:
+def test_object_and_signal_names_are_exactly_those_used(text: str) -> None:
     specification = parse_specification(text)
     names = object_names(specification)
     assert check_names(specification, names, ("battery", "air temperature")) == ()

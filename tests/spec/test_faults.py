@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from spatial_replay.errors import SpecificationError, UsageError
-from spatial_replay.spec import check_names, load_specification, parse_specification
+from spatial_replay import SpecificationError, UsageError, load_specification, parse_specification
+from spatial_replay.spec import check_names
 from spatial_replay.spec.diagnostics import MAX_FAULTS
 
 
@@ -48,15 +48,15 @@ spec template(ego) = ego ovlp goal
         ("spec s = a ovlp S", "S", "found 'S'", '"S"'),
         ("spec s = a ovlp 12", "12", "found '12'", '"12"'),
         ("spec s = F[5, 2] a ovlp b", "[5, 2]", "is empty", ""),
-        ("spec s = F[0, 2.5] a ovlp b", "2.5", "no number of samples", "whole"),
+        ("spec s = F[0, 2.5] a ovlp b", "2.5", "not a whole number of samples", "whole"),
         ("spec s = F[1, 2s] a ovlp b", "[1, 2s]", "from samples to time", "both"),
-        ("spec s = F[-1, 2] a ovlp b", "-1", "no number of samples", ""),
+        ("spec s = F[-1, 2] a ovlp b", "-1", "not a whole number of samples", ""),
         ("spec s = F[inf, inf] a ovlp b", "inf", "cannot begin at inf", ""),
-        ("spec s = F[0, 1e-10s] a ovlp b", "1e-10s", "no usable duration", "nanoseconds"),
+        ("spec s = F[0, 1e-10s] a ovlp b", "1e-10s", "not a usable duration", "nanoseconds"),
         ("spec s = F[0, 3h] a ovlp b", "3h", "neither a number", "s and ms"),
         ("spec s = X[1, 2] a ovlp b", "[1, 2]", "takes no window", ""),
         ("spec s = a[-1][-2] ovlp b", "a[-1][-2]", "a delay of a delayed object", "add"),
-        ("spec s = a[-1.5] ovlp b", "1.5", "no number of samples", ""),
+        ("spec s = a[-1.5] ovlp b", "1.5", "not a whole number of samples", ""),
         ("spec s = enlarge(a, -1) ovlp b", "-1", "negative radius", ""),
         ("spec s = a moved[-1] b", "moved", "negative radius", ""),
         ("spec s = a oriented[1] goal", "oriented", "a region has none", ""),
@@ -70,7 +70,7 @@ spec template(ego) = ego ovlp goal
         ("spec s = f", "f", "is a macro", "write f(a, e)"),
         ("spec s = f(a)", "f(a)", "takes 2 arguments (a, e), not 1", ""),
         ("spec s = ff(a, 1)", "ff", "no macro is named", "did you mean 'f'?"),
-        ("def g(a) = g(a)\nspec s = g(b)", "g(a)", "by way of itself", ""),
+        ("def g(a) = g(a)\nspec s = g(b)", "g(a)", "in terms of itself", ""),
         ("spec s = forall x in goal: x ovlp a", "goal", "runs over a group", ""),
         ("spec s = forall x, x in reds: x ovlp a", "x", "given twice", ""),
         ("spec s = forall x in everyone: F (x ovlp a)", "F (x ovlp a)", "open group", "template"),
@@ -103,15 +103,13 @@ spec template(ego) = ego ovlp goal
         ("group g = a, goal", "goal", "'goal' is a region", ""),
         ("group g = a, a", "a", "listed twice", ""),
         ("use papr\nspec s = a ovlp b", "papr", "unknown profile", "did you mean 'paper'?"),
-        ("const a1 = b1\nconst b1 = a1", "a1", "by way of itself", ""),
+        ("const a1 = b1\nconst b1 = a1", "a1", "in terms of itself", ""),
         ("sepc s = a ovlp b", "sepc", "expected a statement", "did you mean 'spec'?"),
         ("spec s(a, b) = a ovlp b", "b", "more than one parameter", ""),
         ("spec s(goal) = goal ovlp b", "goal", "already the name of a region", ""),
     ],
 )
-def test_a_fault_says_what_where_and_what_instead(
-    statement: str, where: str, message: str, hint: str
-) -> None:
+def test_a_fault_names_the_place_and_the_remedy(statement: str, where: str, message: str, hint: str) -> None:
     found = faults_of(DEFINITIONS + statement + "\n")
     assert len(found) == 1, found
     head, line, caret, *tail = found[0].splitlines()
@@ -122,7 +120,7 @@ def test_a_fault_says_what_where_and_what_instead(
     assert marked.startswith(where) if where else caret.index("^") == len(line)
 
 
-def test_all_faults_are_told_at_once_in_the_order_of_the_text() -> None:
+def test_all_faults_are_reported_together_in_the_order_of_the_text() -> None:
     lines = [f"spec s{number} = a closto b" for number in range(10)]
     found = faults_of("\n".join(lines))
     assert [int(fault.split(":")[1]) for fault in found] == list(range(1, 11))
@@ -135,7 +133,7 @@ def test_a_broken_definition_is_one_fault_however_often_it_is_used() -> None:
     assert len(faults_of(text)) == 3
 
 
-def test_faults_in_macros_say_who_uses_them() -> None:
+def test_a_fault_in_a_macro_names_the_line_that_uses_it() -> None:
     (found,) = faults_of("def f(a) = a[-1] ovlp b\nspec s = f(c[-2])")
     assert "a delay of a delayed object (in 'f', used in line 2)" in found
 
@@ -163,7 +161,7 @@ def test_bodies_of_unused_macros_are_checked() -> None:
     ],
     ids=lambda text: text[:12],
 )  # fmt: skip
-def test_what_is_too_large_is_refused(text: str) -> None:
+def test_a_text_that_is_too_large_is_refused(text: str) -> None:
     assert (
         "more than" in faults_of(text)[0]
         or "never closed" in faults_of(text)[0]
@@ -171,7 +169,7 @@ def test_what_is_too_large_is_refused(text: str) -> None:
     )
 
 
-def test_no_more_faults_are_told_than_can_be_read() -> None:
+def test_the_number_of_reported_faults_is_bounded() -> None:
     found = faults_of("\n".join(f"spec s{number} = foo{number}" for number in range(300)))
     assert len(found) == 101
     assert "200 further faults" in found[-1]
@@ -196,7 +194,7 @@ def calls_to_parse(text: str) -> int:
 
 
 @pytest.mark.parametrize("wrong", ["a closetoo{} b", "a ovlp", "a ovlp b c{}"])
-def test_a_text_full_of_faults_costs_no_more_than_one_without(wrong: str) -> None:
+def test_a_text_full_of_faults_takes_no_longer_than_a_correct_one(wrong: str) -> None:
     number = 1500
     faulty = "\n".join(f"spec s{each} = " + wrong.format(each) for each in range(number))
     right = "\n".join(f"spec s{each} = a closeto[1] b" for each in range(number))
@@ -232,7 +230,7 @@ def test_a_text_full_of_faults_costs_no_more_than_one_without(wrong: str) -> Non
         ("region r = box(0, 0, 1, 1)\ngroup g = a\nspec s = g ovlp r", []),
     ],
 )
-def test_warnings(text: str, messages: list[str]) -> None:
+def test_legal_but_misleading_texts_give_warnings(text: str, messages: list[str]) -> None:
     warnings = parse_specification(text).warnings
     assert len(warnings) == len(messages)
     for warning, message in zip(warnings, messages, strict=True):
@@ -253,18 +251,18 @@ def test_names_are_compared_with_those_of_a_log() -> None:
 
 
 @pytest.mark.parametrize("given", [3, None, b"a ovlp b"])
-def test_something_else_than_a_text_is_a_fault_of_the_call(given: Any) -> None:
+def test_anything_but_a_text_is_a_usage_error(given: Any) -> None:
     with pytest.raises(UsageError, match=r"text is .*; give the text as a str") as caught:
         parse_specification(given)
     assert repr(given) in str(caught.value)
 
 
-def test_something_else_than_a_path_is_a_fault_of_the_call() -> None:
+def test_anything_but_a_path_is_a_usage_error() -> None:
     path: Any = 3
     with pytest.raises(UsageError, match=r"path is 3; give the path of a file"):
         load_specification(path)
 
 
-def test_an_unknown_profile_in_a_call_is_a_fault_of_the_call() -> None:
+def test_an_unknown_profile_in_a_call_is_a_usage_error() -> None:
     with pytest.raises(UsageError, match="paper, spatial_spec"):
         parse_specification("a ovlp b", profile="other")

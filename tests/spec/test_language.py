@@ -8,8 +8,14 @@ from pathlib import Path
 import pytest
 
 import spatial_replay.spec
-from spatial_replay.errors import MissingFileError, SpecificationError, UsageError
-from spatial_replay.spec import format_formula, instantiate, load_specification, parse_specification
+from spatial_replay import (
+    MissingFileError,
+    SpecificationError,
+    UsageError,
+    load_specification,
+    parse_specification,
+)
+from spatial_replay.spec import format_formula, instantiate
 from spatial_replay.spec.formula import (
     ANY_CLASS,
     Atom,
@@ -77,7 +83,7 @@ spec blocks = reach and passage
         "\ufeffspec s = forall x in all:\r\n  x ovlp a\r\n",
     ],
 )
-def test_a_statement_goes_on_where_its_line_cannot_end(text: str) -> None:
+def test_a_statement_continues_after_a_line_that_cannot_end_it(text: str) -> None:
     assert len(parse_specification(text).specs) == 1
 
 
@@ -121,7 +127,7 @@ def test_quantifiers_over_open_groups_bind_a_variable() -> None:
     assert formula.body.terms == (Variable("m"), TrackedName("b"))
 
 
-def test_macros_do_not_capture_what_is_given_to_them() -> None:
+def test_macros_do_not_capture_their_arguments() -> None:
     formula = formula_of(
         'def near(a) = exists m in all: a closeto[1] m\nspec s = forall m in all: near(m) and near("m")'
     )
@@ -144,7 +150,7 @@ def test_groups_stand_for_their_members() -> None:
         assert atom_of(text.format(written)).terms[0] == term
 
 
-def test_a_template_is_put_in_place_with_its_object() -> None:
+def test_a_template_is_instantiated_with_its_object() -> None:
     specification = parse_specification(
         'group people = class "person"\nspec near(ego) = G (ego dist (people except ego) >= 1)'
     )
@@ -153,7 +159,7 @@ def test_a_template_is_put_in_place_with_its_object() -> None:
     assert format_formula(instantiate(spec, "robot 1")) == (
         'G ("robot 1" dist (people except "robot 1") >= 1)'
     )
-    with pytest.raises(UsageError, match="no template"):
+    with pytest.raises(UsageError, match="not a template"):
         instantiate(parse_specification("a ovlp b").specs[0], "a")
 
 
@@ -169,7 +175,7 @@ def test_a_template_is_put_in_place_with_its_object() -> None:
         ("[1e-9s, 1e2ms]", Bound(1, 100_000_000, "ns")),
     ],
 )
-def test_windows(window: str, bound: Bound) -> None:
+def test_windows_are_read_in_samples_or_nanoseconds(window: str, bound: Bound) -> None:
     for text in (f"F{window} a ovlp b", f"a ovlp b S{window} c ovlp d"):
         formula = formula_of(text)
         assert isinstance(formula, Temporal) and formula.bound == bound
@@ -190,7 +196,7 @@ def test_constants_stand_for_numbers_and_durations_and_can_be_replaced() -> None
             parse_specification(text, constants={"wait": value})  # type: ignore[dict-item]
 
 
-def test_a_specification_says_what_its_constants_are() -> None:
+def test_a_specification_lists_its_constants() -> None:
     text = "const e = far\nconst far = 2.5\nconst wait = 2s\nspec s = F[0, wait] a closeto[e] b"
     constants = parse_specification(text, constants={"far": 7}).constants
     assert constants == {"e": Constant(7.0), "far": Constant(7.0), "wait": Constant(2.0, 2_000_000_000)}
@@ -211,7 +217,7 @@ def test_relations_can_be_added_in_python() -> None:
             parse_specification("a ovlp b", relations=wrong)
 
 
-def test_names_may_be_anything_in_quotes() -> None:
+def test_quoted_names_may_hold_any_character() -> None:
     atom = atom_of('"/robot1/base \\"link\\" \\\\" ovlp "F"')
     assert atom.terms == (TrackedName('/robot1/base "link" \\'), TrackedName("F"))
     assert atom_of(atom.text).terms == atom.terms
@@ -232,7 +238,7 @@ def test_nodes_know_where_they_come_from() -> None:
     assert places == ["f(c)", "x ovlp y"]
 
 
-def test_files(tmp_path: Path) -> None:
+def test_files_are_read_and_missing_ones_reported(tmp_path: Path) -> None:
     path = tmp_path / "reach.spatial"
     path.write_bytes("\ufeffspec s = a ovlp b\r\n".encode())
     assert load_specification(path).filename == "reach.spatial"
@@ -244,11 +250,11 @@ def test_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", spatial_replay.spec.__all__)
-def test_every_name_of_the_language_is_there(name: str) -> None:
+def test_the_package_exports_every_name_of_the_language(name: str) -> None:
     assert callable(getattr(spatial_replay.spec, name))
     assert name in dir(spatial_replay.spec)
 
 
-def test_other_names_of_the_language_are_not_there() -> None:
+def test_the_package_has_no_other_names() -> None:
     with pytest.raises(AttributeError, match="no attribute 'parse_everything'"):
         _ = spatial_replay.spec.parse_everything

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from spatial_replay.spec import format_formula, format_specification, parse_specification
+from spatial_replay import parse_specification
+from spatial_replay.spec import format_formula, format_specification
 from spatial_replay.spec.formula import FUTURE_OPERATORS, Temporal
 from spatial_replay.spec.walks import iter_formulas
 
@@ -57,24 +58,24 @@ from spatial_replay.spec.walks import iter_formulas
         ("(F(G(X((a ovlp b)))))", "F (G (X (a ovlp b)))"),
     ],
 )
-def test_every_production(published: str, canonical: str) -> None:
+def test_every_production_of_the_published_grammar_keeps_its_meaning(published: str, canonical: str) -> None:
     formula = parse_specification(published, profile="spatial_spec").specs[0].formula
     assert format_formula(formula) == canonical
 
 
-def test_an_object_called_t_stays_one() -> None:
+def test_an_object_named_t_is_read_as_an_object() -> None:
     formula = parse_specification("!t ovlp b and (a ovlp b ->t ovlp c)").specs[0].formula
     assert format_formula(formula) == "(not (t ovlp b)) and ((a ovlp b) -> (t ovlp c))"
 
 
-def test_a_number_by_name_is_a_constant() -> None:
+def test_a_named_number_is_a_constant() -> None:
     specification = parse_specification(
         "use spatial_spec\nconst n = 2\nspec s = (F [0, n] (a dist b[-n] <= n))"
     )
     assert format_formula(specification.specs[0].formula) == "F[0, 2] (a dist b[-2] <= 2)"
 
 
-def test_recorded_specifications(data_folder: Path) -> None:
+def test_recorded_specifications_are_read(data_folder: Path) -> None:
     cases = json.loads((data_folder / "vectors" / "semantics.json").read_text())["cases"]
     recorded = json.loads((data_folder / "paper" / "expected.json").read_text()).values()
     operators: set[str] = set()

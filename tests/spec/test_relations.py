@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from spatial_replay.spec import parse_specification
+from spatial_replay import parse_specification
 from spatial_replay.spec.formula import (
     Atom,
     CentroidProjection,
@@ -132,12 +132,12 @@ def robustness(text: str, profile: str) -> float:
 
 
 @pytest.mark.parametrize(("text", "expected"), PAPER.items())
-def test_paper(text: str, expected: float) -> None:
+def test_a_relation_of_the_paper_profile_has_the_defined_value(text: str, expected: float) -> None:
     assert robustness(text, "paper") == expected
 
 
 @pytest.mark.parametrize(("text", "expected"), (PAPER | CHANGED_IN_PUBLISHED).items())
-def test_published(text: str, expected: float) -> None:
+def test_a_relation_of_the_published_profile_has_the_defined_value(text: str, expected: float) -> None:
     assert robustness(text, "spatial_spec") == expected
 
 
@@ -152,7 +152,7 @@ def test_touch_in_the_published_profile_does_not_look_at_depth() -> None:
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_every_relation_says_how_it_is_written_and_what_number_it_is(profile: str) -> None:
+def test_the_docstring_of_a_relation_gives_its_syntax_and_value(profile: str) -> None:
     for name, relation in PROFILES[profile].items():
         written, _, number = (inspect.getdoc(relation) or "").partition(": ")
         assert re.fullmatch(rf"`a {name}(\[\w+\])? .*`", written), name

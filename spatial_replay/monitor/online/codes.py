@@ -57,7 +57,8 @@ PART_WIDTH = 9
 # columns of reports: the index is of the signal or part, the rule is for now
 REPORT_CODE, REPORT_INDEX, REPORT_RULE, REPORT_FIRST, REPORT_END = range(5)
 REPORT_WIDTH = 5
-# codes of reports
+# codes of reports: a row is a node as written, so that here, alone, `xor`, `->` and `<->` have codes;
+# rows for their expansions would cost eight numbers a sample each
 REPORT_SIGNAL, REPORT_PART = 0, 1
 REPORT_NOT, REPORT_AND, REPORT_OR, REPORT_XOR, REPORT_IMPLIES, REPORT_IFF, REPORT_SPEC = 2, 3, 4, 5, 6, 7, 8
 REPORT_OF_BOOLEAN = MappingProxyType(

@@ -35,7 +35,7 @@ WIDTH = 11
 NOTHING = -1
 """No upper end, no column, no table of pairs."""
 
-# codes of nodes
+# codes of nodes; a row is a node as written, since Def. 16 gives a number to each
 LEAF_NODE, TRUTH = 0, 1
 NOT, AND, OR, XOR, IMPLIES, IFF, SAME = 2, 3, 4, 5, 6, 7, 8
 NEXT, EVENTUALLY, ALWAYS, UNTIL = 9, 10, 11, 12
