@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from spatial_replay.cli import run
-from spatial_replay.planning.read import read_decisions
+from spatial_replay.planning import read_decisions
 
 SATISFIED = "spec calm = F (green leftof red)\n"
 IMPOSSIBLE = "spec torn = F (red leftof blue and red rightof blue)\n"

@@ -10,11 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import spatial_replay as sr
-from spatial_replay.planning.decisions import Outcome
-from spatial_replay.planning.maps import centre_of, moved_object, proposition_maps
-from spatial_replay.planning.planner import MOST_MOTIONS, Planner
-from spatial_replay.planning.settings import Settings
-from spatial_replay.planning.workspace import Grid, Workspace
+from spatial_replay.planning import (
+    MOST_MOTIONS,
+    Grid,
+    Outcome,
+    Planner,
+    Settings,
+    Workspace,
+    centre_of,
+    moved_object,
+    proposition_maps,
+)
 
 TEXTS = (
     "a leftof b",

@@ -9,6 +9,7 @@ from planning.kinematics import BLOCKS, PUSHING, block, run
 from planning.plans import PUSH, record_plan_of
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.planning import (
+    FREE,
     Grid,
     Planner,
     Settings,
@@ -17,7 +18,6 @@ from spatial_replay.planning import (
     proposition_maps,
     read_steps,
 )
-from spatial_replay.planning.maps import FREE
 
 SAMPLE = sr.Sample(
     0, {"cup": block(1, 1, size=1), "mat": block(6, 6, size=4), "<jug>": sr.Footprint.disc(1, 6, 1)}

@@ -6,8 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 import spatial_replay as sr
-from spatial_replay.planning.decisions import Outcome
-from spatial_replay.planning.maps import moved_object
+from spatial_replay.planning import Outcome, moved_object
 
 
 @dataclass

@@ -6,10 +6,15 @@ from dataclasses import replace
 
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, PUSHING, Table
-from spatial_replay.planning.decision_log import PLAN_METADATA, BlackBox
-from spatial_replay.planning.planner import Planner
-from spatial_replay.planning.settings import Settings, text_from_settings
-from spatial_replay.planning.workspace import Grid, Workspace
+from spatial_replay.planning import (
+    PLAN_METADATA,
+    BlackBox,
+    Grid,
+    Planner,
+    Settings,
+    Workspace,
+    text_from_settings,
+)
 from spatial_replay.runs.run_log import run_log
 
 PUSH = Settings(

@@ -17,12 +17,18 @@ from planning.plans import PUSH, record_plan_of
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_PATH
+from spatial_replay.planning import (
+    Grid,
+    Reason,
+    Settings,
+    Workspace,
+    planner_of,
+    read_decisions,
+    recompute_decisions,
+    settings_from_text,
+    text_from_settings,
+)
 from spatial_replay.planning.decision_log import CELL
-from spatial_replay.planning.decisions import Reason
-from spatial_replay.planning.read import planner_of, read_decisions
-from spatial_replay.planning.recompute import recompute_decisions
-from spatial_replay.planning.settings import Settings, settings_from_text, text_from_settings
-from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.replay import ReplayOptions, Window, load_files, run_replay, verify_certificate
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec import load_specification

@@ -10,11 +10,16 @@ import pytest
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, PUSHING, Table, block, run
 from spatial_replay.errors import TraceError, UsageError
-from spatial_replay.planning.decisions import Outcome, Reason
-from spatial_replay.planning.maps import moved_object
-from spatial_replay.planning.planner import MOST_MOTIONS, Planner
-from spatial_replay.planning.settings import Settings
-from spatial_replay.planning.workspace import Grid, Workspace
+from spatial_replay.planning import (
+    MOST_MOTIONS,
+    Grid,
+    Outcome,
+    Planner,
+    Reason,
+    Settings,
+    Workspace,
+    moved_object,
+)
 
 PUSH = Settings(
     Workspace(Grid.over(0.3, -0.225, 0.75, 0.225, 0.005)), "push", margin=0.01, constraint_margin=0.005

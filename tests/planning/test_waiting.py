@@ -10,13 +10,16 @@ import pytest
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, run
 from planning.plans import PUSH, record_plan_of
-from spatial_replay.planning import read_steps
-from spatial_replay.planning.maps import moved_object
-from spatial_replay.planning.planner import Planner
-from spatial_replay.planning.read import read_decisions
-from spatial_replay.planning.recompute import recompute_decisions
-from spatial_replay.planning.settings import Settings
-from spatial_replay.planning.workspace import Grid, Workspace
+from spatial_replay.planning import (
+    Grid,
+    Planner,
+    Settings,
+    Workspace,
+    moved_object,
+    read_decisions,
+    read_steps,
+    recompute_decisions,
+)
 from spatial_replay.sources.open_log import open_source
 
 DONE = "green rightof red"

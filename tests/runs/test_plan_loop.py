@@ -9,10 +9,7 @@ import pytest
 
 import spatial_replay as sr
 from planning.kinematics import Table, block
-from spatial_replay.planning.decision_log import BlackBox
-from spatial_replay.planning.planner import Planner
-from spatial_replay.planning.settings import Settings
-from spatial_replay.planning.workspace import Grid, Workspace
+from spatial_replay.planning import BlackBox, Grid, Planner, Settings, Workspace
 from spatial_replay.runs.planned import HOLDING_SAMPLES, MOST_WAITING_SAMPLES, PlanLoop
 from spatial_replay.runs.run_log import run_log
 

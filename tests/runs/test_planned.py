@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 import spatial_replay as sr
-from spatial_replay.planning.read import read_decisions
-from spatial_replay.planning.recompute import recompute_decisions
+from spatial_replay.planning import read_decisions, recompute_decisions
 from spatial_replay.replay import load_files, run_replay, verify_certificate
 from spatial_replay.runs.planned import PlannedRun, record_plan
 from spatial_replay.sources.open_log import open_source

@@ -12,9 +12,14 @@ import numpy as np
 
 import spatial_replay as sr
 from spatial_replay.automata.compile import automaton
-from spatial_replay.planning import Grid, Workspace, gradient_map, proposition_maps
-from spatial_replay.planning.maps import moved_object
-from spatial_replay.planning.paths import shortest_path
+from spatial_replay.planning import (
+    Grid,
+    Workspace,
+    gradient_map,
+    moved_object,
+    proposition_maps,
+    shortest_path,
+)
 
 PUSHING = """
 use spatial_spec
