@@ -75,7 +75,7 @@ def test_decisions_are_recomputed(tmp_path: Path) -> None:
 
 
 def test_decisions_that_differ_are_reported(tmp_path: Path) -> None:
-    record_plan_of(tmp_path / "run.mcap", told=replace(PUSH, margin=0.03))
+    record_plan_of(tmp_path / "run.mcap", recorded_settings=replace(PUSH, margin=0.03))
     code, said = call("verify", tmp_path / "run.mcap", "--decisions")
     assert code == 1
     assert "of decision 0" in said
@@ -124,7 +124,7 @@ def test_a_motion_cut_off_by_the_end_of_the_log_is_marked(tmp_path: Path) -> Non
         return sample
 
     with pytest.raises(KeyboardInterrupt):
-        record_plan_of(tmp_path / "run.mcap", seen_as=seen)
+        record_plan_of(tmp_path / "run.mcap", recorded_as=seen)
     _, said = call("info", tmp_path / "run.mcap", "--decisions")
     lines = said.splitlines()
     assert lines[0] == "run.mcap: 2 decisions for 'push', 1 motion and one cut short, 1 edge given up"

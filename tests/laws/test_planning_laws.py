@@ -151,7 +151,7 @@ def settings_of_planners(draw):
 
 @given(tasks(), settings_of_planners(), st.integers(0, 2**32 - 1))
 @settings(max_examples=60)
-def test_a_planner_comes_to_an_end_and_says_what_it_gave_up(specification, options, seed):
+def test_a_planner_terminates_with_a_reason_for_each_pruned_edge(specification, options, seed):
     random = np.random.default_rng(seed)
     planner = Planner(specification, options)
     places = random.uniform(-5, 5, (len(THINGS), 2))
@@ -187,7 +187,7 @@ def test_a_planner_comes_to_an_end_and_says_what_it_gave_up(specification, optio
 
 @given(tasks(), settings_of_planners(), st.integers(0, 2**32 - 1))
 @settings(max_examples=40)
-def test_a_target_is_free_and_holds_as_well_as_it_says(specification, options, seed):
+def test_a_target_is_free_and_has_the_robustness_that_it_states(specification, options, seed):
     random = np.random.default_rng(seed)
     planner = Planner(specification, options)
     shape = sr.TrackedObject(sr.Footprint.box(0, 0, 1, 1))
@@ -215,7 +215,7 @@ def test_a_target_is_free_and_holds_as_well_as_it_says(specification, options, s
     st.sampled_from(["a leftof b", "a dist c <= 1", "a above b and a above c"]),
 )
 @settings(max_examples=60)
-def test_what_is_pushed_touches_nothing_on_its_way_whatever_time_there_is(seed, when, goal):
+def test_a_pushed_object_touches_nothing_whatever_the_deadline(seed, when, goal):
     random = np.random.default_rng(seed)
     workspace = Workspace(Grid(-6.0, -6.0, 0.5, 24, 24), farthest=7.0, clearance=0.25)
     shape = sr.TrackedObject(sr.Footprint.box(0, 0, 1, 1))

@@ -28,18 +28,18 @@ def test_a_page_shows_verdicts_and_numbers():
         assert word in text
 
 
-def test_a_page_of_a_result_is_about_that_alone():
+def test_a_page_of_a_result_shows_no_other_result():
     evaluation = judged(PARTS, RISING)
     assert "both" not in shown(evaluation.result("other"))
 
 
-def test_a_page_tells_the_interval_of_what_is_not_known():
+def test_a_page_shows_the_interval_of_an_unknown_robustness():
     text = shown(judged("G a dist b <= 1", points(a=[0, None], b=[0, 0])))
     assert "■ unknown" in text
     assert "-inf to" in text
 
 
-def test_texts_of_logs_are_text():
+def test_texts_of_logs_are_escaped():
     trace = sr.Trace.from_samples([sr.Sample(0, {"<b>a</b>": sr.Footprint.disc(0, 0, 1)})])
     evaluation = judged("spec seen(x) = G x dist x <= 0", trace, each={"x": "all"})
     assert "seen for <b>a</b>" in shown(evaluation)
@@ -72,7 +72,7 @@ def test_curves_are_the_values_of_a_result_and_its_named_parts():
 
 
 @pytest.mark.usefixtures("figures")
-def test_the_band_shows_what_the_value_can_become():
+def test_the_band_spans_the_values_still_possible():
     ax = judged("spec low = G x <= 1", RISING).result().plot()
     bottom, top = ax.get_ylim()
     band = ax.collections[0].get_paths()[0].vertices
@@ -94,7 +94,7 @@ def test_names_of_curves_do_not_cover_each_other(semantics):
 
 
 @pytest.mark.usefixtures("figures")
-def test_what_is_never_known_is_drawn_too():
+def test_a_robustness_that_is_never_known_is_drawn_too():
     ax = judged("G a dist b <= 1", points(a=[None, None], b=[0, 0])).result().plot()
     ax.figure.canvas.draw()
     assert "unknown, robustness -inf to inf" in ax.get_title(loc="left")

@@ -15,7 +15,7 @@ def outcome(program):
     return done.returncode, done.stderr
 
 
-def test_without_the_library_an_error_says_what_to_install():
+def test_without_matplotlib_an_error_says_what_to_install():
     program = "import spatial_replay as sr\nsr.parse_specification('F a ovlp b').plot()"
     code, said = outcome(WITHOUT + program)
     assert code != 0
@@ -23,7 +23,7 @@ def test_without_the_library_an_error_says_what_to_install():
     assert "pip install 'spatial-replay[notebook]'" in said
 
 
-def test_without_the_library_pages_are_shown():
+def test_without_matplotlib_pages_are_shown():
     program = "import spatial_replay as sr\nsr.parse_specification('F a ovlp b')._repr_html_()"
     assert outcome(WITHOUT + program) == (0, "")
 
@@ -37,6 +37,6 @@ def test_without_the_library_pages_are_shown():
         "spatial_replay.spec.load",
     ],
 )
-def test_the_library_loads_when_something_is_drawn(used):
+def test_matplotlib_loads_when_something_is_drawn(used):
     program = f"import sys, {used}\nsys.exit('matplotlib' in sys.modules)"
     assert outcome(program) == (0, "")

@@ -47,7 +47,7 @@ def test_a_page_of_a_map_counts_its_cells():
 
 
 @pytest.mark.usefixtures("figures")
-def test_a_map_is_drawn_where_it_belongs():
+def test_a_map_is_drawn_over_its_grid():
     found = mat_map()
     ax = found.plot(sample=SAMPLE)
     (image,) = ax.images
@@ -59,7 +59,7 @@ def test_a_map_is_drawn_where_it_belongs():
 
 
 @pytest.mark.usefixtures("figures")
-def test_the_colours_of_a_map_are_the_same_distance_from_zero():
+def test_the_colours_of_a_map_are_symmetric_around_zero():
     (image,) = mat_map().plot().images
     least, greatest = image.get_clim()
     assert least == -greatest
@@ -68,7 +68,7 @@ def test_the_colours_of_a_map_are_the_same_distance_from_zero():
 
 
 @pytest.mark.usefixtures("figures")
-def test_of_several_orientations_the_one_meant_is_drawn():
+def test_the_target_orientation_of_a_map_is_drawn():
     workspace = Workspace(Grid.over(0, 0, 10, 10, 0.5), yaws=(0.0, 0.785), supports=frozenset({"mat"}))
     found = mat_map(workspace)
     drawn = found.plot().images[0].get_array().filled(np.nan)
@@ -95,7 +95,7 @@ def test_a_step_draws_a_map_for_each_object_and_edge():
     axes[0].figure.canvas.draw()
 
 
-def test_a_page_of_a_step_tells_what_was_decided():
+def test_a_page_of_a_step_shows_the_decision():
     (step, *_), _ = run(Planner(sr.parse_specification(PUSHING), PUSH), BLOCKS)
     text = shown(step)
     for word in ("step 0: execute", step.reason[:60], "given up: no object can do it", "chosen"):
@@ -118,7 +118,7 @@ def test_the_steps_of_a_log_are_those_of_the_run(run_log):
             np.testing.assert_array_equal(one.map.values, other.map.values)
 
 
-def test_the_steps_of_a_log_tell_how_it_went(run_log):
+def test_the_steps_of_a_log_have_outcomes(run_log):
     first, *_, last = read_steps(run_log[0])
     assert first.sample.time_ns == first.step.time_ns
     assert first.outcome.succeeded
@@ -142,7 +142,7 @@ def test_a_log_without_a_plan_has_no_steps(tmp_path):
 
 
 def test_a_log_of_other_decisions_is_refused(tmp_path):
-    told = Settings(PUSH.workspace, "push", margin=0.02, constraint_margin=0.005)
-    record_plan_of(tmp_path / "run.mcap", told=told)
+    other = Settings(PUSH.workspace, "push", margin=0.02, constraint_margin=0.005)
+    record_plan_of(tmp_path / "run.mcap", recorded_settings=other)
     with pytest.raises(LogError, match="verify --decisions"):
         read_steps(tmp_path / "run.mcap")

@@ -14,13 +14,13 @@ spec task = reach and G (red1 dist red2 >= near)
 """
 
 
-def test_a_page_shows_what_a_specification_is_made_of():
+def test_a_page_shows_the_parts_of_a_specification():
     text = shown(sr.parse_specification(TASK))
     for word in ("task = and", "reach = F", "red1 dist red2 >= 0.1", "constants: near", "regions: goal"):
         assert word in text
 
 
-def test_texts_of_a_specification_are_text():
+def test_texts_of_a_specification_are_escaped():
     text = shown(
         sr.parse_specification("""F ("<script>alert(1)</script>" ovlp "<img src=x onerror=alert(1)>")""")
     )
@@ -56,13 +56,13 @@ def test_a_drawing_has_a_label_for_each_node():
 
 
 @pytest.mark.usefixtures("figures")
-def test_a_drawing_of_a_large_tree_says_how_much_it_shows():
+def test_a_drawing_of_a_large_tree_says_how_many_nodes_it_shows():
     ax = wide(500).plot()
     assert ax.get_title(loc="left") == "<text>, the first 60 of 1,001 nodes"
 
 
 @pytest.mark.usefixtures("figures")
-def test_dollars_are_no_formulas():
+def test_dollars_are_not_read_as_mathematics():
     ax = sr.parse_specification('F ("$x^" ovlp "$y_")').plot()
     ax.figure.canvas.draw()
 

@@ -1,4 +1,4 @@
-"""A table without physics: objects go where they are told to, unless they are stuck."""
+"""A table without physics: objects reach their targets unless they are stuck."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from spatial_replay.planning import Outcome, moved_object
 
 @dataclass
 class Table:
-    """Objects, a planner that watches them, and a hand that moves them: an `Executor`.
+    """Objects, a planner that observes them, and an `Executor` that moves them.
 
     Attributes:
         stuck: objects that do not move.
@@ -54,7 +54,7 @@ class Table:
 
 
 def run(planner, objects, most=50, **options):
-    """All steps until nothing is left to execute, and the table afterwards."""
+    """Return all steps until nothing is left to execute, and the table after them."""
     table = Table(dict(objects), planner, **options)
     table.look()
     steps = []

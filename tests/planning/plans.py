@@ -23,14 +23,14 @@ PUSH = Settings(
 
 
 class _Watched:
-    """What a table shows its samples to: the black box and the log."""
+    """The observer of a table, which passes samples to the black box and to the log."""
 
-    def __init__(self, box, log, seen_as):
-        self._box, self._log, self._seen_as = box, log, seen_as
+    def __init__(self, box, log, recorded_as):
+        self._box, self._log, self._recorded_as = box, log, recorded_as
         self.settings = box.planner.settings
 
     def observe(self, sample):
-        self._log.write(self._seen_as(sample))
+        self._log.write(self._recorded_as(sample))
         self._box.observe(sample)
 
 
@@ -39,30 +39,32 @@ def record_plan_of(
     text=PUSHING,
     objects=BLOCKS,
     settings=PUSH,
-    told=None,
-    seen_as=lambda sample: sample,
-    most_told=None,
+    recorded_settings=None,
+    recorded_as=lambda sample: sample,
+    most_recorded=None,
     **options,
 ):
-    """A planned run in a log.
+    """Record a planned run, and return its steps.
 
     Args:
-        told: the settings that the log tells of, if they are not those that were planned with.
-        seen_as: the sample that the log holds of each sample.
-        most_told: how many decisions and outcomes the log holds, the first ones; all if it is None.
+        recorded_settings: the settings in the log, if they differ from those of the planner.
+        recorded_as: gives the sample in the log for each sample.
+        most_recorded: how many decisions and outcomes the log holds; all of them if it is None.
     """
     specification = replace(sr.parse_specification(text), filename="task.spatial")
     box = BlackBox(Planner(specification, settings))
     with run_log(path, [specification]) as log:
-        kept = {"file": "task.spatial", "specification": box.planner.automaton.name}
-        log.add_metadata(PLAN_METADATA, {**kept, "settings": text_from_settings(told or settings)})
-        table = Table(dict(objects), _Watched(box, log, seen_as), **options)
+        about = {"file": "task.spatial", "specification": box.planner.automaton.name}
+        log.add_metadata(
+            PLAN_METADATA, {**about, "settings": text_from_settings(recorded_settings or settings)}
+        )
+        table = Table(dict(objects), _Watched(box, log, recorded_as), **options)
         table.look()
-        steps, said = [], []
+        steps, sent = [], []
 
-        def tell(messages):
-            said.append(messages)
-            if most_told is None or len(said) <= most_told:
+        def record(messages):
+            sent.append(messages)
+            if most_recorded is None or len(sent) <= most_recorded:
                 log.write_messages(messages)
 
         while not steps or steps[-1].kind in ("execute", "wait"):
@@ -70,8 +72,8 @@ def record_plan_of(
             if step in steps:
                 table.look()
                 continue
-            tell(messages)
+            record(messages)
             steps.append(step)
             if step.kind == "execute":
-                tell(box.conclude(table.execute(step)))
+                record(box.conclude(table.execute(step)))
     return steps

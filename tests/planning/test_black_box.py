@@ -41,19 +41,19 @@ def payloads(path, topic, kind):
     return [kind.FromString(each) for each in found]
 
 
-def test_decisions_are_told_with_their_outcomes(tmp_path):
+def test_decisions_are_logged_with_their_outcomes(tmp_path):
     steps = record_plan_of(tmp_path / "run.mcap", slips=1)
-    told = read_decisions(tmp_path / "run.mcap").decisions
-    assert [each.number for each in told] == list(range(len(steps)))
-    assert [each.outcome.succeeded for each in told[:-1]] == [False, *[True] * (len(steps) - 2)]
-    assert told[0].outcome.reason == "it slipped"
-    assert not told[-1].HasField("outcome")
-    assert told[-1].kind == told[-1].KIND_HOLD
-    assert Reason.from_text(told[0].considered[0].pruned) == steps[0].considered[0].pruned
-    assert [each.object for each in told[0].considered[1].candidates] == ["blue", "green", "red"]
+    decisions = read_decisions(tmp_path / "run.mcap").decisions
+    assert [each.number for each in decisions] == list(range(len(steps)))
+    assert [each.outcome.succeeded for each in decisions[:-1]] == [False, *[True] * (len(steps) - 2)]
+    assert decisions[0].outcome.reason == "it slipped"
+    assert not decisions[-1].HasField("outcome")
+    assert decisions[-1].kind == decisions[-1].KIND_HOLD
+    assert Reason.from_text(decisions[0].considered[0].pruned) == steps[0].considered[0].pruned
+    assert [each.object for each in decisions[0].considered[1].candidates] == ["blue", "green", "red"]
 
 
-def test_decisions_made_again_are_the_same(tmp_path):
+def test_recomputed_decisions_are_the_same(tmp_path):
     steps = record_plan_of(tmp_path / "run.mcap", slips=1)
     recomputed = recompute_decisions(open_source(tmp_path / "run.mcap"))
     assert recomputed.differences == ()
@@ -68,22 +68,22 @@ def test_equal_runs_give_equal_logs(tmp_path):
 
 
 def test_other_settings_make_other_decisions(tmp_path):
-    record_plan_of(tmp_path / "run.mcap", told=replace(PUSH, margin=0.03))
+    record_plan_of(tmp_path / "run.mcap", recorded_settings=replace(PUSH, margin=0.03))
     (first, *_) = recompute_decisions(open_source(tmp_path / "run.mcap")).differences
     assert "/plan/decision differs in" in first
     assert "of decision 0" in first
 
 
-def test_a_sample_that_was_changed_shows(tmp_path):
-    def seen_as(sample):
+def test_a_changed_sample_is_a_difference(tmp_path):
+    def recorded_as(sample):
         return sr.Sample(sample.time_ns, {**sample.objects, "red": block(0.5, -0.0500001, math.pi / 4)})
 
-    record_plan_of(tmp_path / "run.mcap", seen_as=seen_as)
+    record_plan_of(tmp_path / "run.mcap", recorded_as=recorded_as)
     assert recompute_decisions(open_source(tmp_path / "run.mcap")).differences
 
 
 @pytest.mark.parametrize(
-    ("most_told", "missing"),
+    ("most_recorded", "missing"),
     [
         (0, "the log has no decision"),
         (1, "the log has no outcome of decision 0 at 0.000 s"),
@@ -92,15 +92,15 @@ def test_a_sample_that_was_changed_shows(tmp_path):
         (4, "the log has no decision after decision 1 at 0.100 s"),
     ],
 )
-def test_decisions_that_are_not_told_show(tmp_path, most_told, missing):
-    record_plan_of(tmp_path / "run.mcap", most_told=most_told)
+def test_missing_decisions_are_a_difference(tmp_path, most_recorded, missing):
+    record_plan_of(tmp_path / "run.mcap", most_recorded=most_recorded)
     (difference,) = recompute_decisions(open_source(tmp_path / "run.mcap")).differences
     assert difference.startswith(missing)
 
 
-def test_a_wait_whose_end_is_not_told_shows(tmp_path):
+def test_a_wait_without_an_end_is_a_difference(tmp_path):
     text = "F[30,900] (green rightof red)"
-    record_plan_of(tmp_path / "run.mcap", f"use spatial_spec\nspec late = {text}", most_told=1)
+    record_plan_of(tmp_path / "run.mcap", f"use spatial_spec\nspec late = {text}", most_recorded=1)
     (difference,) = recompute_decisions(open_source(tmp_path / "run.mcap")).differences
     assert difference.startswith("the log has no decision after decision 0")
 
@@ -111,7 +111,7 @@ def cut(log, to, window):
     run_replay(source, load_files((), source), ReplayOptions(window), output=to)
 
 
-def test_what_is_left_of_a_run_is_enough_if_it_is_the_beginning(tmp_path):
+def test_the_beginning_of_a_run_can_be_recomputed_and_the_end_cannot(tmp_path):
     record_plan_of(tmp_path / "run.mcap", slips=1)
     first, second, *_ = read_decisions(tmp_path / "run.mcap").decisions
     cut(tmp_path / "run.mcap", tmp_path / "begun.mcap", Window(end_ns=second.time_ns + 1))
@@ -125,7 +125,7 @@ def test_what_is_left_of_a_run_is_enough_if_it_is_the_beginning(tmp_path):
             recompute_decisions(open_source(tmp_path / name))
 
 
-def test_a_replay_keeps_what_was_decided(tmp_path):
+def test_a_replay_keeps_decisions(tmp_path):
     record_plan_of(tmp_path / "run.mcap")
     (tmp_path / "edited.spatial").write_text("use spatial_spec\nF (red above blue)\n")
     edited = load_specification(tmp_path / "edited.spatial")
@@ -133,7 +133,7 @@ def test_a_replay_keeps_what_was_decided(tmp_path):
     assert recompute_decisions(open_source(tmp_path / "annotated.mcap")).differences == ()
 
 
-def test_certificates_count_what_was_decided(tmp_path):
+def test_certificates_cover_decisions(tmp_path):
     record_plan_of(tmp_path / "run.mcap")
     verified = verify_certificate(open_source(tmp_path / "run.mcap"))
     assert verified.recorded
@@ -166,9 +166,9 @@ def value_at(message, x, y):
 def test_every_map_of_every_edge_is_in_the_log(tmp_path, options):
     steps = record_plan_of(tmp_path / "run.mcap", **options)
     maps = payloads(tmp_path / "run.mcap", GRADIENT_MAP, GridMessage)
-    told = read_decisions(tmp_path / "run.mcap").decisions
+    decisions = read_decisions(tmp_path / "run.mcap").decisions
     numbers = []
-    for step, decision in zip(steps, told, strict=True):
+    for step, decision in zip(steps, decisions, strict=True):
         for edge, seen in zip(step.considered, decision.considered, strict=True):
             for candidate, shown in zip(edge.candidates, seen.candidates, strict=True):
                 assert [each.turn for each in shown.maps] == candidate.map.turns.tolist()
@@ -183,7 +183,7 @@ def test_every_map_of_every_edge_is_in_the_log(tmp_path, options):
 @pytest.mark.parametrize(
     "options", [{}, {"text": TURNED, "objects": THINGS, "settings": TURNING}], ids=["pushed", "turned"]
 )
-def test_the_last_map_of_a_step_is_that_of_what_is_done(tmp_path, options):
+def test_the_last_map_of_a_step_is_that_of_the_chosen_object(tmp_path, options):
     steps = record_plan_of(tmp_path / "run.mcap", **options)
     maps = payloads(tmp_path / "run.mcap", GRADIENT_MAP, GridMessage)
     moves = [step for step in steps if step.target is not None]
@@ -194,14 +194,14 @@ def test_the_last_map_of_a_step_is_that_of_what_is_done(tmp_path, options):
         assert np.isnan(values_of(last)).any()
 
 
-def test_maps_are_counted_on_their_topic(tmp_path):
+def test_maps_are_numbered_on_their_topic(tmp_path):
     record_plan_of(tmp_path / "run.mcap")
     with (tmp_path / "run.mcap").open("rb") as stream:
         messages = list(make_reader(stream).iter_messages([GRADIENT_MAP]))
     assert [message.sequence for _, _, message in messages] == list(range(len(messages)))
 
 
-def test_where_no_path_is_left_the_maps_say_why(tmp_path):
+def test_maps_without_a_good_cell_explain_that_no_path_is_left(tmp_path):
     text = "F (cup leftof fork and cup rightof fork)"
     steps = record_plan_of(tmp_path / "run.mcap", text, THINGS, replace(TURNING, margin=0.1))
     assert [step.kind for step in steps] == ["no path"]
@@ -210,7 +210,7 @@ def test_where_no_path_is_left_the_maps_say_why(tmp_path):
     assert not any((values_of(each) >= 0.1).any() for each in maps)
 
 
-def test_the_recorded_push_shows_why_not_all_is_done_at_once():
+def test_the_maps_of_the_recorded_push_explain_the_pruned_edge():
     first, *_ = read_decisions(RECORDED).decisions
     given_up, aim = first.considered
     maps = payloads(RECORDED, GRADIENT_MAP, GridMessage)
@@ -225,7 +225,7 @@ def test_the_recorded_push_shows_why_not_all_is_done_at_once():
     assert value >= needed
 
 
-def test_a_path_is_drawn_and_then_the_way_that_was_travelled(tmp_path):
+def test_the_planned_path_is_drawn_first_and_then_the_travelled_one(tmp_path):
     steps = record_plan_of(tmp_path / "run.mcap")
     planned, travelled, *_, last = payloads(tmp_path / "run.mcap", PLAN_PATH, SceneUpdate)
     points = [(point.x, point.y) for point in planned.entities[0].lines[0].points]
@@ -235,7 +235,7 @@ def test_a_path_is_drawn_and_then_the_way_that_was_travelled(tmp_path):
     assert [each.id for each in last.deletions] == ["plan/way", "plan/travelled"]
 
 
-def test_everything_of_a_decision_has_the_time_of_its_sample(tmp_path):
+def test_all_messages_of_a_decision_have_the_time_of_its_sample(tmp_path):
     steps = record_plan_of(tmp_path / "run.mcap")
     times = {
         message.timestamp.ToNanoseconds()
@@ -245,17 +245,17 @@ def test_everything_of_a_decision_has_the_time_of_its_sample(tmp_path):
     assert times <= {int(time) for time in sr.read_trace(tmp_path / "run.mcap").times_ns}
 
 
-def test_the_planner_and_the_log_agree_on_where_the_automaton_is(tmp_path):
+def test_the_planner_and_the_log_agree_on_the_states_of_the_automaton(tmp_path):
     steps = record_plan_of(tmp_path / "run.mcap", slips=1)
     logged = payloads(tmp_path / "run.mcap", "/spatial/automaton", AutomatonState)
     states = {message.time_ns: tuple(message.states) for message in logged}
     assert [states[step.time_ns] for step in steps] == [step.states for step in steps]
-    told = read_decisions(tmp_path / "run.mcap").decisions
-    after = [(states[each.outcome.end_ns], tuple(each.outcome.states)) for each in told[:-1]]
+    decisions = read_decisions(tmp_path / "run.mcap").decisions
+    after = [(states[each.outcome.end_ns], tuple(each.outcome.states)) for each in decisions[:-1]]
     assert all(one == other for one, other in after)
 
 
-def test_a_log_without_decisions_has_none_to_make_again(tmp_path):
+def test_a_log_without_decisions_cannot_be_recomputed(tmp_path):
     with sr.Recorder(tmp_path / "run.mcap") as recorder:
         recorder.write(sr.Sample(0, BLOCKS))
     with pytest.raises(UsageError, match="holds no decisions"):
@@ -264,7 +264,7 @@ def test_a_log_without_decisions_has_none_to_make_again(tmp_path):
         read_decisions(tmp_path / "run.mcap")
 
 
-def test_settings_are_read_back_as_they_were():
+def test_settings_survive_a_round_trip_as_text():
     workspace = Workspace(
         Grid(0.1, -0.7, 1 / 3, 5, 7),
         yaws=(0.0, math.pi / 3),
@@ -280,10 +280,10 @@ def test_settings_are_read_back_as_they_were():
 
 def test_settings_that_are_too_large_are_refused():
     large = Settings(Workspace(Grid(0, 0, 1.0, 500, 500), yaws=(0.0, 1.0, 2.0, 3.0)))
-    told = json.loads(text_from_settings(large))
-    for change in ({"yaws": [*told["yaws"], 4.0]}, {"grid": [0.0, 0.0, 1.0, 1000, 1001], "yaws": []}):
+    document = json.loads(text_from_settings(large))
+    for change in ({"yaws": [*document["yaws"], 4.0]}, {"grid": [0.0, 0.0, 1.0, 1000, 1001], "yaws": []}):
         with pytest.raises(LogError, match="give at most 1,000,000 cells"):
-            settings_from_text(json.dumps(told | change))
+            settings_from_text(json.dumps(document | change))
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[1]", json.dumps({"grid": [0, 0, 0, 1, 1]})])

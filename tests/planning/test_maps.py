@@ -23,14 +23,14 @@ def maps(workspace, *texts, sample=SAMPLE):
     return proposition_maps(propositions(*texts), {}, sample, "cup", workspace)
 
 
-def test_a_map_is_best_in_the_middle_of_what_the_object_is_to_be_in():
+def test_a_map_is_best_in_the_middle_of_the_enclosing_object():
     found = gradient_map(maps(Workspace(GRID), "cup enclosedin mat"), (((0, True),),), (), Workspace(GRID))
     row, column = np.unravel_index(int(np.argmax(found.robustness[0])), GRID.shape)
     assert GRID.centre(int(row), int(column)) in {(5.5, 5.5), (5.5, 6.5), (6.5, 5.5), (6.5, 6.5)}
     assert found.robustness[0, 5, 5] == 1.0
 
 
-def test_cells_are_blocked_for_a_reason():
+def test_blocked_cells_have_a_reason():
     workspace = Workspace(
         GRID,
         base=(5.0, 5.0),
@@ -69,12 +69,12 @@ def test_a_blocked_set_is_the_minkowski_sum_of_obstacle_and_object():
     assert ((found.blocked[0] == OCCUPIED) == inside).all()
 
 
-def test_what_an_object_has_no_part_in_is_the_same_everywhere():
+def test_a_proposition_about_other_objects_is_the_same_in_every_cell():
     found = maps(Workspace(GRID), "jug leftof mat")
     assert np.unique(found.lower).tolist() == [2.0]
 
 
-def test_an_object_that_is_not_seen_makes_no_cell_good_and_every_cell_doubtful():
+def test_a_missing_object_makes_every_cell_unknown():
     workspace = Workspace(GRID)
     found = maps(workspace, "cup leftof spoon", "cup below mat")
     assert gradient_map(found, (((0, True),),), (), workspace).best() == -math.inf
@@ -108,7 +108,7 @@ def test_propositions_over_earlier_samples_have_no_map():
         maps(Workspace(GRID), "cup moved[1] cup[-1]")
 
 
-def test_an_object_that_is_not_there_cannot_be_moved():
+def test_an_object_outside_the_sample_cannot_be_moved():
     with pytest.raises(UsageError, match=r"spoon.*the sample has: cup, mat, jug"):
         proposition_maps([], {}, SAMPLE, "spoon", Workspace(GRID))
 
@@ -124,7 +124,7 @@ def test_an_object_that_is_not_there_cannot_be_moved():
         ((0, 0, 1, 1, "1"), "cell_size is '1'"),
     ],
 )
-def test_grids_that_cannot_be_are_refused(numbers, message):
+def test_invalid_grids_are_refused(numbers, message):
     with pytest.raises(UsageError, match=message):
         Grid.over(*numbers)
 
@@ -151,7 +151,7 @@ def test_a_grid_has_whole_numbers_of_cells():
         ({"grid": (0, 0, 1, 1)}, "grid is"),
     ],
 )
-def test_workspaces_that_cannot_be_are_refused(options, message):
+def test_invalid_workspaces_are_refused(options, message):
     with pytest.raises(UsageError, match=message):
         Workspace(**{"grid": GRID, **options})
 

@@ -73,7 +73,7 @@ def mazes(draw):
 
 
 @given(mazes())
-def test_a_path_is_as_short_as_any_and_goes_where_it_may(maze):
+def test_a_path_is_shortest_and_crosses_only_free_cells(maze):
     free, start, goals = maze
     path = shortest_path(free, start, goals)
     expected = length_by_a_star(free, start, goals)
@@ -97,7 +97,7 @@ def test_large_grids_agree_with_plain_search():
         assert (None if path is None else path.length) == length_by_a_star(free, (2, 3), goals)
 
 
-def test_a_wall_is_gone_around_without_cutting_its_corner():
+def test_a_path_around_a_wall_does_not_cut_its_corner():
     free = np.ones((5, 5), bool)
     free[1:, 2] = False
     goals = np.zeros((5, 5), bool)
@@ -115,7 +115,7 @@ def test_a_start_that_is_a_goal_is_a_path():
     assert path.cells.tolist() == [[1, 1]]
 
 
-def test_no_goal_is_no_path():
+def test_without_a_goal_there_is_no_path():
     assert shortest_path(np.ones((3, 3), bool), (0, 0), np.zeros((3, 3), bool)) is None
 
 

@@ -46,7 +46,7 @@ def test_three_blocks_are_pushed_as_in_the_paper():
     assert result.verdict == "satisfied"
 
 
-def test_a_way_keeps_clear_of_what_must_not_be():
+def test_a_path_keeps_clear_of_constraints():
     _, table = run(planner(PUSHING, PUSH), BLOCKS)
     always = sr.parse_specification(
         "G (green dist red >= 0.03 and green dist blue >= 0.03 and red dist blue >= 0.03)"
@@ -54,7 +54,7 @@ def test_a_way_keeps_clear_of_what_must_not_be():
     assert sr.evaluate(always, sr.Trace.from_samples(table.samples)).verdict == "satisfied"
 
 
-def test_things_are_put_one_after_the_other():
+def test_things_are_placed_one_after_the_other():
     text = "(F (cup enclosedin plate)) and (F (fork leftof plate and fork dist plate <= 1))"
     steps, table = run(planner(text), THINGS)
     assert sorted(step.target.name for step in steps[:-1]) == ["cup", "fork"]
@@ -63,14 +63,14 @@ def test_things_are_put_one_after_the_other():
     assert result.verdict == "satisfied"
 
 
-def test_only_what_can_be_moved_is_moved():
+def test_only_movable_objects_are_moved():
     settings = Settings(TABLE.workspace, movable=("cup",))
     steps, _ = run(planner("F (cup enclosedin plate)", settings), THINGS)
     assert [candidate.name for candidate in steps[0].candidates] == ["cup"]
 
 
 @pytest.mark.parametrize(("room", "is_roomy"), [(0.0, False), (2.0, True), (50.0, False)])
-def test_things_are_placed_with_room_around_them_where_there_is(room, is_roomy):
+def test_things_are_placed_with_room_around_them_if_there_is_any(room, is_roomy):
     settings = Settings(TABLE.workspace, movable=("cup",), room=room)
     steps, table = run(planner("F (cup dist fork <= 4)", settings), THINGS)
     assert steps[-1].kind == "hold"
@@ -79,7 +79,7 @@ def test_things_are_placed_with_room_around_them_where_there_is(room, is_roomy):
     assert (sr.evaluate(apart, last).verdict == "satisfied") == is_roomy
 
 
-def test_an_object_is_turned_where_that_is_asked_for():
+def test_an_object_is_turned_if_the_specification_needs_it():
     yaws = tuple(k * math.pi / 4 for k in range(8))
     settings = Settings(Workspace(Grid.over(0, 0, 10, 10, 0.5), yaws))
     fork = block(1, 1, 0.3, size=1)
@@ -119,7 +119,7 @@ NEAR = "F (cup dist plate <= 1)"
         ({"base": (10.0, 5.0), "farthest": 6.0}, {"fork": block(2, 5, size=2)}, "G (cup dist fork >= 0)"),
     ],
 )
-def test_what_lies_out_of_reach_is_pushed_around_what_stands_in_its_way(options, others, apart):
+def test_an_object_out_of_reach_is_pushed_around_obstacles(options, others, apart):
     workspace = Workspace(Grid.over(0, 0, 10, 10, 0.5), clearance=0.5, **options)
     objects = {**OUTSIDE, **others}
     steps, _ = run(planner(NEAR, Settings(workspace, "push", movable=("cup",))), objects)
@@ -129,7 +129,7 @@ def test_what_lies_out_of_reach_is_pushed_around_what_stands_in_its_way(options,
     assert sr.evaluate(sr.parse_specification(apart), trace).verdict == "satisfied"
 
 
-def test_what_no_way_leads_to_is_not_pushed():
+def test_an_object_without_a_free_path_is_not_pushed():
     walls = (sr.Footprint.box(-0.6, -20, -0.4, 30),)
     workspace = Workspace(Grid.over(0, 0, 10, 10, 0.5), obstacles=walls)
     steps, _ = run(planner(NEAR, Settings(workspace, "push", movable=("cup",))), OUTSIDE)
@@ -139,7 +139,7 @@ def test_what_no_way_leads_to_is_not_pushed():
     assert "cup: it lies too far outside the workspace" in steps[0].pruned[0][1].detail
 
 
-def test_what_cannot_be_moved_is_given_up_with_a_reason():
+def test_an_edge_is_pruned_after_failed_motions():
     steps, _ = run(planner("F (cup enclosedin plate)"), THINGS, stuck={"cup", "plate"})
     assert steps[-1].kind == "no path"
     assert steps[-1].pruned == (((0, 1), Reason("tried 3 times")),)
@@ -147,7 +147,7 @@ def test_what_cannot_be_moved_is_given_up_with_a_reason():
     assert len(steps) == 1 + TABLE.attempts
 
 
-def test_what_is_impossible_ends_with_the_edges_given_up():
+def test_an_impossible_task_ends_with_the_reasons_for_pruned_edges():
     steps, _ = run(planner("F (cup leftof plate and cup rightof plate and cup enclosedin plate)"), THINGS)
     assert [step.kind for step in steps] == ["no path"]
     assert steps[0].reason.startswith("no path left")
@@ -156,7 +156,7 @@ def test_what_is_impossible_ends_with_the_edges_given_up():
     assert "cup: nowhere would it hold" in reason.detail
 
 
-def test_what_is_violated_for_good_has_no_path():
+def test_a_violated_specification_has_no_path():
     steps, _ = run(
         planner("(G (cup leftof plate)) and F (fork leftof plate)"), {**THINGS, "cup": block(8, 1)}
     )
@@ -165,14 +165,14 @@ def test_what_is_violated_for_good_has_no_path():
     assert not steps[0].pruned
 
 
-def test_nothing_is_done_for_what_is_satisfied():
+def test_a_satisfied_specification_is_held():
     steps, _ = run(planner("G (cup leftof plate)"), THINGS)
     assert [step.kind for step in steps] == ["hold"]
     assert steps[0].target is None
     assert steps[0].candidates == ()
 
 
-def test_it_waits_for_what_is_not_seen():
+def test_the_planner_waits_for_unknown_propositions():
     one = planner("(G (cup leftof plate)) and F (fork leftof plate)")
     one.observe(sr.Sample(0, {"plate": THINGS["plate"], "fork": THINGS["fork"]}))
     step = one.next_step()
@@ -182,7 +182,7 @@ def test_it_waits_for_what_is_not_seen():
     assert one.next_step().kind == "execute"
 
 
-def test_it_holds_on_to_what_was_satisfied_but_for_what_was_not_seen():
+def test_a_doubtful_specification_is_held():
     one = planner("G (cup leftof plate)")
     for time_ns, seen in enumerate([THINGS, {"plate": THINGS["plate"]}, THINGS]):
         one.observe(sr.Sample(time_ns, seen))
@@ -192,14 +192,14 @@ def test_it_holds_on_to_what_was_satisfied_but_for_what_was_not_seen():
     assert not one.is_accepting
 
 
-def test_where_everything_was_tried_nothing_is_left():
+def test_no_target_is_left_after_all_were_tried():
     settings = Settings(Workspace(Grid.over(2.0, 4.5, 3.0, 5.5, 1.0)), movable=("cup",), attempts=9)
     steps, _ = run(planner("F (cup leftof plate and cup dist plate <= 1)", settings), THINGS, stuck={"cup"})
     assert [step.kind for step in steps] == ["execute", "no path"]
     assert "it was tried wherever it would hold" in steps[-1].pruned[0][1].detail
 
 
-def test_what_nobody_can_move_is_not_planned_for():
+def test_an_edge_without_movable_objects_is_pruned():
     settings = Settings(TABLE.workspace, movable=("fork",))
     steps, _ = run(planner("F (cup leftof plate and cup above plate)", settings), THINGS)
     assert steps[0].pruned == (((0, 1), Reason("no object that can be moved matters to it")),)
@@ -211,7 +211,7 @@ def test_equal_samples_give_equal_steps():
     assert [step.reason for step in first] == [step.reason for step in second]
 
 
-def test_steps_come_in_their_order():
+def test_calls_out_of_order_are_refused():
     one = planner("F (cup enclosedin plate)")
     with pytest.raises(UsageError, match="observe a sample first"):
         one.next_step()
@@ -225,7 +225,7 @@ def test_steps_come_in_their_order():
         one.next_step()
 
 
-def test_what_is_no_sample_or_outcome_changes_nothing():
+def test_wrong_types_of_arguments_are_refused():
     with pytest.raises(UsageError, match="settings is 'x'; give Settings"):
         planner("F (cup enclosedin plate)", "x")
     one = planner("F (cup enclosedin plate)")
@@ -271,14 +271,14 @@ def test_formulas_that_cannot_be_planned_are_refused():
         ({"workspace": None, "margin": math.inf}, ["workspace is None", "margin is inf"]),
     ],
 )
-def test_settings_that_cannot_be_are_refused_all_at_once(options, messages):
+def test_all_errors_in_settings_are_reported_together(options, messages):
     with pytest.raises(UsageError) as raised:
         Settings(**{"workspace": TABLE.workspace, **options})
     lines = str(raised.value).splitlines()
     assert [message in line for line, message in zip(lines, messages, strict=True)] == [True] * len(messages)
 
 
-def test_movable_objects_that_nobody_knows_are_named():
+def test_unknown_movable_objects_are_named():
     one = planner("F (cup enclosedin plate)", replace(TABLE, movable=("cpu", "cup", "spoon", "fork")))
     with pytest.raises(UsageError) as raised:
         one.observe(sr.Sample(0, {"fork": THINGS["fork"], "plate": THINGS["plate"]}))
@@ -288,7 +288,7 @@ def test_movable_objects_that_nobody_knows_are_named():
     assert second.endswith("the sample has: fork, plate")
 
 
-def test_without_settings_it_plans_around_what_it_sees():
+def test_default_settings_plan_around_the_first_sample():
     one = Planner(sr.parse_specification("F (cup leftof plate and cup dist plate <= 1)"))
     with pytest.raises(UsageError, match="observe one first"):
         _ = one.settings
@@ -299,12 +299,12 @@ def test_without_settings_it_plans_around_what_it_sees():
     assert max(one.settings.workspace.grid.shape) == 80
 
 
-def test_what_is_pushed_is_not_turned():
+def test_a_pushed_object_cannot_be_turned():
     with pytest.raises(UsageError, match="yaws"):
         Settings(Workspace(TABLE.workspace.grid, yaws=(0.0,)), "push")
 
 
-def test_what_succeeds_does_not_use_up_attempts():
+def test_successful_motions_do_not_use_up_attempts():
     one = planner("G F (cup dist plate <= 1)", replace(TABLE, movable=("cup",)))
     table = Table(dict(THINGS), one)
     for _ in range(2 * TABLE.attempts):
@@ -316,7 +316,7 @@ def test_what_succeeds_does_not_use_up_attempts():
         assert one.next_step().kind == "hold"
 
 
-def test_even_what_succeeds_comes_to_an_end():
+def test_successful_motions_are_limited_too():
     one = planner("G F (cup dist plate <= 1)", replace(TABLE, movable=("cup",)))
     table = Table(dict(THINGS), one)
     table.look()

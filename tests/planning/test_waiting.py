@@ -41,7 +41,7 @@ def verdict(text, samples):
 
 
 @pytest.mark.parametrize(("text", "samples"), TIMED.items())
-def test_it_waits_for_as_long_as_nothing_else_helps(text, samples):
+def test_the_planner_waits_as_long_as_time_has_to_pass(text, samples):
     steps, table = run(planner(text), BLOCKS)
     assert [step.kind for step in steps] == ["wait", "execute", "hold"]
     assert len(steps[0].ahead) == samples
@@ -50,27 +50,27 @@ def test_it_waits_for_as_long_as_nothing_else_helps(text, samples):
     assert verdict(text, table.samples) == "satisfied"
 
 
-def test_nothing_is_waited_for_before_a_deadline():
+def test_the_planner_does_not_wait_before_a_deadline():
     steps, table = run(planner(f"F[0,600] ({DONE})"), BLOCKS)
     assert [step.kind for step in steps] == ["execute", "hold"]
     assert steps[0].constraints.texts == ()
     assert verdict(f"F[0,600] ({DONE})", table.samples) == "satisfied"
 
 
-def test_what_cannot_be_done_is_not_waited_for():
+def test_the_planner_does_not_wait_for_an_impossible_task():
     steps, _ = run(planner("F[0,600] (green rightof red and green leftof red)"), BLOCKS)
     assert [step.kind for step in steps] == ["no path"]
     assert len(steps[0].pruned) == 1
 
 
-def test_one_thing_is_done_after_the_other_before_a_deadline():
+def test_two_tasks_with_a_deadline_are_done_one_after_the_other():
     text = "(F[0,600] (green rightof blue)) and (F[0,600] (red leftof blue and red above blue))"
     steps, table = run(planner(text), BLOCKS)
     assert [step.kind for step in steps] == ["execute", "execute", "hold"]
     assert verdict(text, table.samples) == "satisfied"
 
 
-def test_the_same_wait_goes_on_until_something_else_is_seen():
+def test_a_wait_ends_when_the_automaton_takes_another_transition():
     one = planner(f"(G[0,60] (green leftof red)) and F ({DONE})")
     one.observe(sr.Sample(0, BLOCKS))
     first = one.next_step()
@@ -108,7 +108,7 @@ def test_a_deadline_is_no_reason_to_go_through_a_wall(samples, always):
 
 
 @pytest.mark.parametrize("text", TIMED)
-def test_a_wait_is_told_once_with_its_outcome(tmp_path, text):
+def test_a_wait_is_logged_once_with_its_outcome(tmp_path, text):
     log = tmp_path / "run.mcap"
     steps = record_plan_of(log, f"use spatial_spec\nspec task = {text}")
     waits = [each for each in read_decisions(log).decisions if each.kind == each.KIND_WAIT]
