@@ -67,7 +67,7 @@ class Choice:
 def find_instances(
     specification: Specification, each: Mapping[str, str], traces: Iterable[Trace], start_ns: int, end_ns: int
 ) -> list[Instance]:
-    """The instances of a specification over the samples from `start_ns` to before `end_ns`.
+    """Return the instances of a specification over the samples from `start_ns` to before `end_ns`.
 
     A template has one per object chosen, in order of names, over the samples from the object's first to its
     last appearance among them.
@@ -99,7 +99,7 @@ def find_instances(
 
 
 def check_choices(templates: list[NamedSpec], each: Mapping[str, str]) -> None:
-    """That each template's parameter has its objects chosen, and nothing else has."""
+    """Check that the parameters of all templates, and no others, have a choice of objects."""
     for spec in templates:
         if spec.parameter not in each:
             raise UsageError(
@@ -115,7 +115,7 @@ def check_choices(templates: list[NamedSpec], each: Mapping[str, str]) -> None:
 def _appearances(
     choices: Mapping[str | None, Choice], traces: Iterable[Trace], start_ns: int, end_ns: int
 ) -> dict[str | None, dict[str, tuple[int, int]]]:
-    """For each choice, the objects that are ever of that kind, with their first and last times."""
+    """Return the objects that fit each choice, with the times of their first and last samples."""
     spans: dict[str, tuple[int, int]] = {}
     fitting: dict[str | None, set[str]] = {parameter: set() for parameter in choices}
     for trace in traces:

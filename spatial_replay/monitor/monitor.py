@@ -59,7 +59,7 @@ class SpecUpdate:
         return tuple([tuple.__new__(NodeUpdate, column) for column in columns])
 
     def node(self, identifier: int) -> NodeUpdate:
-        """The node with a number, once the monitor has started."""
+        """Return the node with an id, once the monitor has started."""
         if self.numbers is None:
             raise UsageError(f"{self.spec.name!r} has no numbers yet; the monitor's start is still to come")
         return NodeUpdate(identifier, self.names[identifier], *self.numbers[identifier].tolist())
@@ -91,7 +91,7 @@ class Update:
         return worst_verdict(spec.verdict for spec in self.specs)
 
     def node(self, name: str) -> NodeUpdate:
-        """The node of a named spec, wherever it stands.
+        """Return the root node of a named spec, wherever it occurs.
 
         Raises:
             UsageError: no node has the name.
@@ -161,7 +161,7 @@ class Monitor:
 
 
 def _places_of_names(names: tuple[tuple[str | None, ...], ...]) -> Mapping[str, tuple[int, int]]:
-    """Which spec and node has a name; the first where several do."""
+    """Map each name to its spec and node; to the first if several have it."""
     places: dict[str, tuple[int, int]] = {}
     for index, of_spec in enumerate(names):
         for identifier, name in enumerate(of_spec):

@@ -41,7 +41,7 @@ class FinishedTable(SignalTable):
         return super()._added_row(formula, operands)
 
     def instructions(self, nodes: Sequence[int]) -> Integers:
-        """Rows with the columns that they read and write: that of node n is n, others come after.
+        """Return rows with the columns they read and write: n for node n, then those of other rows.
 
         Args:
             nodes: (N,), the row of each node.
@@ -73,7 +73,7 @@ class Finished:
     columns: Floats
 
     def ends(self, node: int, *, wide: bool = True) -> tuple[Floats, Floats]:
-        """Low and high end (T,) of a node's robustness at each sample, with uncertainty unless not `wide`."""
+        """Return the ends (T,) of a node's robustness at each sample, with uncertainty if `wide`."""
         low, high = low_and_high(len(self.columns), wide=wide)
         return self.columns[low, node], self.columns[high, node]
 
@@ -98,14 +98,14 @@ def finished(
 def full_signal(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
 ) -> Floats:
-    """(N, T): each node's robustness at each sample, to the end of the stretch; NaN where not determined."""
+    """Compute each node's robustness at each sample, to the end of the log, (N, T); NaN: not determined."""
     return _determined(finished(formula, order, leaves[:2], times_ns).columns)
 
 
 def window_signal(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers, width_ns: int
 ) -> Floats:
-    """(N, T): each node's robustness over the samples in (t - width, t], for the sample at each t.
+    """Compute each node's robustness over the samples in (t - width, t], at each sample's t, (N, T).
 
     It is that at the first of these samples, on these samples alone: past operators start there. NaN where it
     is not determined. Takes time in proportion to the samples in a window.
@@ -125,14 +125,14 @@ def window_signal(
 
 
 def new_leaves(formula: Formula, order: Sequence[Atom | Quantified]) -> list[Atom | Quantified]:
-    """The leaves of a formula that are not among others."""
+    """Return the leaves of a formula that are not in `order`."""
     table = FinishedTable(order)
     table.add(formula)
     return table.leaves[len(order) :]
 
 
 def _compiled(formula: Formula, order: Sequence[Atom | Quantified]) -> tuple[Integers, int, int]:
-    """The table of a formula, how many nodes it has, and how many columns it needs."""
+    """Compile a formula; return its table, number of nodes and number of columns."""
     table = FinishedTable(order)
     nodes = [table.add(node) for _, _, node in iter_nodes(formula)]
     instructions = table.instructions(nodes)
@@ -140,7 +140,7 @@ def _compiled(formula: Formula, order: Sequence[Atom | Quantified]) -> tuple[Int
 
 
 def _determined(ends: Floats) -> Floats:
-    """(C, N, T) ends, which are written to, as numbers (N, T).
+    """Reduce the ends (C, N, T) to determined numbers (N, T), in place.
 
     Adding zero turns -0.0 into 0.0, so that equal numbers are equal bits.
     """

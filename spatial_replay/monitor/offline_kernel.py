@@ -51,7 +51,7 @@ def _at(steps: Steps, step: int) -> int:
 
 @inlined
 def _distance(steps: Steps, unit: int, earlier: int, later: int) -> int:
-    """From one step to a later one, in samples or in ns."""
+    """Return the distance from one step to a later one, in samples or in ns."""
     if unit == SAMPLES:
         return later - earlier
     return int(abs(steps.stamps[_at(steps, later)] - steps.stamps[_at(steps, earlier)]))
@@ -59,7 +59,7 @@ def _distance(steps: Steps, unit: int, earlier: int, later: int) -> int:
 
 @piece
 def _run_past(code: int, first: Floats, second: Floats, target: Floats, steps: Steps) -> None:
-    """Unbounded once, historically and since."""
+    """Run an unbounded once, historically or since."""
     value = np.inf if code == HISTORICALLY else -np.inf
     for i in range(steps.length):
         k = _at(steps, i)
@@ -76,7 +76,7 @@ def _run_past(code: int, first: Floats, second: Floats, target: Floats, steps: S
 def _run_delay(
     source: Floats, target: Floats, steps: Steps, unit: int, distance: int, missing: float
 ) -> None:
-    """The last step at least so far back."""
+    """Take the value at the last step at least `distance` back."""
     back = -1
     for i in range(steps.length):
         while back < i and _distance(steps, unit, back + 1, i) >= distance:
@@ -88,7 +88,7 @@ def _run_delay(
 def _slide(
     source: Floats, target: Floats, steps: Steps, unit: int, near: int, far: int, sign: float, extrema: Floats
 ) -> None:
-    """Greatest (sign 1) or least (sign -1) over the steps from `far` to `near` back.
+    """Compute the greatest (sign 1) or least (sign -1) value over the steps from `far` to `near` back.
 
     The window is kept in two stacks: `extrema` holds those from each step up to a middle, `recent` that of
     the steps from there on. Every step enters either once, however wide the window is.
@@ -135,7 +135,7 @@ def _run_boolean(
 def run_finished(
     rows: Integers, leaves: Floats, stamps: Integers, begin: int, end: int, columns: Floats, extrema: Floats
 ) -> None:
-    """Every row at every sample from begin to before end, as if there were no others.
+    """Run all rows over the samples from begin to before end, as if there were no others.
 
     Args:
         rows: (R, FINISHED_WIDTH), operands first.
@@ -174,7 +174,7 @@ def run_windows(
     rows: Integers, leaves: Floats, stamps: Integers, starts: Integers, columns: Floats, extrema: Floats,
     result: Floats,
 ) -> None:  # fmt: skip
-    """What the first columns are at the start of a window that ends at each sample, on its samples alone.
+    """Compute the first columns at the start of a window that ends at each sample, on its samples alone.
 
     Args:
         starts: (T,), the first sample of each window.

@@ -20,14 +20,14 @@ class Verdict(StrEnum):
 
 
 def final_verdict(lower: float, upper: float) -> Verdict:
-    """The verdict of a finished log, from the interval of its value."""
+    """Return the verdict of a finished log, from the interval of its value."""
     if lower >= 0.0:
         return Verdict.SATISFIED
     return Verdict.VIOLATED if upper < 0.0 else Verdict.UNKNOWN
 
 
 def online_verdict(lower: float, upper: float) -> Verdict:
-    """The verdict while samples still come, from the interval of the value over every continuation.
+    """Return the verdict while samples still come, from the interval over every continuation.
 
     Without such an interval (NaN: the paper's semantics knows no continuation) it is unknown.
     """
@@ -39,6 +39,6 @@ def online_verdict(lower: float, upper: float) -> Verdict:
 
 
 def worst_verdict(verdicts: Iterable[Verdict]) -> Verdict:
-    """Violated before unknown before pending before satisfied; satisfied if there are none."""
+    """Return the worst: violated, unknown, pending, satisfied; satisfied if there are none."""
     order = (Verdict.SATISFIED, Verdict.PENDING, Verdict.UNKNOWN, Verdict.VIOLATED)
     return max(verdicts, key=order.index, default=Verdict.SATISFIED)

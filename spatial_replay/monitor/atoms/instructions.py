@@ -129,10 +129,10 @@ class OpenGroups(Protocol):
     """Who can be in the open groups of some samples."""
 
     def candidates(self, group: Group | Earlier) -> tuple[str, ...]:
-        """Names of the objects that are members in any of the samples."""
+        """Return the names of the objects that are members in any of the samples."""
 
     def may_be_unknown(self, group: Group | Earlier) -> bool:
-        """Whether the group is that of a time before the first sample in any of them."""
+        """Return whether any sample looks back to a group before the first sample."""
 
 
 class Membership(NamedTuple):
@@ -165,7 +165,7 @@ class LeafCode:
         self.members: dict[Membership, int] = {}
 
     def add_leaves(self, leaves: Sequence[Formula], bindings: Bindings) -> list[int]:
-        """The number of the instruction that gives each leaf of a formula, as an interval.
+        """Return the number of the instruction that computes each leaf of a formula, as an interval.
 
         Raises:
             UsageError: more than `MAX_BINDINGS`.
@@ -174,7 +174,7 @@ class LeafCode:
         return [self._add(leaf, bindings) for leaf in leaves]
 
     def _add(self, formula: Formula, bindings: Bindings) -> int:
-        """The number of the instruction that gives a formula without temporal operators."""
+        """Return the number of the instruction that computes a formula without temporal operators."""
         match formula:
             case Truth():
                 return self._constant(inf if formula.value else -inf)

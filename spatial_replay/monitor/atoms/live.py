@@ -74,7 +74,7 @@ class LeafPlan:
         return sum(array.nbytes for array in self._arrays)
 
     def leaf_values(self, samples: Sequence[Sample | None], stands_for: Mapping[str, str]) -> Floats:
-        """Each leaf of each formula, one after the other.
+        """Compute the leaves of all formulas, one after the other.
 
         Args:
             samples: the one at each of the frame's delays; None before the first.
@@ -97,7 +97,7 @@ class LeafPlan:
         )
 
     def _flattened(self, seen: list[TrackedObject | None]) -> tuple[list[int], list[float], list[Floats]]:
-        """What the objects at the plan's places are made of (see `leaves_of_sample`)."""
+        """Flatten the objects at the plan's places for `leaves_of_sample`."""
         classes: list[int] = []
         counts: list[int] = []
         sizes: list[int] = []
@@ -128,7 +128,7 @@ _NO_VERTICES = np.empty((0, 2))
 
 
 def class_code(tracked: TrackedObject, classes: Mapping[str, int]) -> int:
-    """The code of an object's class."""
+    """Return the code of an object's class."""
     return classes.get((tracked.class_name or "").casefold(), 0) if classes else 0
 
 
@@ -191,7 +191,7 @@ def _starts(among: Sequence[Sequence[object]]) -> Integers:
 
 
 def _enlargement(term: Term) -> float:
-    """How much a term is enlarged in all, added in the order in which a scene does."""
+    """Return the total enlargement of a term, summed in the order in which `TraceScene` sums it."""
     return _enlargement(term.term) + term.radius if isinstance(term, Enlarged) else 0.0
 
 
@@ -241,7 +241,7 @@ class SampleLeaves:
         return self._recent.add(sample)
 
     def values(self, samples: Sequence[Sample | None]) -> Floats:
-        """(C, A, 1), each leaf of each formula.
+        """Compute the leaves of all formulas, (C, A, 1).
 
         Args:
             samples: what `look_at` gave.
@@ -266,7 +266,7 @@ class SampleLeaves:
         return plan.leaf_values(samples, stands_for)
 
     def _unnamed_members(self, samples: Sequence[Sample | None]) -> dict[_Classes, list[str]]:
-        """Who is in any open group in any of the samples and not named in the specification, by kind."""
+        """Return the members of open groups that the specification does not name, by their classes."""
         found: dict[str, _Classes] = {}
         own: list[Member] = []
         for sample in samples:
@@ -286,11 +286,11 @@ class SampleLeaves:
         return kinds
 
     def _stand_ins(self, classes: _Classes, count: int) -> list[str]:
-        """Names for so many unnamed objects: none that the specification names."""
+        """Return placeholder names for unnamed objects, none of which the specification uses."""
         return [f"{self._prefix}{classes} {number}" for number in range(count)]
 
     def _plan_for(self, counts: Mapping[_Classes, int]) -> LeafPlan:
-        """The plan for so many unnamed members of each kind."""
+        """Return the plan for the given number of unnamed members of each kind."""
         key = self._own_members, tuple(sorted(counts.items()))
         if key in self._plans:
             self._plans.move_to_end(key)
@@ -311,13 +311,13 @@ class SampleLeaves:
 
 
 def _room(count: int) -> int:
-    """For how many a plan for so many is made: 1, 2, 3, 4, 6, 8, 12, 16, …, so that there are few plans."""
+    """Round a number of members up to 1, 2, 3, 4, 6, 8, 12, 16, …, so that few plans are needed."""
     power = 1 << (count - 1).bit_length()
     return count if count < 4 else power * 3 // 4 if count <= power * 3 // 4 else power
 
 
 def _names(bases: Sequence[Term]) -> frozenset[str]:
-    """The objects that terms name."""
+    """Return the objects that terms name."""
     names: set[str] = set()
     for base in bases:
         if isinstance(base, TrackedName):

@@ -134,7 +134,7 @@ def _is_there(classes: Integers, row: int, wanted: int) -> bool:
 
 @piece
 def _starts(before: int, first: Integers, second: Integers) -> Integers:
-    """Where rows of lengths 0 (so many), `first` and `second` begin, and the last ends."""
+    """Return where rows begin and the last ends: `before` empty ones, then lengths `first` and `second`."""
     starts = np.zeros(before + len(first) + len(second) + 1, np.int64)
     at = before
     for lengths in (first, second):
@@ -164,7 +164,7 @@ def _lengths(starts: Integers) -> Integers:
 
 @piece
 def _spreads(starts: Integers, members: Integers, places: Floats, here: int) -> Floats:
-    """Each operand's uncertainty, the largest of its members'; last that of no operand, 0."""
+    """Return each operand's uncertainty, the largest of its members'; then 0, for no operand."""
     spreads = np.zeros(len(starts))
     for operand in range(len(starts) - 1):
         for k in range(starts[operand], starts[operand + 1]):
@@ -241,7 +241,7 @@ def _members(plan: PlanArrays, classes: Integers, members: Flags) -> None:
 
 @inlined
 def _channels_of(values: Floats, spreads: Floats, signals: Floats, members: Flags) -> int:
-    """How many channels hold what is known: 4 with uncertainty, 2 with anything unknown, else 1."""
+    """Return the number of channels needed: 4 with uncertainty, 2 with anything unknown, else 1."""
     channels = 1
     for k in range(len(values)):
         if spreads[k, 0] != 0.0:
@@ -259,7 +259,7 @@ def _channels_of(values: Floats, spreads: Floats, signals: Floats, members: Flag
 
 @kernel
 def leaves_of_sample(packed_plan: PackedPlan, whole: Integers, numbers: Floats, vertices: Floats) -> Floats:
-    """(C, A, 1), as `leaf_values` gives them.
+    """Compute the leaves of one sample, (C, A, 1), as `leaf_values` does.
 
     Args:
         whole: class codes of the samples and of the places, parts of each place, vertices of each part.

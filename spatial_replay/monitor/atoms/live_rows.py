@@ -83,7 +83,7 @@ class PlanRows:
         return [Row(self._place(sample, names[each]), wanted) for each in membership.chosen]
 
     def of_term(self, term: Term) -> list[Row]:
-        """The rows that a term is the union of."""
+        """Return the rows whose union a term is."""
         term = without_enlargement(term)
         sample = self._sample_of(term)
         base = term.term if isinstance(term, Earlier) else term
@@ -98,7 +98,7 @@ class PlanRows:
         return [Row(self._place(sample, name)) for name in base.members if name not in left_out]
 
     def required(self, term: Term) -> list[int]:
-        """The rows without which a term is unknown as a whole: that of its sample among them."""
+        """Return the rows, its sample's among them, without which a term is unknown."""
         term = without_enlargement(term)
         base = term.term if isinstance(term, Earlier) else term
         sample = [self._sample_of(term)] if isinstance(term, Earlier) else []

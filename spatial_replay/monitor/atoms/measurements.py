@@ -29,7 +29,7 @@ from spatial_replay.spec.walks import base_of, map_terms, measured_terms
 
 
 def measured(scene: TraceScene, measurements: Sequence[Measurement]) -> tuple[Floats, Floats]:
-    """Each measurement in each sample of a scene.
+    """Compute each measurement in each sample of a scene, or take it from the trace's cache.
 
     Returns:
         Values (K, T), NaN where unknown, and how far each may be off for uncertainty (K, T).
@@ -51,7 +51,7 @@ def measured(scene: TraceScene, measurements: Sequence[Measurement]) -> tuple[Fl
 
 
 def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Floats]:
-    """(2, T) for each: value, NaN where unknown, and uncertainty; all in one kernel call."""
+    """Compute value (NaN if unknown) and uncertainty of each measurement, (2, T), in one kernel call."""
     numbers: dict[Term, int] = {}
     operands: list[Operand] = []
 
@@ -98,7 +98,7 @@ def quantity_of(measurement: Measurement) -> Quantity:
 
 
 def _key(scene: TraceScene, measurement: Measurement) -> Hashable:
-    """What a measurement is apart from the specification it stands in: regions by shape, not by name."""
+    """Return the cache key of a measurement: independent of its specification, with regions by shape."""
     shapes = tuple(
         scene.regions[name] for name in map(_region, measured_terms(measurement)) if name is not None
     )
@@ -121,7 +121,7 @@ def _unnamed(term: Term) -> Term:
 
 
 def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings) -> Floats:
-    """Each leaf in each sample of a scene.
+    """Compute each leaf in each sample of a scene.
 
     Returns:
         (C, A, T) with C = 1 where everything is known, C = 2 (low and high end) where something may not be,
@@ -159,7 +159,7 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
 
 
 def _flags(scene: TraceScene, membership: Membership) -> Flags:
-    """(T,): what a binding is in each sample (see `Membership`)."""
+    """Return the state of a binding in each sample, (T,) (see `Membership`)."""
     _, members, unknown = scene.members(membership.group)
     if not membership.chosen:
         return np.where(unknown, -1, 0).astype(np.int8)

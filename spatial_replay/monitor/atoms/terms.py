@@ -79,21 +79,21 @@ class TraceScene:
         )
 
     def find(self, term: Term) -> ResolvedTerm:
-        """A term without variables (see `bind`)."""
+        """Resolve a term without variables (see `bind`)."""
         if term not in self._found:
             self._found[term] = self._find(term)
         return self._found[term]
 
     def candidates(self, group: Group | Earlier) -> tuple[str, ...]:
-        """Names of the objects that are ever in an open group."""
+        """Return the names of the objects that are ever in an open group."""
         return self.members(group)[0]
 
     def may_be_unknown(self, group: Group | Earlier) -> bool:
-        """Whether an open group is ever that of a time before the trace."""
+        """Return whether an open group is ever that of a time before the trace."""
         return bool(self.members(group)[2].any())
 
     def members(self, group: Group | Earlier) -> tuple[tuple[str, ...], Flags, Booleans]:
-        """Who is in an open group.
+        """Return the members of an open group.
 
         Returns:
             Names of those who ever are (M,), (T, M) with 1 where they are and 0 where not, and (T,) where
@@ -130,7 +130,7 @@ class TraceScene:
         return self._found_rows(rows, unknown | (source < 0))
 
     def _base_and_source(self, term: _Base | Earlier) -> tuple[_Base, Integers]:
-        """What a term is about, and which sample of the trace each of the scene's looks at (-1: none)."""
+        """Return what a term is about, and the trace's sample each of the scene's looks at (-1: none)."""
         now = np.arange(self.skip, len(self.trace), dtype=np.int64)
         if not isinstance(term, Earlier):
             return term, now
@@ -161,7 +161,7 @@ class TraceScene:
         )
 
     def _rows_of(self, name: str) -> Integers:
-        """(T,) of the whole trace; everywhere absent for an object that it does not have."""
+        """Return an object's row in each sample of the whole trace, (T,); `ABSENT` for an unknown object."""
         if name in self._column:
             return self.trace.rows[:, self._column[name]]
         return np.full(len(self.trace), ABSENT, np.int64)
@@ -174,7 +174,7 @@ class TraceScene:
         return np.stack(columns, axis=1)
 
     def _open_rows(self, group: Group) -> tuple[tuple[str, ...], Integers]:
-        """Names that can be members, and their rows over the whole trace: `ABSENT` where they are not."""
+        """Return possible members and their rows over the whole trace, `ABSENT` where not members."""
         left_out = left_out_of(group)
         names = tuple(name for name in self.trace.names if name not in left_out)
         rows = self.trace.rows[:, [self._column[name] for name in names]]
@@ -192,7 +192,7 @@ class TraceScene:
 
 
 def footprint_from_outline(outline: Outline) -> Footprint:
-    """The shape of a region; a polygon that is not convex is decomposed.
+    """Return the shape of a region; a polygon that is not convex is decomposed.
 
     Raises:
         GeometryError: an outline that makes no footprint.
@@ -204,7 +204,7 @@ def footprint_from_outline(outline: Outline) -> Footprint:
 
 
 def open_group(term: Group | Earlier) -> Group:
-    """The open group that a term is, now or earlier."""
+    """Return the open group that a term denotes, now or earlier."""
     base = term.term if isinstance(term, Earlier) else term
     if not isinstance(base, Group) or base.members is not None:
         raise TypeError(f"{term!r} is not an open group")

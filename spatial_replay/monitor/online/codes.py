@@ -86,11 +86,11 @@ _STANDS_FOR = MappingProxyType({1: (0, 0, 0, 0), 2: (0, 1, 0, 1), 4: (0, 1, 2, 3
 
 
 def in_channels(numbers: Floats, channels: int) -> Floats:
-    """Numbers (C, …) in the given number of channels, at least C: 1, 2 or 4."""
+    """Expand numbers (C, …) to the given number of channels, at least C: 1, 2 or 4."""
     return numbers if len(numbers) == channels else numbers[list(_STANDS_FOR[len(numbers)][:channels])]
 
 
 def low_and_high(channels: int, *, wide: bool) -> tuple[int, int]:
-    """Which of so many channels hold the low and the high ends, nominal or with uncertainty."""
+    """Return the channels of the low and high ends, nominal or with uncertainty."""
     stands_for = _STANDS_FOR[channels]
     return (stands_for[2], stands_for[3]) if wide else (stands_for[0], stands_for[1])

@@ -38,21 +38,21 @@ _WINDOWS = (codes.WINDOW_MAX, codes.WINDOW_MIN)
 
 
 def looks_ahead(formula: Formula) -> bool:
-    """Whether a formula holds a future operator."""
+    """Return whether a formula contains a future operator."""
     if isinstance(formula, Temporal) and formula.operator in FUTURE_OPERATORS:
         return True
     return any(looks_ahead(operand) for operand in operands_of(formula))
 
 
 def window_of(bound: Bound | None) -> tuple[int, int, int | None]:
-    """The unit, the lower and the upper end (None: unbounded) of an operator's window."""
+    """Return the unit, the lower and the upper end (None: unbounded) of an operator's window."""
     if bound is None:
         return codes.SAMPLES, 0, None
     return (codes.SAMPLES if bound.unit == "samples" else codes.NANOSECONDS), bound.lower, bound.upper
 
 
 def array_of_rows(rows: Sequence[Row], width: int) -> Integers:
-    """(R, width), also for no rows."""
+    """Return rows as an array (R, width), also for R = 0."""
     return np.array(rows, np.int64).reshape(len(rows), width)
 
 
@@ -84,7 +84,7 @@ class SignalTable:
         return any(row[0] in _WINDOWS or row[0] == codes.DELAY for row in self._rows)
 
     def array(self) -> Integers:
-        """(S, SIGNAL_WIDTH), with the numbers of the sliding windows."""
+        """Return the table (S, SIGNAL_WIDTH), with its sliding windows numbered."""
         window = 0
         rows = []
         for row in self._rows:
@@ -135,7 +135,7 @@ class SignalTable:
         return first
 
     def _temporal(self, operator: str, operands: list[int], bound: Bound | None, ahead: int = 0) -> int:
-        """A past operator; with `codes.AHEAD`, the future operator that is its mirror image in time."""
+        """Add a past operator; with `codes.AHEAD`, the future operator that mirrors it in time."""
         unit, low, high = window_of(bound)
         match operator:
             case "Y":
@@ -151,7 +151,7 @@ class SignalTable:
         return running if low == 0 else self._delay(running, unit, low, ahead, is_weak=is_weak)
 
     def _since(self, left: int, right: int, unit: int, low: int, high: int | None, ahead: int) -> int:
-        """phi S[a,b] psi as O[a,b] psi and phi S[a,inf] psi, the latter as phi on the last a and
+        """Write phi S[a,b] psi as O[a,b] psi and phi S[a,inf] psi, the latter as phi on the last a and
         phi S psi before: since min distributes over max, both are exact for robustness too."""
         result = self._row(codes.SINCE + ahead, left, right)
         if low > 0:
@@ -164,7 +164,7 @@ class SignalTable:
         return result
 
     def _delay(self, operand: int, unit: int, distance: int, ahead: int, *, is_weak: bool = False) -> int:
-        """An operand so far back: +inf where there is none for a weak operator, -inf for a strong one."""
+        """Add an operand delayed by a distance; before the first sample +inf if weak, -inf if strong."""
         return self._row(codes.DELAY + ahead, operand, 0, unit, distance, 1 if is_weak else -1)
 
 
@@ -178,7 +178,7 @@ _PAST = (*_RECURRENT_PAST, codes.PAST_WINDOW_MAX, codes.PAST_WINDOW_MIN, codes.P
 
 
 def part_of(signals: SignalTable, node: Temporal) -> WindowedPart:
-    """The part of a node: anchored where that does, since it is the cheaper to run.
+    """Return the part of a node: anchored if possible, since that is cheaper to run.
 
     Raises:
         UsageError: more than `MAX_VARIABLES` unbounded future operators.
@@ -222,7 +222,7 @@ class WindowedPart:
             self._add(root, True)
 
     def rows(self) -> tuple[Row, ...]:
-        """Rows with the number of their variable, of their table, and whether they depend on either."""
+        """Return rows with the numbers of their variable and table, and whether they depend on either."""
         variable = 0
         table = 1  # the part's own is 0
         result: list[Row] = []
@@ -311,7 +311,7 @@ class WindowedPart:
     def _bounded(
         self, left: int, right: int, unit: int, low: int, high: int | None, *, is_until: bool
     ) -> int:
-        """Until or release over a window, by the identity that `SignalTable` uses for since."""
+        """Add until or release over a window, by the identity that `SignalTable` uses for since."""
         weak = int(not is_until)
         own, other = _by_kind(codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN, is_until)
         within = None if high is None else self._row(own, right, 0, weak, unit, low, high)

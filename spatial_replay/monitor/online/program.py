@@ -60,7 +60,7 @@ class Program:
 
 
 def compile_formula(formula: Formula) -> Program:
-    """The tables of a formula.
+    """Compile a formula to tables.
 
     Raises:
         UsageError: more than `MAX_VARIABLES` unbounded future operators under one node.
@@ -104,7 +104,7 @@ class _Parts:
         self._built: dict[tuple[Row, ...], int] = {}
 
     def add(self, part: WindowedPart) -> int:
-        """The number of a part."""
+        """Add a part and return its number."""
         rows = part.rows()
         if rows in self._built:
             return self._built[rows]
@@ -131,7 +131,7 @@ class _Parts:
 
 
 def _nodes_with_operands(formula: Formula) -> list[tuple[Formula, list[int]]]:
-    """Every node of a tree, by id, with the ids of its operands."""
+    """Return every node of a tree, by id, with the ids of its operands."""
     nodes: list[tuple[Formula, list[int]]] = []
     for identifier, parent, node in iter_nodes(formula):
         nodes.append((node, []))
@@ -141,7 +141,7 @@ def _nodes_with_operands(formula: Formula) -> list[tuple[Formula, list[int]]]:
 
 
 def _now_rule(node: Temporal, part: WindowedPart) -> int:
-    """What a future operator is on the newest sample alone (`now`)."""
+    """Return how a future operator follows from its operands on the newest sample alone (`now`)."""
     if part.is_remembering:
         return codes.NOW_OF_PART
     weak = node.operator in ("G", "R", "W", "WX")

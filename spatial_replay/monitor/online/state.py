@@ -84,7 +84,7 @@ class Scratch(NamedTuple):
 
 
 def first_memory(program: Program, room: int) -> Memory:
-    """Memory before the first sample, with room for so many recent ones."""
+    """Return the memory before the first sample, with room for some recent ones."""
     signals = len(program.signals)
     cells = np.zeros(program.cells, np.int64)
     for _, _, variables, tables, _, cell, *_ in program.parts:
@@ -103,7 +103,7 @@ def first_memory(program: Program, room: int) -> Memory:
 
 
 def scratch_for(program: Program, room: int, tile: int) -> Scratch:
-    """Room to work in with so many recent samples, so many of them taken in together."""
+    """Allocate scratch arrays for some recent samples, and for the samples added together."""
     widest = max((int(end - first) for first, end, *_ in program.parts), default=0)
     largest = max(((1 << int(part[2])) * int(part[3]) for part in program.parts), default=1)
     most_tables = max((int(part[3]) for part in program.parts), default=1)
@@ -126,7 +126,7 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
 
 
 def widen(memory: Memory, before: int) -> None:
-    """Give each channel that appears now the state of the one of the `before` that it was equal to."""
+    """Copy into each new channel the state of the one of the `before` channels that it was equal to."""
     by_channel = (memory.running, memory.firsts, memory.tables, memory.history)
     by_window = (memory.wedges.swapaxes(0, 1), memory.wedge_ends.swapaxes(0, 1))
     for state in (*by_channel, *by_window):
@@ -142,7 +142,7 @@ def forget(memory: Memory, moved: int, used: int) -> None:
 
 
 def doubled(memory: Memory) -> Memory:
-    """The same with twice the room for recent samples."""
+    """Return the memory with twice the room for recent samples."""
     old = len(memory.stamps)
     wedges = np.zeros((*memory.wedges.shape[:2], 2 * old), np.int64)
     for window, channel in np.ndindex(memory.wedges.shape[:2]):
@@ -157,7 +157,7 @@ def doubled(memory: Memory) -> Memory:
 
 @piece
 def first_after(stamps: Integers, offset: int, last: int, position: int, distance: int) -> int:
-    """The first position, offset … last, at least so many ns after another; last + 1 if there is none.
+    """Return the first position, offset … last, at least `distance` ns after another; else last + 1.
 
     Times are compared by their differences, which fit where a time plus the distance might not.
     """
@@ -174,7 +174,7 @@ def first_after(stamps: Integers, offset: int, last: int, position: int, distanc
 
 @piece
 def first_onward(stamps: Integers, offset: int, last: int, position: int, distance: int, before: int) -> int:
-    """`first_after`, sought step by step from what it was for a position before."""
+    """Return `first_after`, searched step by step from its result for the previous position."""
     origin = stamps[position - offset]
     while before <= last and stamps[before - offset] - origin < distance:
         before += 1
@@ -183,7 +183,7 @@ def first_onward(stamps: Integers, offset: int, last: int, position: int, distan
 
 @piece
 def ahead(stamps: Integers, offset: int, last: int, position: int, unit: int, distance: int) -> int:
-    """The first position at least so far ahead (it may lie after `last`)."""
+    """Return the first position at least a distance ahead (it may lie after `last`)."""
     if unit == SAMPLES:
         return position + distance
     if position > last:
@@ -193,7 +193,7 @@ def ahead(stamps: Integers, offset: int, last: int, position: int, unit: int, di
 
 @piece
 def last_ahead(stamps: Integers, offset: int, last: int, position: int, unit: int, distance: int) -> int:
-    """The last position at most so far ahead, and known: `last` at most."""
+    """Return the last known position at most a distance ahead: `last` at most."""
     if unit == SAMPLES:
         return min(position + distance, last)
     if position > last:
@@ -203,7 +203,7 @@ def last_ahead(stamps: Integers, offset: int, last: int, position: int, unit: in
 
 @piece
 def is_closed(stamps: Integers, offset: int, last: int, position: int, unit: int, distance: int) -> bool:
-    """Whether no later sample can fall into the window that ends so far ahead of a position."""
+    """Return whether no later sample can fall into the window that ends a distance ahead of a position."""
     if position > last:
         return False
     if unit == SAMPLES:
@@ -213,7 +213,7 @@ def is_closed(stamps: Integers, offset: int, last: int, position: int, unit: int
 
 @piece
 def behind(stamps: Integers, offset: int, position: int, unit: int, distance: int) -> int:
-    """The last position at least so far behind; before `offset` if there is none."""
+    """Return the last position at least a distance behind; before `offset` if there is none."""
     if unit == SAMPLES:
         return position - distance
     return first_after(stamps, offset, position, position, 1 - distance) - 1
@@ -221,7 +221,7 @@ def behind(stamps: Integers, offset: int, position: int, unit: int, distance: in
 
 @piece
 def first_behind(stamps: Integers, offset: int, position: int, unit: int, distance: int) -> int:
-    """The first position at most so far behind, `offset` at least."""
+    """Return the first position at most a distance behind, `offset` at least."""
     if unit == SAMPLES:
         return max(position - distance, offset)
     return first_after(stamps, offset, position, position, -distance)

@@ -73,7 +73,7 @@ from spatial_replay.monitor.online.windows import kept_from, step_windows
 
 @piece
 def _combine_low(code: int, low: float, high: float, other_low: float, other_high: float) -> float:
-    """Lower end of a Boolean operator over two intervals; the upper end is its mirror image."""
+    """Return the lower end of a Boolean operator over two intervals; the upper end is its mirror image."""
     if code == REPORT_AND:
         return min(low, other_low)
     if code == REPORT_OR:
@@ -105,7 +105,7 @@ def _combine(code: int, into: Floats, other: Floats, count: int) -> None:
 
 @piece
 def _set_now(rule: int, into: Floats, first: Floats, last: Floats, count: int) -> None:
-    """What a part is now, from what its first and its last operand are."""
+    """Compute what a part is now, from what its first and its last operand are."""
     for number in (2, 3):
         for k in range(count):
             if rule == NOW_LAST_OPERAND:
@@ -120,7 +120,7 @@ def _set_now(rule: int, into: Floats, first: Floats, last: Floats, count: int) -
 
 @piece
 def _write_series(numbers: Floats, t: int, count: int, series: Floats) -> None:
-    """value, now, lower and upper of every node; NaN where the ends of value or now differ.
+    """Write value, now, lower and upper of every node; NaN where the ends of value or now differ.
 
     Adding zero turns -0.0 into 0.0, so that equal numbers are equal bits.
     """
@@ -140,7 +140,7 @@ def report(
     reports: Integers, operands: Integers, memory: Memory, scratch: Scratch, channels: int, begin: int,
     count: int, t: int, series: Floats, final: Floats,
 ) -> None:  # fmt: skip
-    """The numbers of every node over `count` samples, operands first.
+    """Compute the numbers of every node over `count` samples, operands first.
 
     Args:
         begin: where these samples stand in the history.
@@ -190,7 +190,7 @@ def report(
 def step_signals(
     signals: Integers, leaves: Floats, t: int, count: int, position: int, offset: int, memory: Memory
 ) -> None:
-    """All signals over the samples t … t + count - 1 of `leaves`, in every channel, into the history.
+    """Add all signals over the samples t … t + count - 1 of `leaves`, in every channel, to the history.
 
     Args:
         position: of the first of these samples in the run; it stands at position - offset in the history.
@@ -245,7 +245,7 @@ def step_signals(
 
 @piece
 def _run_past(code: int, first: Floats, second: Floats, target: Floats, before: float, starts: bool) -> None:
-    """Unbounded once, historically and since, from their value at the sample before."""
+    """Run an unbounded once, historically or since, from its value at the previous sample."""
     value = before
     if starts:
         value = np.inf if code == HISTORICALLY else -np.inf
@@ -272,7 +272,7 @@ def _slide(
     ends: Integers,
     entering: int,
 ) -> None:
-    """Extremum over a sliding window: a wedge of the positions whose values can still become it.
+    """Compute an extremum over a sliding window, with a wedge of the positions that can still attain it.
 
     The wedge is a ring; `ends` counts the positions that ever left and entered it.
     """  # fmt: skip
@@ -381,7 +381,7 @@ class OnlineRun:
         self._start_ns = 0
 
     def __len__(self) -> int:
-        """How many samples were taken in."""
+        """Return how many samples were added."""
         return self._position
 
     @property
@@ -425,7 +425,7 @@ class OnlineRun:
         self._position += count
 
     def _make_room(self, wanted: int) -> int:
-        """How many of the wanted samples there is room for, at least one."""
+        """Make room for at least one of the wanted samples; return for how many."""
         room = len(self._memory.stamps)
         if not self._program.keeps_history:
             self._offset = self._position

@@ -43,7 +43,7 @@ from spatial_replay.monitor.online.state import Memory, Scratch
 
 @piece
 def read_table(table: Floats, variables: int, point: Floats, order: Integers) -> float:
-    """A table at a point: walk its corners in descending order of the coordinates."""
+    """Read a table at a point: walk its corners in descending order of the coordinates."""
     if variables == 1:
         return float(max(table[0], min(point[0], table[1])))
     for j in range(variables):
@@ -67,7 +67,7 @@ def corner_value(corner: int, variable: int) -> float:
 
 @piece
 def _start(nodes: Integers, part: Integers, table: Floats, values: Floats) -> None:
-    """The table before the first sample: each operator is what it will be there."""
+    """Fill the table before the first sample: each operator as it is there."""
     first, end = part[PART_FIRST], part[PART_END]
     for corner in range(1 << part[PART_VARIABLES]):
         for d in range(first, end):
@@ -89,7 +89,7 @@ def _fill_columns(
     count: int,
     columns: Floats,
 ) -> None:
-    """The nodes that depend on no variable, over a stretch of samples."""
+    """Compute the nodes that depend on no variable, over some samples."""
     for d in range(part[PART_FIRST], part[PART_END]):
         code, a, b = nodes[d, NODE_CODE], nodes[d, NODE_A], nodes[d, NODE_B]
         column = columns[d - part[PART_FIRST]]
@@ -116,7 +116,7 @@ def _is_anchored(code: int) -> bool:
 
 @piece
 def _expand(node: Integers, left: float, right: float, later: float, position: int, elapsed_ns: int) -> float:
-    """An until or release at a sample, from its operands there and its value at the next sample.
+    """Expand an until or release at a sample, from its operands there and its value at the next sample.
 
     Of an anchored one the right operand counts inside its window only.
     """
@@ -148,7 +148,7 @@ def _step_channel(
     nodes: Integers, part: Integers, table: Floats, channel: int, mirror: int, memory: Memory,
     scratch: Scratch, position: int, start_ns: int, begin: int, count: int,
 ) -> None:  # fmt: skip
-    """`step_tables` in one channel; into `scratch.series` what if the run ended there, and the bounds."""
+    """Run `step_tables` in one channel; put the values of an ending run and the bounds into the scratch."""
     first, end, variables, end_corner = (
         part[PART_FIRST],
         part[PART_END],
@@ -203,7 +203,7 @@ def _step_simple(
     lows: Floats,
     highs: Floats,
 ) -> None:
-    """`step_tables` for a single until or release: a table of two numbers."""
+    """Run `step_tables` for a single until or release: a table of two numbers."""
     low, high = table[0], table[1]
     a, b = node[NODE_A], node[NODE_B]
     until = node[NODE_CODE] == UNTIL

@@ -95,7 +95,7 @@ class Look(NamedTuple):
 
 @inlined
 def _cells_of(part: Integers) -> tuple[int, int, int]:
-    """Where a part's cells hold its base, its variables' positions and its tables' positions."""
+    """Return where a part's cells hold its base, its variables' positions and its tables' positions."""
     base = part[PART_CELL_START]
     return base, base + 1, base + 1 + part[PART_VARIABLES]
 
@@ -105,7 +105,7 @@ def reach(
     nodes: Integers, part: Integers, memory: Memory, scratch: Scratch, root_low: int, root_high: int,
     offset: int, last: int,
 ) -> bool:  # fmt: skip
-    """Which positions of each node matter for the root at root_low … root_high.
+    """Compute which positions of each node matter for the root at root_low … root_high.
 
     Returns whether every window that they look through has closed. `plain` holds the lower ends before
     they are widened to what the tables start from.
@@ -145,7 +145,7 @@ def reach(
 def _operands_reach(
     node: Integers, low: int, high: int, stamps: Integers, offset: int, last: int
 ) -> tuple[int, int, bool]:
-    """Which positions of its operands a node looks at from low … high, and whether none is still to come."""
+    """Return the operands' positions a node looks at from low … high, and whether all of them are known."""
     code, unit, near, far = node[NODE_CODE], node[NODE_UNIT], node[NODE_LOW], node[NODE_HIGH]
     if code in (PART_WINDOW_MAX, PART_WINDOW_MIN):
         closed = is_closed(stamps, offset, last, high, unit, far)
@@ -163,7 +163,7 @@ def _operands_reach(
 
 @inlined
 def _beyond(mode: int, weak: int) -> float:
-    """What an operator that is still open takes from beyond the last sample."""
+    """Return the value an operator that is still open takes from beyond the last sample."""
     if mode == OPEN_END:
         return np.inf if weak else -np.inf
     return np.inf if mode == OPEN_HIGH else -np.inf
@@ -173,7 +173,7 @@ def _beyond(mode: int, weak: int) -> float:
 def _run_boolean(
     node: Integers, columns: Floats, target: Floats, history: Floats, look: Look, begin: int, end: int
 ) -> None:
-    """A literal, a conjunction or a disjunction."""
+    """Run a literal, a conjunction or a disjunction."""
     code, a, b = node[NODE_CODE], node[NODE_A], node[NODE_B]
     if code == PART_AND:
         for k in range(begin, end):
@@ -193,7 +193,7 @@ def _run_boolean(
 def _run_recurrence(
     node: Integers, columns: Floats, target: Floats, start: float, begin: int, end: int, step: int
 ) -> None:
-    """An operator without a window: until and release backwards, since and trigger forwards."""
+    """Run an operator without a window: until and release backwards, since and trigger forwards."""
     a, b = node[NODE_A], node[NODE_B]
     is_strong = node[NODE_CODE] in (UNTIL, PAST_SINCE)
     value = start
@@ -210,7 +210,7 @@ def _run_window(
     node: Integers, source: Floats, target: Floats, low: int, high: int, stamps: Integers, offset: int,
     last: int, mode: int, wedge: Integers,
 ) -> None:  # fmt: skip
-    """A bounded operator at positions low … high: extremum of `source` over the window ahead or behind."""
+    """Run a bounded operator at low … high: the extremum of `source` over the window ahead or behind."""
     unit, near, far = node[NODE_UNIT], node[NODE_LOW], node[NODE_HIGH]
     is_ahead = node[NODE_CODE] in (PART_WINDOW_MAX, PART_WINDOW_MIN)
     sign = 1.0 if node[NODE_CODE] in (PART_WINDOW_MAX, PAST_WINDOW_MAX) else -1.0
@@ -250,7 +250,7 @@ def _run_shift(
     node: Integers, source: Floats, target: Floats, low: int, high: int, stamps: Integers, offset: int,
     last: int, mode: int,
 ) -> None:  # fmt: skip
-    """A shift or a delay at positions low … high: `source` where it lies so far ahead or behind."""
+    """Run a shift or a delay at positions low … high: `source` at a distance ahead or behind."""
     unit, distance = node[NODE_UNIT], node[NODE_LOW]
     is_ahead = node[NODE_CODE] == SHIFT
     missing = _beyond(mode if is_ahead else OPEN_END, node[NODE_WEAK])
@@ -267,7 +267,7 @@ def _run_until(
     node: Integers, part: Integers, target: Floats, low: int, high: int, look: Look, memory: Memory,
     scratch: Scratch, offset: int,
 ) -> None:  # fmt: skip
-    """An unbounded until or release at positions low … high; its variable's value goes to the point."""
+    """Run an unbounded until or release at low … high; its variable's value goes to the point."""
     variable = node[NODE_VARIABLE]
     if look.mode == OPEN_CORNER:
         after = corner_value(look.corner, variable) if variable >= 0 else -np.inf
@@ -284,7 +284,7 @@ def _run_since(
     node: Integers, part: Integers, tables: Floats, target: Floats, high: int, memory: Memory,
     scratch: Scratch, offset: int,
 ) -> None:  # fmt: skip
-    """An unbounded since or trigger from the position of its table up to `high`."""
+    """Run an unbounded since or trigger from the position of its table up to `high`."""
     table, variables = node[NODE_TABLE], part[PART_VARIABLES]
     start = memory.cells[_cells_of(part)[2] + table]
     if start < 0:
@@ -301,7 +301,7 @@ def _run_columns(
     nodes: Integers, part: Integers, tables: Floats, look: Look, memory: Memory, scratch: Scratch,
     offset: int, last: int,
 ) -> None:  # fmt: skip
-    """Every node of a part over the positions that matter, operands first.
+    """Run every node of a part over the positions that matter, operands first.
 
     `scratch.point` receives the variables' values where the table's base ends, `scratch.starts` the
     values that past operators start from.
@@ -333,7 +333,7 @@ def _value_at_first(
     nodes: Integers, part: Integers, tables: Floats, look: Look, memory: Memory, scratch: Scratch,
     offset: int, last: int,
 ) -> float:  # fmt: skip
-    """The part's value at the first sample, as a run over the recent ones leaves it."""
+    """Return the part's value at the first sample, given a run over the recent ones."""
     _run_columns(nodes, part, tables, look, memory, scratch, offset, last)
     if memory.cells[part[PART_CELL_START]] == 0:
         return float(scratch.columns[part[PART_END] - 1 - part[PART_FIRST], 0 - offset])
@@ -368,7 +368,7 @@ def _renew_tables(
     nodes: Integers, part: Integers, channel: int, mirror: int, memory: Memory, scratch: Scratch,
     offset: int, last: int,
 ) -> None:  # fmt: skip
-    """The tables of a part, in one channel, once the position at its base is taken in."""
+    """Renew the tables of a part, in one channel, after adding the position at its base."""
     first, fresh, size = part[PART_FIRST], scratch.fresh, 1 << part[PART_VARIABLES]
     states = _cells_of(part)[2]
     tables = _tables_of(part, channel, memory)
@@ -388,7 +388,7 @@ def _renew_tables(
 
 @piece
 def _tables_of(part: Integers, channel: int, memory: Memory) -> Floats:
-    """A part's own table and those of its past operators, one after the other."""
+    """Return a part's own table and those of its past operators, one after the other."""
     start = part[PART_TABLE_START]
     return memory.tables[channel, start : start + (part[PART_TABLES] << part[PART_VARIABLES])]
 
@@ -398,7 +398,7 @@ def step_windows(
     nodes: Integers, part: Integers, memory: Memory, scratch: Scratch, channels: int, position: int,
     offset: int, count: int, numbers: Floats,
 ) -> None:  # fmt: skip
-    """`count` samples, the first of them at `position`, of a part that looks through windows.
+    """Run a part with windows over `count` samples, the first of them at `position`.
 
     Args:
         numbers: (NUMBERS, TILE), receives what the part says; how the run would end, for the last one only.
@@ -435,7 +435,7 @@ def kept_from(
     signals: Integers, nodes: Integers, parts: Integers, memory: Memory, scratch: Scratch, offset: int,
     last: int,
 ) -> int:  # fmt: skip
-    """The first position that anything may still look at once the sample at `last` is done."""
+    """Return the first position that anything may still look at after the sample at `last`."""
     keep = last
     for s in range(signals.shape[0]):
         code, unit = signals[s, SIGNAL_CODE], signals[s, SIGNAL_UNIT]

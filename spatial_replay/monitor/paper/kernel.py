@@ -77,7 +77,7 @@ class PaperMemory(NamedTuple):
 
 @piece
 def _set_now(rows: Integers, operands: Integers, n: int, numbers: Floats, lost: Flags) -> None:
-    """A node at the newest sample, alone, from its operands there."""
+    """Compute a node on the newest sample alone, from its operands there."""
     code, first, end = rows[n, CODE], rows[n, FIRST], rows[n, END]
     if code == NEXT or (code > NEXT and rows[n, LOW] > 0):
         numbers[n], lost[n] = np.nan, 0
@@ -95,7 +95,7 @@ def _set_now(rows: Integers, operands: Integers, n: int, numbers: Floats, lost: 
 
 @piece
 def _fold(code: int, operands: Integers, numbers: Floats, lost: Flags, n: int) -> None:
-    """A Boolean node, from its operands."""
+    """Compute a Boolean node from its operands."""
     number, is_lost = numbers[operands[0]], lost[operands[0]]
     number = combine(code, number, number) if len(operands) == 1 else number
     for each in operands[1:]:
@@ -106,7 +106,7 @@ def _fold(code: int, operands: Integers, numbers: Floats, lost: Flags, n: int) -
 
 @piece
 def _set_column(rows: Integers, operands: Integers, n: int, last: int, memory: PaperMemory) -> None:
-    """A Boolean node at every sample, from its operands."""
+    """Compute a Boolean node at every sample, from its operands."""
     code, first, end = rows[n, CODE], rows[n, FIRST], rows[n, END]
     row = rows[n, COLUMN]
     into, lost = memory.columns[row], memory.lost_columns[row]
@@ -125,7 +125,7 @@ def _set_column(rows: Integers, operands: Integers, n: int, last: int, memory: P
 
 @piece
 def _window_at_first(rows: Integers, n: int, last: int, time_ns: int, memory: PaperMemory) -> bool:
-    """Whether the last sample is in the window of the first; notes where that window begins."""
+    """Return whether the last sample is in the first one's window; note where that window begins."""
     passed = time_ns - memory.stamps[0] if rows[n, IS_IN_NS] else last
     if memory.starts[n] < 0 and passed >= rows[n, LOW]:
         memory.starts[n] = last
@@ -136,7 +136,7 @@ def _window_at_first(rows: Integers, n: int, last: int, time_ns: int, memory: Pa
 def _step_first(
     rows: Integers, operands: Integers, n: int, last: int, time_ns: int, memory: PaperMemory
 ) -> None:
-    """A temporal node that is wanted at the first sample alone."""
+    """Update a temporal node that is needed at the first sample only."""
     code, value, lost = rows[n, CODE], memory.value, memory.lost_value
     right = operands[rows[n, END] - 1]
     right_row = rows[right, COLUMN]
@@ -180,13 +180,13 @@ def _step_first(
 
 @piece
 def _apart(rows: Integers, n: int, earlier: int, later: int, memory: PaperMemory) -> int:
-    """How far two samples are apart, in the unit of a node's window."""
+    """Return the distance of two samples, in the unit of a node's window."""
     return memory.stamps[later] - memory.stamps[earlier] if rows[n, IS_IN_NS] else later - earlier
 
 
 @piece
 def _step_column(rows: Integers, operands: Integers, n: int, last: int, memory: PaperMemory) -> None:
-    """A temporal node that is wanted at every sample: those whose window has not closed before."""
+    """Update a temporal node that is needed at every sample, where its window was still open."""
     code = rows[n, CODE]
     row, inner = rows[n, COLUMN], rows[n, INNER]
     into, into_lost = memory.columns[row], memory.lost_columns[row]
@@ -221,7 +221,7 @@ def _step_column(rows: Integers, operands: Integers, n: int, last: int, memory: 
 def _scan_node(
     rows: Integers, operands: Integers, n: int, start: int, last: int, memory: PaperMemory
 ) -> None:
-    """The unbounded operator on the run from each sample, from `start` on, to the last one."""
+    """Run the unbounded operator from each sample, from `start` on, to the last one."""
     code, inner = rows[n, CODE], rows[n, INNER]
     into, into_lost = memory.columns[inner], memory.lost_columns[inner]
     right_node, left_node = operands[rows[n, END] - 1], operands[rows[n, FIRST]]

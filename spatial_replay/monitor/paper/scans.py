@@ -65,7 +65,7 @@ class PaperTable:
 
 
 def paper_table(formula: Formula, leaves: Sequence[Atom | Quantified]) -> PaperTable:
-    """The table of a formula of `OPERATORS` over these leaves."""
+    """Compile a formula of `OPERATORS` over these leaves."""
     nodes = [(node, parent) for _, parent, node in iter_nodes(formula)]
     operands: list[list[int]] = [[] for _ in nodes]
     for identifier, (_, parent) in enumerate(nodes):
@@ -105,7 +105,7 @@ def _is_plain(formula: Formula) -> bool:
 def _columns(
     nodes: Sequence[tuple[Formula, int | None]], operands: Sequence[Sequence[int]], is_plain: Sequence[bool]
 ) -> list[bool]:
-    """Which nodes are wanted at all samples; parents come before their operands."""
+    """Return which nodes are needed at all samples; parents come before their operands."""
     wanted = [False] * len(nodes)
     for identifier, (node, _) in enumerate(nodes):
         for operand in operands[identifier]:
@@ -117,7 +117,7 @@ def _columns(
 
 
 def _code(node: Formula, leaves: Sequence[Atom | Quantified]) -> tuple[int, int]:
-    """A node's code, and which leaf it is or which sign of infinity."""
+    """Return a node's code, and its leaf or the sign of its infinity."""
     match node:
         case Truth():
             return TRUTH, 1 if node.value else -1
@@ -145,7 +145,7 @@ def _meaning(leaf: Quantified) -> tuple[object, ...]:
 
 @inlined
 def least(one: float, other: float) -> float:
-    """The lesser number; that which is not left out; NaN if both are."""
+    """Return the lesser number, of those not left out; NaN if both are."""
     if np.isnan(one):
         return other
     if np.isnan(other):
@@ -155,7 +155,7 @@ def least(one: float, other: float) -> float:
 
 @inlined
 def most(one: float, other: float) -> float:
-    """As `least`, the greater."""
+    """Return the greater number, of those not left out; NaN if both are."""
     if np.isnan(one):
         return other
     if np.isnan(other):
@@ -165,13 +165,13 @@ def most(one: float, other: float) -> float:
 
 @inlined
 def pick(is_least: bool, one: float, other: float) -> float:
-    """`least` or `most`."""
+    """Return `least` or `most` of two numbers."""
     return least(one, other) if is_least else most(one, other)
 
 
 @inlined
 def combine(code: int, one: float, other: float) -> float:
-    """A Boolean operator; of one operand, both are that operand."""
+    """Apply a Boolean operator; for one operand, both are that operand."""
     if code == AND:
         return least(one, other)
     if code == OR:
@@ -191,7 +191,7 @@ def combine(code: int, one: float, other: float) -> float:
 def total(
     is_least: bool, numbers: Floats, lost: Flags, first: int, last: int
 ) -> tuple[float, int]:  # fmt: skip
-    """The least or the greatest number from `first` to `last`."""
+    """Return the least or the greatest number from `first` to `last`."""
     result, is_lost = np.nan, 0
     for t in range(first, last + 1):
         result = pick(is_least, result, numbers[t])
@@ -203,7 +203,7 @@ def total(
 def scan(
     is_least: bool, numbers: Floats, lost: Flags, first: int, last: int, into: Floats, into_lost: Flags
 ) -> None:
-    """For each sample from `first` on: the least or the greatest number from there to `last`."""
+    """Compute, from each sample from `first` on, the least or greatest number up to `last`."""
     result, is_lost = np.nan, 0
     for t in range(last, first - 1, -1):
         result = pick(is_least, result, numbers[t])
@@ -216,7 +216,7 @@ def scan_until(
     left: Floats, left_lost: Flags, right: Floats, right_lost: Flags,
     first: int, last: int, into: Floats, into_lost: Flags,
 ) -> None:  # fmt: skip
-    """Until, from each sample from `first` on to `last`, of a left operand that depends on no later sample.
+    """Run until from each sample from `first` on to `last`; the left operand depends on no later sample.
 
     The best over later ends is capped by the left operand here. An end of which everything was left out so
     far takes on the left operand here, which is then as good as any.
@@ -242,7 +242,7 @@ def scan_until_by_last(
     left: Floats, left_lost: Flags, right: float, right_lost: int,
     first: int, last: int, into: Floats, into_lost: Flags,
 ) -> None:  # fmt: skip
-    """Until, from each sample to `last`, given until to the sample before: the right operand is settled."""
+    """Run until from each sample to `last`, given until to the sample before it."""
     still, is_lost = np.nan, right_lost
     into[last], into_lost[last] = np.nan, 0
     for t in range(last, first - 1, -1):
@@ -257,7 +257,7 @@ def scan_until_by_pairs(
     still: Floats, still_lost: Flags, starts: Integers, right: Floats, right_lost: Flags,
     first: int, last: int, into: Floats, into_lost: Flags,
 ) -> None:  # fmt: skip
-    """Until, from each sample to `last`, given the least left operand for each beginning and end."""
+    """Run until from each sample to `last`, given the least left operand for each beginning and end."""
     into[first : last + 1], into_lost[first : last + 1] = np.nan, 0
     for end in range(first, last + 1):
         for t in range(first, end + 1):

@@ -55,7 +55,7 @@ from spatial_replay.trace.trace import ABSENT
 
 
 def unknowns_of(scene: TraceScene, atom: Atom) -> tuple[str, ...]:
-    """What is not known of the one sample of a scene, each reason once, in the order of the atom."""
+    """Return what is unknown in the one sample of a scene, each reason once, in the order of the atom."""
     parts = iter_expressions(atom.expression)
     return tuple(dict.fromkeys(reason for part in parts for reason in _reasons(scene, part)))
 
@@ -87,7 +87,7 @@ def _reasons_of_term(scene: TraceScene, part: Expression, term: Term) -> Iterato
 
 
 def _missing(scene: TraceScene, term: Term) -> Iterator[str]:
-    """What of a term is not there."""
+    """Iterate over the reasons why a term is unknown."""
     term = without_enlargement(term)
     if isinstance(term, Earlier) and _is_before_the_first(scene, term):
         yield f"{format_term(term)} looks back to before the first sample"
@@ -103,7 +103,7 @@ def _missing(scene: TraceScene, term: Term) -> Iterator[str]:
 
 
 def _members(base: Term) -> Sequence[str]:
-    """Who a term stands for, if they are named."""
+    """Return the objects a term stands for, if they are named."""
     match base:
         case TrackedName():
             return [base.name]
@@ -176,7 +176,7 @@ class DecidingAtom:
 
 
 def deciding_atom(scene: TraceScene, leaf: Formula, end: End) -> DecidingAtom | None:
-    """The atom that decides a leaf in the one sample of a scene; None where nobody is in its group."""
+    """Return the atom that decides a leaf in the one sample of a scene; None if its group is empty."""
     while not isinstance(leaf, Atom):
         below = _below(scene, leaf, end)
         if below is None:
@@ -191,14 +191,14 @@ def deciding_atom(scene: TraceScene, leaf: Formula, end: End) -> DecidingAtom | 
 
 
 def _intervals(scene: TraceScene, formulas: Sequence[Formula], *, wide: bool = True) -> list[Interval]:
-    """The interval of each formula in the one sample of a scene."""
+    """Return the interval of each formula in the one sample of a scene."""
     values = leaf_values(scene, formulas, {})[:, :, 0]
     low, high = low_and_high(len(values), wide=wide)
     return [(float(a), float(b)) for a, b in zip(values[low], values[high], strict=True)]
 
 
 def _below(scene: TraceScene, leaf: Formula, end: End) -> tuple[Formula, End] | None:
-    """The operand or the binding that decides a leaf, and which of its ends."""
+    """Return the operand or the binding that decides a leaf, and which of its ends."""
     match leaf:
         case Boolean():
             formulas = list(leaf.operands)
@@ -216,7 +216,7 @@ def _below(scene: TraceScene, leaf: Formula, end: End) -> tuple[Formula, End] | 
 
 
 def _bodies(scene: TraceScene, formula: Quantified) -> Iterator[Formula]:
-    """The body for each way of binding the variables to members of the group."""
+    """Iterate over the body for each binding of the variables to members of the group."""
     names, members, _ = scene.members(formula.group)
     present = [name for name, is_member in zip(names, members[0].tolist(), strict=True) if is_member]
     for bound in permutations(present, len(formula.variables)):
@@ -229,7 +229,7 @@ def _bodies(scene: TraceScene, formula: Quantified) -> Iterator[Formula]:
 def _branch(
     scene: TraceScene, expression: Expression, end: End, sign: int
 ) -> Iterator[tuple[int, Expression]]:
-    """What an expression is the sum of, once its minima and maxima have taken an operand."""
+    """Iterate over the signed summands of an expression, once minima and maxima have taken an operand."""
     match expression:
         case Sum():
             yield from _branch(scene, expression.first, end, sign)
@@ -256,7 +256,7 @@ def _as_atom(expression: Expression) -> Atom:
 
 
 def _measured(scene: TraceScene, part: Expression) -> Measured:
-    """A signal, or a measurement of single objects: of groups, the members that it is attained by."""
+    """Return a signal or a measurement of single objects: of groups, the members that attain it."""
     match part:
         case Signal():
             return Measured("signal", (part.name,), float(scene.trace.signals[part.name][scene.skip]))
@@ -297,7 +297,7 @@ def _greatest(scene: TraceScene, candidates: Iterable[Any]) -> Any:
 
 
 def _singles(scene: TraceScene, term: Term) -> list[Term]:
-    """The objects or regions that a term stands for in the sample; the term itself for none."""
+    """Return the objects or regions a term stands for in the sample; the term itself if there are none."""
     base = base_of(term)
     if not isinstance(base, Group):
         return [term]
@@ -332,7 +332,7 @@ def _contact(scene: TraceScene, part: Measurement) -> Contact | None:
 
 
 def _footprint(scene: TraceScene, term: Term) -> Footprint | None:
-    """Of a single object or region; None for a group with nobody in it."""
+    """Return the footprint of a single object or region; None for an empty group."""
     operand = scene.find(term).operand
     rows = operand.rows[0]
     if len(rows) != 1 or rows[0] < 0:

@@ -62,11 +62,11 @@ class End(Enum):
         return {End.LOW: End.HIGH, End.HIGH: End.LOW, End.OPEN: End.OPEN}[self]
 
     def of_minimum(self, low: _Number, high: _Number) -> _Number:
-        """The end by which a minimum chooses its operand."""
+        """Return the numbers by which a minimum chooses its operand."""
         return high if self is End.HIGH else low
 
     def of_maximum(self, low: _Number, high: _Number) -> _Number:
-        """The end by which a maximum chooses its operand."""
+        """Return the numbers by which a maximum chooses its operand."""
         return low if self is End.LOW else high
 
 
@@ -108,7 +108,7 @@ def _normal_form(formula: Formula, numbers: Mapping[int, int], *, negated: bool)
 def chosen(
     part: SignedOperand | Extremum, end: End, interval: Callable[[int], Interval]
 ) -> list[SignedOperand]:
-    """The operands that a part takes its number from: one, or several equal ones in their order.
+    """Return the operands that attain an extremum: one, or several equal ones in their order.
 
     Args:
         interval: low and high end of each operand, not negated.
@@ -158,7 +158,7 @@ class DecidingPath:
 
 
 def deciding_path(formula: Formula, done: Finished, times_ns: Integers, node: int, end: End) -> DecidingPath:
-    """What decides a node at the first sample.
+    """Return the path to what decides a node at the first sample.
 
     Of equal operands it takes that which leads to the earliest sample, then the first; of equal samples in a
     window the earliest.
@@ -184,7 +184,7 @@ class _Walk:
                 self._operands[parent].append(identifier)
 
     def follow(self, node: int, sample: int, end: End) -> DecidingPath:
-        """The path from a node at a sample."""
+        """Return the path from a node at a sample."""
         here = PathNode(node, sample)
         match self._nodes[node]:
             case Boolean() as boolean:
@@ -212,7 +212,7 @@ class _Walk:
         return (-high, -low) if operand.negated else (low, high)
 
     def _taken(self, formula: Temporal, operands: Sequence[int], sample: int, end: End) -> PathNode | None:
-        """The operand and the sample that an operator takes its number from; None where it looks at none."""
+        """Return the operand and sample that an operator takes its number from; None for an empty window."""
         *_, right = operands
         window = self._window(formula, sample)
         if not len(window):
@@ -234,7 +234,7 @@ class _Walk:
         return self._until(SignedOperand(left), SignedOperand(right), sample, window, end, is_ahead=is_ahead)
 
     def _window(self, formula: Temporal, sample: int) -> range:
-        """The samples that an operator looks at."""
+        """Return the samples that an operator looks at."""
         last = len(self._times) - 1
         is_ahead = formula.operator in ("X", "WX", "F", "G", "U", "R", "W")
         if formula.operator in ("X", "WX", "Y"):
@@ -273,7 +273,7 @@ class _Walk:
         *,
         is_ahead: bool = True,
     ) -> PathNode:
-        """Until or, looking back, since."""
+        """Return what decides an until or, looking back, a since."""
         span = slice(sample, window.stop) if is_ahead else slice(window.start, sample + 1)
         lefts, rights = self._ends(left, span), self._ends(right, slice(window.start, window.stop))
         kept = [_least_between(each, is_ahead=is_ahead) for each in lefts]
@@ -290,7 +290,7 @@ class _Walk:
         return first[0] if least < right_key else PathNode(right.index, at)
 
     def _weak_until(self, operands: Sequence[int], sample: int, window: range, end: End) -> PathNode:
-        """`phi U psi` or `G phi`, whichever is the greater."""
+        """Return what decides a weak until: the greater of `phi U psi` and `G phi`."""
         left, right = map(SignedOperand, operands)
         inside = slice(window.start, window.stop)
         lefts, rights = self._ends(left, slice(sample, window.stop)), self._ends(right, inside)
@@ -304,7 +304,7 @@ class _Walk:
 
 
 def _least_between(column: Floats, *, is_ahead: bool) -> Floats:
-    """The least of a column from its near end up to, not including, each place; +inf at the near end."""
+    """Return the least of a column from its near end to before each place; +inf at the near end."""
     ordered = column if is_ahead else column[::-1]
     least = np.minimum.accumulate(np.concatenate([[np.inf], ordered[:-1]]))
     return least if is_ahead else least[::-1]
@@ -326,11 +326,11 @@ class Evidence:
         self._reach = look_back([instance.formula])
 
     def bound(self, formula: Formula) -> Formula:
-        """A formula of the instance, with the object that it is about in place of its variable."""
+        """Bind a formula of the instance to the object that it is about."""
         return substitute(formula, self.instance.bindings)
 
     def scene(self, time_ns: int) -> TraceScene:
-        """The one sample of that time, with those before it that it may look back at.
+        """Return the one sample of that time, with the earlier ones that it may look back at.
 
         Raises:
             LookupError: there is none; the log changed since it was evaluated.
@@ -344,7 +344,7 @@ class Evidence:
         raise LookupError(f"there is no sample at {time_ns} ns any more")
 
     def columns(self, formulas: Sequence[Formula]) -> Floats:
-        """(C, K, T): what K formulas without temporal operators are in each sample (see `leaf_values`)."""
+        """Compute K formulas without temporal operators in each sample, (C, K, T) (see `leaf_values`)."""
         parts: list[Floats] = []
         for scene in self._scenes():
             times_ns = scene.trace.times_ns[scene.skip :]
@@ -354,7 +354,7 @@ class Evidence:
         return np.concatenate([in_channels(part, channels) for part in parts], axis=2)
 
     def _scenes(self) -> Iterator[TraceScene]:
-        """The samples, in stretches, each with what it may look back at."""
+        """Iterate over the samples in blocks, each with the earlier ones that it may look back at."""
         past: Trace | None = None
         for trace in self._traces():
             skip = 0

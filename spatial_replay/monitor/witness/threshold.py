@@ -65,7 +65,7 @@ class Dial:
 
     @classmethod
     def of(cls, deciding: DecidingAtom) -> Dial:
-        """The first number of the deciding branch that is written in the atom, else a radius, else 0."""
+        """Choose the first number of the deciding branch written in the atom, else a radius, else 0."""
         atom = deciding.atom
         is_exact = "==" in atom.parameters
         for sign, part in deciding.branch:
@@ -80,14 +80,14 @@ class Dial:
         return cls("margin", 0.0, -1, True, is_exact)
 
     def turned(self, expression: Expression, value: float) -> Expression:
-        """The expression with another number in its place."""
+        """Return the expression with another number in its place."""
         if self.kind == "margin":
             return Sum(expression, Number(-value))
         return _replaced(expression, self.kind, self.value, value)
 
 
 def rewritten(formula: Formula, is_meant: Callable[[Atom], bool], change: Callable[[Atom], Atom]) -> Formula:
-    """A formula of the same shape with some of its atoms changed."""
+    """Return a formula of the same shape with some of its atoms changed."""
     match formula:
         case Atom():
             return change(formula) if is_meant(formula) else formula
@@ -101,7 +101,7 @@ def rewritten(formula: Formula, is_meant: Callable[[Atom], bool], change: Callab
 
 
 def _slopes(expression: Expression, number: float) -> set[int]:
-    """What adding 1 to every such number adds to the expression, over the branches that may decide it."""
+    """Return what adding 1 to every such number adds to the expression, for each branch that may decide."""
     match expression:
         case Number():
             return {int(expression.value == number)}
@@ -130,7 +130,7 @@ def _slope_of_radius(expression: Expression, radius: float) -> int:
 
 
 def _radii(expression: Expression) -> list[float]:
-    """The radii that a measurement depends on, in the order written."""
+    """Iterate over the radii that a measurement depends on, in the order written."""
     match expression:
         case SignedDistance():
             return _radii_of(expression.first) + _radii_of(expression.second)
@@ -209,7 +209,7 @@ def threshold_of(
     verdict: Verdict,
     deciding: DecidingAtom,
 ) -> Threshold | Obstacle | None:
-    """How far the deciding atom's number has to move to flip a verdict, or why none does.
+    """Compute how far the deciding atom's number has to move to flip a verdict, or why no number does.
 
     All atoms that were written in the same place move together: those that a quantifier over a named group,
     or a macro, made of one text.
@@ -262,7 +262,7 @@ class _Search:
         self._rises = deciding.end is End.HIGH
 
     def number(self) -> float | None:
-        """The nearest number that flips the verdict."""
+        """Return the nearest number that flips the verdict."""
         if self.dial.slope == 0:
             return None
         nearest = abs(self._deciding.lower if self._deciding.end is End.LOW else self._deciding.upper)
@@ -272,7 +272,7 @@ class _Search:
         return None if size is None else self._moved(size)
 
     def would_flip(self) -> bool:
-        """Whether the verdict would flip if the atom could be moved as far as one likes."""
+        """Return whether the verdict flips if the atom is moved arbitrarily far."""
         far = _FAR if self._rises else -_FAR
 
         def change(atom: Atom) -> Atom:
@@ -283,7 +283,7 @@ class _Search:
         return self._evaluated(formula, added, self._evidence.columns(added)) is not self._verdict
 
     def verdicts(self, numbers: Sequence[float]) -> list[Verdict]:
-        """The verdict with each number in place of the dial's."""
+        """Return the verdict with each number in place of the dial's."""
         formulas = [self._turned(number) for number in numbers]
         added = [new_leaves(formula, self._order) for formula in formulas]
         if self._is_uniform:
@@ -301,7 +301,7 @@ class _Search:
         return [verdicts.get(number, self._verdict) is not self._verdict for number in numbers]
 
     def _moved(self, size: float) -> float:
-        """The number that moves the atom so far, and a little further: rounding must not bring it back.
+        """Return the number that moves the atom by `size` and a little more, so that rounding cannot undo it.
 
         A radius goes no lower than 0.
         """
@@ -329,7 +329,7 @@ class _Search:
         return sizes[-1]
 
     def _is_meant(self, atom: Atom) -> bool:
-        """Whether an atom was written where the deciding one was."""
+        """Return whether an atom was written where the deciding one was."""
         meant = self._deciding.atom
         if meant.span.start == meant.span.end:
             return atom.expression == meant.expression
@@ -342,7 +342,7 @@ class _Search:
         return replace(atom, expression=self.dial.turned(atom.expression, number))
 
     def _shifted(self, added: Sequence[Formula], number: float) -> Floats:
-        """Columns of turned atoms, from those of the atoms as they were."""
+        """Return columns of turned atoms, shifted from those of the original ones."""
         shift = self.dial.slope * (number - self.dial.value)
         indices = {self._turned_atom(atom, number).expression: index for index, atom in self._moving.items()}
         return self._leaves[:, [indices[leaf.expression] for leaf in added if isinstance(leaf, Atom)]] + shift
@@ -356,7 +356,7 @@ class _Search:
 
 
 def _atoms_of(formulas: Iterable[Formula]) -> Iterator[Atom]:
-    """Every atom in some formulas, those in the bodies of quantifiers too."""
+    """Iterate over every atom in some formulas, those in the bodies of quantifiers too."""
     for formula in formulas:
         for each in iter_formulas(formula):
             if isinstance(each, Atom):

@@ -76,7 +76,7 @@ class Witness:
 
 
 def find_witness(evidence: Evidence, leaves: Floats, times_ns: Integers, node: int = 0) -> Witness:
-    """The witness of a node.
+    """Return the witness of a node.
 
     Ties go to the earliest sample, then to the first operand.
 
