@@ -1,4 +1,4 @@
-"""Simulated worlds: bodies that touch, a robot that moves them, and samples of where they are."""
+"""Simulated worlds: bodies with contact, a robot that moves them, and samples of their poses."""
 
 from __future__ import annotations
 

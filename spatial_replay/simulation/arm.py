@@ -1,4 +1,4 @@
-"""A robot arm with a gripper, commanded by where its tool should be."""
+"""A robot arm with a gripper, commanded by poses of its tool."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from spatial_replay.simulation.bullet import STEPS_PER_S, Engine
 from spatial_replay.simulation.kinematics import REST, downwards, joints_for, tool_frame
 
 TICKS_PER_S = 60
-"""How often in a second the arm is commanded."""
+"""Commands of the arm per second."""
 STEPS_PER_TICK = STEPS_PER_S // TICKS_PER_S
 
 WIDEST = 0.08
-"""The greatest distance of the fingers, in metres."""
+"""The maximum distance of the fingers, in metres."""
 FINGERTIP = 0.008
 """How far the fingertips reach below the tool's point, in metres."""
 FINGER_DEPTH, FINGER_WIDTH = 0.018, 0.0145
-"""A finger's size across the axis on which the fingers open, and along it, in metres."""
+"""The size of a finger across the axis on which the fingers open, and along it, in metres."""
 ABOVE = 0.3
-"""The height at which the tool travels, in metres."""
+"""The travel height of the tool, in metres."""
 
 Motion: TypeAlias = Generator[None, None, None]
-"""A movement: each step of it commands the arm for one tick."""
+"""A motion: each of its steps commands the arm for one tick."""
 
 _FAST = 0.45
 _TURNING = 2.0
@@ -34,15 +34,15 @@ _REACHED = 0.003
 _SETTLING_TICKS = 30
 _GRIP_FORCE = 25.0
 _MIDDLE, _FURTHEST = 0.78, 2.75
-"""The middle of what the tool turns against the direction from the base, and how far it turns either way."""
+"""The centre of the tool's yaw range relative to the direction from the base, and its half width."""
 _NEAREST, _FARTHEST = 0.27, 0.77
-"""How near to the base and how far from it the tool comes to the table, in metres."""
+"""The smallest and the largest distance from the base at which the tool reaches the table, in metres."""
 _INSIDE = 0.33
-"""The tool travels around the base at no less than this distance from it, in metres."""
+"""The smallest distance from the base when the tool travels around it, in metres."""
 
 
 class Arm:
-    """A Franka arm: positions in metres, turns of the tool in radians."""
+    """A Franka arm: positions in metres, yaw of the tool in radians."""
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
@@ -51,32 +51,32 @@ class Arm:
         self._width = WIDEST
         self._velocities = np.zeros_like(self._joints)
         self.limp = False
-        """Whether the gripper lets go, whatever it is commanded."""
+        """Whether the gripper stays open, regardless of its commands."""
         engine.set_joints(self._joints, self._width)
 
     @property
     def position(self) -> Floats:
-        """Where the tool's point (3,) is."""
+        """The actual position (3,) of the tool point."""
         return tool_frame(self._engine.joints())[0]
 
     @property
     def width(self) -> float:
-        """How far apart the fingers are."""
+        """The actual distance of the fingers."""
         return self._engine.finger_width()
 
     def drive(self) -> None:
-        """Give the motors the newest command; it holds for a tick."""
+        """Send the latest command to the motors; it holds for one tick."""
         width = WIDEST if self.limp else self._width
         self._engine.drive(self._joints, self._velocities, width, _GRIP_FORCE)
 
     def aim(self, position: Floats, yaw: float) -> None:
-        """Command the tool to a pose that it can reach within a tick."""
+        """Command the tool to a pose that it can reach within one tick."""
         joints = joints_for(position, downwards(yaw), self._joints)
         self._velocities = (joints - self._joints) * TICKS_PER_S
         self._joints, self._position, self._yaw = joints, position, yaw
 
     def move(self, x: float, y: float, z: float, yaw: float | None = None, *, speed: float = _FAST) -> Motion:
-        """Move the tool in a straight line, and wait until it has come to rest."""
+        """Move the tool in a straight line, and wait until it is at rest."""
         goal = np.array([x, y, z])
         start, turned = self._position, self._yaw
         turn = 0.0 if yaw is None else yaw - turned
@@ -87,7 +87,7 @@ class Arm:
         yield from self._settle()
 
     def travel(self, x: float, y: float, yaw: float) -> Motion:
-        """Lift the tool and bring it above a point, around the base."""
+        """Lift the tool and move it above a point, around the base."""
         start = self._position
         if start[2] < ABOVE - 0.01:
             yield from self.move(start[0], start[1], ABOVE)
@@ -101,11 +101,11 @@ class Arm:
             r, a = max(radius + share * longer, _INSIDE), angle + share * further
             self.aim(np.array([r * math.cos(a), r * math.sin(a), ABOVE]), turned + share * turn)
             yield
-        # the goal may lie nearer to the base than one travels
+        # the goal may be closer to the base than the travel radius
         yield from self.move(x, y, ABOVE)
 
     def grip(self, width: float) -> Motion:
-        """Move the fingers to a distance, or until something between them stops them."""
+        """Move the fingers to a distance, or until a body between them stops them."""
         self._width = width
         self._velocities = np.zeros_like(self._joints)
         last = self.width
@@ -125,19 +125,19 @@ class Arm:
             yield
 
     def rest(self) -> Motion:
-        """Hold still for ever."""
+        """Hold still forever."""
         while True:
             yield from self.wait(1.0)
 
     @property
     def commanded(self) -> tuple[float, float, float]:
-        """Where the tool's point is commanded to be."""
+        """The commanded position of the tool point."""
         x, y, z = self._position.tolist()
         return x, y, z
 
     @property
     def yaw(self) -> float:
-        """The turn of the tool that is commanded."""
+        """The commanded yaw of the tool."""
         return self._yaw
 
     def _settle(self) -> Motion:
@@ -149,25 +149,26 @@ class Arm:
 
 
 def _shares(*durations_s: float) -> list[float]:
-    """How much of a movement is done after each of its ticks: slow at both ends."""
+    """Return the share of a motion that is done after each tick: a cubic, slow at both ends."""
+    # the cubic is 1.5 times as fast in the middle as on average
     count = max(1, math.ceil(1.5 * max(durations_s) * TICKS_PER_S))
     return [3 * (k / count) ** 2 - 2 * (k / count) ** 3 for k in range(1, count + 1)]
 
 
 def turn_towards(yaw: float, x: float, y: float, period: float = math.pi) -> float:
-    """The turn of a tool at a point that differs from `yaw` by whole periods and suits the last joint best.
+    """Return the yaw, `yaw` plus whole periods, that is closest to the middle of the last joint's range.
 
-    A gripper looks alike after half a turn; what it holds does not.
+    The period is pi for an empty gripper, which is symmetric, and 2 pi for one that holds a body.
     """
     low = math.atan2(y, x) + _MIDDLE - period / 2
     return low + (yaw - low) % period
 
 
 def in_reach(x: float, y: float) -> bool:
-    """Whether the tool, pointing down, comes to a point on the table."""
+    """Return whether the tool, pointing down, reaches a point on the table."""
     return _NEAREST <= math.hypot(x, y) <= _FARTHEST
 
 
 def can_turn(yaw: float, x: float, y: float) -> bool:
-    """Whether the last joint can turn the tool at a point to `yaw`."""
+    """Return whether the last joint can turn the tool at a point to `yaw`."""
     return abs(yaw - math.atan2(y, x) - _MIDDLE) <= _FURTHEST

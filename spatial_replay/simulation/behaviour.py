@@ -1,4 +1,4 @@
-"""Placing things by a behaviour tree: detect, pick, carry, place, and recover from what went wrong.
+"""Placing bodies by a behaviour tree: detect, pick, carry, place, and recover from failures.
 
 The only module that knows py_trees.
 """
@@ -18,17 +18,17 @@ from spatial_replay.simulation.scene import Scene
 from spatial_replay.simulation.world import Execution
 
 Goal = tuple[Point, float | None]
-"""Where something belongs, and how it is turned there; None for any turn."""
+"""The target position of a body, and its yaw there; None for any yaw."""
 
 _ATTEMPTS = 3
 _TURNED = 0.15
-"""Something that is turned by this much, in radians, is not as it should be."""
+"""The tolerance of the yaw, in radians."""
 
 
 def setting_by_tree(scene: Scene, goals: Mapping[str, Goal]) -> Generator[None, None, Execution]:
-    """Place some bodies one after the other, each tried anew when it goes wrong, a few times."""
-    notes = _Notes()
-    tasks = [_task(scene, name, goal, notes) for name, goal in goals.items()]
+    """Place bodies one after the other, with a few attempts each."""
+    blackboard = _Blackboard()
+    tasks = [_task(scene, name, goal, blackboard) for name, goal in goals.items()]
     tree = Sequence("set", memory=True, children=tasks)
     while True:
         tree.tick_once()
@@ -37,111 +37,115 @@ def setting_by_tree(scene: Scene, goals: Mapping[str, Goal]) -> Generator[None, 
         yield
     succeeded = tree.status is Status.SUCCESS
     done = f"placed {', '.join(goals)}"
-    if notes.mishaps:
-        done += f", after this went wrong: {'; '.join(notes.mishaps)}"
-    return Execution(succeeded, done if succeeded else notes.mishaps[-1])
+    if blackboard.failures:
+        done += f", after this went wrong: {'; '.join(blackboard.failures)}"
+    return Execution(succeeded, done if succeeded else blackboard.failures[-1])
 
 
-class _Notes:
-    """What the parts of a tree tell each other: how a thing is held, and what went wrong so far."""
+class _Blackboard:
+    """The blackboard of a tree: the grasp of each body, and the failures so far."""
 
     def __init__(self) -> None:
         self.grasps: dict[str, Grasp] = {}
-        self.mishaps: list[str] = []
+        self.failures: list[str] = []
 
 
-def _task(scene: Scene, name: str, goal: Goal, notes: _Notes) -> Behaviour:
-    """Bring one thing where it belongs."""
+def _task(scene: Scene, name: str, goal: Goal, blackboard: _Blackboard) -> Behaviour:
+    """Return the subtree that places one body."""
     point, _ = goal
 
     def recover() -> Generator[None, None, str]:
-        """Let go of whatever is held, and say that another attempt is due."""
-        yield from let_go(scene, _opening(notes, name))
+        """Open the gripper, and fail, so that the tree starts another attempt."""
+        yield from let_go(scene, _opening(blackboard, name))
         return "another attempt"
 
     def leave() -> Generator[None, None, str]:
-        yield from let_go(scene, _opening(notes, name))
+        yield from let_go(scene, _opening(blackboard, name))
         return missed(scene, name, point)
 
     steps: dict[str, _Motion] = {
-        "pick": lambda: pick_up(scene, name, notes.grasps[name]),
-        "carry": lambda: carry(scene, name, notes.grasps[name], point),
+        "pick": lambda: pick_up(scene, name, blackboard.grasps[name]),
+        "carry": lambda: carry(scene, name, blackboard.grasps[name], point),
         "place": lambda: set_down(scene, name, point),
         "leave": leave,
     }
-    leaves: list[Behaviour] = [_Moving(f"{verb} {name}", motion, notes) for verb, motion in steps.items()]
+    leaves: list[Behaviour] = [
+        _Moving(f"{verb} {name}", motion, blackboard) for verb, motion in steps.items()
+    ]
     attempt = Selector(
         f"bring {name}",
         memory=True,
         children=[
             _Placed(scene, name, goal),
-            Sequence(f"move {name}", memory=True, children=[_Detecting(scene, name, goal, notes), *leaves]),
+            Sequence(
+                f"move {name}", memory=True, children=[_Detecting(scene, name, goal, blackboard), *leaves]
+            ),
             _Moving(f"recover {name}", recover, None),
         ],
     )
     return Retry(f"try {name}", attempt, num_failures=_ATTEMPTS)
 
 
-def _opening(notes: _Notes, name: str) -> float:
-    return notes.grasps[name].opening if name in notes.grasps else 0.05
+def _opening(blackboard: _Blackboard, name: str) -> float:
+    return blackboard.grasps[name].opening if name in blackboard.grasps else 0.05
 
 
 _Motion = Callable[[], Generator[None, None, str]]
-"""A motion that returns what went wrong, or ""."""
+"""A motion that returns the reason of its failure, or ""."""
 
 
 class _Moving(Behaviour):
-    """A motion as a leaf of the tree: one tick of the one is one tick of the other."""
+    """A motion as a leaf of the tree: each tick of the tree is one tick of the motion."""
 
-    def __init__(self, name: str, motion: _Motion, notes: _Notes | None) -> None:
+    def __init__(self, name: str, motion: _Motion, blackboard: _Blackboard | None) -> None:
         super().__init__(name)
         self._begin = motion
-        self._notes = notes
+        self._blackboard = blackboard
         self._motion: Generator[None, None, str] | None = None
 
     def initialise(self) -> None:
-        """Begin the motion anew."""
+        """Start the motion from its beginning."""
         self._motion = self._begin()
 
     def update(self) -> Status:
-        """Go on by a tick."""
+        """Advance the motion by one tick."""
         if self._motion is None:
             return Status.INVALID
         try:
             next(self._motion)
         except StopIteration as end:
-            if end.value and self._notes is not None:
-                self._notes.mishaps.append(end.value)
+            if end.value and self._blackboard is not None:
+                self._blackboard.failures.append(end.value)
             return Status.FAILURE if end.value else Status.SUCCESS
         return Status.RUNNING
 
 
 class _Detecting(Behaviour):
-    """See how a thing lies, and how to grasp it for its place."""
+    """Detect the pose of a body, and choose a grasp for its goal."""
 
-    def __init__(self, scene: Scene, name: str, goal: Goal, notes: _Notes) -> None:
+    def __init__(self, scene: Scene, name: str, goal: Goal, blackboard: _Blackboard) -> None:
         super().__init__(f"detect {name}")
-        self._scene, self._body, self._goal, self._notes = scene, name, goal, notes
+        self._scene, self._body, self._goal, self._blackboard = scene, name, goal, blackboard
 
     def update(self) -> Status:
-        """Look."""
+        """Choose the grasp."""
         grasp = best_grasp(self._scene, self._body, *self._goal)
         if isinstance(grasp, str):
-            self._notes.mishaps.append(grasp)
+            self._blackboard.failures.append(grasp)
             return Status.FAILURE
-        self._notes.grasps[self._body] = grasp
+        self._blackboard.grasps[self._body] = grasp
         return Status.SUCCESS
 
 
 class _Placed(Behaviour):
-    """Whether a thing is already where it belongs."""
+    """Whether a body is at its goal already."""
 
     def __init__(self, scene: Scene, name: str, goal: Goal) -> None:
         super().__init__(f"is {name} placed?")
         self._scene, self._body, self._goal = scene, name, goal
 
     def update(self) -> Status:
-        """Look."""
+        """Compare position and yaw with the goal."""
         point, yaw = self._goal
         is_there = not missed(self._scene, self._body, point)
         turned = 0.0 if yaw is None else abs(self._scene.pose(self._body).turned_from(yaw))

@@ -19,22 +19,22 @@ from spatial_replay.simulation.kinematics import JOINTS
 from spatial_replay.simulation.shapes import Box, Pose, Shape
 
 STEPS_PER_S = 240
-"""Steps of the simulation in a second."""
+"""Simulation steps per second."""
 
 FINGERS = (9, 10)
-"""The joints, and the links, of the two fingers."""
+"""The indices of the two fingers, as joints and as links."""
 
 _FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
-"""The greatest torques of the arm's joints in N m, those the maker gives."""
+"""Maximum torques of the arm's joints in N m, from the data sheet."""
 _GAINS = (0.3,) * JOINTS
 _WOOD = 0.5
-"""Friction of what has no other."""
+"""Default friction."""
 _FRICTION = MappingProxyType({"lateralFriction": _WOOD, "spinningFriction": 2e-3, "rollingFriction": 2e-3})
-"""Friction of bodies; what rolls comes to rest, as on a table that is not quite smooth."""
+"""Friction of bodies; rolling friction brings rolling bodies to rest, as on a real table."""
 
 
 class Engine:
-    """A table with a robot on it and bodies around it, that move by the laws of mechanics.
+    """The simulated table, robot and bodies.
 
     Raises:
         UsageError: the simulator is not installed, or there is no display for its window.
@@ -62,7 +62,7 @@ class Engine:
         self.set_grip(1.0)
 
     def close(self) -> None:
-        """Give the simulator back; closing twice does nothing."""
+        """Release the simulator; closing twice does nothing."""
         if self._client >= 0:
             self._call("disconnect")
             self._client = -1
@@ -81,27 +81,28 @@ class Engine:
         yaw: float,
         colour: tuple[float, float, float],
     ) -> None:
-        """Put a body into the world, its axis z upwards; a mass of 0 fixes it."""
+        """Add a body with its z axis upwards; a mass of 0 fixes it."""
         number = self._add(shape, mass, position, yaw, (*colour, 1.0))
         self._call("changeDynamics", number, -1, **_FRICTION)
         self._bodies[name] = number
 
     def pose(self, name: str) -> Pose:
-        """Where a body is."""
+        """Return the pose of a body."""
         position, turn = self._call("getBasePositionAndOrientation", self._bodies[name])
         return Pose(np.array(position), np.array(self._bullet.getMatrixFromQuaternion(turn)).reshape(3, 3))
 
     # -------------------------------------------------------------------------------------- the robot
 
     def set_joints(self, joints: Floats, width: float) -> None:
-        """Put the arm's joints (7,) and the fingers, `width` metres apart, in place at once."""
+        """Reset the arm's joints (7,) and the fingers, `width` metres apart, without motion."""
         for number, angle in enumerate(joints.tolist()):
             self._call("resetJointState", self._robot, number, angle)
         for finger in FINGERS:
             self._call("resetJointState", self._robot, finger, width / 2)
 
     def drive(self, joints: Floats, velocities: Floats, width: float, force: float) -> None:
-        """Command the motors: joints (7,), their velocities, the fingers' distance and their force in N."""
+        """Command the motors: joints (7,), their velocities, the distance of the fingers and their force in
+        N."""
         bullet = self._bullet
         self._call(
             "setJointMotorControlArray",
@@ -124,30 +125,30 @@ class Engine:
         )
 
     def joints(self) -> Floats:
-        """The arm's joints (7,) as they are."""
+        """Return the actual joints (7,) of the arm."""
         states = self._call("getJointStates", self._robot, list(range(JOINTS)))
         return np.array([state[0] for state in states])
 
     def finger_width(self) -> float:
-        """The distance of the fingers, in metres."""
+        """Return the distance of the fingers, in metres."""
         return float(sum(state[0] for state in self._call("getJointStates", self._robot, list(FINGERS))))
 
     def fingers_touching(self, name: str) -> int:
-        """How many of the two fingers touch a body."""
+        """Return how many of the two fingers touch a body."""
         touching = (
             self._call("getContactPoints", self._robot, self._bodies[name], finger) for finger in FINGERS
         )
         return sum(bool(points) for points in touching)
 
     def set_grip(self, friction: float) -> None:
-        """Set the friction of the fingers: 1 for rubber, next to 0 for oil."""
+        """Set the friction of the fingers: 1 for rubber, close to 0 for oil."""
         for finger in FINGERS:
             self._call("changeDynamics", self._robot, finger, lateralFriction=friction)
 
     # ---------------------------------------------------------------------------------------- private
 
     def _couple_fingers(self) -> None:
-        """Let one motor drive both fingers, as in the real hand: what they hold stays in their middle."""
+        """Couple the fingers, as in the real hand, so that a body they hold stays in the middle."""
         left, right = FINGERS
         kind, axis, centre = self._bullet.JOINT_GEAR, (1, 0, 0), (0, 0, 0)
         gear = self._call(
@@ -177,12 +178,12 @@ class Engine:
         return number
 
     def _call(self, function: str, *arguments: Any, **named: Any) -> Any:
-        """Call the simulator's function for this world, of which a process may have several."""
+        """Call a function of the simulator for this world; a process may have several."""
         return getattr(self._bullet, function)(*arguments, physicsClientId=self._client, **named)
 
 
 def _load() -> ModuleType:
-    """The simulator.
+    """Import the simulator.
 
     Raises:
         UsageError: it is not installed.
@@ -200,7 +201,7 @@ def _load() -> ModuleType:
 
 
 def _refuse_no_display() -> None:
-    """That there is a display to open a window on; without one, the simulator would end the process.
+    """Check that there is a display for a window; without one, the simulator would end the process.
 
     Raises:
         UsageError: there is none.
@@ -221,12 +222,12 @@ def _refuse_no_display() -> None:
 
 @contextmanager
 def _without_greeting() -> Iterator[None]:
-    """Keep standard error free of the date that the simulator's library writes there when it loads."""
-    kept = os.dup(2)
+    """Suppress the build date that PyBullet writes to standard error on import."""
+    stderr = os.dup(2)
     try:
         with Path(os.devnull).open("wb") as nothing:
             os.dup2(nothing.fileno(), 2)
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(stderr, 2)
+        os.close(stderr)

@@ -1,4 +1,4 @@
-"""How a body can be held between two fingers, and set down."""
+"""Choose grasps: how to hold a body between two fingers, and set it down."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from spatial_replay.simulation.shapes import Box
 Point = tuple[float, float]
 
 _THICKEST = WIDEST - 0.008
-"""What is thicker than this, in metres, does not fit between the fingers."""
+"""The maximum thickness of a body between the fingers, in metres."""
 _OPENING = 0.02
-"""How much further than what they grasp the fingers open, in metres."""
+"""How much wider than the body the fingers open, in metres."""
 _BELOW_TOP = 0.022
-"""How far below its top a body is grasped, in metres, if it is tall enough."""
+"""The depth of a grasp below the top of a tall body, in metres."""
 _HAND_DEPTH, _HAND_WIDTH, _HAND_ABOVE = 0.064, 0.21, 0.035
-"""The gripper's body: its size across and along its opening, and how far above the tool's point it begins."""
+"""The hand: its size across and along its opening, and its height above the tool point, in metres."""
 _ROOM, _AMPLE = 0.0015, 0.01
-"""Room around the fingers, in metres, that is just enough, and beyond which more is no better."""
+"""The clearance around the fingers, in metres, that is required, and beyond which more does not count."""
 _ANGLES = 12
 
 
 @dataclass(frozen=True, slots=True)
 class Grasp:
-    """How a body is held and set down.
+    """A grasp of a body.
 
     Attributes:
-        yaw: the tool's turn where the body is picked up, in radians.
-        turn: the tool's turn where it is set down.
-        above_bottom: height of the tool's point above the body's lowest point, in metres.
-        opening: how far apart the fingers are before and after, in metres.
+        yaw: of the tool when it picks the body up, in radians.
+        turn: yaw of the tool when it sets the body down.
+        above_bottom: height of the tool point above the body's lowest point, in metres.
+        opening: distance of the fingers before and after, in metres.
     """
 
     yaw: float
@@ -51,7 +51,7 @@ class Grasp:
 
 
 def best_grasp(scene: Scene, name: str, goal: Point, yaw: float | None) -> Grasp | str:
-    """The grasp with the most room, of those the thinnest; or why there is none."""
+    """Return the grasp with the most clearance, preferring thin sides; or the reason why there is none."""
     start = scene.place_of(name)
     if not in_reach(*start):
         return f"{name} lies out of the robot's reach"
@@ -77,7 +77,7 @@ def best_grasp(scene: Scene, name: str, goal: Point, yaw: float | None) -> Grasp
 
 
 def surface(scene: Scene, name: str, goal: Point) -> float:
-    """The height of what is under a point: the table, or a body that others may be placed on."""
+    """Return the height of the support under a point: the table, or a body that supports others."""
     spot = rectangle(*goal, 1e-3, 1e-3, 0.0)
     under = [
         scene.height(other)[1]
@@ -88,7 +88,7 @@ def surface(scene: Scene, name: str, goal: Point) -> float:
 
 
 def _angles(scene: Scene, name: str) -> list[tuple[float, float]]:
-    """How thick a body is, and turns of the tool that grasp it there: across flat sides, if it has them."""
+    """Return (thickness, yaw of the tool) of possible grasps: across flat sides if there are any."""
     pose, covered = scene.pose(name), scene.footprint(name)
     if isinstance(scene.bodies[name].shape, Box) and pose.stands:
         turns = [pose.yaw, pose.yaw + math.pi / 2]
@@ -105,8 +105,9 @@ def _angles(scene: Scene, name: str) -> list[tuple[float, float]]:
 def _turns(
     scene: Scene, name: str, angle: float, goal: Point, yaw: float | None
 ) -> Iterator[tuple[float, float]]:
-    """Turns of the tool for picking up and setting down: both are within what the arm can do."""
+    """Iterate over the yaws of the tool for picking up and setting down that the arm can reach."""
     pose, start = scene.pose(name), scene.place_of(name)
+    # any yaw suits a round body: the arm keeps its own relative to the direction from the base
     is_round = not isinstance(scene.bodies[name].shape, Box) and pose.stands
     for picked in (angle, angle + math.pi):
         grasp_yaw = turn_towards(picked, *start, 2 * math.pi)
@@ -119,7 +120,7 @@ def _turns(
 
 
 def _room(scene: Scene, name: str, place: Point, turn: float, grasp: Grasp, bottom: float) -> float:
-    """How far fingers and gripper are from other bodies when the body is held at a place."""
+    """Return the clearance of fingers and hand to other bodies when a body is held at a place."""
     tool = bottom + grasp.above_bottom
     fingers = rectangle(*place, FINGER_DEPTH, grasp.opening + 2 * FINGER_WIDTH, turn)
     hand = rectangle(*place, _HAND_DEPTH, _HAND_WIDTH, turn)

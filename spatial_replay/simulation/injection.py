@@ -1,4 +1,4 @@
-"""What is made to go wrong in a run, and when."""
+"""Injected failures: what goes wrong in a run, and when."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from spatial_replay.errors import UsageError
 Kind = Literal["drop", "slip"]
 
 DURATION_NS = {"drop": 400 * 10**6, "slip": 4 * 10**9}
-"""How long it lasts when it has a time."""
+"""How long an injection with a start lasts."""
 
 _WRITTEN = re.compile(r"(?P<kind>\w+)(?:@(?P<number>\d+(?:\.\d+)?)(?P<unit>ms|s))?")
 
 
 @dataclass(frozen=True, slots=True)
 class Injection:
-    """A mishap.
+    """A failure of the gripper.
 
     Attributes:
-        kind: `drop`: the gripper lets go; `slip`: the fingers are slippery, as if oiled.
+        kind: `drop`: the gripper opens; `slip`: the fingers are slippery, as if oiled.
         at_ns: when it begins; None for the whole run.
     """
 
@@ -30,7 +30,7 @@ class Injection:
 
     @classmethod
     def parse(cls, text: str) -> Injection:
-        """A mishap as it is written: `drop@7s`, `slip@2500ms`, or `slip` for the whole run.
+        """Parse `drop@7s`, `slip@2500ms`, or `slip` for the whole run.
 
         Raises:
             UsageError: anything else.
@@ -44,10 +44,10 @@ class Injection:
                 return cls(kind, round(float(match["number"]) * (10**9 if match["unit"] == "s" else 10**6)))
             if kind == "slip":
                 return cls(kind)
-        raise UsageError(f"{text!r} is nothing that can be injected; write drop@7s, slip@7s or slip")
+        raise UsageError(f"{text!r} cannot be injected; write drop@7s, slip@7s or slip")
 
     def holds(self, time_ns: int) -> bool:
-        """Whether it is going on at a time."""
+        """Return whether the failure is active at a time."""
         return self.at_ns is None or self.at_ns <= time_ns < self.at_ns + DURATION_NS[self.kind]
 
     def __str__(self) -> str:

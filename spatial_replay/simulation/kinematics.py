@@ -1,6 +1,6 @@
-"""Where the joints of a Franka arm bring its tool, and which joints bring the tool somewhere.
+"""Forward and inverse kinematics of a Franka arm.
 
-The tool's frame lies between the fingertips: z along the fingers, y along the axis on which they open.
+The tool frame is between the fingertips: z along the fingers, y along the axis on which they open.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ JOINTS = 7
 
 LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
 UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
-"""Limits of the joints in radians, those the maker gives."""
+"""Limits of the joints in radians, from the data sheet."""
 
 REST = np.array([0.0, -0.3, 0.0, -2.3, 0.0, 2.0, math.pi / 4])
 """Joints in radians in front of the base, the elbow up and the fingers down."""
@@ -24,10 +24,11 @@ _OFFSETS = np.array(
     [(0, 0, 0.333), (0, 0, 0), (0, -0.316, 0), (0.0825, 0, 0), (-0.0825, 0.384, 0), (0, 0, 0), (0.088, 0, 0)]
 )
 _TURNS = (0.0, -math.pi / 2, math.pi / 2, math.pi / 2, -math.pi / 2, math.pi / 2, math.pi / 2)
-"""Each joint's frame in that of the link before: an offset in metres, and a turn around x in radians."""
+"""The frame of each joint in that of the previous link: an offset in metres, a rotation about x in
+radians."""
 
 _TOOL = 0.107 + 0.105
-"""From the last joint to between the fingertips, in metres."""
+"""The distance from the last joint to the tool frame, in metres."""
 
 _DAMPING = 1e-5
 _STEPS = 3
@@ -36,22 +37,23 @@ _LONGEST = 0.2
 
 
 def tool_frame(joints: Floats) -> tuple[Floats, Floats]:
-    """The tool's position (3,) in metres and rotation (3, 3) for joints (7,) in radians."""
+    """Return the position (3,) in metres and the rotation (3, 3) of the tool for joints (7,) in radians."""
     position, rotation, _ = _chain(joints)
     return position, rotation
 
 
 def downwards(yaw: float) -> Floats:
-    """The rotation (3, 3) of a tool that points down and is turned by `yaw`; it opens across that."""
+    """Return the rotation (3, 3) of a tool that points down with a yaw; the fingers open across it."""
     cosine, sine = math.cos(yaw), math.sin(yaw)
     return np.array([[cosine, sine, 0.0], [sine, -cosine, 0.0], [0.0, 0.0, -1.0]])
 
 
 def joints_for(position: Floats, rotation: Floats, start: Floats, steps: int = _STEPS) -> Floats:
-    """Joints (7,) that bring the tool near a pose, found from others by damped least squares.
+    """Return joints (7,) that bring the tool near a pose, by damped least squares from `start`.
 
-    Of all that do, it tends to those close to rest. A pose out of reach is approached as far as the arm
-    goes: whoever needs to know compares `tool_frame` of the result.
+    The arm is redundant; its free motion tends to the rest position. A pose out of reach is approached as far
+    as
+    possible: compare with `tool_frame` of the result if that matters.
     """
     joints = start
     for _ in range(steps):
@@ -62,7 +64,7 @@ def joints_for(position: Floats, rotation: Floats, start: Floats, steps: int = _
         free = np.eye(JOINTS) - inverse @ jacobian
         rest = REST.copy()
         rest[0] = math.atan2(position[1], position[0])
-        # the last joint is the tool's turn and has no rest
+        # the last joint sets the yaw of the tool and has no rest position
         rest[6] = joints[6]
         change = inverse @ error + free @ (0.1 * (rest - joints))
         joints = np.clip(joints + change * min(1.0, _LONGEST / max(1e-9, np.abs(change).max())), LOWER, UPPER)
@@ -70,7 +72,7 @@ def joints_for(position: Floats, rotation: Floats, start: Floats, steps: int = _
 
 
 def _chain(joints: Floats) -> tuple[Floats, Floats, Floats]:
-    """The tool's position and rotation, and the Jacobian (6, 7) of both."""
+    """Return the position and the rotation of the tool, and the Jacobian (6, 7) of both."""
     position, rotation = np.zeros(3), np.eye(3)
     origins, axes = [], []
     for offset, turn, angle in zip(_OFFSETS, _TURNS, joints.tolist(), strict=True):
@@ -87,7 +89,7 @@ def _chain(joints: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def _rotation_between(first: Floats, second: Floats) -> Floats:
-    """The rotation vector (3,) that turns one frame into another; small or exact enough to iterate with."""
+    """Return the rotation vector (3,) from one rotation to another, exact enough to iterate with."""
     between = second @ first.T
     axis = np.array(
         [between[2, 1] - between[1, 2], between[0, 2] - between[2, 0], between[1, 0] - between[0, 1]]

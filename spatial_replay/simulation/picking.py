@@ -1,4 +1,4 @@
-"""Picking a body up between two fingers that hold it by friction, and placing it elsewhere."""
+"""Picking bodies up with two fingers, which hold them by friction, and placing them elsewhere."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from spatial_replay.simulation.world import Execution
 
 _SLOW = 0.15
 _SETTING_DOWN = 0.002
-"""The height above its support at which a body is let go, in metres."""
+"""The height above its support at which a body is released, in metres."""
 _LOST_TICKS = 6
-"""A body that no finger touches for so long is lost."""
+"""Ticks without contact after which a body is lost."""
 _NEAR = 0.02
-"""A body this near to its goal, in metres, is there."""
+"""The tolerance of a body's position, in metres."""
 
 
 def picking(scene: Scene, name: str, goal: Point, yaw: float | None) -> Generator[None, None, Execution]:
-    """Pick a body up and place it with its centre at a point, turned to `yaw` unless that is None."""
+    """Pick a body up and place its centre at a point, with `yaw` unless that is None."""
     grasp = best_grasp(scene, name, goal, yaw)
     if isinstance(grasp, str):
         return Execution(False, grasp)
@@ -36,7 +36,7 @@ def picking(scene: Scene, name: str, goal: Point, yaw: float | None) -> Generato
 
 
 def pick_up(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str]:
-    """Grasp a body and lift it; returns what went wrong, if anything."""
+    """Grasp a body and lift it; return the reason of a failure, or ""."""
     arm, (x, y) = scene.arm, scene.place_of(name)
     z = scene.height(name)[0] + grasp.above_bottom
     yield from arm.travel(x, y, grasp.yaw)
@@ -51,17 +51,17 @@ def pick_up(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str]
 
 
 def carry(scene: Scene, name: str, grasp: Grasp, goal: Point) -> Generator[None, None, str]:
-    """Bring what is held above a point; returns what went wrong, if anything."""
+    """Move the held body above a point; return the reason of a failure, or ""."""
     x, y = _tool_for(scene, name, goal, grasp.turn)
     carried = yield from _holding(scene, name, scene.arm.travel(x, y, grasp.turn))
     return "" if carried else f"{name} slipped out of the fingers on the way"
 
 
 def set_down(scene: Scene, name: str, goal: Point) -> Generator[None, None, str]:
-    """Lower what is held above a point; returns what went wrong, if anything."""
+    """Lower the held body onto its support; return the reason of a failure, or ""."""
     arm = scene.arm
     x, y, above = arm.commanded
-    # it may hang otherwise than it stood
+    # measured now, because the body may hang in another pose than it stood in
     z = surface(scene, name, goal) + above - scene.height(name)[0] + _SETTING_DOWN
     lowered = yield from _holding(scene, name, arm.move(x, y, z + 0.03))
     if lowered:
@@ -77,7 +77,7 @@ def let_go(scene: Scene, opening: float) -> Motion:
 
 
 def missed(scene: Scene, name: str, goal: Point, *, stood: bool = True) -> str:
-    """How a body that was let go is not as it should be, if so."""
+    """Return how a released body differs from its goal, or ""."""
     if stood and not scene.pose(name).stands:
         return f"{name} fell over"
     away = math.dist(scene.place_of(name), goal)
@@ -85,7 +85,7 @@ def missed(scene: Scene, name: str, goal: Point, *, stood: bool = True) -> str:
 
 
 def _tool_for(scene: Scene, name: str, goal: Point, turn: float) -> Point:
-    """Where the tool must be for what it holds, hardly ever in its very middle, to be at a point."""
+    """Return the tool position for which the held body, usually off centre, is at a point."""
     x, y = scene.place_of(name)
     tool_x, tool_y, _ = scene.arm.commanded
     dx, dy, turned = x - tool_x, y - tool_y, turn - scene.arm.yaw
@@ -94,7 +94,7 @@ def _tool_for(scene: Scene, name: str, goal: Point, turn: float) -> Point:
 
 
 def _holding(scene: Scene, name: str, motion: Motion) -> Generator[None, None, bool]:
-    """Move while the fingers hold a body; ends at once, False, when they have lost it."""
+    """Move while the fingers hold a body; stop and return False when they lose it."""
     lost = 0
     for _ in motion:
         yield

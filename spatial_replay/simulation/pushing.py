@@ -1,4 +1,4 @@
-"""Pushing a body over the table with two fingers side by side, so that it does not turn away."""
+"""Pushing bodies over the table with two fingers side by side, so that they do not turn away."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from spatial_replay.simulation.world import Execution
 Point = tuple[float, float]
 
 _LOW = FINGERTIP + 0.006
-"""The height at which the tool pushes, in metres: low enough not to tip what it pushes."""
+"""The height of the tool while it pushes, in metres: low enough not to tip a body."""
 _AWAY = 0.01
-"""How far behind a body the fingers come down, in metres."""
+"""The distance behind a body at which the fingers come down, in metres."""
 _MARGIN = 0.001
 _FAST, _SLOW = 0.1, 0.015
 _CLOSE = 0.004
-"""A body this near to its goal, in metres, is there."""
+"""The distance to its goal, in metres, at which a body needs no further stroke."""
 _FAR = 0.015
-"""A body this far from its goal, in metres, is not."""
+"""The tolerance of a body's position after all strokes, in metres."""
 _STRAIGHT = 0.0025
 _STROKES = 4
-"""How often a body is pushed at the same goal."""
+"""The maximum number of strokes to one goal."""
 
 
 def pushing(scene: Scene, name: str, path: Sequence[Point]) -> Generator[None, None, Execution]:
-    """Push a body along a path, one stroke for each straight stretch, and put right what strokes miss."""
+    """Push a body along a path, one stroke for each straight stretch, with corrections at the end."""
     corners = straightened([scene.place_of(name), *path])[1:]
     for corner in corners[:-1]:
         trouble = yield from _push_to(scene, name, corner, strokes=1, allowed=3 * _FAR)
@@ -53,7 +53,7 @@ def _along(stretches: int) -> str:
 def _push_to(
     scene: Scene, name: str, goal: Point, *, strokes: int, allowed: float
 ) -> Generator[None, None, str]:
-    """Push a body to a point in some strokes; returns what went wrong, if anything."""
+    """Push a body to a point in several strokes; return the reason of a failure, or ""."""
     missed = 0.0
     for _ in range(strokes):
         trouble = yield from _stroke(scene, name, goal)
@@ -66,7 +66,7 @@ def _push_to(
 
 
 def straightened(path: Sequence[Point]) -> list[Point]:
-    """The corners of a path: points that lie on the line between others are left out (Douglas, Peucker)."""
+    """Return the corners of a path, without points on the line between others (Douglas–Peucker)."""
     if len(path) < 3:
         return list(path)
     points = np.array(path)
@@ -84,7 +84,7 @@ def straightened(path: Sequence[Point]) -> list[Point]:
 
 
 def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, str]:
-    """Push a body straight towards a point; returns what was in the way, if anything."""
+    """Push a body straight towards a point; return the reason of a failure, or ""."""
     x, y = scene.place_of(name)
     length = math.dist((x, y), goal)
     if length < _CLOSE:
@@ -113,7 +113,7 @@ def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, str]:
 def _advance(
     scene: Scene, name: str, behind: Point, heading: float, length: float, back: float
 ) -> Generator[None, None, bool]:
-    """Move the fingers forward until the body has moved by a length; False if it does not."""
+    """Move the fingers forward until the body has moved by a length; return whether it did."""
     u, v = math.cos(heading), math.sin(heading)
     x, y = scene.place_of(name)
     travelled = 0.0
@@ -130,7 +130,7 @@ def _advance(
 
 
 def _gap(scene: Scene, name: str, behind: Point, heading: float) -> float | None:
-    """How far apart the fingers fit between others behind a body; None where they do not."""
+    """Return the widest gap of the fingers that fits behind a body; None if none does."""
     low, high = extent(scene.footprint(name), heading + math.pi / 2)
     widest = max(0.0, min(0.05, high - low - 2 * FINGER_WIDTH))
     for gap in (widest, widest / 2, 0.0):

@@ -1,4 +1,4 @@
-"""What makes one world differ from another: the bodies, where they lie, and what the robot can do."""
+"""Scenarios: the bodies of a world, their initial poses, and what the robot does."""
 
 from __future__ import annotations
 
@@ -11,21 +11,20 @@ from spatial_replay.simulation.scene import Scene
 from spatial_replay.simulation.world import Body, Execution, ReachableArea, Skill
 
 Placing = Callable[[Scene, str, Point, float | None], Generator[None, None, Execution]]
-"""How a robot picks a body up and places it: `picking`, or something more careful."""
+"""How the robot picks a body up and places it: `picking`, or a behaviour tree around it."""
 
 Script = Callable[[Scene], Generator[None, None, Execution]]
-"""What the robot does when nobody plans."""
+"""The motion of the robot without a planner."""
 
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """A body at the beginning.
+    """The initial state of a body.
 
     Attributes:
-        body: what it is.
-        x, y, yaw: where its centre is, in metres and radians.
-        bottom: the height of what it lies on, in metres.
-        mass_kg: its mass.
+        x, y, yaw: the pose of its centre, in metres and radians.
+        mass_kg: 0 for a fixed body.
+        bottom: the height of its support, in metres.
         colour: red, green, blue from 0 to 1.
     """
 
@@ -40,16 +39,16 @@ class Placement:
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """A world before anything happens.
+    """The definition of a world.
 
     Attributes:
         name: as on the command line.
-        placements: the bodies.
-        workspace: where the robot can put them.
-        skill: what the robot does with them.
-        script: its motion when nobody plans.
-        placing: how it picks and places, where that is its skill.
-        scatter_m, scatter_rad: how far a seed moves and turns each body, at most.
+        placements: the bodies in their initial poses.
+        workspace: where the robot can put bodies.
+        skill: what the robot does with bodies.
+        script: the motion of the robot without a planner.
+        placing: how it picks and places, if that is its skill.
+        scatter_m, scatter_rad: the maximum shift and rotation of each body by the seed.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""A robot and what lies around it, as its motions see it."""
+"""The scene that motions work on: the robot and the poses, footprints and clearances of bodies."""
 
 from __future__ import annotations
 
@@ -27,31 +27,31 @@ class Scene:
     bodies: Mapping[str, Body]
 
     def pose(self, name: str) -> Pose:
-        """Where a body is."""
+        """Return the pose of a body."""
         return self.engine.pose(name)
 
     def place_of(self, name: str) -> tuple[float, float]:
-        """A body's centre in the plane, in metres."""
+        """Return the centre of a body in the plane, in metres."""
         x, y, _ = self.engine.pose(name).position.tolist()
         return x, y
 
     def footprint(self, name: str) -> Footprint:
-        """What a body covers of the plane."""
+        """Return the footprint of a body."""
         return footprint(self.bodies[name].shape, self.engine.pose(name))
 
     def height(self, name: str) -> tuple[float, float]:
-        """A body's lowest and highest point."""
+        """Return the lowest and the highest point of a body."""
         return height(self.bodies[name].shape, self.engine.pose(name))
 
     def clearance(self, covered: Footprint, name: str, *, above: float = 0.0) -> float:
-        """How far something is from all bodies but one that reach higher than `above`, in metres."""
+        """Return the distance, in metres, to all bodies but one that reach higher than `above`."""
         others = [
             self.footprint(other) for other in self.bodies if other != name and self.height(other)[1] > above
         ]
         return _distance(covered, others) if others else math.inf
 
     def distance(self, covered: Footprint, name: str) -> float:
-        """How far something is from a body in the plane; below 0 where they overlap."""
+        """Return the distance to a body in the plane; below 0 if they overlap."""
         return _distance(covered, [self.footprint(name)])
 
 
@@ -62,7 +62,7 @@ def _distance(covered: Footprint, others: Sequence[Footprint]) -> float:
 
 
 def extent(covered: Footprint, angle: float) -> tuple[float, float]:
-    """The least and greatest of a footprint's coordinates along a direction in the plane."""
+    """Return the smallest and the largest coordinate of a footprint along a direction."""
     along = np.array([math.cos(angle), math.sin(angle)])
     spans = [(part.vertices @ along, part.radius) for part in covered.parts]
     low = min(float(values.min()) - radius for values, radius in spans)
@@ -70,7 +70,7 @@ def extent(covered: Footprint, angle: float) -> tuple[float, float]:
 
 
 def rectangle(x: float, y: float, length: float, width: float, yaw: float) -> Footprint:
-    """A rectangle around a point, its length along `yaw`."""
+    """Return a rectangle around a point, with its length along `yaw`."""
     turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
     corners: Floats = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * np.array([length, width]) / 2
     return Footprint.polygon(corners @ turn + np.array([x, y]))

@@ -1,4 +1,4 @@
-"""Shapes of bodies, and what they cover of the plane in a pose."""
+"""Shapes of bodies, and their footprints and heights in a pose."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import Footprint
 
 UPRIGHT = 1e-2
-"""A body that leans less than this, in radians, stands: its footprint is that of an upright one."""
+"""The lean, in radians, below which a body counts as upright."""
 
 _RIM = 16
-"""Corners of the polygon that stands for the rim of a cylinder that leans."""
+"""Corners of the polygon around the rim of a leaning cylinder."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ Shape: TypeAlias = Box | Cylinder
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """Where a body's centre is, and how the body is turned.
+    """The position of a body's centre, and its orientation.
 
     Attributes:
         position: (3,) float64, metres.
@@ -56,7 +56,7 @@ class Pose:
         return math.atan2(self.rotation[1, 0], self.rotation[0, 0])
 
     def turned_from(self, yaw: float) -> float:
-        """By how much the body is turned against `yaw`, -pi to pi."""
+        """Return the difference of the body's yaw to `yaw`, -pi to pi."""
         return math.remainder(self.yaw - yaw, 2 * math.pi)
 
     @property
@@ -71,7 +71,7 @@ class Pose:
 
 
 def footprint(shape: Shape, pose: Pose) -> Footprint:
-    """What a body covers of the plane, seen from above: polygon, or disc for a cylinder that stands."""
+    """Return the footprint of a body: a polygon, or a disc for an upright cylinder."""
     x, y = float(pose.position[0]), float(pose.position[1])
     match shape:
         case Cylinder(radius=radius) if pose.stands:
@@ -83,7 +83,7 @@ def footprint(shape: Shape, pose: Pose) -> Footprint:
 
 
 def height(shape: Shape, pose: Pose) -> tuple[float, float]:
-    """The least and the greatest height of a body's points."""
+    """Return the lowest and the highest z of a body."""
     z = float(pose.position[2])
     up = np.abs(pose.rotation[2])
     if isinstance(shape, Box):
@@ -100,12 +100,13 @@ def _rectangle(x: float, y: float, a: float, b: float, yaw: float) -> list[tuple
 
 
 def _outline(shape: Shape, pose: Pose) -> Floats:
-    """(n, 3) points whose convex hull is the body, of a cylinder with a polygon around its rim."""
+    """Return points (n, 3) whose convex hull is the body, or contains it for a cylinder."""
     if isinstance(shape, Box):
         signs = np.array([(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], np.float64)
         points = signs * np.array([shape.length, shape.width, shape.height]) / 2
     else:
         angles = np.arange(_RIM) * (2 * math.pi / _RIM)
+        # the polygon is around the rim, so that the footprint covers the body
         rim = shape.radius / math.cos(math.pi / _RIM) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         points = np.concatenate([np.c_[rim, np.full(_RIM, z)] for z in (-shape.height / 2, shape.height / 2)])
     moved: Floats = points @ pose.rotation.T + pose.position

@@ -1,7 +1,4 @@
-"""A table with a robot and bodies on it: the world of every scenario.
-
-Errors of detection, drawn from a seed.
-"""
+"""A table with a robot and bodies: the world of every scenario, with seeded detection noise."""
 
 from __future__ import annotations
 
@@ -25,38 +22,23 @@ from spatial_replay.simulation.shapes import Box, Pose, footprint, height
 from spatial_replay.simulation.world import Body, Execution, ReachableArea, Skill
 from spatial_replay.trace.sample import Sample
 
-
-def displacements(radius_m: float, seed: int, sample: int, count: int) -> list[tuple[float, float]]:
-    """How far detection is off for each of `count` bodies in a sample, in metres along x and y.
-
-    Each is drawn evenly from a disc, so that no error is greater than its radius. They depend on nothing
-    but the arguments: a sample looked at twice shows the same.
-    """
-    if radius_m == 0:
-        return [(0.0, 0.0)] * count
-    drawn = np.random.default_rng([seed, sample, 1]).random((count, 2))
-    radii = (radius_m * np.sqrt(drawn[:, 0])).tolist()
-    angles = (2 * math.pi * drawn[:, 1]).tolist()
-    return [(r * math.cos(a), r * math.sin(a)) for r, a in zip(radii, angles, strict=True)]
-
-
 SAMPLES_PER_S = 30
-"""Samples in a simulated second."""
+"""Samples per simulated second."""
 
 _TICKS_PER_SAMPLE = TICKS_PER_S // SAMPLES_PER_S
 _SETTLING_STEPS = 120
-"""How long bodies come to rest before time 0."""
+"""Simulation steps before time 0, in which bodies come to rest."""
 _RUBBER, _OIL = 1.0, 0.02
-"""Friction of the fingers, as they are and when they slip."""
+"""Friction of the fingers, normally and when they slip."""
 
 _Result = TypeVar("_Result")
 
 
 class Tabletop:
-    """A scenario's world; see `World` for what it does.
+    """The world of a scenario; see `World`.
 
     Raises:
-        UsageError: the simulator is not installed, a noise below 0, or something that cannot be injected.
+        UsageError: the simulator is not installed, the noise is below 0, or an injection is impossible.
     """
 
     def __init__(
@@ -68,12 +50,12 @@ class Tabletop:
         injections: Sequence[Injection] = (),
         gui: bool = False,
     ) -> None:
-        """Make the world at time 0.
+        """Create the world at time 0.
 
         Args:
-            seed: of where bodies lie and of noise.
-            noise_m: detection is off by up to this much, in metres, and the samples' uncertainty says so.
-            injections: what goes wrong, and when.
+            seed: of the initial poses and of the noise.
+            noise_m: the maximum error of detected positions, in metres; samples have it as uncertainty.
+            injections: failures, and when they happen.
             gui: show a window, and run no faster than real time.
         """
         if noise_m < 0 or not math.isfinite(noise_m):
@@ -123,7 +105,7 @@ class Tabletop:
 
     @property
     def scene(self) -> Scene:
-        """The robot and what lies around it."""
+        """The robot and the bodies, for motions."""
         return self._scene
 
     def attach(self, listen: Callable[[Sample], None]) -> None:
@@ -135,8 +117,8 @@ class Tabletop:
         if seed < 0:
             raise UsageError(f"the seed is {seed}; give 0 or more")
         self.close()
-        self._seed, self._ticks, self._seen = seed, 0, -1
-        # only a fresh simulator is known to compute the same again
+        self._seed, self._ticks, self._last_sampled = seed, 0, -1
+        # a reset of PyBullet leaves internal state behind; only a new simulator repeats a run exactly
         self._engine = engine = Engine(gui=self._gui)
         scenario, drawn = self._scenario, np.random.default_rng([seed, 0])
         for each in scenario.placements:
@@ -159,11 +141,11 @@ class Tabletop:
 
     def sample(self) -> Sample:
         """See `World`."""
-        self._working()
+        self._open_engine()
         number = self._ticks // _TICKS_PER_SAMPLE
-        errors = displacements(self._noise_m, self._seed, number, len(self._scene.bodies))
+        errors = _displacements(self._noise_m, self._seed, number, len(self._scene.bodies))
         objects = {
-            name: self._seen_as(body, self._scene.pose(name), error)
+            name: self._tracked(body, self._scene.pose(name), error)
             for (name, body), error in zip(self._scene.bodies.items(), errors, strict=True)
         }
         x, y, z = self._scene.arm.position.tolist()
@@ -185,11 +167,11 @@ class Tabletop:
         return self.run(self._scenario.placing(self._scene, name, (x, y), yaw))
 
     def script(self) -> Generator[None, None, Execution]:
-        """The robot's motion when nobody plans."""
+        """Return the motion of the robot without a planner."""
         return self._scenario.script(self._scene)
 
     def run(self, motion: Generator[None, None, _Result]) -> _Result:
-        """Move the robot to a motion's end, and return what the motion does.
+        """Run a motion to its end, and return its result.
 
         Raises:
             UsageError: the world is closed.
@@ -203,9 +185,9 @@ class Tabletop:
             self.tick()
 
     def follow(self, motion: Generator[None, None, _Result], duration_ns: int | None) -> _Result | None:
-        """Move the robot for a time, and let it hold still when the motion ends before; None if it does not.
+        """Run a motion for a time; the robot holds still after its end. Return None if it does not end.
 
-        Without a duration it takes as long as the motion.
+        Without a duration, run it to its end.
         """
         if duration_ns is None:
             return self.run(motion)
@@ -225,9 +207,9 @@ class Tabletop:
         return result
 
     def tick(self) -> None:
-        """Advance by the time that one command of the arm holds."""
-        engine = self._working()
-        self._tell()
+        """Advance by one command of the arm."""
+        engine = self._open_engine()
+        self._emit()
         began = time.monotonic() if self._gui else 0.0
         self._inject()
         self._scene.arm.drive()
@@ -236,7 +218,7 @@ class Tabletop:
         self._ticks += 1
         if self._gui:
             time.sleep(max(0.0, began + 1 / TICKS_PER_S - time.monotonic()))
-        self._tell()
+        self._emit()
 
     def close(self) -> None:
         """See `World`."""
@@ -244,10 +226,10 @@ class Tabletop:
             self._engine.close()
             self._engine = None
 
-    def _tell(self) -> None:
-        """Hand on the sample of now, if it is time for one, once."""
-        if self._ticks % _TICKS_PER_SAMPLE == 0 and self._ticks != self._seen:
-            self._seen = self._ticks
+    def _emit(self) -> None:
+        """Pass the current sample to the listener, once, if one is due."""
+        if self._ticks % _TICKS_PER_SAMPLE == 0 and self._ticks != self._last_sampled:
+            self._last_sampled = self._ticks
             self._listen(self.sample())
 
     def _inject(self) -> None:
@@ -257,19 +239,19 @@ class Tabletop:
         self._scene.arm.limp = "drop" in going_on
         self._scene.engine.set_grip(_OIL if "slip" in going_on else _RUBBER)
 
-    def _seen_as(self, body: Body, pose: Pose, error: tuple[float, float]) -> TrackedObject:
-        seen = Pose(pose.position + np.array([*error, 0.0]), pose.rotation)
+    def _tracked(self, body: Body, pose: Pose, error: tuple[float, float]) -> TrackedObject:
+        detected = Pose(pose.position + np.array([*error, 0.0]), pose.rotation)
         yaw = pose.yaw if isinstance(body.shape, Box) and pose.stands else None
         return TrackedObject(
-            footprint(body.shape, seen),
+            footprint(body.shape, detected),
             class_name=body.class_name,
             yaw=yaw,
-            height=None if body.support else height(body.shape, seen),
+            height=None if body.support else height(body.shape, detected),
             uncertainty=self._noise_m,
         )
 
-    def _working(self) -> Engine:
-        """The physics.
+    def _open_engine(self) -> Engine:
+        """Return the physics.
 
         Raises:
             UsageError: the world is closed.
@@ -279,7 +261,7 @@ class Tabletop:
         return self._engine
 
     def _refuse_unless(self, skill: str, name: str, numbers: Sequence[float]) -> None:
-        self._working()
+        self._open_engine()
         if self._scenario.skill != skill:
             other = self._scenario.skill
             raise UsageError(f"the robot of {self.name} does not {skill} objects; it can {other} them")
@@ -291,4 +273,18 @@ class Tabletop:
 
 
 def _ignore(sample: Sample) -> None:
-    """Nobody listens."""
+    """Ignore samples, while no listener is attached."""
+
+
+def _displacements(radius_m: float, seed: int, sample: int, count: int) -> list[tuple[float, float]]:
+    """Return the detection error of each of `count` bodies in a sample, in metres along x and y.
+
+    Errors are uniform on a disc, so that none exceeds the radius. They depend on the arguments alone:
+    repeating a sample gives the same errors.
+    """
+    if radius_m == 0:
+        return [(0.0, 0.0)] * count
+    drawn = np.random.default_rng([seed, sample, 1]).random((count, 2))
+    radii = (radius_m * np.sqrt(drawn[:, 0])).tolist()
+    angles = (2 * math.pi * drawn[:, 1]).tolist()
+    return [(r * math.cos(a), r * math.sin(a)) for r, a in zip(radii, angles, strict=True)]

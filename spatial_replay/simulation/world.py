@@ -1,4 +1,4 @@
-"""What the rest of the package knows of a simulated world."""
+"""The interface of simulated worlds to the rest of the package."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from spatial_replay.simulation.shapes import Shape
 from spatial_replay.trace.sample import Sample
 
 Skill = Literal["push", "place"]
-"""What a robot does with an object: push it along a path, or pick it up and place it."""
+"""What the robot does with an object: push it along a path, or pick and place it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,10 +21,10 @@ class Body:
 
     Attributes:
         name, class_name: as in the samples.
-        shape: its form and size, in metres.
+        shape: in metres.
         movable: whether the robot can push it, or pick and place it.
-        support: whether other objects may be placed on it, as on a plate. It is then no obstacle to them, and
-            its samples have no height: what lies on it lies in it.
+        support: whether other objects may be placed on it, as on a plate. It is then not an obstacle to them,
+            and has no height in samples, so that objects on it count as inside.
     """
 
     name: str
@@ -36,12 +36,12 @@ class Body:
 
 @dataclass(frozen=True, slots=True)
 class ReachableArea:
-    """Where the robot can put the centre of an object: a box, cut by a ring around its base at (0, 0).
+    """The area in which the robot can place the centre of an object: a box and a ring around its base.
 
     Attributes:
         xmin, ymin, xmax, ymax: the box, in metres.
         nearest, farthest: distances from the base, in metres.
-        yaws: how the robot may turn objects, in radians; none to leave them as they are.
+        yaws: allowed yaws of objects, in radians; none to keep theirs.
     """
 
     xmin: float
@@ -53,18 +53,18 @@ class ReachableArea:
     yaws: tuple[float, ...] = ()
 
     def contains(self, x: float, y: float) -> bool:
-        """Whether a point lies in it, its border included."""
+        """Return whether a point is inside or on the border."""
         inside = self.xmin <= x <= self.xmax and self.ymin <= y <= self.ymax
         return inside and self.nearest <= math.hypot(x, y) <= self.farthest
 
 
 @dataclass(frozen=True, slots=True)
 class Execution:
-    """How a motion of the robot went.
+    """The result of a motion.
 
     Attributes:
-        succeeded: whether the object is where it was to be.
-        reason: what happened, in words.
+        succeeded: whether the object is at its goal.
+        reason: what happened, as text.
     """
 
     succeeded: bool
@@ -72,11 +72,11 @@ class Execution:
 
 
 class World(Protocol):
-    """A world that is simulated step by step; lengths are metres, y grows to the robot's left, z upwards.
+    """A world that is simulated step by step; lengths are in metres.
 
-    The robot's base stands at (0, 0) and looks along x; the table's surface is z = 0. Everything that
-    advances time (`step`, `push`, `place`) hands each sample, when its time has come, to the listener that
-    is attached; the first one, of time 0, when time begins to advance.
+    The robot's base is at (0, 0); x points forward, y to its left, z up; the table is z = 0. Methods that
+    advance time (`step`, `push`, `place`) pass each sample to the attached listener when it is due; the first
+    one, of time 0, when time starts to advance.
     """
 
     @property
@@ -89,45 +89,45 @@ class World(Protocol):
 
     @property
     def bodies(self) -> tuple[Body, ...]:
-        """The objects, in the order of their names in the samples."""
+        """The objects, in the order of the samples."""
 
     @property
     def workspace(self) -> ReachableArea:
-        """Where the robot reaches."""
+        """Where the robot can place objects."""
 
     @property
     def obstacles(self) -> tuple[Footprint, ...]:
-        """What stands in the plane beside the bodies and never moves."""
+        """Fixed obstacles that are not bodies."""
 
     @property
     def time_ns(self) -> int:
-        """The simulated time, 0 at the beginning."""
+        """The simulated time, from 0."""
 
     def attach(self, listen: Callable[[Sample], None]) -> None:
-        """Hand samples to `listen` from now on."""
+        """Pass samples to `listen` from now on."""
 
     def reset(self, seed: int) -> None:
-        """Begin anew at time 0; equal seeds give equal worlds."""
+        """Restart at time 0; equal seeds give equal worlds."""
 
     def sample(self) -> Sample:
-        """What is seen now: every body, with noise if there is any; the same however often one asks."""
+        """Return the current sample: all bodies, with detection noise; repeated calls return the same."""
 
     def step(self) -> None:
-        """Advance to the next sample's time, the robot holding still."""
+        """Advance to the time of the next sample; the robot holds still."""
 
     def push(self, name: str, path: Sequence[tuple[float, float]]) -> Execution:
-        """Push an object so that its centre follows a path of points (x, y) in the plane.
+        """Push an object along a path of points (x, y) of its centre.
 
         Raises:
-            UsageError: no such object, or the world's robot does not push.
+            UsageError: no such object, or the robot does not push.
         """
 
     def place(self, name: str, x: float, y: float, yaw: float | None = None) -> Execution:
-        """Pick an object up and place it with its centre at (x, y); `yaw` None leaves its turn as it is.
+        """Pick an object up and place its centre at (x, y); None keeps its yaw.
 
         Raises:
-            UsageError: no such object, or the world's robot does not pick.
+            UsageError: no such object, or the robot does not pick.
         """
 
     def close(self) -> None:
-        """Give back what the simulator holds."""
+        """Release the simulator."""

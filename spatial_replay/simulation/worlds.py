@@ -1,4 +1,4 @@
-"""The worlds by name."""
+"""Worlds by name, with their default specifications."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from spatial_replay.spec import parse_specification
 from spatial_replay.spec.formula import Specification
 
 SCENARIOS: tuple[str, ...] = ("push", "pick-place", "table-setting")
-"""Each has a module of that name in `scenarios`, and a specification beside it."""
+"""Each has a module in `scenarios` and a specification next to it."""
 
 
 def make_world(
@@ -24,17 +24,17 @@ def make_world(
     injections: Sequence[Injection] = (),
     gui: bool = False,
 ) -> Tabletop:
-    """A scenario's world at time 0; for the arguments see `Tabletop`.
+    """Create the world of a scenario at time 0; for the arguments see `Tabletop`.
 
     Raises:
-        UsageError: there is no such scenario, and what `Tabletop` raises.
+        UsageError: there is no such scenario, or an argument of `Tabletop` is invalid.
     """
     scenario = _scenario(name)
     return Tabletop(scenario, seed=seed, noise_m=noise_m, injections=injections, gui=gui)
 
 
 def default_specification(name: str) -> Specification:
-    """What a scenario's robot should do, if nobody says otherwise.
+    """Return the default specification of a scenario.
 
     Raises:
         UsageError: there is no such scenario.

@@ -1,4 +1,4 @@
-"""What is made to go wrong goes wrong."""
+"""Injected failures happen, and only when they should."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def test_a_drop_makes_the_robot_lose_what_it_carries() -> None:
         assert any(5 * 10**9 < time_ns < 6 * 10**9 for time_ns in wide)
 
 
-def test_slippery_fingers_hold_nothing_heavy() -> None:
+def test_slippery_fingers_lose_a_heavy_object() -> None:
     with world("pick-place", inject=("slip",)) as (made, _):
         done = made.place("crackerbox", 0.45, -0.3)
         assert not done.succeeded
         assert "crackerbox" in done.reason
 
 
-def test_a_mishap_that_is_over_does_no_harm() -> None:
+def test_a_failure_that_is_over_has_no_effect() -> None:
     with world("pick-place", inject=("drop@0s",)) as (made, _):
         assert made.place("mug", *GOAL).succeeded
 
@@ -40,17 +40,17 @@ def test_a_mishap_that_is_over_does_no_harm() -> None:
         ("slip", Injection("slip")),
     ],
 )
-def test_mishaps_are_read(text: str, expected: Injection) -> None:
+def test_an_injection_is_parsed(text: str, expected: Injection) -> None:
     assert Injection.parse(text) == expected
     assert Injection.parse(str(expected)) == expected
 
 
 @pytest.mark.parametrize("text", ["", "drop", "drop@", "drop@7", "fall@7s", "slip@-1s", "drop@7s "])
-def test_other_mishaps_are_refused(text: str) -> None:
+def test_an_invalid_injection_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="write drop@7s"):
         Injection.parse(text)
 
 
-def test_nothing_can_be_dropped_where_nothing_is_held() -> None:
+def test_a_drop_is_refused_in_a_world_without_grasping() -> None:
     with pytest.raises(UsageError, match="nothing is held in push"), world("push", inject=("drop@1s",)):
         pass

@@ -1,4 +1,4 @@
-"""The arm's joints and where they bring its tool."""
+"""Forward and inverse kinematics of the arm."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from spatial_replay.simulation.kinematics import LOWER, REST, UPPER, downwards, 
 
 
 @given(st.floats(0.35, 0.7), st.floats(-2, 2), st.floats(0.01, 0.3), st.floats(-1.5, 1.5))
-def test_joints_bring_the_tool_where_it_should_be(
+def test_the_inverse_kinematics_reach_a_pose(
     radius: float, bearing: float, above: float, turn: float
 ) -> None:
     goal = np.array([radius * math.cos(bearing), radius * math.sin(bearing), above])
@@ -25,7 +25,7 @@ def test_joints_bring_the_tool_where_it_should_be(
 
 
 @given(st.lists(st.floats(0, 1), min_size=7, max_size=7))
-def test_a_tool_has_a_frame_for_all_joints(shares: list[float]) -> None:
+def test_the_tool_frame_is_a_rotation_within_reach_for_all_joints(shares: list[float]) -> None:
     position, rotation = tool_frame(LOWER + np.array(shares) * (UPPER - LOWER))
     assert np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-9
     assert math.dist(position, (0, 0, 0.333)) < 1.2

@@ -1,4 +1,4 @@
-"""The scripts of the scenarios satisfy their specifications, and cope with mishaps as they can."""
+"""Scripts of scenarios satisfy their specifications, and recover from injected failures if they can."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import pytest
 
 from simulation.worlds import off, world
-from spatial_replay.monitor.evaluate import evaluate
+from spatial_replay import evaluate
 from spatial_replay.simulation.worlds import default_specification
 from spatial_replay.trace.trace import Trace
 
@@ -20,7 +20,7 @@ def test_the_pushing_script_satisfies_its_specification() -> None:
         assert verdict == "satisfied"
 
 
-def test_a_behaviour_tree_tries_again_what_was_dropped() -> None:
+def test_a_behaviour_tree_retries_after_a_drop() -> None:
     with world("table-setting", inject=("drop@5s",)) as (made, _):
         goal = (0.34, 0.0)
         done = made.place("fork", *goal, math.pi / 2)
@@ -30,14 +30,14 @@ def test_a_behaviour_tree_tries_again_what_was_dropped() -> None:
         assert abs(made.scene.pose("fork").turned_from(math.pi / 2)) < 0.1
 
 
-def test_a_behaviour_tree_moves_nothing_that_is_in_its_place() -> None:
+def test_a_behaviour_tree_does_not_move_an_object_at_its_goal() -> None:
     with world("table-setting") as (made, _):
         x, y, _ = made.scene.pose("cup").position.tolist()
         assert made.place("cup", x, y).succeeded
         assert made.time_ns == 0
 
 
-def test_a_behaviour_tree_gives_up_with_the_reason() -> None:
+def test_a_behaviour_tree_fails_with_the_last_reason() -> None:
     with world("table-setting", inject=("slip",)) as (made, _):
         done = made.place("fork", 0.34, 0.0)
         assert not done.succeeded

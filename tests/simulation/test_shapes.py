@@ -1,4 +1,4 @@
-"""What a body covers of the plane, in every pose."""
+"""Footprints and heights of bodies in every pose."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PLACES = st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(0, 1))
 
 
 def rotation(roll: float, yaw: float) -> np.ndarray:
-    """A body that leans by `roll` around its axis x, then is turned by `yaw`."""
+    """Return the rotation of a body that leans by `roll` about its x axis, then turns by `yaw`."""
     lean = np.array([(1, 0, 0), (0, math.cos(roll), -math.sin(roll)), (0, math.sin(roll), math.cos(roll))])
     turn = np.array([(math.cos(yaw), -math.sin(yaw), 0), (math.sin(yaw), math.cos(yaw), 0), (0, 0, 1)])
     return turn @ lean
@@ -70,7 +70,7 @@ def test_a_standing_cylinder_is_a_disc(
     assert (bottom, top) == pytest.approx((place[2] - tall / 2, place[2] + tall / 2))
 
 
-def test_a_box_knows_its_turn_and_whether_it_stands() -> None:
+def test_a_pose_has_a_yaw_and_may_be_upright() -> None:
     pose = Pose(np.zeros(3), rotation(0.0, 0.7))
     assert pose.yaw == pytest.approx(0.7)
     assert pose.stands

@@ -1,4 +1,4 @@
-"""Worlds: what is seen of them, and what the robot does in them."""
+"""Worlds: their samples, and what the robot does in them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def tracked(sample: Sample, name: str) -> TrackedObject:
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
-def test_samples_show_the_bodies_where_they_are(name: str) -> None:
+def test_samples_have_the_poses_of_bodies(name: str) -> None:
     with world(name) as (made, _):
         sample = made.sample()
         assert list(sample.objects) == [body.name for body in made.bodies]
@@ -36,7 +36,7 @@ def test_samples_show_the_bodies_where_they_are(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
-def test_its_specification_is_about_its_objects(name: str) -> None:
+def test_a_default_specification_names_objects_of_its_world(name: str) -> None:
     with world(name) as (made, _):
         names = set(object_names(default_specification(name)))
         assert names
@@ -44,7 +44,7 @@ def test_its_specification_is_about_its_objects(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
-def test_everything_lies_in_reach_and_at_rest(name: str) -> None:
+def test_all_bodies_start_in_reach_and_at_rest(name: str) -> None:
     with world(name, seed=3) as (made, _):
         before = {body.name: centre(made, body.name) for body in made.bodies}
         for body in made.bodies:
@@ -62,7 +62,7 @@ def test_samples_come_thirty_times_a_second_from_time_0() -> None:
         assert made.time_ns == 10**8
 
 
-def test_a_reset_begins_anew() -> None:
+def test_a_reset_restarts_the_world() -> None:
     with world("push", seed=4) as (made, _):
         first = made.sample()
         made.push("red", [(0.4, 0.0)])
@@ -101,7 +101,7 @@ def test_the_robot_pushes_a_block_along_a_path() -> None:
         assert widest < 0.47
 
 
-def test_the_robot_places_things_where_they_should_go() -> None:
+def test_the_robot_places_objects_at_their_goals() -> None:
     with world("pick-place") as (made, _):
         for name, goal, yaw in [("mug", (0.36, -0.2), None), ("banana", (0.42, 0.2), 1.2)]:
             done = made.place(name, *goal, yaw)
@@ -111,14 +111,14 @@ def test_the_robot_places_things_where_they_should_go() -> None:
         assert made.scene.pose("banana").yaw == pytest.approx(1.2, abs=0.05)
 
 
-def test_what_lies_on_a_plate_lies_higher() -> None:
+def test_an_object_on_a_plate_lies_higher() -> None:
     with world("pick-place") as (made, _):
         assert made.place("kanelbulle", *centre(made, "plate")).succeeded
         top = made.scene.height("plate")[1]
         assert made.scene.height("kanelbulle")[0] == pytest.approx(top, abs=2e-3)
 
 
-def test_what_cannot_be_done_is_said() -> None:
+def test_an_impossible_placement_fails_with_a_reason() -> None:
     with world("pick-place") as (made, _):
         can = centre(made, "can")
         done = made.place("banana", *can)
@@ -127,7 +127,7 @@ def test_what_cannot_be_done_is_said() -> None:
         assert made.time_ns == 0
 
 
-def test_wrong_uses_are_refused() -> None:
+def test_invalid_calls_are_refused() -> None:
     with world("push") as (made, _):
         with pytest.raises(UsageError, match="'purple' cannot be moved in push; green, red, blue can"):
             made.push("purple", [(0.4, 0.0)])
@@ -146,7 +146,7 @@ def test_wrong_uses_are_refused() -> None:
         make_world("push", noise_m=-1)
 
 
-def test_what_is_out_of_reach_is_said() -> None:
+def test_a_goal_out_of_reach_fails_with_a_reason() -> None:
     with world("pick-place") as (made, _):
         assert made.place("banana", 0.1, 0.1).reason == "(0.10, 0.10) is out of the robot's reach"
     with world("push") as (made, _):

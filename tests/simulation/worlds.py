@@ -1,4 +1,4 @@
-"""Worlds for tests, and what is seen of them."""
+"""Worlds for tests, with their samples."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NO_SIMULATOR = "PyBullet is not installed; it has wheels for Python 3.11"
 def world(
     name: str, *, seed: int = 0, noise_m: float = 0.0, inject: tuple[str, ...] = ()
 ) -> Iterator[tuple[Tabletop, list[Sample]]]:
-    """A world, and the samples that it has handed out so far."""
+    """Create a world; yield it with the list of its samples so far."""
     pytest.importorskip("pybullet", reason=NO_SIMULATOR)
     injections = [Injection.parse(text) for text in inject]
     made = make_world(name, seed=seed, noise_m=noise_m, injections=injections)
@@ -33,11 +33,11 @@ def world(
 
 
 def centre(world: Tabletop, name: str) -> tuple[float, float]:
-    """Where a body is in the plane."""
+    """Return the centre of a body in the plane."""
     x, y, _ = world.scene.pose(name).position.tolist()
     return x, y
 
 
 def off(world: Tabletop, name: str, goal: tuple[float, float]) -> float:
-    """How far a body is from a point, in metres."""
+    """Return the distance of a body from a point, in metres."""
     return math.dist(centre(world, name), goal)

@@ -1,1 +1,1 @@
-"""The worlds that ship with the package, each with a specification of what its robot should do."""
+"""The scenarios of the package, each with a default specification."""

@@ -1,4 +1,4 @@
-"""Nine things on a table, from a banana to a box of crackers, and a robot that picks and places them."""
+"""Nine objects on a table, from a banana to a box of crackers, and a robot that picks and places them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _thing(
 
 
 def _script(scene: Scene) -> Generator[None, None, Execution]:
-    """Breakfast: the bun on the plate, the banana before it, mug and bottle behind, boxes away."""
+    """Set the breakfast: bun on the plate, banana in front of it, mug and bottle behind, a box aside."""
     x, y = scene.place_of("plate")
     goals = {
         "kanelbulle": (x, y),

@@ -13,7 +13,7 @@ from spatial_replay.simulation.shapes import Box, Cylinder
 from spatial_replay.simulation.world import Body, Execution, ReachableArea
 
 _UPRIGHT = math.pi / 2
-"""Cutlery points along y, away from who will eat."""
+"""Cutlery points along y, away from the diner."""
 _STEEL = (0.75, 0.77, 0.8)
 
 
