@@ -22,7 +22,7 @@ from spatial_replay.logs.objects.wire import WireTemplate, payloads_of
 from spatial_replay.logs.schemas import AutomatonState_pb2
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.topics import AUTOMATA_PREFIX
-from spatial_replay.monitor.offline import finished
+from spatial_replay.monitor.offline import evaluate_offline
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Atom, Formula, NamedSpec, Quantified, Specification, iter_nodes
@@ -110,7 +110,7 @@ class AutomatonRun:
         for number in np.flatnonzero(unclear.any(axis=1)).tolist():
             # a number that is not determined can still have a sign that is
             formula = self._automaton.propositions[number].formula
-            done = finished(formula, self._order, stretch.leaves, stretch.times_ns)
+            done = evaluate_offline(formula, self._order, stretch.leaves, stretch.times_ns)
             low, high = done.ends(0, wide=False)
             values[number, unclear[number]] = UNKNOWN
             values[number, unclear[number] & (low >= 0.0)] = TRUE

@@ -220,7 +220,7 @@ def _locate(
         if pair is None:
             continue
         there = here[leaf == index]
-        operands = [scene.find(term).operand for term in (pair.first, pair.second)]
+        operands = [scene.resolve(term).operand for term in (pair.first, pair.second)]
         first, second = (Operand(each.rows[samples[there]], each.enlargement) for each in operands)
         numbers = contacts(scene.batch, first, second, is_protrusion=pair.is_protrusion)
         found.points[there] = numbers[:, :4].reshape(-1, 2, 2)

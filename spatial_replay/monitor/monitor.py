@@ -142,7 +142,7 @@ class Monitor:
         self._last_ns: int | None = None
 
     def update(self, sample: Sample) -> Update:
-        """Take in the next sample.
+        """Add the next sample and return its numbers and verdicts.
 
         Raises:
             TraceError: a time that does not come after the last one's.

@@ -1,9 +1,7 @@
-"""A formula over a finished stretch of samples: every node at every sample.
+"""Offline robustness: rho(t, node) of every node from each sample to the end of a finished log.
 
-This is the usual offline robustness, rho(t, node) from each sample to the end, beside the monitor's numbers,
-which are about the first and the newest sample. A window that slides over a run is a stretch of its own.
-
-Every subformula of a formula, compiled for `finished_kernel.run_finished`.
+A monitor's numbers, in contrast, are about the first and the newest sample. A sliding window is evaluated as
+a log of its own at each position.
 """
 
 from __future__ import annotations
@@ -17,9 +15,9 @@ import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.offline_kernel import run_finished, run_windows
+from spatial_replay.monitor.offline_kernel import run_offline, run_windows
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.codes import FINISHED_TARGET, low_and_high
+from spatial_replay.monitor.online.codes import OFFLINE_TARGET, low_and_high
 from spatial_replay.monitor.online.operators import SignalTable, array_of_rows
 from spatial_replay.spec.formula import Atom, Formula, Quantified, Temporal, iter_nodes
 from spatial_replay.trace.sample import LATEST_NS
@@ -28,7 +26,7 @@ _MIRRORED = MappingProxyType({"X": "Y", "F": "O", "G": "H", "U": "S"})
 """Future operators and the past ones that they are in reversed time."""
 
 
-class FinishedTable(SignalTable):
+class OfflineTable(SignalTable):
     """Rows of past operators, and of future operators as past ones in reversed time.
 
     That needs the samples' end, so it is for a stretch that is finished; there, unlike for a stretch that
@@ -47,7 +45,7 @@ class FinishedTable(SignalTable):
             nodes: (N,), the row of each node.
 
         Returns:
-            (R, FINISHED_WIDTH), operands first.
+            (R, OFFLINE_WIDTH), operands first.
         """
         column = {row: node for node, row in reversed(list(enumerate(nodes)))}
         others = (row for row in range(len(self._rows)) if row not in column)
@@ -59,11 +57,11 @@ class FinishedTable(SignalTable):
         # equal nodes share a row, but each has a column of its own
         copies = [(codes.AND, column[row], column[row], 0, 0, 0, n) for n, row in enumerate(nodes)]
         result += [copy for copy in copies if copy[1] != copy[-1]]
-        return array_of_rows(result, codes.FINISHED_WIDTH)
+        return array_of_rows(result, codes.OFFLINE_WIDTH)
 
 
 @dataclass(frozen=True, eq=False)
-class Finished:
+class OfflineNodes:
     """Every node at every sample.
 
     Attributes:
@@ -78,9 +76,9 @@ class Finished:
         return self.columns[low, node], self.columns[high, node]
 
 
-def finished(
+def evaluate_offline(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
-) -> Finished:
+) -> OfflineNodes:
     """Evaluate every node over all samples.
 
     Args:
@@ -91,15 +89,15 @@ def finished(
     table, nodes, width = _compiled(formula, order)
     columns = np.empty((len(leaves), width, len(times_ns)))
     extrema = np.empty(len(times_ns))
-    run_finished(table, np.ascontiguousarray(leaves), times_ns, 0, len(times_ns), columns, extrema)
-    return Finished(columns[:, :nodes])
+    run_offline(table, np.ascontiguousarray(leaves), times_ns, 0, len(times_ns), columns, extrema)
+    return OfflineNodes(columns[:, :nodes])
 
 
 def full_signal(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
 ) -> Floats:
     """Compute each node's robustness at each sample, to the end of the log, (N, T); NaN: not determined."""
-    return _determined(finished(formula, order, leaves[:2], times_ns).columns)
+    return _determined(evaluate_offline(formula, order, leaves[:2], times_ns).columns)
 
 
 def window_signal(
@@ -126,17 +124,17 @@ def window_signal(
 
 def new_leaves(formula: Formula, order: Sequence[Atom | Quantified]) -> list[Atom | Quantified]:
     """Return the leaves of a formula that are not in `order`."""
-    table = FinishedTable(order)
+    table = OfflineTable(order)
     table.add(formula)
     return table.leaves[len(order) :]
 
 
 def _compiled(formula: Formula, order: Sequence[Atom | Quantified]) -> tuple[Integers, int, int]:
     """Compile a formula; return its table, number of nodes and number of columns."""
-    table = FinishedTable(order)
+    table = OfflineTable(order)
     nodes = [table.add(node) for _, _, node in iter_nodes(formula)]
     instructions = table.instructions(nodes)
-    return instructions, len(nodes), int(instructions[:, FINISHED_TARGET].max()) + 1
+    return instructions, len(nodes), int(instructions[:, OFFLINE_TARGET].max()) + 1
 
 
 def _determined(ends: Floats) -> Floats:

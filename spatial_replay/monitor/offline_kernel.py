@@ -1,4 +1,4 @@
-"""Operators over a stretch of samples whose end is known: one pass each, whatever the width of a window.
+"""Kernels for operators over samples whose end is known: one pass each, independent of window widths.
 
 A future operator is a past one in reversed time, so each kernel works on *steps* 0, 1, … in the direction in
 which it looks back; step i stands at begin + i, or at end - 1 - i for an operator that looks ahead.
@@ -17,10 +17,10 @@ from spatial_replay.monitor.online.codes import (
     AND,
     CONSTANT,
     DELAY,
-    FINISHED_TARGET,
     HISTORICALLY,
     LEAF,
     NOT,
+    OFFLINE_TARGET,
     ONCE,
     OR,
     SAMPLES,
@@ -30,7 +30,7 @@ from spatial_replay.monitor.online.codes import (
 
 
 class Steps(NamedTuple):
-    """The samples begin … end - 1 in the direction in which an operator sees them.
+    """The samples begin … end - 1 in the direction in which an operator reads them.
 
     Attributes:
         stamps: times of all samples in ns.
@@ -132,13 +132,13 @@ def _run_boolean(
 
 
 @kernel
-def run_finished(
+def run_offline(
     rows: Integers, leaves: Floats, stamps: Integers, begin: int, end: int, columns: Floats, extrema: Floats
 ) -> None:
     """Run all rows over the samples from begin to before end, as if there were no others.
 
     Args:
-        rows: (R, FINISHED_WIDTH), operands first.
+        rows: (R, OFFLINE_WIDTH), operands first.
         leaves: (C, A, T) in one, two or four channels.
         stamps: (T,), ns.
         columns: (C, K, T), receives the numbers.
@@ -153,7 +153,7 @@ def run_finished(
         steps = Steps(stamps, end - 1 if is_ahead else begin, -1 if is_ahead else 1, end - begin)
         for channel in range(channels):
             mirror = channel ^ 1 if channels > 1 else channel
-            target = columns[channel, row[FINISHED_TARGET]]
+            target = columns[channel, row[OFFLINE_TARGET]]
             if code == LEAF:
                 target[begin:end] = leaves[channel, row[1], begin:end]
                 continue
@@ -181,7 +181,7 @@ def run_windows(
         result: (C, N, T).
     """
     for t in range(len(stamps)):
-        run_finished(rows, leaves, stamps, starts[t], t + 1, columns, extrema)
+        run_offline(rows, leaves, stamps, starts[t], t + 1, columns, extrema)
         for channel in range(leaves.shape[0]):
             for n in range(result.shape[1]):
                 result[channel, n, t] = columns[channel, n, starts[t]]

@@ -14,7 +14,7 @@ from laws.strategies_spec import Vocabulary
 from laws.test_monitor_laws import observed_in
 from spatial_replay.annotate.sentences import sentences_of
 from spatial_replay.monitor.evaluate import evaluate
-from spatial_replay.monitor.offline import finished
+from spatial_replay.monitor.offline import evaluate_offline
 from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.monitor.witness.path import End, deciding_path
@@ -60,7 +60,7 @@ def comparison_texts(draw) -> str:
 @given(formula=formulas_of_leaves, run=leaf_runs())
 def test_the_way_down_ends_at_the_number_it_began_with(formula, run):
     order, times = compile_formula(formula).leaves, np.array(run.times_ns)
-    done = finished(formula, order, run.values(order), times)
+    done = evaluate_offline(formula, order, run.values(order), times)
     for index, _ in enumerate(iter_nodes(formula)):
         low, high = (float(column[0]) for column in done.ends(index))
         end = End.LOW if low >= 0.0 else End.HIGH if high < 0.0 else End.OPEN

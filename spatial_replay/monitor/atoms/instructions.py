@@ -1,9 +1,7 @@
-"""Atoms and open quantifiers, compiled for the objects that some samples have.
+"""Leaves (atoms and open quantifiers) compiled to instructions over columns of samples.
 
-The instructions that leaves are made of, run over columns of samples.
-
-Each instruction writes one column in every channel (see `run`): what it computes from earlier columns, or
-reads from measurements, signals and constants.
+Each instruction writes one column in every channel (see `online.codes`): computed from earlier columns, or
+read from measurements, signals and constants.
 """
 
 from __future__ import annotations
@@ -50,7 +48,7 @@ AND, OR = 8, 9  # intervals
 AND_MEMBER, OR_MEMBER = 10, 11  # a, and b where members c is 1, anything where it is -1
 
 TILE = 128
-"""How many samples are taken at a time, so that their columns stay in the processor's cache."""
+"""Samples processed together: few, so that their columns stay in the processor's cache."""
 
 
 @long_kernel
@@ -122,11 +120,11 @@ def run_instructions(
 
 
 MAX_BINDINGS = 20_000
-"""How many ways of binding their variables the open quantifiers of one formula may have in all."""
+"""The most bindings of variables that the open quantifiers of one formula may have in total."""
 
 
 class OpenGroups(Protocol):
-    """Who can be in the open groups of some samples."""
+    """The possible members of open groups in some samples."""
 
     def candidates(self, group: Group | Earlier) -> tuple[str, ...]:
         """Return the names of the objects that are members in any of the samples."""

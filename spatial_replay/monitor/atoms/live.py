@@ -1,14 +1,12 @@
-"""What the leaves of a monitor are computed from, found once for samples with the same objects.
+"""The leaves of single samples, for monitors: plans are compiled once and reused.
 
-To a monitor most samples look alike: other numbers, the same names. A plan holds what follows from the names,
-as index arrays, so that a sample costs little more than its numbers. It serves every sample whose members of
-open groups are among its own, under whatever names; an object that is not in a sample is only a flag to it.
+Most samples differ in their numbers, not in their names. A plan holds what follows from the names as index
+arrays, so that a sample costs little more than its numbers. It serves every sample whose members of open
+groups fit into it; an object missing from a sample is only a flag.
 
-Which plan serves a sample: one for all where no group is open, else by how many are in the open groups.
-
-To a specification, objects that it does not name are all alike but for their classes. So a plan has stand-ins
-for them, and in each sample it is said whom they stand for: tracks that come and go under ever new names need
-no plan of their own.
+Without open groups one plan serves all samples. Otherwise it depends on how many members they have: objects
+that the specification does not name differ only in their classes, so a plan has placeholders for them, and
+each sample assigns objects to placeholders. Tracks that appear under new names need no new plan.
 """
 
 from __future__ import annotations
@@ -52,7 +50,7 @@ from spatial_replay.trace.sample import Sample
 
 
 class LeafPlan:
-    """How the leaves of formulas follow from a sample and the earlier ones that it looks back at."""
+    """Index arrays that compute the leaves of a sample and the earlier ones it looks back at."""
 
     def __init__(self, frame: PlanContext, members: frozenset[Member]) -> None:
         """Plan for samples that hold no other members of open groups.
@@ -70,7 +68,7 @@ class LeafPlan:
 
     @property
     def nbytes(self) -> int:
-        """How much memory its arrays take."""
+        """The memory of its arrays."""
         return sum(array.nbytes for array in self._arrays)
 
     def leaf_values(self, samples: Sequence[Sample | None], stands_for: Mapping[str, str]) -> Floats:
@@ -197,21 +195,20 @@ def _enlargement(term: Term) -> float:
 
 MOST_PLANS = 256
 MOST_BYTES = 1 << 22
-"""How many plans are kept, and how much memory they take but for the newest; first goes the one used longest
-ago."""
+"""Limits on stored plans, by number and memory; the least recently used go first, never the newest."""
 
-_NOBODY = ""
+_NO_OBJECT = ""
 """A name that no object has."""
 
 _Classes: TypeAlias = tuple[int, ...]
-"""Codes of the classes that one object has in the samples looked at: nearly always one."""
+"""Codes of the classes of one object in the samples looked at: nearly always one."""
 
 _Counts: TypeAlias = tuple[tuple[_Classes, int], ...]
-"""How many stand-ins there are for the unnamed objects of each kind."""
+"""The number of placeholders for the unnamed objects of each kind."""
 
 
 class SampleLeaves:
-    """The leaves of some formulas, sample after sample, with what they look back at."""
+    """The leaves of some formulas, sample by sample."""
 
     def __init__(self, leaves: Sequence[Leaves], regions: Mapping[str, Outline]) -> None:
         formulas = list(chain.from_iterable(leaves))
@@ -237,7 +234,7 @@ class SampleLeaves:
         self._bytes = 0
 
     def look_at(self, sample: Sample) -> list[Sample | None]:
-        """Take in the next sample; it and those that it looks back at."""
+        """Add the next sample; return it and those that it looks back at."""
         return self._recent.add(sample)
 
     def values(self, samples: Sequence[Sample | None]) -> Floats:
@@ -261,7 +258,7 @@ class SampleLeaves:
         stands_for: dict[str, str] = {}
         for classes, names in unnamed.items():
             stands_for.update(
-                zip_longest(self._stand_ins(classes, counts[classes]), names, fillvalue=_NOBODY)
+                zip_longest(self._placeholders(classes, counts[classes]), names, fillvalue=_NO_OBJECT)
             )
         return plan.leaf_values(samples, stands_for)
 
@@ -285,7 +282,7 @@ class SampleLeaves:
             kinds.setdefault(classes, []).append(name)
         return kinds
 
-    def _stand_ins(self, classes: _Classes, count: int) -> list[str]:
+    def _placeholders(self, classes: _Classes, count: int) -> list[str]:
         """Return placeholder names for unnamed objects, none of which the specification uses."""
         return [f"{self._prefix}{classes} {number}" for number in range(count)]
 
@@ -298,7 +295,7 @@ class SampleLeaves:
         unnamed = {
             Member(name, code)
             for classes, count in counts.items()
-            for name in self._stand_ins(classes, count)
+            for name in self._placeholders(classes, count)
             for code in classes
         }
         plan = LeafPlan(self._frame, self._own_members | unnamed)

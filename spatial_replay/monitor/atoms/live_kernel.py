@@ -1,8 +1,8 @@
-"""The leaves of one sample: measured and computed in one call.
+"""Kernel that measures and computes the leaves of one sample in one call.
 
-What does not change from sample to sample, which rows are measured with which and what becomes of the
-numbers, is in a plan's arrays. Rows stand for, in this order: each sample looked at, the regions, then the
-places, each an object in one of those samples. The class code of a row is `ABSENT` for what is not there.
+A plan's arrays say which rows are measured with which, and how leaves follow. Rows stand for, in this order:
+each sample looked at, the regions, then the places, each an object in one of those samples. A missing sample
+or object has the class code `ABSENT`.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from spatial_replay.monitor.atoms.instructions import run_instructions
 
 ABSENT = -1
 ANY = -1
-"""The class wanted where any will do."""
+"""The required class if any class matches."""
 
 NUMBERS_OF_PLACE = 4
-"""Bottom, top, yaw (NaN where there is none) and uncertainty."""
+"""Bottom, top, yaw (NaN if absent) and uncertainty."""
 
 
 class PlanArrays(NamedTuple):
-    """What a plan does with every sample; ragged lists come with where each begins and the last ends.
+    """What a plan does with every sample; ragged lists come with the offsets of their rows.
 
     Attributes:
         extent: (4,), how many samples, regions, places and signals there are.

@@ -1,7 +1,4 @@
-"""Atoms and open quantifiers: their values in every sample, from measurements and signals.
-
-Numbers that leaves are computed from: measured once per trace, kept for the next edit.
-"""
+"""The leaves of whole traces, from signals and from measurements that the trace caches."""
 
 from __future__ import annotations
 
@@ -58,7 +55,7 @@ def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Flo
     def operand(term: Term) -> int:
         if term not in numbers:
             numbers[term] = len(operands)
-            operands.append(scene.find(term).operand)
+            operands.append(scene.resolve(term).operand)
         return numbers[term]
 
     requests = [
@@ -69,7 +66,7 @@ def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Flo
     values = iter(measure(scene.batch, operands, requests) if requests else ())
     result = []
     for each in measurements:
-        found = [scene.find(term) for term in measured_terms(each)]
+        found = [scene.resolve(term) for term in measured_terms(each)]
         if isinstance(each, Misalignment):
             value, spread = misalignment(found[0].yaw, found[1].yaw), np.zeros(len(scene))
         else:

@@ -1,4 +1,4 @@
-"""Terms of a specification found in a trace: which footprints, how sure, in which samples."""
+"""Resolve the terms of a specification in a trace: footprints, uncertainty, and where they are unknown."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class ResolvedTerm:
         operand: its footprints.
         unknown: (T,), where it is unknown as a whole.
         spread: (T,), its uncertainty; the largest of a group's members.
-        yaw: (T,), its orientation, NaN where it has none.
+        yaw: (T,), its orientation, NaN if it has none.
     """
 
     operand: Operand
@@ -61,7 +61,7 @@ class TraceScene:
         self.regions = regions
         self.skip = skip
         self._column = {name: index for index, name in enumerate(trace.names)}
-        self._found: dict[Term, ResolvedTerm] = {}
+        self._resolved: dict[Term, ResolvedTerm] = {}
         self._members: dict[Group | Earlier, tuple[tuple[str, ...], Flags, Booleans]] = {}
 
     def __len__(self) -> int:
@@ -78,11 +78,11 @@ class TraceScene:
             [self.trace.footprints, FootprintBatch.from_footprints(regions, heights)]
         )
 
-    def find(self, term: Term) -> ResolvedTerm:
+    def resolve(self, term: Term) -> ResolvedTerm:
         """Resolve a term without variables (see `bind`)."""
-        if term not in self._found:
-            self._found[term] = self._find(term)
-        return self._found[term]
+        if term not in self._resolved:
+            self._resolved[term] = self._resolve(term)
+        return self._resolved[term]
 
     def candidates(self, group: Group | Earlier) -> tuple[str, ...]:
         """Return the names of the objects that are ever in an open group."""
@@ -111,9 +111,9 @@ class TraceScene:
         present = (rows != ABSENT)[np.maximum(source, 0)] & ~before[:, None]
         return names, present.astype(np.int8), before
 
-    def _find(self, term: Term) -> ResolvedTerm:
+    def _resolve(self, term: Term) -> ResolvedTerm:
         if isinstance(term, Enlarged):
-            inner = self.find(term.term)
+            inner = self.resolve(term.term)
             operand = Operand(inner.operand.rows, inner.operand.enlargement + term.radius)
             return ResolvedTerm(operand, inner.unknown, inner.spread, inner.yaw)
         base, source = self._base_and_source(term)

@@ -1,10 +1,8 @@
-"""Numbers by which `program` tells `step` what to do; the columns of its tables, in their order.
+"""Operation codes and table columns shared by `program` and `step`, and the channels of numbers.
 
-Channels: what a number can be when something is unknown or uncertain.
-
-All numbers exist in up to four channels: the ends of the interval with every uncertainty at 0 (nominal low
-and high), and the ends with uncertainty (wide low and high). They are equal, and only the first is kept, for
-as long as everything is known; the second appears with the first unknown, the rest with uncertainty. A
+Every number has up to four channels: the ends of the interval with every uncertainty at 0 (nominal low and
+high), and the ends with uncertainty (wide low and high). While everything is known they are equal and only
+the first is stored; the second appears with the first unknown, the others with the first uncertainty. A
 negation swaps low and high: channel ^ 1.
 """
 
@@ -19,8 +17,8 @@ SAMPLES, NANOSECONDS = 0, 1
 # columns of signals
 SIGNAL_CODE, SIGNAL_A, SIGNAL_B, SIGNAL_UNIT, SIGNAL_LOW, SIGNAL_HIGH, SIGNAL_WINDOW = range(7)
 SIGNAL_WIDTH = 7
-FINISHED_TARGET = 6  # of finished stretches: the column that a row writes, in place of the window
-FINISHED_WIDTH = 7
+OFFLINE_TARGET = 6  # of finished stretches: the column that a row writes, in place of the window
+OFFLINE_WIDTH = 7
 # codes of signals
 LEAF = 0  # leaf a
 CONSTANT = 1  # low times infinity

@@ -1,8 +1,7 @@
-"""Parts: temporal operators that look ahead, compiled for `tables.step_tables` and `windows.step_windows`.
+"""Compile operators: those without future operands to signals, those that look ahead to parts.
 
-A part is in negation normal form over signals, so that its value is monotone in everything it is made of.
-
-The signal table: subformulas without a future operator, compiled for `signals.step_signals`.
+Signals are run by `step.step_signals`, parts by `tables.step_tables` and `windows.step_windows`. A part is in
+negation normal form over signals, so that its value is monotone in all its operands.
 """
 
 from __future__ import annotations

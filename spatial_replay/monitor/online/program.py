@@ -1,14 +1,14 @@
-"""Formulas compiled for the step kernels: flat tables of what to do with each sample.
+"""Compile formulas for the step kernels: flat tables of what to do with each sample.
 
-A formula becomes three tables, each in an order in which operands come first:
+A formula becomes three tables, each with operands first:
 
-- *signals*: every subformula without a future operator. Its robustness at a sample is final once the
-  sample is there, so it is computed forwards, with a little state for past operators.
-- *parts*: one for each node of the tree that is a temporal operator and looks ahead, in negation normal
-  form over signals, so that its robustness is monotone in everything it is made of.
-- *reports*: the tree as the user sees it; Boolean nodes combine the numbers of their operands.
+- *signals*: every subformula without a future operator. Its robustness at a sample is final with that
+  sample, so it is computed forwards, with a little state for past operators.
+- *parts*: one for each node that is a temporal operator and looks ahead, in negation normal form over
+  signals, so that its robustness is monotone in all its operands.
+- *reports*: the tree as the user wrote it; Boolean nodes combine the numbers of their operands.
 
-`Run` takes samples through them.
+`OnlineRun` runs samples through them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The arrays that kernels share: what a run remembers, and room to work in.
-
-Positions of samples in a run, and how far windows in samples or in time reach from them.
-
+"""The arrays that kernels share: a run's memory and scratch space; positions of samples and window ends.
 `stamps` holds the times of the samples offset, offset + 1, … of the run; `last` is the newest of them that
 counts.
 """

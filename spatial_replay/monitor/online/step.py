@@ -8,7 +8,7 @@ The tree that the user sees: every node's numbers, from signals, parts and opera
 
 One program on one stream of samples: the compiled step that a monitor and a replay share.
 
-Samples are taken in by tiles: first the signals of a tile, then each part, then the tree. A tile of one
+Samples are run in tiles: first the signals of a tile, then each part, then the tree. A tile of one
 sample and a tile of many give the same bits, because the only arithmetic is minima, maxima and negation.
 
 Numbers are kept in as many channels as are needed so far (see `channels`).
@@ -314,7 +314,7 @@ def step(
     tables: Tables, memory: Memory, scratch: Scratch, leaves: Floats, times_ns: Integers, start_ns: int,
     position: int, offset: int, t: int, count: int, series: Floats, final: Floats,
 ) -> None:  # fmt: skip
-    """Take in the samples t … t + count - 1 of `leaves`, by a program without windows under its parts.
+    """Run the samples t … t + count - 1 of `leaves` through a program without windows under its parts.
 
     Args:
         leaves: (C, A, T), for as many channels as the run has.
@@ -363,7 +363,7 @@ class OnlineRun:
 
         Args:
             room: for how many recent samples there is room at first (it doubles when needed).
-            tile: how many samples are taken in together, at most. What comes one by one is faster with 1,
+            tile: how many samples are run together, at most. Samples that come one by one are faster with 1,
                 since the numbers worked with then lie closer together.
         """
         self._program = program
@@ -390,7 +390,7 @@ class OnlineRun:
         return self._final.copy()
 
     def extend(self, leaves: Floats, times_ns: Integers) -> Floats:
-        """Take in more samples.
+        """Add samples.
 
         Args:
             leaves: (C, A, T), the program's leaves: with C = 1 exact values, with C = 2 the ends of the
@@ -415,7 +415,7 @@ class OnlineRun:
         return series
 
     def _step(self, leaves: Floats, times_ns: Integers, t: int, count: int, series: Floats) -> None:
-        """Take in the samples t up to t + count, for which there is room."""
+        """Run the samples t up to t + count, for which there is room."""
         if self._position == 0:
             self._start_ns = int(times_ns[t])
         self._take_in(

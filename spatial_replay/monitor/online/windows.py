@@ -1,13 +1,13 @@
 """Bounded operators below unbounded ones, and past operators above future ones.
 
-What such a part says about its oldest open positions changes with every sample, so the samples since then
-are kept. Its table (see `tables`) stands at a *base*: the last position of the root all of whose windows have
-closed. What came later is run backwards from the newest sample each time, at a cost that depends on how many
+Such a part's value at its oldest open positions changes with every sample, so the samples since then are
+stored. Its table (see `tables`) belongs to a *base*: the last position of the root all of whose windows have
+closed. Later positions are run backwards from the newest sample each time, at a cost that depends on how many
 samples the windows span, and read into the table. A past operator with a future operator below it carries a
 table of its own from base to base.
 
-A part's cells hold: the base, as the next position to take in; for each variable, the position where it
-stands in the table; for each table of a past operator, the position it belongs to (-1: before the first).
+A part's cells hold: the base, as the next position to absorb; for each variable, its position in the table;
+for each table of a past operator, the position it belongs to (-1: before the first).
 """
 
 from __future__ import annotations

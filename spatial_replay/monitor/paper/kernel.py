@@ -1,8 +1,7 @@
-"""Def. 16 on every prefix: one sample through the table of a formula.
+"""Kernels for Def. 16 on every prefix: one sample at a time through the table of a formula.
 
-A number is left out where it reaches beyond the run: it is NaN then, and no minimum or maximum counts it. It
-is lost where it depends on something that is not known: a mark beside the number, which every minimum and
-maximum over it takes on.
+A number that reaches beyond the run is left out: it is NaN, and minima and maxima skip it. A number that
+depends on something unknown is lost: a mark beside it, which every minimum and maximum over it inherits.
 """
 
 from __future__ import annotations
@@ -250,7 +249,7 @@ def step_paper(
     rows: Integers, operands: Integers, leaves: Floats, lost_leaves: Flags, times_ns: Integers,
     t: int, count: int, position: int, memory: PaperMemory, series: Floats,
 ) -> None:  # fmt: skip
-    """Take in the samples t up to t + count, of which `position` came before.
+    """Run the samples t up to t + count; `position` samples came before.
 
     Args:
         leaves: (A, T); NaN where one is left out.

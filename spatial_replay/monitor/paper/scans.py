@@ -1,12 +1,10 @@
-"""Minima and maxima that leave out NaN, and temporal operators over whole runs of numbers.
+"""The table of a formula for `kernel`, and its operators: minima and maxima that skip NaN, scans over runs.
 
-Every number has a mark beside it, 1 where it is lost; whatever is made of lost numbers is lost.
+Every number has a mark beside it, 1 if it is lost; a number that depends on a lost one is lost.
 
-The tree of a formula as a table for `kernel`, which evaluates Def. 16 on every prefix.
-
-A node without temporal operator below is *plain*: its number at a sample is settled once the sample is there.
-Any other node's number at a sample may change with every further sample. Most formulas need it at the first
-sample alone (`value`); a node below a temporal operator needs it at all samples, in a *column*.
+A node without temporal operator below is *plain*: its number at a sample is final with that sample. Any other
+node's number may change with every later sample. Most formulas need it at the first sample only (`value`); a
+node below a temporal operator needs it at all samples, in a *column*.
 """
 
 from __future__ import annotations

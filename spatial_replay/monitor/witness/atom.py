@@ -1,7 +1,4 @@
-"""Within a leaf at one sample: which atom decides it, by which measurements of which objects.
-
-Why an atom is unknown in a sample, in words.
-"""
+"""The atom that decides a leaf at one sample: its measurements and objects, or why it is unknown."""
 
 from __future__ import annotations
 
@@ -74,7 +71,7 @@ def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
 
 
 def _reasons_of_term(scene: TraceScene, part: Expression, term: Term) -> Iterator[str]:
-    found = scene.find(term)
+    found = scene.resolve(term)
     if found.unknown[0]:
         yield from _missing(scene, term)
     elif isinstance(part, Misalignment) and np.isnan(found.yaw[0]):
@@ -93,7 +90,7 @@ def _missing(scene: TraceScene, term: Term) -> Iterator[str]:
         yield f"{format_term(term)} looks back to before the first sample"
         return
     members = _members(base_of(term))
-    rows = scene.find(term).operand.rows[0]
+    rows = scene.resolve(term).operand.rows[0]
     for name, row in zip(members or [format_term(term)] * len(rows), rows.tolist(), strict=True):
         when = " then" if isinstance(term, Earlier) else ""
         if row < ABSENT:
@@ -333,7 +330,7 @@ def _contact(scene: TraceScene, part: Measurement) -> Contact | None:
 
 def _footprint(scene: TraceScene, term: Term) -> Footprint | None:
     """Return the footprint of a single object or region; None for an empty group."""
-    operand = scene.find(term).operand
+    operand = scene.resolve(term).operand
     rows = operand.rows[0]
     if len(rows) != 1 or rows[0] < 0:
         return None

@@ -1,11 +1,7 @@
-"""From a node down to the leaf that decides it, by the operands that minima and maxima take.
+"""The path from a node to the leaf that decides it, through the operands that attain minima and maxima.
 
-Robustness is made of minima and maxima alone, so each number is that of one leaf at one sample, perhaps with
-its sign turned. The way to it follows one end of the interval (see `extremum.End`).
-
-Which operand a minimum or a maximum takes its number from.
-
-The samples that an instance was evaluated over, to be looked at again.
+Robustness consists of minima and maxima only, so each number is that of one leaf at one sample, perhaps
+negated. The path to it follows one end of the interval (see `End`).
 """
 
 from __future__ import annotations
@@ -23,7 +19,7 @@ from spatial_replay.monitor.atoms.delays import look_back, tail
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
-from spatial_replay.monitor.offline import Finished
+from spatial_replay.monitor.offline import OfflineNodes
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.spec.formula import (
     Boolean,
@@ -58,7 +54,7 @@ class End(Enum):
 
     @property
     def turned(self) -> End:
-        """That of the operand of a negation."""
+        """The end for the operand of a negation."""
         return {End.LOW: End.HIGH, End.HIGH: End.LOW, End.OPEN: End.OPEN}[self]
 
     def of_minimum(self, low: _Number, high: _Number) -> _Number:
@@ -72,7 +68,7 @@ class End(Enum):
 
 @dataclass(frozen=True, slots=True)
 class SignedOperand:
-    """What enters a minimum or a maximum: number `index` of something, as it is or negated."""
+    """An operand of a minimum or a maximum, by index, possibly negated."""
 
     index: int
     negated: bool = False
@@ -80,7 +76,7 @@ class SignedOperand:
 
 @dataclass(frozen=True, slots=True)
 class Extremum:
-    """A minimum or a maximum of operands, or of others."""
+    """A minimum or a maximum of operands or of other extrema."""
 
     is_minimum: bool
     operands: tuple[SignedOperand | Extremum, ...]
@@ -132,7 +128,7 @@ def _interval(part: SignedOperand | Extremum, interval: Callable[[int], Interval
 
 @dataclass(frozen=True, slots=True)
 class PathNode:
-    """A node at a sample, on the way to what decides.
+    """A node at a sample on a deciding path.
 
     Attributes:
         node: its id.
@@ -145,11 +141,11 @@ class PathNode:
 
 @dataclass(frozen=True, slots=True)
 class DecidingPath:
-    """The way down, from the node asked about to where it ends.
+    """The path down from a node.
 
     Attributes:
         steps: at least one; the last is at a leaf, at `true` or `false`, or at an operator that looks at no
-            sample: a window without any, a next sample that is not there.
+            sample: an empty window, a next sample beyond the log.
         end: which end of the last node's interval decides.
     """
 
@@ -157,11 +153,13 @@ class DecidingPath:
     end: End
 
 
-def deciding_path(formula: Formula, done: Finished, times_ns: Integers, node: int, end: End) -> DecidingPath:
+def deciding_path(
+    formula: Formula, done: OfflineNodes, times_ns: Integers, node: int, end: End
+) -> DecidingPath:
     """Return the path to what decides a node at the first sample.
 
-    Of equal operands it takes that which leads to the earliest sample, then the first; of equal samples in a
-    window the earliest.
+    Ties go to the operand that leads to the earliest sample, then to the first operand; in a window, to the
+    earliest sample.
 
     Args:
         done: every node at every sample of `times_ns` (T,).
@@ -172,7 +170,7 @@ def deciding_path(formula: Formula, done: Finished, times_ns: Integers, node: in
 class _Walk:
     """The tree of a formula with every node's numbers."""
 
-    def __init__(self, formula: Formula, done: Finished, times_ns: Integers) -> None:
+    def __init__(self, formula: Formula, done: OfflineNodes, times_ns: Integers) -> None:
         self._done = done
         self._times = times_ns
         self._nodes: list[Formula] = []
@@ -311,14 +309,15 @@ def _least_between(column: Floats, *, is_ahead: bool) -> Floats:
 
 
 class Evidence:
-    """The samples of one instance, read again whenever something is asked about them."""
+    """The samples of one instance, read again on each request: a log need not fit into memory."""
 
     def __init__(
         self, instance: Instance, regions: Mapping[str, Outline], traces: Callable[[], Iterable[Trace]]
     ) -> None:
-        """
+        """Store how to read the samples.
+
         Args:
-            traces: begins the samples anew, from what may be looked back at, in stretches of any length.
+            traces: iterates over the samples, with those looked back at, in blocks of any length.
         """
         self.instance = instance
         self._regions = regions

@@ -1,7 +1,4 @@
-"""Which change of one number flips a verdict.
-
-The number in an atom that decides, and what turning it does.
-"""
+"""Which change of one number in the deciding atom flips a verdict."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.offline import finished, new_leaves
+from spatial_replay.monitor.offline import evaluate_offline, new_leaves
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom
@@ -171,8 +168,8 @@ def _replaced(expression: Expression, kind: str, old: float, new: float) -> Expr
 _FAR = 1e300
 _DOUBLINGS = 40
 _ROUNDS, _PARTS = 4, 16
-"""How a number is searched for that does not move all samples alike: in rounds, each of which reads the log
-once and tells apart so many places between a number that does not flip the verdict and one that does."""
+"""Search for a number that does not move all samples alike: each round reads the log once, and divides the
+interval between a number that does not flip the verdict and one that does into so many parts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,13 +177,13 @@ class Threshold:
     """The number that decides an atom, and where it would flip the verdict.
 
     Attributes:
-        value: the number as written in the specification. Where none is (`a leftof b`), 0: the margin by
+        value: the number as written in the specification. Without one (`a leftof b`), 0: the margin by
             which the relation has to hold.
-        flips_at: with this number instead the verdict is another. Nearer ones leave it as it is (but for
-            rounding; of a relation under an open quantifier, or between two limits, to within 0.01 %).
+        flips_at: the nearest number that changes the verdict, up to rounding (for a relation under an open
+            quantifier, or between two limits, to within 0.01 %).
         is_written: whether the number is in the text.
-        is_exact: whether just this number flips it, and none beyond (`a dist b == c`).
-        verdict: what the verdict is then.
+        is_exact: whether only this number flips it, and none beyond (`a dist b == c`).
+        verdict: the verdict at `flips_at`.
     """
 
     value: float
@@ -197,8 +194,8 @@ class Threshold:
 
 
 Obstacle: TypeAlias = Literal["others", "limits", "infinity"]
-"""Why no number of an atom flips a verdict: other atoms decide it, too; no number that can be written goes
-far enough; or the atom is infinite."""
+"""Why no number of an atom flips a verdict: other atoms decide it too; no number that can be written is large
+enough; or the atom is infinite."""
 
 
 def threshold_of(
@@ -350,7 +347,7 @@ class _Search:
     def _evaluated(self, formula: Formula, added: Sequence[Atom | Quantified], columns: Floats) -> Verdict:
         channels = max(len(columns), len(self._leaves))
         leaves = np.concatenate([in_channels(self._leaves, channels), in_channels(columns, channels)], axis=1)
-        done = finished(formula, (*self._order, *added), leaves, self._times)
+        done = evaluate_offline(formula, (*self._order, *added), leaves, self._times)
         low, high = done.ends(self._node)
         return final_verdict(float(low[0]), float(high[0]))
 

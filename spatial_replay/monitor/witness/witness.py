@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.offline import finished
+from spatial_replay.monitor.offline import evaluate_offline
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom, deciding_atom
 from spatial_replay.monitor.witness.path import End, Evidence, deciding_path
@@ -16,7 +16,7 @@ from spatial_replay.spec.formula import Atom, Formula, Quantified, iter_nodes, o
 
 @dataclass(frozen=True, slots=True)
 class WitnessStep:
-    """A node on the way to what decides, at the sample where it counts.
+    """A node on the path to the deciding atom, at the sample that decides.
 
     Attributes:
         node: its id.
@@ -37,20 +37,20 @@ class WitnessStep:
 class Witness:
     """What decides a node's verdict over a finished log.
 
-    Robustness is made of minima and maxima, so that one atom at one sample gives it its number: of a violated
-    formula the upper end, of a satisfied one the lower, of an unknown one the ends that leave it open.
+    Robustness consists of minima and maxima, so one atom at one sample determines it: the upper end of a
+    violated formula, the lower end of a satisfied one, the ends that leave an unknown one open.
 
     Attributes:
         name: of the spec.
         object: what a template's parameter stands for, or None.
         verdict, lower, upper: of the node.
-        path: from the node to what decides, at least one step.
-        deciding: the atom; None where the path ends at `true` or `false`, at a window or a next sample
-            that the log does not have, or at a quantifier over an empty group.
-        threshold: which change of the atom's number flips the verdict; None where none does.
-        obstacle: why none does, where there is such an atom.
-        open_end: of a verdict that is settled though one end of its interval is open, the atom that leaves it
-            open, and the time of its sample.
+        path: from the node to the deciding leaf, at least one step.
+        deciding: the atom; None if the path ends at `true` or `false`, at a window or a next sample beyond
+            the log, or at a quantifier over an empty group.
+        threshold: the change of the atom's number that flips the verdict; None if there is none.
+        obstacle: why there is none, if there is an atom.
+        open_end: for a settled verdict whose interval has an open end, the atom that leaves it open, and the
+            time of its sample.
     """
 
     name: str
@@ -87,7 +87,7 @@ def find_witness(evidence: Evidence, leaves: Floats, times_ns: Integers, node: i
         node: its id.
     """
     instance = evidence.instance
-    done = finished(instance.formula, instance.program.leaves, leaves, times_ns)
+    done = evaluate_offline(instance.formula, instance.program.leaves, leaves, times_ns)
     lower, upper = (float(end[0]) + 0.0 for end in done.ends(node))
     verdict = final_verdict(lower, upper)
     end = {Verdict.SATISFIED: End.LOW, Verdict.VIOLATED: End.HIGH}.get(verdict, End.OPEN)
@@ -102,9 +102,9 @@ def find_witness(evidence: Evidence, leaves: Floats, times_ns: Integers, node: i
         return path, deciding_atom(evidence.scene(path[-1].time_ns), leaf, found.end)
 
     path, deciding = follow(end)
-    told = None
+    threshold = None
     if deciding is not None:
-        told = threshold_of(evidence, leaves, times_ns, node, verdict, deciding)
+        threshold = threshold_of(evidence, leaves, times_ns, node, verdict, deciding)
     open_end = None
     if end is not End.OPEN and lower < upper:
         other_path, other = follow(end.turned)
@@ -118,8 +118,8 @@ def find_witness(evidence: Evidence, leaves: Floats, times_ns: Integers, node: i
         upper,
         path,
         deciding,
-        told if isinstance(told, Threshold) else None,
-        None if isinstance(told, Threshold) else told,
+        threshold if isinstance(threshold, Threshold) else None,
+        None if isinstance(threshold, Threshold) else threshold,
         open_end,
     )
 

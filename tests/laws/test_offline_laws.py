@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from laws.reference import Prefix
 from laws.strategies_monitor import formulas_of_leaves, leaf_runs
-from spatial_replay.monitor.offline import finished, full_signal, window_signal
+from spatial_replay.monitor.offline import evaluate_offline, full_signal, window_signal
 from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.spec.formula import iter_nodes
 
@@ -31,7 +31,7 @@ def stretch(run, leaf, begin, end):
 def test_every_node_at_every_sample_is_what_the_definitions_say(formula, run):
     order, times = compile_formula(formula).leaves, np.array(run.times_ns)
     leaves = run.values(order)
-    done = finished(formula, order, leaves, times)
+    done = evaluate_offline(formula, order, leaves, times)
     kinds = [(False, run.nominal_leaf), (True, run.wide_leaf if run.channels == 4 else run.nominal_leaf)]
     for is_wide, leaf in kinds:
         whole = stretch(run, leaf, 0, len(run))
