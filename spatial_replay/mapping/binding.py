@@ -128,7 +128,7 @@ class _Columns:
             raise FieldError(f"{path.text}: $. is for frame, stamp and signals; give a field of the object")
         value = walk(path, self.example)
         if not is_number(value):
-            raise FieldError(f"{path.text}: {type_name(value)} where a number belongs")
+            raise FieldError(f"{path.text}: expected a number, got {type_name(value)}")
         texts = [known.text for known in self.paths]
         if path.text in texts:
             return texts.index(path.text)
@@ -251,7 +251,7 @@ def _polygon(layout: MessageLayout, example: object, style: Style) -> Get | None
     path = FieldPath.of(layout.polygon[0])
     value = walk(path, example)
     if not is_list(value):
-        raise FieldError(f"{path.text}: {type_name(value)} where a list of corners belongs")
+        raise FieldError(f"{path.text}: expected a list of corners, got {type_name(value)}")
     return getter(path, style)
 
 
@@ -266,9 +266,7 @@ def _uncertainty(
     path = FieldPath.of(str(wanted.measure) or layout.covariance or "covariance")
     value = walk(path, columns.example)
     if not is_list(value) or len(value) not in (4, 9, 36):
-        raise FieldError(
-            f"{path.text}: {type_name(value)} is not a covariance; give the path of 4, 9 or 36 numbers"
-        )
+        raise FieldError(f"{path.text}: expected a covariance of 4, 9 or 36 numbers, got {type_name(value)}")
     return None, getter(path, style)
 
 
@@ -282,7 +280,7 @@ def _frame(
             continue
         value = walk(path, root)
         if not isinstance(value, str):
-            raise FieldError(f"{path.text}: {type_name(value)} where a frame's name belongs")
+            raise FieldError(f"{path.text}: expected the name of a frame, got {type_name(value)}")
         return getter(path, style_of(root)), path.from_message
     return None
 

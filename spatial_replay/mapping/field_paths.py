@@ -161,9 +161,9 @@ def _named(path: FieldPath, value: object, name: str) -> object:
 
 def _numbered(path: FieldPath, value: object, index: int) -> object:
     if not is_list(value):
-        raise FieldError(f"{path.text}: [{index}] follows {type_name(value)}, which is not a list")
+        raise FieldError(f"{path.text}: [{index}] needs a list, got {type_name(value)}")
     if index >= len(value):
-        raise FieldError(f"{path.text}: there are only {len(value)} elements where [{index}] is asked for")
+        raise FieldError(f"{path.text}: [{index}] is out of range, there are {len(value)} elements")
     return value[index]
 
 
@@ -224,7 +224,7 @@ def iter_elements(path: FieldPath, message: object) -> Iterator[object]:
         else:
             for value in values:
                 if not is_list(value):
-                    raise FieldError(f"{path.text}: [*] follows {type_name(value)}, which is not a list")
+                    raise FieldError(f"{path.text}: [*] needs a list, got {type_name(value)}")
             values = [element for value in values for element in value]  # type: ignore[attr-defined]
     return iter(values)
 

@@ -302,7 +302,7 @@ def _described(error: Any) -> Iterator[tuple[Place, str]]:
         yield place, "a name is empty; give it a name"
     else:
         wanted = error.schema.get("description", _around(error))
-        yield place, f"{_shown(error.instance)} where this belongs: {wanted}"
+        yield place, f"expected {wanted}; got {_shown(error.instance)}"
 
 
 def _around(error: Any) -> str:

@@ -190,7 +190,7 @@ def _text(value: object, path: FieldPath) -> str:
     if field_names(value) == ("value",):
         # such as osi3.Identifier
         return str(getattr(value, "value", ""))
-    raise FieldError(f"{path.text}: {type_name(value)} where a text or a number belongs")
+    raise FieldError(f"{path.text}: expected a text or a number, got {type_name(value)}")
 
 
 def _checked(name: str) -> str:

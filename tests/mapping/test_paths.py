@@ -64,8 +64,8 @@ def test_a_path_iterates_over_nested_lists() -> None:
         ),
         (pose_stamped(0, 0), "header.frame_id.x", "a text has no field 'x'"),
         (scene(), "entitys", "foxglove.SceneUpdate has no field 'entitys'; did you mean 'entities'"),
-        (scene(), "entities[7]", r"there are only 2 elements where \[7\] is asked for"),
-        (scene(), "entities[0].id[0]", "follows a text, which is not a list"),
+        (scene(), "entities[7]", r"\[7\] is out of range, there are 2 elements"),
+        (scene(), "entities[0].id[0]", "needs a list, got a text"),
         ({"a": 1}, "b", "the JSON object has no field 'b'; its fields are a"),
         ({"a": None}, "a.b", "nothing has no field 'b'"),
         # what every object has in Python is no field
