@@ -1,4 +1,4 @@
-"""Recording: samples in, a log out, with what specifications say of them."""
+"""Recording: samples in, a log out, with the robustness of specifications beside them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Interruptions that come when nothing is half done."""
+"""Signals that are held back while a log is in an inconsistent state."""
 
 from __future__ import annotations
 
@@ -10,51 +10,51 @@ from pathlib import Path
 from types import FrameType
 
 TERMINATED = 128 + signal.SIGTERM
-"""The exit code of a process that ended because of SIGTERM, as a shell tells it."""
+"""The exit code of a process that SIGTERM ended, as shells report it."""
 
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Hold SIGINT and SIGTERM back for a while; one that came then does what it does without this.
+    """Hold SIGINT and SIGTERM back during the block; the first one that arrived is raised after it.
 
-    Signals that are ignored, or end the process at once, stay as they are; so do all outside the main thread,
-    which alone may handle them.
+    Signals that are ignored, or end the process at once, stay as they are, and so does everything outside the
+    main thread, since only that may handle signals.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    came: list[int] = []
+    arrived: list[int] = []
     for number, handler in handlers.items():
         if callable(handler):
-            signal.signal(number, lambda number, frame: came.append(number))
+            signal.signal(number, lambda number, frame: arrived.append(number))
     try:
         yield
     finally:
         for number, handler in handlers.items():
             if callable(handler):
                 signal.signal(number, handler)
-    if came:
-        signal.raise_signal(came[0])
+    if arrived:
+        signal.raise_signal(arrived[0])
 
 
 @contextmanager
 def leaving(output: Path) -> Iterator[None]:
-    """Note on an interruption that ends the block where the shorter log is."""
+    """Add to a KeyboardInterrupt the note that the shorter log can be used."""
     try:
         yield
     except KeyboardInterrupt as interruption:
         interruption.add_note(
-            f"{output} holds what was recorded until then, and says that it was interrupted"
+            f"{output} holds the samples up to the interruption, and is marked as interrupted"
         )
         raise
 
 
 @contextmanager
 def terminable() -> Iterator[None]:
-    """Let SIGTERM raise SystemExit for a while, so that what is open is closed before the process ends.
+    """Let SIGTERM raise SystemExit during the block, so that logs are closed before the process ends.
 
-    A program that handles or ignores SIGTERM, before or meanwhile, keeps its own way; outside the main
+    If the program handles or ignores SIGTERM, before or during the block, that stays; outside the main
     thread, nothing changes.
     """
     is_main = threading.current_thread() is threading.main_thread()

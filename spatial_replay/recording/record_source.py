@@ -1,4 +1,4 @@
-"""A file of tracked objects recorded as a log."""
+"""A source, such as a file of tracked objects, recorded as a log."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from spatial_replay.trace.trace import Trace
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """What was recorded.
+    """The result of a recording.
 
     Attributes:
-        samples: how many samples.
+        samples: number of samples.
         start_ns, end_ns: times of the first and the last.
-        objects: names seen.
+        objects: names of the objects.
         faults: what was lost while reading, each with its place.
-        unreadable: how many observations held a number that is not finite.
+        unreadable: number of observations with a number that is not finite.
         missing: names in the specifications that no sample had.
-        remarks: what else there is to know about the source, without anything being lost.
+        remarks: what the source reports about its samples where nothing was lost.
     """
 
     samples: int
@@ -55,23 +55,23 @@ def record_source(
 ) -> Recorded:
     """Record the samples of a source, in place under the final name.
 
-    Equal sources and specifications give equal bytes. An interruption leaves a shorter log, closed properly,
-    that says so.
+    Equal sources and specifications give equal bytes. An interruption leaves a shorter log, closed properly
+    and marked as interrupted.
 
     Args:
         inputs: files that the output must not be.
-        advance: told how many more samples are done.
+        advance: called with the number of samples of each block that is done.
 
     Raises:
         UsageError: the output is an input, or a specification cannot be recorded.
-        LogError: the source has no sample, or the machine cannot read it to its end.
+        LogError: the source has no sample, or it cannot be read to its end.
         OutputError: the output cannot be written.
     """
     refuse_inputs(output, inputs)
     refuse_templates(files)
     tally = _Tally()
     traces = _traces(source, tally)
-    # a source that holds nothing raises here, before the output is touched
+    # a source without samples raises here, before the output is touched
     first = next(traces)
     with leaving(output), open_output(output) as stream:
         about = {"source": source.name, "options": json.dumps(reading_options(source))}
@@ -80,10 +80,10 @@ def record_source(
 
 
 def _traces(source: Source, tally: _Tally) -> Iterator[Trace]:
-    """The samples of a source in stretches of one or more.
+    """Read the samples of a source, in blocks of one or more.
 
     Raises:
-        LogError: there are none, or the machine cannot read them.
+        LogError: there are none, or they cannot be read.
     """
     any_sample = False
     for block in read_blocks(source):
@@ -103,7 +103,7 @@ def _record(
     traces: Iterator[Trace],
     advance: Callable[[int], None],
 ) -> None:
-    """Write a whole log; it ends where the traces do, or are interrupted."""
+    """Write a whole log, up to the end of the traces or an interruption."""
     interrupted = True
     with ExitStack() as ending:
         # an interruption between two records would leave a log whose index does not fit
@@ -124,7 +124,7 @@ def _end(writer: LogWriter, recording: Recording, *, interrupted: bool) -> None:
 
 
 class _Tally:
-    """What was recorded so far."""
+    """Counts of what was recorded so far."""
 
     def __init__(self) -> None:
         self._times: list[int] = []

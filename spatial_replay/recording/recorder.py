@@ -1,9 +1,4 @@
-"""A recorder in the loop: the caller hands over samples, a thread of its own writes them.
-
-Compiled code loaded before the first sample, so that no sample waits for it.
-
-Compiled code loaded before the first sample, so that no decision waits for it.
-"""
+"""A recorder for a control loop: the caller hands over samples, a thread of its own writes them."""
 
 from __future__ import annotations
 
@@ -29,79 +24,34 @@ from spatial_replay.geometry.measure import Operand
 from spatial_replay.logs.mcap.writer import LogWriter
 from spatial_replay.logs.messages import MemorySink
 from spatial_replay.logs.output_file import open_output, refuse_inputs
-from spatial_replay.planning.decision_log import BlackBox
-from spatial_replay.planning.planner import Planner
-from spatial_replay.planning.settings import Settings
-from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.recording.interruption import terminable, uninterrupted
 from spatial_replay.recording.recording import Recording, refuse_templates
-from spatial_replay.spec import object_names, parse_specification, signal_names
+from spatial_replay.spec import object_names, signal_names
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
-
-def warm_up(files: Sequence[Specification], automata: Sequence[SpecAutomaton]) -> None:
-    """Record some samples into nothing, as the specifications will have it done.
-
-    With nothing in the compiler's cache this takes many seconds, otherwise a fraction of one.
-
-    Args:
-        automata: those of the specifications.
-    """
-    compile_ahead()
-    recording = Recording(MemorySink(), files, known=automata)
-    objects = ["object", *(name for file in files for name in object_names(file))]
-    signals = {name: 0.0 for file in files for name in signal_names(file)}
-    samples = [
-        Sample(
-            time_s * 10**9,
-            {
-                name: _tracked(index + time_s, 0.1 * index + time_s)
-                for index, name in enumerate(dict.fromkeys(objects))
-            },
-            signals,
-        )
-        for time_s in range(4)
-    ]
-    recording.add(Trace.from_samples(samples[:1]))
-    recording.add(Trace.from_samples(samples[1:]))
-    # nothing is known: what may be takes code of its own
-    recording.add(Trace.from_samples([Sample(10**10, {})]))
-    recording.end()
-    # what draws an arrow at a violation, of which these samples may have none
-    shapes = FootprintBatch.from_footprints([Footprint.box(x, 0, x + 1, 1) for x in range(2)])
-    contacts(shapes, *(Operand(np.array([[row]])) for row in range(2)), is_protrusion=False)
-
-
-def _tracked(kind: int, x: float) -> TrackedObject:
-    box, disc = Footprint.box(x, 0, x + 1, 1), Footprint.disc(x + 0.5, 0.5, 0.5)
-    footprint = (box, disc, Footprint((*box.parts, *disc.parts)))[kind % 3]
-    return TrackedObject(footprint, class_name="thing", yaw=x, height=(0.0, 1.0), uncertainty=0.01)
-
-
 FLUSH_S = 0.4
-"""A sample is handed to the operating system at most about this long after it was written."""
+"""About the longest time from writing a sample until the operating system has it."""
 
 _GATHER_S = 0.2
-"""How long samples are gathered before they are encoded: a few together cost hardly more than one, and while
-none are encoded, the caller has the interpreter to itself."""
+"""How long samples are gathered before they are encoded. A few together cost hardly more than one, and while
+none are encoded, the caller's thread need not wait for the interpreter lock."""
 
 _TOGETHER = 1024
-"""At most this many samples are encoded at once."""
+"""The most samples that are encoded at once."""
 
 _PAUSE_S = 0.001
-"""How long a full queue is left to empty before it is looked at again."""
+"""How long `write` waits before it checks a full queue again."""
 
 
 class Recorder:
-    """Records samples into an MCAP log, with the robustness of specifications beside them.
+    """Record samples into an MCAP log, with the robustness of specifications beside them.
 
-    The log is written in place: when the process is killed, what was written more than a second before can be
-    read. Leaving the `with` block closes the log properly, after an error or Ctrl-C too; it then says that it
-    was interrupted. SIGTERM does the same: in a `with` block of the main thread it raises SystemExit(143),
-    unless the program handles SIGTERM in a way of its own. A signal that comes while the log is closed waits
-    until that is done.
+    The log is written in place: if the process is killed, all but the last second can be read. Leaving the
+    `with` block closes the log properly, also after an error or Ctrl-C; the log then says that it was
+    interrupted. So does SIGTERM: in a `with` block of the main thread it raises SystemExit(143), unless the
+    program has a handler of its own. A signal that arrives while the log is closed waits until that is done.
 
     Use as:
 
@@ -120,15 +70,15 @@ class Recorder:
     ) -> None:
         """Begin a log.
 
-        Returns when the first sample can be written at once: the first time on a machine, numerical code is
-        compiled before, which takes many seconds.
+        Returns when the first sample can be written without delay: the first time on a machine, numerical
+        code is compiled first, which takes many seconds.
 
         Args:
             path: replaced if it exists.
-            specifications: evaluated as the samples come, without templates; one or several.
-            about: what the log's metadata should say besides: a seed, where the samples come from.
+            specifications: evaluated as the samples arrive, without templates; one or several.
+            about: further metadata of the log: a seed, where the samples come from.
             waiting: how many samples may wait for the writing thread.
-            block: when that many wait, let `write` wait too; otherwise drop samples, and count them in the
+            block: when that many wait, let `write` wait, too; otherwise drop samples, and count them in the
                 log.
 
         Raises:
@@ -141,7 +91,7 @@ class Recorder:
         refuse_templates(files)
         self._path = Path(path)
         refuse_inputs(self._path, ())
-        # an interruption can leave this kind of queue locked in no way, unlike one with a limit of its own
+        # unlike a queue with a limit of its own, an interruption never leaves this one locked
         self._queue: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._waiting = waiting
@@ -167,19 +117,19 @@ class Recorder:
 
     @property
     def dropped(self) -> int:
-        """How many samples found no place in the queue."""
+        """How many samples were dropped because the queue was full."""
         return self._dropped
 
     def write(self, sample: Sample) -> None:
-        """Hand over the next sample; returns at once unless the queue is full.
+        """Hand over the next sample; return at once unless the queue is full.
 
         Raises:
-            TraceError: a time that does not come after the last one's.
+            TraceError: a time that is not after the last one.
             OutputError: an earlier sample could not be written.
-            UsageError: what is no sample, or the recorder is closed.
+            UsageError: not a sample, or the recorder is closed.
         """
         if not isinstance(sample, Sample):
-            raise UsageError(f"{sample!r} is no sample; give a Sample(time_ns, objects)")
+            raise UsageError(f"{sample!r} is not a sample; give a Sample(time_ns, objects)")
         if self._closed:
             raise UsageError(f"{self._path.name} is closed; open another recorder")
         self._raise_failure()
@@ -198,7 +148,7 @@ class Recorder:
             self._ring()
 
     def close(self, *, interrupted: bool = False) -> None:
-        """Write what waits and finish the log; closing twice does nothing.
+        """Write all waiting samples and finish the log; closing twice does nothing.
 
         Raises:
             OutputError: something could not be written.
@@ -224,7 +174,7 @@ class Recorder:
             self.close(interrupted=error is not None)
 
     def _finish(self, *, interrupted: bool) -> None:
-        """Write the end of the log; of one that failed, nothing more."""
+        """Write the end of the log, unless writing failed before."""
         try:
             if self._failure is None:
                 self._recording.end(interrupted=interrupted, dropped=self._dropped)
@@ -238,7 +188,7 @@ class Recorder:
         self._stream.flush()
 
     def _work(self) -> None:
-        """Encode and write what waits, until told to end."""
+        """Encode and write waiting samples, until `close`."""
         flushed = time.monotonic()
         ended = False
         while not ended:
@@ -252,16 +202,16 @@ class Recorder:
                     self._flush()
                     flushed = time.monotonic()
             except Exception as error:
-                # whatever it is, it is the caller's to know: nobody sees what a thread dies of
+                # raised by the next `write`, since an error that ends a thread goes unnoticed
                 self._failure = error
 
     def _ring(self) -> None:
-        """Let the writing thread begin with what waits."""
+        """Wake the writing thread before its gathering time is over."""
         if self._bell.empty():
             self._bell.put(None)
 
     def _waiting_samples(self) -> tuple[list[Sample], bool]:
-        """What has been gathered; and whether that is the end."""
+        """Return the gathered samples, and whether the log ends with them."""
         if self._queue.qsize() < self._enough:
             with suppress(queue.Empty):
                 self._bell.get(timeout=_GATHER_S)
@@ -281,18 +231,40 @@ class Recorder:
             raise self._failure
 
 
-def warm_up_planner() -> None:
-    """Decide on a push that nobody makes.
+def warm_up(files: Sequence[Specification], automata: Sequence[SpecAutomaton]) -> None:
+    """Record some samples into memory, so that the code for the specifications is compiled and loaded.
 
-    With nothing in the compiler's cache this takes many seconds, otherwise a fraction of one.
+    With an empty compiler cache this takes many seconds, otherwise a fraction of one.
+
+    Args:
+        automata: those of the specifications, which are not compiled again.
     """
     compile_ahead()
-    task = parse_specification("F (cup leftof jug and cup dist jug >= 1)")
-    workspace = Workspace(Grid(0.0, 0.0, 1.0, 8, 8), obstacles=(Footprint.box(0, 0, 1, 1),))
-    box = BlackBox(Planner(task, Settings(workspace, "push")))
-    things = {
-        "cup": TrackedObject(Footprint.box(6, 6, 7, 7), yaw=0.0, height=(0.0, 1.0)),
-        "jug": TrackedObject(Footprint.disc(4, 4, 1), height=(0.0, 1.0)),
-    }
-    box.observe(Sample(0, things))
-    box.decide()
+    recording = Recording(MemorySink(), files, known=automata)
+    objects = ["object", *(name for file in files for name in object_names(file))]
+    signals = {name: 0.0 for file in files for name in signal_names(file)}
+    samples = [
+        Sample(
+            time_s * 10**9,
+            {
+                name: _tracked(index + time_s, 0.1 * index + time_s)
+                for index, name in enumerate(dict.fromkeys(objects))
+            },
+            signals,
+        )
+        for time_s in range(4)
+    ]
+    recording.add(Trace.from_samples(samples[:1]))
+    recording.add(Trace.from_samples(samples[1:]))
+    # without objects: intervals of unknown atoms run code of their own
+    recording.add(Trace.from_samples([Sample(10**10, {})]))
+    recording.end()
+    # the arrow at a violation, of which these samples may have none
+    shapes = FootprintBatch.from_footprints([Footprint.box(x, 0, x + 1, 1) for x in range(2)])
+    contacts(shapes, *(Operand(np.array([[row]])) for row in range(2)), is_protrusion=False)
+
+
+def _tracked(kind: int, x: float) -> TrackedObject:
+    box, disc = Footprint.box(x, 0, x + 1, 1), Footprint.disc(x + 0.5, 0.5, 0.5)
+    footprint = (box, disc, Footprint((*box.parts, *disc.parts)))[kind % 3]
+    return TrackedObject(footprint, class_name="thing", yaw=x, height=(0.0, 1.0), uncertainty=0.01)

@@ -1,4 +1,4 @@
-"""A log as it is recorded: samples in, and beside them what specifications say of them."""
+"""A log as it is recorded: samples in, samples and the messages of an evaluation out."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from spatial_replay.trace.trace import Trace
 
 
 class Recording:
-    """Writes samples to a sink as they come, in stretches of any length."""
+    """Write samples to a sink as they arrive, in blocks of any length."""
 
     def __init__(
         self,
@@ -51,11 +51,11 @@ class Recording:
 
         Args:
             files: specifications to evaluate and write beside the samples.
-            about: what else the metadata says: where the samples come from, a seed.
+            about: further metadata: where the samples come from, a seed.
             known: automata of specs of these files, which are not compiled again.
 
         Raises:
-            UsageError: a template, since it stands for objects that are not known yet.
+            UsageError: a template, since its objects are not known yet.
         """
         refuse_templates(files)
         self._files = files = logged_specifications(files)
@@ -71,22 +71,22 @@ class Recording:
         sink.add_metadata(METADATA, _metadata(files, about or {}))
         if self._evaluation.trees:
             sink.add_metadata(AUTOMATA, self._evaluation.automata_metadata())
-        kept = self._evaluation.automata_attachments(RECORDED_PREFIX)
-        for attachment in [*specification_attachments(files, RECORDED_PREFIX), *kept]:
+        automata = self._evaluation.automata_attachments(RECORDED_PREFIX)
+        for attachment in [*specification_attachments(files, RECORDED_PREFIX), *automata]:
             sink.add_attachment(attachment.name, attachment.media_type, attachment.data)
 
     def __len__(self) -> int:
-        """How many samples were taken in."""
+        """Return the number of samples so far."""
         return self._samples
 
     @property
     def files(self) -> Sequence[Specification]:
-        """The specifications, as the log keeps them."""
+        """The specifications, as the log stores them."""
         return self._files
 
     @property
     def automata(self) -> Sequence[SpecAutomaton]:
-        """One for each result, or why it has none."""
+        """The automaton of each result, or the reason why it has none."""
         return self._evaluation.automata
 
     @property
@@ -96,14 +96,14 @@ class Recording:
         return {tree.name: stream.verdict for tree, stream in reported}
 
     def add(self, trace: Trace, beside: Messages | None = None) -> None:
-        """Take in the next samples.
+        """Write the next samples.
 
         Args:
             beside: messages of other topics that are not derived from samples, none before the first of these
                 samples; a replay keeps them.
 
         Raises:
-            TraceError: samples that do not come after those before.
+            TraceError: samples that are not after those before.
         """
         stretches = self._evaluation.extend(trace)
         own = messages_of(_OBJECTS, trace.times_ns, encode_objects(trace), self._samples)
@@ -121,7 +121,7 @@ class Recording:
             self._result_hash.add(index, stretch.series)
 
     def end(self, *, interrupted: bool = False, dropped: int = 0) -> None:
-        """Write what comes after the last sample; the certificate is that of a replay of the log."""
+        """Write what follows the last sample; the certificate is that of a replay of the log."""
         ending = {
             "samples": str(self._samples),
             "dropped": str(dropped),
@@ -147,10 +147,10 @@ def _metadata(files: Sequence[Specification], about: Mapping[str, str]) -> dict[
 
 
 def refuse_templates(files: Sequence[Specification]) -> None:
-    """That specifications can be evaluated as samples come.
+    """Check that specifications can be evaluated as samples arrive.
 
     Raises:
-        UsageError: a template, since it stands for objects that are not known yet.
+        UsageError: a template, since its objects are not known yet.
     """
     for file in files:
         for spec in file.results:

@@ -1,1 +1,1 @@
-"""Runs: a world, whoever moves what is in it, and the log of what happens."""
+"""Simulated runs, scripted or planned, recorded as logs."""

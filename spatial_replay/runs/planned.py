@@ -1,10 +1,6 @@
-"""A simulated world whose robot does what a planner decides, recorded with every decision.
+"""A simulated world whose robot executes a planner's steps, recorded with every decision.
 
-A planner, what executes its steps and the log of both, from the first sample to the end.
-
-The robot of a simulated world as what executes a planner's steps.
-
-How finely and how carefully is planned in a simulated world.
+`record_plan` sets up world, planner and log; `PlanLoop` observes, decides and executes until the end.
 """
 
 from __future__ import annotations
@@ -19,26 +15,28 @@ from types import MappingProxyType
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.automata.automaton import Automaton
+from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import UsageError
+from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.planning.decision_log import PLAN_METADATA, BlackBox
 from spatial_replay.planning.decisions import Executor, Kind, Outcome, Step
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, Skill, text_from_settings
 from spatial_replay.planning.workspace import Grid, Workspace
-from spatial_replay.recording.recorder import warm_up_planner
 from spatial_replay.runs.run_log import RunLog, run_log
 from spatial_replay.runs.scripted import about_run, refuse_unknown_names
 from spatial_replay.simulation.injection import Injection
 from spatial_replay.simulation.world import World
 from spatial_replay.simulation.worlds import default_specification, make_world
+from spatial_replay.spec import parse_specification
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
 
 
 @dataclass(frozen=True, slots=True)
-class _Care:
-    """How finely and carefully is planned for a skill, in metres."""
+class _Preset:
+    """Resolution and distances for the planning of a skill, in metres."""
 
     cell_size: float
     margin: float
@@ -47,37 +45,37 @@ class _Care:
     room: float
 
 
-_CARE: MappingProxyType[Skill, _Care] = MappingProxyType(
+_PRESETS: MappingProxyType[Skill, _Preset] = MappingProxyType(
     {
-        # a block that is pushed ends up within a centimetre of where it should
-        "push": _Care(cell_size=0.005, margin=0.012, constraint_margin=0.008, clearance=0.0, room=0.0),
-        # fingers need room beside what they hold, and the hand above that beside taller things
-        "place": _Care(cell_size=0.02, margin=0.01, constraint_margin=0.01, clearance=0.02, room=0.09),
+        # a pushed block stops within a centimetre of its target
+        "push": _Preset(cell_size=0.005, margin=0.012, constraint_margin=0.008, clearance=0.0, room=0.0),
+        # fingers need room beside what they hold, and the hand beside taller things
+        "place": _Preset(cell_size=0.02, margin=0.01, constraint_margin=0.01, clearance=0.02, room=0.09),
     }
 )
 
 
 def settings_for(world: World) -> Settings:
-    """How to plan in a world."""
+    """Return the planner settings for a world."""
     bodies, space = world.bodies, world.workspace
     skill: Skill = world.skill
-    care = _CARE[skill]
+    preset = _PRESETS[skill]
     workspace = Workspace(
-        Grid.over(space.xmin, space.ymin, space.xmax, space.ymax, care.cell_size),
+        Grid.over(space.xmin, space.ymin, space.xmax, space.ymax, preset.cell_size),
         yaws=space.yaws,
         nearest=space.nearest,
         farthest=space.farthest,
         obstacles=tuple(world.obstacles),
         supports=frozenset(body.name for body in bodies if body.support),
-        clearance=care.clearance,
+        clearance=preset.clearance,
     )
     return Settings(
         workspace,
         skill,
         movable=tuple(body.name for body in bodies if body.movable),
-        margin=care.margin,
-        constraint_margin=care.constraint_margin,
-        room=care.room,
+        margin=preset.margin,
+        constraint_margin=preset.constraint_margin,
+        room=preset.room,
     )
 
 
@@ -105,39 +103,38 @@ class WorldExecutor:
 
 
 HOLDING_SAMPLES = 30
-"""How long it has to stay satisfied before a run ends."""
+"""How many samples the specification has to stay satisfied before a run ends."""
 MOST_WAITING_SAMPLES = 150
-"""How long it waits between two motions for what it does not see, or while nothing comes of it."""
+"""The most samples without progress between two motions, before a run ends."""
 
 
 class PlanLoop:
-    """Lets a planner decide and an executor act until there is nothing more to do.
+    """Let a planner decide and an executor act until there is nothing more to do.
 
-    Every sample goes to `observe`, during an execution too. The loop comes to an end: motions are bounded by
-    the attempts of the automaton's edges, waiting by a number of samples in which the automaton does not get
-    into another state.
+    Every sample goes to `observe`, also during an execution. The loop ends: motions are bounded by the
+    attempts at the automaton's edges, waiting by the samples in which the automaton reaches no new state.
 
     Attributes:
-        executed: how many motions there were.
-        planning_s: how long the planner thought, in seconds of real time.
+        executed: the number of motions.
+        planning_s: time spent planning, in seconds of real time.
     """
 
     def __init__(self, box: BlackBox, log: RunLog, executor: Executor, look: Callable[[], None]) -> None:
         """Begin before the first sample.
 
         Args:
-            executor: its samples have to come to `observe`.
-            look: lets one more sample come to `observe`, while nothing is moved.
+            executor: executes steps; its samples have to go to `observe`.
+            look: takes one more sample, which has to go to `observe`, while nothing moves.
         """
         self._box, self._log, self._executor, self._look = box, log, executor, look
         self.executed = 0
         self.planning_s = 0.0
 
     def observe(self, sample: Sample) -> None:
-        """Take in the next sample.
+        """Log the next sample and update the planner.
 
         Raises:
-            TraceError: it does not come after the one before.
+            TraceError: it is not after the one before.
             OutputError: the log cannot be written.
         """
         self._log.write(sample)
@@ -146,7 +143,7 @@ class PlanLoop:
         self.planning_s += time.perf_counter() - began
 
     def run(self) -> Step:
-        """Look, decide and act; the last decision."""
+        """Look, decide and act; return the last decision."""
         self._look()
         waited, reached = 0, {self._box.planner.states}
         while True:
@@ -157,6 +154,7 @@ class PlanLoop:
                 self.executed, waited, reached = self.executed + 1, 0, {self._box.planner.states}
             elif step.kind == "wait" and waited < MOST_WAITING_SAMPLES:
                 self._look()
+                # samples count only while the automaton reaches no new state
                 waited += not step.ahead or self._box.planner.states in reached
                 reached.add(self._box.planner.states)
             elif step.kind != "hold" or self._holds():
@@ -170,29 +168,29 @@ class PlanLoop:
         return step
 
     def _holds(self) -> bool:
-        """Whether it stays as satisfied as it can be while nothing is moved."""
+        """Look for a while without a motion; return whether the specification stays satisfied."""
         for _ in range(HOLDING_SAMPLES):
             self._look()
         planner = self._box.planner
-        # doubt about the past stays, whatever is done
+        # no motion can remove doubt about the past
         return planner.is_accepting or planner.is_doubtful
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedRun:
-    """What was planned and recorded.
+    """The result of a planned run.
 
     Attributes:
-        samples: how many samples.
+        samples: number of samples.
         seconds: from the first to the last.
-        ended: the kind of the last decision: "hold" where the specification is satisfied, as far as the
-            planner can tell.
-        name: of the spec that was planned for.
-        verdict: what the log says of that, uncertainty of positions included.
+        ended: the kind of the last decision: "hold" if the specification is satisfied, as far as the planner
+            can see.
+        name: the name of the planned spec.
+        verdict: its verdict in the log, which includes the uncertainty of positions.
         reason: the last decision in words.
-        steps: how many motions were executed.
-        pruned: how many edges of the automaton were given up.
-        planning_s: how long the planner thought, in seconds of real time.
+        steps: number of executed motions.
+        pruned: number of pruned edges of the automaton.
+        planning_s: time spent planning, in seconds of real time.
     """
 
     samples: int
@@ -227,62 +225,52 @@ def record_plan(
     """Let a planner satisfy a specification in a scenario's world; equal arguments give equal bytes.
 
     Args:
-        file: what to plan for; None takes the scenario's own.
-        name: which of its results to plan for; without it, the only one. All are evaluated.
+        file: the specification to plan for; None takes that of the scenario.
+        name: the result to plan for, if there are several. All are evaluated.
         inputs: files that the output must not be.
-        advance: told how many more samples are done.
+        advance: called with the number of new samples.
 
     Raises:
         NoAutomatonError: a specification without an automaton.
         SpecificationError: names that the world does not have.
-        UsageError: no such scenario, no simulator, no such result, several to choose from, one that cannot be
-            planned for.
+        UsageError: no such scenario, no simulator, no such result, several to choose from, a result that
+            cannot be planned for.
         OutputError: the output cannot be written.
     """
     (kept,) = logged_specifications([default_specification(scenario) if file is None else file])
     _refuse_missing(kept, name)
     made = about_run(scenario, seed=seed, noise_m=noise_m, injections=injections)
     about = {**made, "planned": "true"}
-    # a world or a planner that cannot be made leaves the output alone
+    # an error in the world or the planner leaves the output untouched
     with closing(make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, gui=gui)) as world:
         refuse_unknown_names([kept], world.sample())
         planner = Planner(kept, settings_for(world), name=name)
-        warm_up_planner()
+        _warm_up_planner()
         with run_log(output, [kept], about, inputs, _known(kept, planner.automaton)) as log:
             log.add_metadata(PLAN_METADATA, _plan(planner, kept))
             loop = PlanLoop(BlackBox(planner), log, WorldExecutor(world, world.skill), world.step)
-            last = _satisfied(world, loop, advance)
-        return _told(log, loop, planner.automaton.name, last)
 
+            def observe(sample: Sample) -> None:
+                loop.observe(sample)
+                advance(1)
 
-def _satisfied(world: World, loop: PlanLoop, advance: Callable[[int], None]) -> Step:
-    """The last decision of a loop that hears every sample of a world."""
-
-    def hear(sample: Sample) -> None:
-        loop.observe(sample)
-        advance(1)
-
-    world.attach(hear)
-    return loop.run()
-
-
-def _told(log: RunLog, loop: PlanLoop, name: str, last: Step) -> PlannedRun:
-    """What came of a run that has ended."""
-    return PlannedRun(
-        samples=log.samples,
-        seconds=log.seconds,
-        ended=last.kind,
-        name=name,
-        verdict=log.verdicts[name],
-        reason=last.reason,
-        steps=loop.executed,
-        pruned=len(last.pruned),
-        planning_s=loop.planning_s,
-    )
+            world.attach(observe)
+            last = loop.run()
+        return PlannedRun(
+            samples=log.samples,
+            seconds=log.seconds,
+            ended=last.kind,
+            name=planner.automaton.name,
+            verdict=log.verdicts[planner.automaton.name],
+            reason=last.reason,
+            steps=loop.executed,
+            pruned=len(last.pruned),
+            planning_s=loop.planning_s,
+        )
 
 
 def _plan(planner: Planner, file: Specification) -> dict[str, str]:
-    """What a log's metadata keeps to make the decisions again."""
+    """Return the metadata from which the decisions can be recomputed."""
     return {
         "settings": text_from_settings(planner.settings),
         "file": file.filename,
@@ -291,20 +279,33 @@ def _plan(planner: Planner, file: Specification) -> dict[str, str]:
 
 
 def _refuse_missing(file: Specification, name: str | None) -> None:
-    """That a file has a result.
-
-    Raises:
-        UsageError: it has none of that name.
-    """
+    """Raise UsageError if a file has no result of a name."""
     results = [spec.name for spec in file.results]
     if name is not None and name not in results:
         raise UsageError(f"{file.filename} has no result {name!r}; its results are: {', '.join(results)}")
 
 
 def _known(file: Specification, automaton: Automaton) -> list[SpecAutomaton]:
-    """The automaton that is planned with, as a log keeps it."""
+    """Return the automaton that is planned with, as a log stores it."""
     return [
         SpecAutomaton(spec.name, file, spec, automaton)
         for spec in file.results
         if spec.name == automaton.name
     ]
+
+
+def _warm_up_planner() -> None:
+    """Plan a push that is not executed, so that the first decision does not wait for the compiler.
+
+    With an empty compiler cache this takes many seconds, otherwise a fraction of one.
+    """
+    compile_ahead()
+    task = parse_specification("F (cup leftof jug and cup dist jug >= 1)")
+    workspace = Workspace(Grid(0.0, 0.0, 1.0, 8, 8), obstacles=(Footprint.box(0, 0, 1, 1),))
+    box = BlackBox(Planner(task, Settings(workspace, "push")))
+    objects = {
+        "cup": TrackedObject(Footprint.box(6, 6, 7, 7), yaw=0.0, height=(0.0, 1.0)),
+        "jug": TrackedObject(Footprint.disc(4, 4, 1), height=(0.0, 1.0)),
+    }
+    box.observe(Sample(0, objects))
+    box.decide()

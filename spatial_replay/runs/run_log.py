@@ -1,4 +1,4 @@
-"""The log of a run that waits for it: whatever time the log takes, no sample is lost."""
+"""The log of a run that waits for it: no sample is dropped, however long writing takes."""
 
 from __future__ import annotations
 
@@ -19,12 +19,11 @@ from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
 _STRETCH = 30
-"""Samples that are written together. After each such stretch what was written can be read, even if the
-process is killed."""
+"""Samples that are written together. What was written can be read even if the process is killed."""
 
 
 class RunLog:
-    """A log being written: samples as they come, and messages about what was decided in between.
+    """A log being written: samples as they arrive, and messages about decisions in between.
 
     Equal samples, specifications and messages give equal bytes. Use `run_log` to make one.
     """
@@ -39,7 +38,7 @@ class RunLog:
 
     @property
     def samples(self) -> int:
-        """How many samples were taken in."""
+        """The number of samples so far."""
         return self._samples
 
     @property
@@ -49,14 +48,14 @@ class RunLog:
 
     @property
     def verdicts(self) -> Mapping[str, Verdict]:
-        """The verdict of each result, by its name, on what was written; the final one once the log ended."""
+        """The verdict of each result, by its name, on what was written; final when the log has ended."""
         return self._recording.verdicts
 
     def write(self, sample: Sample) -> None:
-        """Take in the next sample.
+        """Add the next sample.
 
         Raises:
-            TraceError: it does not come after the one before.
+            TraceError: it is not after the one before.
             OutputError: the log cannot be written.
         """
         if not self._samples:
@@ -64,7 +63,7 @@ class RunLog:
         self._last_ns = sample.time_ns
         self._samples += 1
         if len(self._waiting) >= _STRETCH:
-            # what is told of the newest sample has its time, and no later sample comes before that
+            # flushed only when the next sample arrives: messages about the newest sample have its time
             self.flush()
         self._waiting.append(sample)
 
@@ -83,7 +82,7 @@ class RunLog:
             self._writer.add_metadata(name, data)
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """Keep a file in the log.
+        """Attach a file to the log.
 
         Raises:
             OutputError: the log cannot be written.
@@ -93,13 +92,13 @@ class RunLog:
             self._writer.add_attachment(name, media_type, data)
 
     def flush(self) -> None:
-        """Write everything taken in so far, so that it can be read whatever happens to the process."""
+        """Write everything so far, so that it can be read even if the process is killed."""
         with uninterrupted():
             self._write_waiting()
             self._writer.flush()
 
     def end(self, *, interrupted: bool = False) -> None:
-        """Write what comes after the last sample, and close the log."""
+        """Write what follows the last sample, and close the log."""
         self._write_waiting()
         self._recording.end(interrupted=interrupted)
         self._writer.close()
@@ -121,11 +120,11 @@ def run_log(
 ) -> Iterator[RunLog]:
     """Open the log of a run, in place under its final name, and close it properly however the run ends.
 
-    After an interruption or an error the log is shorter, and says that it was interrupted.
+    After an interruption or an error the log is shorter, and marked as interrupted.
 
     Args:
         files: specifications to evaluate and write beside the samples.
-        about: what else the metadata says: the scenario, a seed.
+        about: further metadata: the scenario, a seed.
         inputs: files that the output must not be.
         known: automata of specs of these files, which are not compiled again.
 
@@ -137,7 +136,7 @@ def run_log(
     refuse_templates(files)
     interrupted = True
     with leaving(output), terminable(), open_output(output) as stream, ExitStack() as ending:
-        # an interruption meanwhile leaves a log that is ended all the same
+        # an interruption between these lines would leave a log without an end
         with uninterrupted():
             writer = LogWriter(stream)
             log = RunLog(writer, Recording(writer, files, about, known))

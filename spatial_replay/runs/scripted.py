@@ -1,7 +1,4 @@
-"""A simulated world whose robot follows a script, recorded.
-
-Names in specifications, compared with what a simulated world has.
-"""
+"""A simulated world whose robot follows a script, recorded."""
 
 from __future__ import annotations
 
@@ -23,13 +20,13 @@ from spatial_replay.trace.sample import Sample
 
 
 def refuse_unknown_names(files: Iterable[Specification], sample: Sample) -> None:
-    """That a world has what specifications name.
+    """Check that a world has the objects and signals that specifications name.
 
     Args:
-        sample: of the world, which always shows everything that it has.
+        sample: a sample of the world, which always shows all objects.
 
     Raises:
-        SpecificationError: with every name that it does not have.
+        SpecificationError: with every missing name.
     """
     objects, signals = sorted(sample.objects), sorted(sample.signals)
     remarks = [remark for file in files for remark in check_names(file, objects, signals, where="world")]
@@ -40,10 +37,10 @@ def refuse_unknown_names(files: Iterable[Specification], sample: Sample) -> None
 
 @dataclass(frozen=True, slots=True)
 class SimulatedRun:
-    """What was recorded.
+    """The result of a simulated run.
 
     Attributes:
-        samples: how many samples.
+        samples: number of samples.
         seconds: from the first to the last.
         objects: their names.
         outcome: how the robot's motion ended, in words.
@@ -71,10 +68,10 @@ def record_script(
     """Record a scenario's world while its robot follows the script; equal arguments give equal bytes.
 
     Args:
-        files: specifications to evaluate meanwhile; None takes the scenario's own.
-        duration_ns: how long, in simulated time; None ends with the script.
+        files: specifications to evaluate during the run; None takes that of the scenario.
+        duration_ns: duration in simulated time; None ends with the script.
         inputs: files that the output must not be.
-        advance: told how many more samples are done.
+        advance: called with the number of new samples.
 
     Raises:
         SpecificationError: names that the world does not have.
@@ -85,33 +82,33 @@ def record_script(
         raise UsageError("a run of 0 s has no sample; give a longer duration")
     files = [default_specification(scenario)] if files is None else list(files)
     about = about_run(scenario, seed=seed, noise_m=noise_m, injections=injections)
-    # a world that cannot be made, or has not what is named, leaves the output alone
+    # an error in the world or a missing name leaves the output untouched
     with closing(make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, gui=gui)) as world:
         refuse_unknown_names(files, world.sample())
         with run_log(output, files, about, inputs) as log:
-            result = _followed(world, log, duration_ns, advance)
+            result = _follow_script(world, log, duration_ns, advance)
         outcome = "stopped in the middle of its motion" if result is None else result.reason
         return SimulatedRun(log.samples, log.seconds, tuple(world.scene.bodies), outcome)
 
 
 def about_run(scenario: str, *, seed: int, noise_m: float, injections: Sequence[Injection]) -> dict[str, str]:
-    """What a log's metadata keeps of how a run was made."""
+    """Return the metadata about how a run was made."""
     options = {"seed": seed, "noise_m": noise_m, "inject": [str(each) for each in injections]}
     return {"source": scenario, "seed": str(seed), "options": json.dumps(options)}
 
 
-def _followed(
+def _follow_script(
     world: Tabletop, log: RunLog, duration_ns: int | None, advance: Callable[[int], None]
 ) -> Execution | None:
-    """How the script went, every sample of it in the log; None if it was not done within the duration."""
+    """Follow the script and log every sample; return its result, None if the duration ended before it."""
 
-    def hear(sample: Sample) -> None:
+    def observe(sample: Sample) -> None:
         log.write(sample)
         advance(1)
 
-    world.attach(hear)
+    world.attach(observe)
     result = world.follow(world.script(), duration_ns)
     if not log.samples:
-        # the robot had nothing to do, or could do nothing
+        # without a motion there is no sample: take the one of the world at rest
         world.step()
     return result

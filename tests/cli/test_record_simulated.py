@@ -105,7 +105,7 @@ def test_an_interrupted_simulation_is_a_valid_shorter_log(tmp_path: Path) -> Non
         130,
         [
             "spatial-replay: error: interrupted",
-            "  run.mcap holds what was recorded until then, and says that it was interrupted",
+            "  run.mcap holds the samples up to the interruption, and is marked as interrupted",
         ],
     )
     count = len(read_trace(path))

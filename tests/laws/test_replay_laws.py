@@ -57,7 +57,7 @@ def test_a_replay_of_a_replay_is_the_replay(replay: tuple[Trace, Specification])
 
 @FEW
 @given(replays(), st.integers(1, 4), st.integers(1, 3), st.data())
-def test_how_a_source_is_cut_changes_nothing(
+def test_how_a_source_is_split_into_blocks_changes_nothing(
     replay: tuple[Trace, Specification], size: int, every: int, data: st.DataObject
 ) -> None:
     trace, spec = replay
@@ -80,7 +80,7 @@ def test_how_a_source_is_cut_changes_nothing(
 
 @FEW
 @given(recordings(max_size=8))
-def test_a_track_file_and_its_recorded_log_are_one_recording(drawn: Recording) -> None:
+def test_a_track_file_and_its_recorded_log_have_one_certificate_and_verdict(drawn: Recording) -> None:
     certain = Trace.from_samples(drawn.trace().samples())
     spec = parse_specification("spec s = G battery >= 1\nspec t = F battery <= 0.75")
     with TemporaryDirectory() as folder:
@@ -99,7 +99,7 @@ def test_a_track_file_and_its_recorded_log_are_one_recording(drawn: Recording) -
 
 @FEW
 @given(replays())
-def test_what_was_evaluated_live_is_what_a_replay_finds(replay: tuple[Trace, Specification]) -> None:
+def test_a_recorder_and_a_replay_give_the_same_results(replay: tuple[Trace, Specification]) -> None:
     trace, spec = replay
     if _choices(spec):
         return
@@ -114,7 +114,7 @@ def test_what_was_evaluated_live_is_what_a_replay_finds(replay: tuple[Trace, Spe
         assert ours.messages == theirs.messages
 
 
-def test_neither_the_process_nor_its_hash_seed_shows_in_a_file(tmp_path: Path) -> None:
+def test_a_file_depends_neither_on_the_process_nor_on_its_hash_seed(tmp_path: Path) -> None:
     write_tracks(run(), tmp_path / "run.jsonl")
     (tmp_path / "a.spatial").write_text(
         "group all_of = all\nregion z = box(0, 0, 1, 1)\nregion a = box(1, 0, 3, 1)\n"

@@ -53,7 +53,7 @@ def test_samples_are_read_back_as_they_were_written(tmp_path: Path) -> None:
     assert _ending(path) == {"samples": "12", "dropped": "0", "interrupted": "false"}
 
 
-def test_an_error_in_the_loop_closes_the_log_and_says_so(tmp_path: Path) -> None:
+def test_an_error_in_the_loop_closes_the_log_and_marks_it_as_interrupted(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with pytest.raises(ZeroDivisionError), Recorder(path) as recorder:
         recorder.write(sample(0))
@@ -74,7 +74,7 @@ def test_times_must_increase(tmp_path: Path) -> None:
     assert len(read_trace(path)) == 2
 
 
-def test_a_closed_recorder_takes_no_more_and_closes_once(tmp_path: Path) -> None:
+def test_a_closed_recorder_refuses_samples_and_closes_once(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "run.mcap")
     recorder.close()
     recorder.close()
@@ -83,7 +83,7 @@ def test_a_closed_recorder_takes_no_more_and_closes_once(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("waiting", [1, 2, 3000])
-def test_a_loop_that_may_wait_loses_nothing(tmp_path: Path, waiting: int) -> None:
+def test_a_loop_that_may_wait_loses_no_sample(tmp_path: Path, waiting: int) -> None:
     path = tmp_path / "run.mcap"
     with Recorder(path, specifications=[SPEC], waiting=waiting) as recorder:
         for index in range(60):
@@ -91,7 +91,7 @@ def test_a_loop_that_may_wait_loses_nothing(tmp_path: Path, waiting: int) -> Non
     assert (read_trace(path), recorder.dropped) == (run(60), 0)
 
 
-def test_a_loop_that_may_not_wait_drops_and_counts(tmp_path: Path) -> None:
+def test_a_loop_that_may_not_wait_drops_samples_and_counts_them(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with Recorder(path, specifications=[SPEC], waiting=1, block=False) as recorder:
         for index in range(3000):
@@ -108,7 +108,7 @@ def test_a_loop_that_may_not_wait_drops_and_counts(tmp_path: Path) -> None:
         ({"specifications": [parse_specification("spec s(ego) = F ego ovlp a")]}, "is a template"),
     ],
 )
-def test_what_cannot_be_recorded_touches_no_file(tmp_path: Path, options: dict[str, int], said: str) -> None:
+def test_invalid_options_leave_the_file_untouched(tmp_path: Path, options: dict[str, int], said: str) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(b"before")
     with pytest.raises(UsageError, match=said):
@@ -116,7 +116,7 @@ def test_what_cannot_be_recorded_touches_no_file(tmp_path: Path, options: dict[s
     assert path.read_bytes() == b"before"
 
 
-def test_a_full_disk_reaches_the_loop() -> None:
+def test_a_full_disk_is_raised_in_the_loop() -> None:
     if not Path("/dev/full").is_char_device():
         pytest.skip("no /dev/full here")
     with pytest.raises(OutputError, match="no space left on the device"), Recorder("/dev/full") as recorder:
@@ -131,12 +131,12 @@ def test_one_specification_needs_no_list(tmp_path: Path) -> None:
     assert ("recorded/blocks.spatial", SPECIFICATION.encode()) in attachments
 
 
-def test_what_is_no_sample_is_named(tmp_path: Path) -> None:
-    with Recorder(tmp_path / "run.mcap") as recorder, pytest.raises(UsageError, match="3 is no sample"):
+def test_anything_but_a_sample_is_refused(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "run.mcap") as recorder, pytest.raises(UsageError, match="3 is not a sample"):
         recorder.write(3)  # type: ignore[arg-type]
 
 
-def test_what_describes_the_log_is_there_before_the_first_sample(tmp_path: Path) -> None:
+def test_metadata_is_written_before_the_first_sample(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with Recorder(path, specifications=SPEC):
         begun = path.read_bytes()
@@ -178,7 +178,7 @@ def test_closing_is_not_interrupted(tmp_path: Path) -> None:
     assert _ending(path) == {"samples": "3000", "dropped": "0", "interrupted": "false"}
 
 
-def test_a_program_keeps_its_own_way_with_sigterm(tmp_path: Path) -> None:
+def test_a_handler_for_sigterm_of_the_program_stays(tmp_path: Path) -> None:
     came: list[int] = []
     before = signal.signal(signal.SIGTERM, lambda number, frame: came.append(number))
     try:
@@ -219,7 +219,7 @@ def _loop(folder: Path, **environment: str) -> subprocess.Popen[str]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_ended_process_leaves_a_proper_log(tmp_path: Path, number: signal.Signals) -> None:
+def test_a_terminated_process_leaves_a_complete_log(tmp_path: Path, number: signal.Signals) -> None:
     with _loop(tmp_path) as process:
         assert process.stdout is not None
         for _ in range(20):
@@ -234,7 +234,7 @@ def test_an_ended_process_leaves_a_proper_log(tmp_path: Path, number: signal.Sig
 
 
 @pytest.mark.parametrize("is_cold", [False, True], ids=["warm", "cold"])
-def test_what_is_older_than_a_second_survives_a_kill(tmp_path: Path, is_cold: bool) -> None:
+def test_samples_older_than_a_second_survive_a_kill(tmp_path: Path, is_cold: bool) -> None:
     # without a cache of compiled code, a process compiles all that it uses
     with _loop(tmp_path, **({"NUMBA_CACHE_DIR": str(tmp_path / "cache")} if is_cold else {})) as process:
         assert process.stdout is not None

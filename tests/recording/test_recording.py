@@ -11,7 +11,7 @@ from spatial_replay.recording import ENDING, Recording
 from spatial_replay.spec.load import parse_specification
 
 
-def test_what_describes_the_log_comes_before_the_samples() -> None:
+def test_metadata_comes_before_the_samples() -> None:
     sink = MemorySink()
     Recording(sink, [parse_specification(SPECIFICATION)], {"seed": "7"})
     assert [name for name, _ in sink.metadata] == ["spatial_replay", "spatial_replay_automata"]
@@ -21,7 +21,7 @@ def test_what_describes_the_log_comes_before_the_samples() -> None:
     assert sink.messages == []
 
 
-def test_messages_do_not_depend_on_how_samples_come() -> None:
+def test_messages_do_not_depend_on_how_samples_are_split() -> None:
     sinks = [MemorySink() for _ in range(2)]
     for sink, size in zip(sinks, (1, 100), strict=True):
         recording = Recording(sink, [parse_specification(SPECIFICATION)])
@@ -34,7 +34,7 @@ def test_messages_do_not_depend_on_how_samples_come() -> None:
     assert sinks[0].metadata == sinks[1].metadata
 
 
-def test_the_end_counts_what_came() -> None:
+def test_the_end_counts_the_samples() -> None:
     sink = MemorySink()
     recording = Recording(sink)
     recording.add(run())
@@ -42,7 +42,7 @@ def test_the_end_counts_what_came() -> None:
     assert sink.metadata[-2] == (ENDING, {"samples": "12", "dropped": "3", "interrupted": "true"})
 
 
-def test_samples_follow_each_other() -> None:
+def test_times_of_samples_increase() -> None:
     recording = Recording(MemorySink(), [parse_specification(SPECIFICATION)])
     recording.add(run())
     with pytest.raises(TraceError, match="order of their times"):

@@ -30,14 +30,14 @@ def test_a_track_file_becomes_a_log_of_the_same_samples(tmp_path: Path) -> None:
     assert sum(done) == 12
 
 
-def test_how_the_file_is_cut_does_not_show(tmp_path: Path) -> None:
+def test_how_the_source_is_split_into_blocks_changes_no_byte(tmp_path: Path) -> None:
     spec = parse_specification(SPECIFICATION)
     for size in (1, 4, 100):
         record_source(PiecewiseSource(run(40), size), tmp_path / f"{size}.mcap", [spec])
     assert len({(tmp_path / f"{size}.mcap").read_bytes() for size in (1, 4, 100)}) == 1
 
 
-def test_how_polygons_were_read_is_in_the_log_and_its_copies(tmp_path: Path) -> None:
+def test_the_reading_of_polygons_is_recorded_in_the_log_and_its_copies(tmp_path: Path) -> None:
     tracks, log = tmp_path / "run.jsonl", tmp_path / "run.mcap"
     polygon = [[0, 0], [2, 0], [2, 2], [1, 1]]
     tracks.write_text(json.dumps({"time_ns": 0, "objects": [{"name": "cube", "polygon": polygon}]}))
@@ -58,13 +58,13 @@ def _about(path: Path) -> dict[str, str]:
     return dict(content_of(path).metadata)["spatial_replay"]
 
 
-def test_names_that_no_sample_has_are_told(tmp_path: Path) -> None:
+def test_names_that_no_sample_has_are_reported(tmp_path: Path) -> None:
     spec = parse_specification("F cub ovlp cube")
     recorded = record_source(PiecewiseSource(run(), 4), tmp_path / "run.mcap", [spec])
     assert [remark.message for remark in recorded.missing] == ["the log never has the object 'cub'"]
 
 
-def test_an_interruption_leaves_a_shorter_log_that_says_so(tmp_path: Path) -> None:
+def test_an_interruption_leaves_a_shorter_log_marked_as_interrupted(tmp_path: Path) -> None:
     def interrupt_after_two_blocks(samples: int) -> None:
         done.append(samples)
         if len(done) == 2:
@@ -82,7 +82,7 @@ def test_an_interruption_leaves_a_shorter_log_that_says_so(tmp_path: Path) -> No
     }
 
 
-def test_what_cannot_be_recorded_leaves_the_output_alone(tmp_path: Path) -> None:
+def test_an_error_before_the_first_sample_leaves_the_output_untouched(tmp_path: Path) -> None:
     output = tmp_path / "run.mcap"
     output.write_bytes(b"before")
     template = parse_specification("spec s(ego) = F ego ovlp cube")
@@ -104,7 +104,7 @@ class _FailingDisk(PiecewiseSource):
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
 
-def test_a_source_that_cannot_be_read_is_named_and_what_was_read_is_kept(tmp_path: Path) -> None:
+def test_a_source_that_fails_is_named_and_its_samples_up_to_there_are_recorded(tmp_path: Path) -> None:
     path = tmp_path / "out.mcap"
     with pytest.raises(LogError, match=r"^run could not be read: .*; copy it"):
         record_source(_FailingDisk(run(), 5), path)
@@ -112,13 +112,13 @@ def test_a_source_that_cannot_be_read_is_named_and_what_was_read_is_kept(tmp_pat
     assert dict(content_of(path).metadata)[ENDING]["interrupted"] == "true"
 
 
-def test_a_replay_names_the_source_too_and_leaves_no_file(tmp_path: Path) -> None:
+def test_a_replay_of_a_source_that_fails_names_it_and_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"^run could not be read: "):
         run_replay(_FailingDisk(run(), 5), [parse_specification(SPECIFICATION)], output=tmp_path / "out.mcap")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_disk_is_said() -> None:
+def test_a_full_disk_is_reported() -> None:
     if not Path("/dev/full").is_char_device():
         pytest.skip("no /dev/full here")
     with pytest.raises(OutputError, match="/dev/full could not be written: no space left on the device"):

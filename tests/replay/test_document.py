@@ -20,7 +20,7 @@ def found() -> dict[str, Any]:
     return loaded
 
 
-def test_it_says_what_was_evaluated(found: dict[str, Any]) -> None:
+def test_the_document_says_what_was_evaluated(found: dict[str, Any]) -> None:
     log = found["log"]
     assert (log["name"], log["samples"], log["start_ns"], log["damaged"]) == ("run", 12, 0, False)
     assert found["semantics"] == "ltlf"
@@ -33,7 +33,7 @@ def test_it_says_what_was_evaluated(found: dict[str, Any]) -> None:
     }
 
 
-def test_each_result_has_its_tree(found: dict[str, Any]) -> None:
+def test_each_result_lists_the_nodes_of_its_tree(found: dict[str, Any]) -> None:
     reach, apart = found["specifications"]
     assert (reach["name"], reach["object"], reach["verdict"]) == ("reach", None, "satisfied")
     assert reach["lower"] <= reach["robustness"] <= reach["upper"]
@@ -44,7 +44,7 @@ def test_each_result_has_its_tree(found: dict[str, Any]) -> None:
     assert apart["verdict"] == "unknown"
 
 
-def test_what_is_not_determined_is_null_and_what_is_infinite_a_text(found: dict[str, Any]) -> None:
+def test_undetermined_numbers_are_null_and_infinite_ones_texts(found: dict[str, Any]) -> None:
     _, apart = found["specifications"]
     assert apart["robustness"] is None
     assert apart["lower"] == "-inf"
@@ -59,6 +59,6 @@ def test_series_have_one_list_per_node(found: dict[str, Any]) -> None:
     assert reach["first_satisfied_ns"] == reach["series"]["time_ns"][first]
 
 
-def test_there_are_no_series_unless_asked_for() -> None:
+def test_there_are_no_series_by_default() -> None:
     replayed = run_replay(PiecewiseSource(run(), 5), [parse_specification(SPECIFICATION)])
     assert all("series" not in each for each in document_from_replay(replayed)["specifications"])

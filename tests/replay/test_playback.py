@@ -89,13 +89,15 @@ TIMES = st.lists(st.integers(0, COUNT * STEP_NS), max_size=6)
 
 @settings(max_examples=25)
 @given(TIMES)
-def test_from_the_start_it_is_the_annotated_log_however_it_is_cut(until: list[int]) -> None:
+def test_a_playback_from_the_start_is_the_annotated_log_however_it_is_split(until: list[int]) -> None:
     assert played(playback(), 0, until) == whole()
 
 
 @settings(max_examples=25)
 @given(st.lists(st.integers(0, COUNT * STEP_NS), min_size=1, max_size=3), TIMES)
-def test_after_seeks_it_is_the_annotated_log_from_there_on(sought: list[int], until: list[int]) -> None:
+def test_a_playback_after_seeks_is_the_annotated_log_from_there_on(
+    sought: list[int], until: list[int]
+) -> None:
     player = playback()
     for time_ns in sought:
         player.seek(time_ns)
@@ -108,7 +110,7 @@ def test_after_seeks_it_is_the_annotated_log_from_there_on(sought: list[int], un
 
 @settings(max_examples=25)
 @given(st.integers(0, 2 * COUNT * STEP_NS))
-def test_a_seek_sends_what_stands_there(time_ns: int) -> None:
+def test_a_seek_sends_the_latest_messages(time_ns: int) -> None:
     found = sent(playback().seek(time_ns))
     for topic in (OBJECTS, ROBUSTNESS):
         last_ns = max(each[1] for each in whole() if each[0] == topic and each[1] <= time_ns)
@@ -116,11 +118,11 @@ def test_a_seek_sends_what_stands_there(time_ns: int) -> None:
         assert [each for each in found if each[0] == topic] == newest
     [specified] = [data for topic, _, data in found if topic == SPECIFICATION]
     assert specified == next(data for topic, _, data in whole() if topic == SPECIFICATION)
-    told = [each for each in whole() if each[0] == "/spatial/log" and each[1] <= time_ns]
-    assert [each for each in found if each[0] == "/spatial/log"] == told
+    lines = [each for each in whole() if each[0] == "/spatial/log" and each[1] <= time_ns]
+    assert [each for each in found if each[0] == "/spatial/log"] == lines
 
 
-def test_a_seek_deletes_what_is_shown_and_gone() -> None:
+def test_a_seek_deletes_shown_objects_that_are_gone() -> None:
     player = playback()
     player.seek(2 * STEP_NS)
     [drawn] = [data for topic, _, data in sent(player.seek(3 * STEP_NS)) if topic == SCENE]
@@ -141,7 +143,7 @@ def test_a_window_is_played_as_a_replay_writes_it(window: Window, is_recorded: b
     assert played(player, 0, times_ns) == expected
 
 
-def test_messages_of_others_are_played_and_stand_after_a_seek(tmp_path: Path) -> None:
+def test_external_messages_are_played_and_sent_again_after_a_seek(tmp_path: Path) -> None:
     source = open_source(ROOT / "recordings/push.mcap")
     file = sr.load_specification(ROOT / "recordings/push.spatial")
     run_replay(source, [file], output=tmp_path / "annotated.mcap")
@@ -172,7 +174,7 @@ def talking(path: Path) -> Path:
     return path
 
 
-def test_it_starts_at_the_first_sample_with_what_stands_there(tmp_path: Path) -> None:
+def test_a_playback_starts_at_the_first_sample_with_the_messages_before_it(tmp_path: Path) -> None:
     source = open_source(talking(tmp_path / "talking.mcap"))
     expected = annotated(source, tmp_path / "annotated.mcap")
     player = playback(source)
@@ -197,7 +199,7 @@ def test_the_end_of_the_log_comes_last_and_once(tmp_path: Path) -> None:
     assert not len(player.advance_to(player.end_ns))
 
 
-def test_other_numbers_are_shown_where_it_is() -> None:
+def test_another_evaluation_is_shown_at_the_present_time() -> None:
     player = playback()
     player.seek(5 * STEP_NS)
     player.tuned = player.tuned.tuning.evaluate({"far": 2.0})
@@ -207,7 +209,7 @@ def test_other_numbers_are_shown_where_it_is() -> None:
 
 @settings(max_examples=25)
 @given(st.lists(st.integers(-STEP_NS, 2 * COUNT * STEP_NS), min_size=2, max_size=6))
-def test_it_stays_within_the_log_and_goes_forwards(times_ns: list[int]) -> None:
+def test_a_playback_stays_within_the_log_and_never_goes_back(times_ns: list[int]) -> None:
     player = playback()
     places = []
     for time_ns in times_ns:
@@ -218,7 +220,7 @@ def test_it_stays_within_the_log_and_goes_forwards(times_ns: list[int]) -> None:
 
 
 @pytest.mark.parametrize("name", ["table.jsonl", "push.mcap"])
-def test_the_layout_finds_all_it_shows_in_what_is_sent(name: str, tmp_path: Path) -> None:
+def test_every_path_of_the_layout_is_in_the_messages(name: str, tmp_path: Path) -> None:
     log = ROOT / "recordings" / name
     file = sr.load_specification(log.with_suffix(".spatial"))
     tuned = Tuning(open_source(log), [file]).evaluate()

@@ -64,7 +64,7 @@ def foreign(log: Path, tmp_path: Path) -> Path:
     return path
 
 
-def test_messages_metadata_and_attachments_of_others_stay_as_they_are(foreign: Path, tmp_path: Path) -> None:
+def test_external_messages_metadata_and_attachments_are_copied(foreign: Path, tmp_path: Path) -> None:
     output = tmp_path / "out.mcap"
     run_replay(open_source(foreign), [SPEC], output=output)
     before, after = content_of(foreign), content_of(output)
@@ -78,7 +78,9 @@ def test_messages_metadata_and_attachments_of_others_stay_as_they_are(foreign: P
     assert output.read_bytes() == again.read_bytes()
 
 
-def test_messages_come_by_time_then_topic_and_what_the_end_brings_last(foreign: Path, tmp_path: Path) -> None:
+def test_messages_are_in_order_of_time_then_topic_and_those_of_the_end_come_last(
+    foreign: Path, tmp_path: Path
+) -> None:
     output = tmp_path / "out.mcap"
     run_replay(open_source(foreign), [SPEC], output=output)
     *order, event, sentence = [(time_ns, topic) for topic, time_ns, *_ in content_of(output).messages]
@@ -96,7 +98,7 @@ def test_our_metadata_comes_first_and_the_certificate_last(log: Path, tmp_path: 
     assert certificate == dict(replayed.certificate)
 
 
-def test_a_layer_holds_what_was_found_alone(foreign: Path, tmp_path: Path) -> None:
+def test_a_layer_holds_only_the_messages_of_the_evaluation(foreign: Path, tmp_path: Path) -> None:
     layer, whole = tmp_path / "layer.mcap", tmp_path / "whole.mcap"
     in_layer = run_replay(open_source(foreign), [SPEC], output=layer, layer=True)
     in_whole = run_replay(open_source(foreign), [SPEC], output=whole)
@@ -137,7 +139,7 @@ def test_every_nth_sample_of_the_log_counts() -> None:
     assert _spans(_replayed(PAST, Window(4 * STEP_NS, every=5))) == [5, 10]
 
 
-def test_bounds_and_looks_back_count_kept_samples() -> None:
+def test_bounds_and_delays_in_samples_count_selected_ones() -> None:
     text = "spec s = F[1, 1] (cube[-1] leftof cube)"
     (all_samples,) = _replayed(text, Window()).results
     (kept,) = _replayed(text, Window(every=4)).results
@@ -153,12 +155,12 @@ def test_an_every_below_one_and_an_empty_window_are_refused() -> None:
         Window(5, 5)
 
 
-def test_a_window_without_samples_names_those_that_there_are() -> None:
+def test_an_empty_window_names_the_times_of_the_log() -> None:
     with pytest.raises(UsageError, match=r"no sample in the requested window.*from 0 to 2750000000 ns"):
         _replayed(PAST, Window(10**12))
 
 
-def test_a_template_is_evaluated_for_each_object_chosen() -> None:
+def test_a_template_is_evaluated_for_each_chosen_object() -> None:
     spec = parse_specification("spec near(ego) = G (ego dist cube <= 9)")
     source = PiecewiseSource(run(), 4)
     everyone = run_replay(source, [spec], ReplayOptions(each={"ego": "all"}))
@@ -189,20 +191,20 @@ def test_the_objects_of_templates_take_one_pass() -> None:
         ({"ego": "class:dosh"}, "no object of run is of the class 'dosh'; its classes are: Block, dish"),
     ],
 )
-def test_objects_that_cannot_be_chosen_are_said(each: dict[str, str], said: str) -> None:
+def test_invalid_choices_of_objects_are_reported(each: dict[str, str], said: str) -> None:
     spec = parse_specification("spec near(ego) = G (ego dist cube <= 9)")
     with pytest.raises(UsageError, match=said):
         run_replay(PiecewiseSource(run(), 4), [spec], ReplayOptions(each=each))
 
 
-def test_a_class_that_is_elsewhere_in_the_log_stands_for_nobody_here() -> None:
+def test_a_class_that_appears_only_outside_the_window_gives_no_result() -> None:
     spec = parse_specification("spec near(ego) = G (ego dist cube <= 9)")
     only_cube = Window(3 * STEP_NS, 4 * STEP_NS)
     replayed = run_replay(PiecewiseSource(run(), 4), [spec], ReplayOptions(only_cube, {"ego": "class:dish"}))
     assert replayed.results == ()
 
 
-def test_names_that_the_log_never_has_are_all_told_at_once() -> None:
+def test_all_names_that_the_log_never_has_are_reported_together() -> None:
     spec = parse_specification("spec s = F (cub ovlp hand)\nspec t = batery >= 1")
     with pytest.raises(SpecificationError) as error:
         run_replay(PiecewiseSource(run(), 4), [spec])
@@ -218,7 +220,7 @@ def test_a_name_need_not_be_in_the_window() -> None:
     assert [str(r.verdict) for r in replayed.results] == ["violated", "unknown"]
 
 
-def test_specifications_of_one_file_name_keep_their_results_apart(tmp_path: Path) -> None:
+def test_results_of_files_with_the_same_name_stay_apart(tmp_path: Path) -> None:
     paths = [tmp_path / folder / "a.spatial" for folder in ("one", "two")]
     for path, bound in zip(paths, (1, 20), strict=True):
         path.parent.mkdir()
@@ -232,7 +234,9 @@ def test_specifications_of_one_file_name_keep_their_results_apart(tmp_path: Path
     assert (tmp_path / "own.mcap").read_bytes() == (tmp_path / "once.mcap").read_bytes()
 
 
-def test_a_specification_of_a_chosen_profile_is_read_back_with_it(log: Path, tmp_path: Path) -> None:
+def test_a_specification_with_a_chosen_profile_is_read_back_with_that_profile(
+    log: Path, tmp_path: Path
+) -> None:
     text = tmp_path / "published.txt"
     text.write_text('F (cube closeto "cup 物")')
     spec = load_specification(text, profile="spatial_spec")
@@ -243,7 +247,7 @@ def test_a_specification_of_a_chosen_profile_is_read_back_with_it(log: Path, tmp
     assert (tmp_path / "own.mcap").read_bytes() == (tmp_path / "once.mcap").read_bytes()
 
 
-def test_the_last_replay_s_specification_goes_before_the_recorded_one(tmp_path: Path) -> None:
+def test_the_specification_of_the_last_replay_takes_precedence_over_the_recorded_one(tmp_path: Path) -> None:
     log = tmp_path / "run.mcap"
     record_source(PiecewiseSource(run(), 5), log, [SPEC])
     assert load_files((), open_source(log)) == [SPEC]
@@ -253,14 +257,14 @@ def test_the_last_replay_s_specification_goes_before_the_recorded_one(tmp_path: 
     assert ("recorded/blocks.spatial", SPEC.source.encode()) in content_of(tmp_path / "out.mcap").attachments
 
 
-def test_a_log_without_a_specification_says_what_to_give(log: Path) -> None:
+def test_a_log_without_a_specification_names_the_missing_option(log: Path) -> None:
     with pytest.raises(
         UsageError, match=r"run\.mcap holds no specification of its own; give one with --spec"
     ):
         load_files((), open_source(log))
 
 
-def test_a_source_without_samples_is_no_verdict() -> None:
+def test_a_source_without_samples_is_an_error() -> None:
     with pytest.raises(LogError, match="run has no sample"):
         run_replay(PiecewiseSource(Trace.from_samples(()), 3), [SPEC])
 
@@ -277,7 +281,7 @@ def test_times_may_be_as_large_as_a_log_holds(last_ns: int, tmp_path: Path) -> N
 
 
 class TestOutputs:
-    def test_one_that_is_an_input_is_refused(self, log: Path) -> None:
+    def test_an_output_that_is_an_input_is_refused(self, log: Path) -> None:
         before = log.read_bytes()
         with pytest.raises(UsageError, match="is an input too"):
             run_replay(open_source(log), [SPEC], output=log, inputs=[log])
@@ -287,28 +291,28 @@ class TestOutputs:
             run_replay(open_source(log), [SPEC], output=link, inputs=[log])
         assert log.read_bytes() == before
 
-    def test_a_folder_and_a_file_in_no_folder_are_refused(self, log: Path, tmp_path: Path) -> None:
+    def test_a_folder_or_a_file_in_a_missing_folder_is_refused(self, log: Path, tmp_path: Path) -> None:
         with pytest.raises(UsageError, match="is a folder"):
             run_replay(open_source(log), [SPEC], output=tmp_path)
         with pytest.raises(UsageError, match="there is no folder"):
             run_replay(open_source(log), [SPEC], output=tmp_path / "none" / "out.mcap")
 
-    def test_one_behind_a_link_is_written_there(self, log: Path, tmp_path: Path) -> None:
+    def test_an_output_behind_a_link_is_written_there(self, log: Path, tmp_path: Path) -> None:
         link = tmp_path / "latest.mcap"
         link.symlink_to("out.mcap")
         run_replay(open_source(log), [SPEC], output=link)
         assert link.is_symlink()
         assert content_of(tmp_path / "out.mcap").topics() >= ANNOTATION
 
-    def test_a_failed_replay_leaves_the_file_of_before(self, log: Path, tmp_path: Path) -> None:
+    def test_a_failed_replay_leaves_the_former_file(self, log: Path, tmp_path: Path) -> None:
         output = tmp_path / "out.mcap"
         output.write_bytes(b"before")
         with pytest.raises(SpecificationError):
-            run_replay(open_source(log), [parse_specification("G nobody ovlp cube")], output=output)
+            run_replay(open_source(log), [parse_specification("G ghost ovlp cube")], output=output)
         assert output.read_bytes() == b"before"
         assert sorted(path.name for path in tmp_path.iterdir()) == ["out.mcap", "run.mcap"]
 
-    def test_a_full_device_is_said_and_stays_a_device(self, log: Path) -> None:
+    def test_a_full_device_is_reported_and_stays_a_device(self, log: Path) -> None:
         full = Path("/dev/full")
         if not full.is_char_device():
             pytest.skip("no /dev/full here")

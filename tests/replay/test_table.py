@@ -32,7 +32,7 @@ def _rows(path: Path) -> list[list[str]]:
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
-def test_every_number_is_there(annotated: tuple[Path, Replayed], tmp_path: Path, quantity: str) -> None:
+def test_the_table_has_every_number(annotated: tuple[Path, Replayed], tmp_path: Path, quantity: str) -> None:
     path, replayed = annotated
     output = tmp_path / "run.csv"
     rows, columns, faults = export_table(open_source(path), output, quantity=quantity)  # type: ignore[arg-type]
@@ -57,7 +57,7 @@ def test_every_number_is_there(annotated: tuple[Path, Replayed], tmp_path: Path,
     }
 
 
-def test_columns_are_named_after_nodes(annotated: tuple[Path, Replayed], tmp_path: Path) -> None:
+def test_columns_have_the_names_of_nodes(annotated: tuple[Path, Replayed], tmp_path: Path) -> None:
     export_table(open_source(annotated[0]), tmp_path / "run.csv")
     assert _rows(tmp_path / "run.csv")[0] == [
         "time_ns",
@@ -72,7 +72,7 @@ def test_columns_are_named_after_nodes(annotated: tuple[Path, Replayed], tmp_pat
     ]
 
 
-def test_no_two_columns_are_named_alike(tmp_path: Path) -> None:
+def test_no_two_columns_have_the_same_name(tmp_path: Path) -> None:
     spec = parse_specification('spec time_ns = F cube ovlp "cup 物"\nspec s = G time_ns\n')
     twin = parse_specification("spec s = F cube ovlp cube", filename="twin.spatial")
     path = tmp_path / "annotated.mcap"
@@ -100,13 +100,13 @@ def test_parquet_holds_the_same_numbers(annotated: tuple[Path, Replayed], tmp_pa
     assert [list(row) for row in zip(*table.to_pydict().values(), strict=True)] == cells
 
 
-def test_a_log_without_robustness_says_how_to_get_it(tmp_path: Path) -> None:
+def test_a_log_without_robustness_is_reported_with_the_remedy(tmp_path: Path) -> None:
     log = record(run(), tmp_path / "run.mcap")
     with pytest.raises(UsageError, match="holds no /spatial/robustness; write it with spatial-replay replay"):
         export_table(open_source(log), tmp_path / "run.csv")
     assert not (tmp_path / "run.csv").exists()
 
 
-def test_the_ending_says_the_format(annotated: tuple[Path, Replayed], tmp_path: Path) -> None:
+def test_the_ending_of_the_file_gives_the_format(annotated: tuple[Path, Replayed], tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"run\.xls ends in neither \.csv nor \.parquet"):
         export_table(open_source(annotated[0]), tmp_path / "run.xls")

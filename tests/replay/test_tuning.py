@@ -57,7 +57,7 @@ SECONDS = st.integers(1, 40).map(lambda number: f"{number / 4}s")
 
 @settings(max_examples=25)
 @given(DISTANCES, SECONDS, st.integers(1, 41))
-def test_other_values_give_what_the_edited_text_gives(far: float, soon: str, size: int) -> None:
+def test_other_values_give_the_numbers_of_the_edited_text(far: float, soon: str, size: int) -> None:
     tuned = tuning(size=size).evaluate({"far": far, "soon": soon})
     edited = specification(TEXT.format(far=far, soon=soon))
     assert_equal(tuned, sr.evaluate(edited, run(40)))
@@ -65,14 +65,14 @@ def test_other_values_give_what_the_edited_text_gives(far: float, soon: str, siz
 
 @settings(max_examples=25)
 @given(st.lists(st.tuples(DISTANCES, SECONDS), min_size=1, max_size=4))
-def test_what_was_tried_before_changes_no_number(tried: list[tuple[float, str]]) -> None:
+def test_earlier_values_change_no_number(tried: list[tuple[float, str]]) -> None:
     held = tuning()
     for far, soon in tried:
         held.evaluate({"far": far, "soon": soon})
     assert_equal(held.evaluate(), sr.evaluate(specification(), run(40)))
 
 
-def test_constants_are_told_as_they_are_written_and_as_they_are() -> None:
+def test_written_and_present_values_of_constants_are_reported() -> None:
     held = tuning()
     assert {name: constant_text(each) for name, each in held.constants.items()} == {
         "far": "0.5",
@@ -94,21 +94,21 @@ def test_constants_are_told_as_they_are_written_and_as_they_are() -> None:
         ({"far": float("inf")}, "finite number"),
     ],
 )
-def test_values_that_cannot_be_are_refused(values: dict[str, float | str], said: str) -> None:
+def test_invalid_values_are_refused(values: dict[str, float | str], said: str) -> None:
     held = tuning()
     with pytest.raises(UsageError, match=said):
         held.evaluate(values)
     assert_equal(held.evaluate(), sr.evaluate(specification(), run(40)))
 
 
-def test_a_specification_that_means_nothing_with_a_value_is_refused() -> None:
+def test_a_value_that_makes_a_specification_invalid_is_refused() -> None:
     text = 'const wide = 0.5\nspec near = G (cube dist enlarge("cup 物", wide) >= 0)\n'
     held = tuning(specification(text))
     with pytest.raises(SpecificationError):
         held.evaluate({"wide": -1.0})
 
 
-def test_a_name_that_two_files_share_is_called_after_the_file() -> None:
+def test_a_constant_of_two_files_is_named_after_its_file() -> None:
     other = 'const far = 0.25\nconst own = 0.1\nspec wide = G (cube dist enlarge("cup 物", own) >= far)\n'
     held = tuning(specification(), specification(other, "wide.spatial"))
     assert list(held.constants) == ["blocks.far", "soon", "wide.far", "own"]
@@ -120,7 +120,7 @@ def test_a_name_that_two_files_share_is_called_after_the_file() -> None:
 
 
 @pytest.mark.parametrize("window", [Window(2 * STEP_NS), Window(0, 20 * STEP_NS), Window(STEP_NS, every=3)])
-def test_a_window_is_evaluated_as_a_replay_evaluates_it(window: Window) -> None:
+def test_a_window_gives_the_numbers_of_a_replay(window: Window) -> None:
     held = Tuning(PiecewiseSource(run(40), 7), [specification(WRITTEN + PAST)], ReplayOptions(window))
     replayed = run_replay(
         PiecewiseSource(run(40), 4),
@@ -141,14 +141,14 @@ def test_a_template_is_evaluated_for_its_objects() -> None:
     assert [tree.object for tree in held.evaluate({"far": 0.0}).evaluation.trees] == ["cup 物"]
 
 
-def test_what_holds_no_sample_cannot_be_tuned() -> None:
+def test_a_log_or_a_window_without_samples_is_an_error() -> None:
     with pytest.raises(LogError):
         Tuning(PiecewiseSource(run(0), 5), [specification()])
     with pytest.raises(UsageError, match="window"):
         tuning(window=Window(10**15))
 
 
-def test_results_can_be_inquired_into() -> None:
+def test_results_have_witnesses() -> None:
     tuned = tuning().evaluate({"far": 4.0})
     assert tuned.verdict == "violated"
     [both] = tuned.replayed.results

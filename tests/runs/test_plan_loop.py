@@ -1,4 +1,4 @@
-"""A planner in the loop with what executes its steps, without physics."""
+"""A planner in a loop with an executor of its steps, without physics."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ THINGS = {"cup": block(1, 1, size=1), "fork": block(9, 9, size=1), "plate": bloc
 
 @dataclass
 class Camera:
-    """Sees the table, but for what is hidden in a sample.
+    """A camera that does not see the objects hidden in a sample.
 
     Attributes:
-        hides: (number of a sample, name of an object) to whether it is not seen.
+        hides: says for a sample's number and an object's name whether the object is hidden.
     """
 
     loop: PlanLoop
@@ -37,7 +37,7 @@ class Camera:
 
 
 def run(path, text, hides, things=THINGS, **options):
-    """The last decision, the planner, the loop and the log's verdict."""
+    """Return the last decision, the planner, the loop and the log's verdict."""
     specification = sr.parse_specification(text)
     planner = Planner(specification, TABLE)
     with run_log(path, [specification]) as log:
@@ -49,7 +49,7 @@ def run(path, text, hides, things=THINGS, **options):
     return last, planner, loop, log.verdicts["spec"]
 
 
-def test_doubt_that_stays_does_not_keep_a_run_going(tmp_path):
+def test_a_doubt_that_remains_does_not_prolong_a_run(tmp_path):
     text = "(G (fork rightof plate)) and F (cup enclosedin plate)"
     last, planner, loop, verdict = run(
         tmp_path / "run.mcap", text, lambda number, name: name == "fork" and number == 1
@@ -62,7 +62,7 @@ def test_doubt_that_stays_does_not_keep_a_run_going(tmp_path):
     assert loop.executed == 1
 
 
-def test_what_is_never_seen_ends_with_waiting(tmp_path):
+def test_a_run_ends_while_waiting_for_an_object_that_never_appears(tmp_path):
     text = "(G (fork rightof plate)) and F (cup enclosedin plate)"
     last, _, loop, _ = run(tmp_path / "run.mcap", text, lambda number, name: name == "fork")
     assert last.kind == "wait"
@@ -71,7 +71,7 @@ def test_what_is_never_seen_ends_with_waiting(tmp_path):
     assert len(sr.read_trace(tmp_path / "run.mcap")) == 1 + MOST_WAITING_SAMPLES
 
 
-def test_what_only_takes_time_is_waited_for(tmp_path):
+def test_a_run_waits_for_a_bound_in_the_future(tmp_path):
     text = f"F[{2 * MOST_WAITING_SAMPLES},{3 * MOST_WAITING_SAMPLES}] (cup enclosedin plate)"
     last, _, loop, verdict = run(tmp_path / "run.mcap", text, lambda number, name: False)
     assert (last.kind, verdict) == ("hold", "satisfied")
@@ -79,7 +79,7 @@ def test_what_only_takes_time_is_waited_for(tmp_path):
     assert last.number == 2
 
 
-def test_what_is_satisfied_is_watched_for_a_while(tmp_path):
+def test_a_satisfied_specification_is_observed_for_some_samples(tmp_path):
     seen = 0
 
     def counted(number, name):
@@ -104,7 +104,7 @@ def test_what_is_satisfied_is_watched_for_a_while(tmp_path):
         "F (G (cup enclosedin plate))",
     ],
 )
-def test_it_ends_whatever_is_not_seen(tmp_path, text, seed):
+def test_a_run_ends_whichever_objects_are_hidden(tmp_path, text, seed):
     random = np.random.default_rng(seed)
     last, planner, loop, verdict = run(
         tmp_path / "run.mcap", text, lambda number, name: number > 0 and random.random() < 0.2, slips=2

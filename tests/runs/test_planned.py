@@ -31,13 +31,13 @@ def test_three_blocks_are_pushed_one_after_the_other(pushed: tuple[Path, Planned
     assert planned.steps >= 2
 
 
-def test_a_replay_says_that_it_is_satisfied(pushed: tuple[Path, PlannedRun]) -> None:
+def test_a_replay_confirms_that_the_specification_is_satisfied(pushed: tuple[Path, PlannedRun]) -> None:
     source = open_source(pushed[0])
     replayed = run_replay(source, load_files((), source))
     assert replayed.verdict == "satisfied"
 
 
-def test_decisions_and_certificate_are_confirmed(pushed: tuple[Path, PlannedRun]) -> None:
+def test_recomputed_decisions_and_certificate_are_equal(pushed: tuple[Path, PlannedRun]) -> None:
     source = open_source(pushed[0])
     assert verify_certificate(source).differences == ()
     recomputed = recompute_decisions(source)
@@ -45,7 +45,7 @@ def test_decisions_and_certificate_are_confirmed(pushed: tuple[Path, PlannedRun]
     assert recomputed.decisions == len(read_decisions(pushed[0]).decisions)
 
 
-def test_what_cannot_be_done_ends_and_says_why(tmp_path: Path) -> None:
+def test_an_impossible_task_ends_with_a_reason(tmp_path: Path) -> None:
     pytest.importorskip("pybullet", reason="PyBullet is not installed; it has wheels for Python 3.11")
     impossible = sr.parse_specification("F (red leftof blue and red rightof blue)")
     planned = record_plan("push", tmp_path / "run.mcap", impossible)
@@ -75,7 +75,7 @@ def test_a_bun_is_placed_on_a_plate(tmp_path: Path) -> None:
     assert planned.steps == 1
 
 
-def test_a_knife_is_turned_as_it_should_lie(tmp_path: Path) -> None:
+def test_a_knife_is_turned_to_its_place(tmp_path: Path) -> None:
     pytest.importorskip("pybullet", reason="PyBullet is not installed; it has wheels for Python 3.11")
     knife = sr.parse_specification(
         "F (plate leftof knife and knife dist plate <= 0.08 and knife oriented[0.05] mat)"

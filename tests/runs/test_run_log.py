@@ -1,4 +1,4 @@
-"""The log of a run: samples, and messages about what was decided in between."""
+"""The log of a run: samples, and messages about decisions in between."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ def remarks(path: Path) -> list[bytes]:
 
 @pytest.mark.parametrize("every", [1, 7, 30, 31])
 def test_messages_and_samples_make_one_log_with_one_certificate(tmp_path: Path, every: int) -> None:
-    told = list(range(0, 100, every))
+    numbers = list(range(0, 100, every))
     with run_log(tmp_path / "run.mcap") as log:
         for number in range(100):
             log.write(sample(number))
-            if number in told:
-                log.write_messages(remark(number, told.index(number)))
-    assert remarks(tmp_path / "run.mcap") == [b'{"at": %d}' % number for number in told]
+            if number in numbers:
+                log.write_messages(remark(number, numbers.index(number)))
+    assert remarks(tmp_path / "run.mcap") == [b'{"at": %d}' % number for number in numbers]
     assert len(sr.read_trace(tmp_path / "run.mcap")) == 100
     verified = verify_certificate(open_source(tmp_path / "run.mcap"))
     assert verified.recorded
@@ -54,7 +54,7 @@ def test_no_message_is_lost_at_the_end(tmp_path: Path) -> None:
     assert remarks(tmp_path / "run.mcap") == [b'{"at": 0}']
 
 
-def test_what_was_written_before_an_error_can_be_read(tmp_path: Path) -> None:
+def test_samples_written_before_an_error_can_be_read(tmp_path: Path) -> None:
     def fail(log: RunLog) -> None:
         log.write(sample(0))
         log.write_messages(remark(0, 0))

@@ -133,7 +133,7 @@ def test_a_log_played_from_the_start_is_the_annotated_log(server: Serving, tmp_p
         await own.message(SCENE)
         assert (await own.control(play=True, speed=10.0, seek_ns=0, request="play")).status == PLAYING
         found = await own.until(lambda each: isinstance(each, Message) and each[:2] == last[:2])
-        # whoever has just subscribed may be sent the first sample twice
+        # a new subscriber may be sent the first sample twice
         assert {tuple(each) for each in found if isinstance(each, Message)} == set(expected)
 
     watch(server, looking)
@@ -362,7 +362,7 @@ def test_services_answer_in_json(server: Serving) -> None:
         ("evaluate", b'{"constants": {"far": NaN}}', "finite"),
         ("evaluate", b" " * 100_000, "bytes"),
         ("explain", b'{"node": "apat"}', "apart"),
-        ("explain", b'{"object": "nobody"}', "nobody"),
+        ("explain", b'{"object": "ghost"}', "ghost"),
     ],
 )
 def test_services_name_the_error_in_a_request(server: Serving, service: str, raw: bytes, said: str) -> None:

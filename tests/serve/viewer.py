@@ -52,7 +52,7 @@ Received = Message | State | Asset | dict[str, Any] | int
 
 @dataclass
 class Viewer:
-    """A connection, and what has come over it that nobody has waited for yet."""
+    """A connection, and the messages received over it that were not read yet."""
 
     connection: ClientConnection
     channels: dict[str, int] = field(default_factory=dict)
@@ -83,7 +83,7 @@ class Viewer:
         return found
 
     async def next_of(self, kind: type[Any], is_wanted: Callable[[Any], bool] = lambda each: True) -> Any:
-        """The next of a kind that is wanted; what else comes meanwhile waits to be asked for."""
+        """Return the next wanted message of a kind; others stay to be read later."""
         passed: list[Received] = []
         async with asyncio.timeout(PATIENCE_S):
             while True:
