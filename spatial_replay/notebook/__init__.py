@@ -1,6 +1,6 @@
-"""Pictures of values in notebooks: `html` shows one as a cell's output, `plot` draws one with matplotlib.
+"""Values in notebooks: `html` shows one as a cell's output, `plot` draws one with matplotlib.
 
-Both dispatch on the type of the value. Views are imported when a value of their type is shown for the first
+Both dispatch on the type of the value. A view is imported when a value of its type is shown for the first
 time, so that showing a formula loads neither the planner nor matplotlib.
 """
 
@@ -24,7 +24,7 @@ _VIEWS: Mapping[str, str] = MappingProxyType(
         "spatial_replay.spec.formula": "specification_view",
     }
 )
-"""For each module that defines a value, the view that registers how it is shown."""
+"""The view that registers the types of a module."""
 
 
 @singledispatch
@@ -59,6 +59,6 @@ def _after_loading_view(function: Any, value: object) -> Any:
     generic = function.registry[object]
     if (view := _VIEWS.get(kind.__module__)) is not None:
         import_module(f"spatial_replay.notebook.{view}")
-    if (found := function.dispatch(kind)) is generic:
+    if (view_function := function.dispatch(kind)) is generic:
         raise UsageError(f"there is no picture of a {kind.__name__}")
-    return found
+    return view_function

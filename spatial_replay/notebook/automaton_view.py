@@ -1,4 +1,4 @@
-"""Automata in notebooks: drawn, with short names for long propositions, and in words."""
+"""Automata in notebooks: drawn with short names for long propositions, and as a list of transitions."""
 
 from __future__ import annotations
 
@@ -37,24 +37,24 @@ if TYPE_CHECKING:
 
 _MOST_STATES: Final = 40
 _MOST_CUBES: Final = 100
-"""States, and cubes on arrows, of an automaton that is drawn without being asked for."""
+"""The most states, and cubes on arrows, of an automaton that a cell's output draws."""
 _MOST_LINES: Final = 200
-"""Lines in words."""
+"""The most lines of the list of transitions."""
 _ARROW: Final = hexadecimal(NEUTRAL)
 _INCH: Final = 72.0
-"""Graphviz counts in points."""
+"""Points of Graphviz in an inch."""
 _LONGEST_SIDE: Final = 40.0
-"""Of a figure, in inches."""
+"""The longest side of a figure, in inches."""
 
 
 @html.register(Automaton)
 def automaton_html(automaton: Automaton) -> Html:
-    """Its size; if it is small, also a drawing, if Graphviz is there, and its states and moves in words."""
+    """Return the size of an automaton; if it is small, also a drawing and its transitions as text."""
     title = element("div", element("b", automaton.name), quiet(f" {size_words(automaton)}"))
     if _is_large(automaton):
         return element("div", title, quiet("too large to be drawn here; plot() draws it, to_dot() writes it"))
     drawing = automaton_svg(automaton)
-    shown = quiet("drawing it takes Graphviz") if drawing is None else Html(drawing)
+    shown = quiet("install Graphviz to see it drawn") if drawing is None else Html(drawing)
     words = words_text(automaton).split("\n")
     lines = [element("div", code(line)) for line in words[:_MOST_LINES]]
     more = [quiet(f"… and {len(words) - _MOST_LINES:,} lines more")] if len(words) > _MOST_LINES else []
@@ -63,14 +63,14 @@ def automaton_html(automaton: Automaton) -> Html:
 
 
 def automaton_svg(automaton: Automaton) -> str | None:
-    """The automaton drawn by Graphviz; None if it is large or cannot be drawn here."""
+    """Return an automaton as SVG; None if it is large or Graphviz cannot draw it here."""
     if _is_large(automaton):
         return None
     try:
         drawing = svg_text(automaton)
     except (UsageError, OutputError):
         return None
-    # what comes before is for files, not for pages
+    # the XML declaration and document type before it belong in files, not in pages
     return drawing[drawing.index("<svg") :]
 
 
@@ -82,7 +82,7 @@ def _is_large(automaton: Automaton) -> bool:
 
 @plot.register(Automaton)
 def draw_automaton(automaton: Automaton, ax: Axes | None = None) -> Axes:
-    """Draw the automaton where Graphviz puts its states and arrows.
+    """Draw the automaton with the layout of Graphviz.
 
     Raises:
         UsageError: Graphviz or matplotlib is not installed.
@@ -112,7 +112,7 @@ def draw_automaton(automaton: Automaton, ax: Axes | None = None) -> Axes:
 
 
 def _draw_state(ax: Axes, automaton: Automaton, node: Mapping[str, Any]) -> None:
-    """A circle with the state's number; without one, the point that leads to the first state."""
+    """Draw a circle with the number of a state, or the point before the first state, which has none."""
     x, y = _point(node["pos"])
     radius = float(node["width"]) * _INCH / 2
     is_state = node["name"].isdecimal()
@@ -125,7 +125,7 @@ def _draw_state(ax: Axes, automaton: Automaton, node: Mapping[str, Any]) -> None
 
 
 def _draw_edge(ax: Axes, edge: Mapping[str, Any]) -> None:
-    """A curve with a head, and the guard beside it."""
+    """Draw a curve with a head, and the guard beside it."""
     head, *points = (_point(each.removeprefix("e,")) for each in edge["pos"].split())
     draw_curve(ax, points, _ARROW)
     ax.annotate(

@@ -1,7 +1,4 @@
-"""Robustness as curves over time.
-
-Evaluations in notebooks: verdicts, and trees with the numbers at the end.
-"""
+"""Evaluations in notebooks: verdicts with trees of final numbers, and robustness as curves over time."""
 
 from __future__ import annotations
 
@@ -39,15 +36,25 @@ if TYPE_CHECKING:
 
 _MOST_RESULTS: Final = 50
 _MOST_NODES: Final = 300
-"""Nodes in the trees of all results together."""
+"""The most nodes in the trees of all results together."""
+_MOST_PANELS: Final = 8
+_MOST_CURVES: Final = 6
+"""The most curves in a panel, including that of the result."""
+_WIDTH, _HEIGHT = 8.0, 2.4
+"""Size of a panel, in inches."""
+_LONGEST_NAME: Final = 24
+_SHADE: Final = 0.15
+"""Opacity of the band."""
+_GAP: Final = 0.11
+"""Least distance of two labels, as a fraction of the height of a panel."""
 
 
 @html.register(Evaluation)
 def evaluation_html(evaluation: Evaluation) -> Html:
-    """The verdict, a table of results, and the tree of each with its numbers at the end."""
+    """Return the verdict, a table of results, and a tree of each with its final numbers."""
     name = element("b", evaluation.specification.filename)
     title = element("div", name, " ", verdict_mark(evaluation.verdict))
-    shown = worst_of(evaluation.results, _MOST_RESULTS)
+    shown = _worst_of(evaluation.results, _MOST_RESULTS)
     left_out = len(evaluation.results) - len(shown)
     more = quiet(f"… and {counted(left_out, 'result')} more, none of them worse") if left_out else Html("")
     return element("div", title, _results_table(shown), more, *_trees(shown))
@@ -55,26 +62,26 @@ def evaluation_html(evaluation: Evaluation) -> Html:
 
 @html.register(SpecResult)
 def result_html(result: SpecResult) -> Html:
-    """A result as a table, and its tree with the numbers at the end."""
+    """Return a result as a table, and its tree with the final numbers."""
     return element("div", _results_table([result]), *_trees([result]))
 
 
-def title_of(result: SpecResult) -> str:
-    """What a result is called: the name, and the object that it is about."""
+def _title_of(result: SpecResult) -> str:
+    """Return the name of a result, with its object if it has one."""
     return result.name if result.object is None else f"{result.name} for {result.object}"
 
 
-def robustness_text(value: float, lower: float, upper: float) -> str:
-    """A robustness that is known, or the interval that it lies in."""
+def _robustness_text(value: float, lower: float, upper: float) -> str:
+    """Return a robustness, or its interval if it is unknown."""
     return f"{value:.4g}" if value == value else f"{lower:.4g} to {upper:.4g}"
 
 
 def _results_table(results: Sequence[SpecResult]) -> Html:
     rows = [
         (
-            element("b", title_of(each)),
+            element("b", _title_of(each)),
             verdict_mark(each.verdict),
-            robustness_text(each.robustness, each.lower, each.upper),
+            _robustness_text(each.robustness, each.lower, each.upper),
             _first_satisfied(each),
         )
         for each in results
@@ -88,7 +95,7 @@ def _first_satisfied(result: SpecResult) -> str:
 
 
 def _trees(results: Sequence[SpecResult]) -> Iterator[Html]:
-    """The tree of each result, as far as there is room."""
+    """Iterate over the trees of results, up to the most nodes."""
     left = _MOST_NODES
     for result in results:
         if left <= 0:
@@ -98,7 +105,7 @@ def _trees(results: Sequence[SpecResult]) -> Iterator[Html]:
         left_out = len(result.final) - len(rows)
         more = quiet(f"… and {counted(left_out, 'node')} more") if left_out else Html("")
         nodes = table(["verdict", "robustness", "node"], rows)
-        yield folded(f"tree of {title_of(result)}, each node at the first sample", nodes, more)
+        yield folded(f"tree of {_title_of(result)}, each node at the first sample", nodes, more)
 
 
 def _tree_rows(result: SpecResult) -> Iterator[tuple[str, str, str]]:
@@ -106,31 +113,19 @@ def _tree_rows(result: SpecResult) -> Iterator[tuple[str, str, str]]:
         lower, upper = result.final[identifier].tolist()
         value = float(result.series[identifier, 0, -1])
         verdict = verdict_mark(final_verdict(lower, upper))
-        yield verdict, robustness_text(value, lower, upper), tree_cell(stem, node)
+        yield verdict, _robustness_text(value, lower, upper), tree_cell(stem, node)
 
 
-def worst_of(results: Sequence[SpecResult], most: int) -> Sequence[SpecResult]:
-    """The results, or so many of the worst where there are more."""
+def _worst_of(results: Sequence[SpecResult], most: int) -> Sequence[SpecResult]:
+    """Return the results, or the `most` worst ones if there are more."""
     if len(results) <= most:
         return results
     severity = {Verdict.VIOLATED: 0, Verdict.UNKNOWN: 1}
     return sorted(results, key=lambda result: severity.get(result.verdict, 2))[:most]
 
 
-_MOST_PANELS: Final = 8
-_MOST_CURVES: Final = 6
-"""Curves in a panel, that of the result included."""
-_WIDTH, _HEIGHT = 8.0, 2.4
-"""Of a panel, in inches."""
-_LONGEST_NAME: Final = 24
-_SHADE: Final = 0.15
-"""How strong the colour of the band is."""
-_GAP: Final = 0.11
-"""Between two labels, as a share of a panel's height."""
-
-
-class Curve(NamedTuple):
-    """A curve and what it is called."""
+class _Curve(NamedTuple):
+    """A curve to draw with its name."""
 
     name: str
     values: Floats
@@ -139,7 +134,7 @@ class Curve(NamedTuple):
 
 @plot.register(Evaluation)
 def draw_evaluation(evaluation: Evaluation, ax: Axes | Iterable[Axes] | None = None) -> tuple[Axes, ...]:
-    """Draw each result in axes of its own, below each other; of many, the worst ones.
+    """Draw each result in its own axes, one below the other; of many results, the worst ones.
 
     Args:
         ax: axes to draw into, one for each result.
@@ -150,7 +145,7 @@ def draw_evaluation(evaluation: Evaluation, ax: Axes | Iterable[Axes] | None = N
     if ax is not None:
         given = np.array(list(ax) if isinstance(ax, Iterable) else [ax], object)
         return _drawn(evaluation.results, tuple(given.flat))
-    shown = worst_of(evaluation.results, _MOST_PANELS)
+    shown = _worst_of(evaluation.results, _MOST_PANELS)
     if not shown:
         return ()
     size = (_WIDTH, 0.4 + _HEIGHT * len(shown))
@@ -166,7 +161,7 @@ def draw_evaluation(evaluation: Evaluation, ax: Axes | Iterable[Axes] | None = N
 
 
 def _drawn(results: Sequence[SpecResult], panels: tuple[Axes, ...]) -> tuple[Axes, ...]:
-    """Each result in its axes."""
+    """Draw each result in its axes."""
     if len(results) != len(panels):
         count = counted(len(results), "result")
         raise UsageError(f"ax has {len(panels)} axes for {count}; give one for each, or draw one result")
@@ -177,7 +172,7 @@ def _drawn(results: Sequence[SpecResult], panels: tuple[Axes, ...]) -> tuple[Axe
 
 @plot.register(SpecResult)
 def draw_result(result: SpecResult, ax: Axes | None = None) -> Axes:
-    """Draw a result's robustness on what was seen so far, what it can still become, and that of its parts.
+    """Draw the robustness of a result over time, its interval of possible values, and that of named parts.
 
     Raises:
         UsageError: matplotlib is not installed.
@@ -196,7 +191,7 @@ def draw_result(result: SpecResult, ax: Axes | None = None) -> Axes:
         color=curves[0].colour, alpha=_SHADE, linewidth=0,
     )  # fmt: skip
     for number, curve in enumerate(curves):
-        # the result's own shows below a part's where both are the same
+        # the result's curve is thicker, so that it shows below an equal one of a part
         ax.plot(seconds, curve.values, color=curve.colour, linewidth=1.2 if number else 3.0)
     _name_curves(ax, curves, has_band)
     ax.set_title(_title(result), loc="left", fontsize=10)
@@ -206,36 +201,36 @@ def draw_result(result: SpecResult, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def _curves(result: SpecResult) -> list[Curve]:
-    """The result's own curve, and those of the first specs that it is made of."""
+def _curves(result: SpecResult) -> list[_Curve]:
+    """Return the curve of a result, and those of the first named specs in it."""
     colours = {Verdict.SATISFIED: POSITIVE, Verdict.VIOLATED: NEGATIVE}
     own = hexadecimal(colours.get(result.verdict, NEUTRAL))
     named = {node.name: number for number, _, node in reversed(list(iter_nodes(result.formula))) if node.name}
     parts = sorted((number, name) for name, number in named.items() if number)
-    # blue and vermillion say how the result is
+    # the first two colours stand for satisfied and violated
     others = zip(parts, CURVES[2 : _MOST_CURVES + 1], strict=False)
     return [
-        Curve(title_of(result), _finite(result, 0), own),
-        *(Curve(name, _finite(result, number), colour) for (number, name), colour in others),
+        _Curve(_title_of(result), _finite(result, 0), own),
+        *(_Curve(name, _finite(result, number), colour) for (number, name), colour in others),
     ]
 
 
 def _finite(result: SpecResult, node: int) -> Floats:
-    """A node's value, where it is a number."""
+    """Return the value of a node, NaN where it is infinite."""
     values = result.series[node, 0]
     return np.where(np.isfinite(values), values, np.nan)
 
 
 def _limits(curves: Sequence[Floats]) -> tuple[float, float]:
-    """The least and the greatest robustness that a panel shows; 0 lies between."""
+    """Return the least and the greatest robustness of a panel, which always shows 0."""
     values = np.concatenate([[0.0], *(curve[~np.isnan(curve)] for curve in curves)])
     low, high = float(values.min()), float(values.max())
     margin = 0.1 * (high - low) or 1.0
     return low - margin, high + margin
 
 
-def _name_curves(ax: Axes, curves: Sequence[Curve], has_band: bool) -> None:
-    """Write to the right what each curve is, and below what the band is; no name over another."""
+def _name_curves(ax: Axes, curves: Sequence[_Curve], has_band: bool) -> None:
+    """Write the name of each curve to its right, and that of the band below, without overlap."""
     low, high = ax.get_ylim()
     ends = [(_last(curve.values) - low) / (high - low) for curve in curves]
     *places, bottom = _apart([*ends, 0.0])
@@ -248,7 +243,7 @@ def _name_curves(ax: Axes, curves: Sequence[Curve], has_band: bool) -> None:
 def _draw_key(
     ax: Axes, place: float, name: str, colour: str, *, alpha: float = 1.0, is_bold: bool = False
 ) -> None:
-    """A square of a colour to the right of the axes, and what it stands for."""
+    """Draw a coloured square to the right of the axes, with its name."""
     weight = "bold" if is_bold else "normal"
     mark, word = {"color": colour, "alpha": alpha}, {"fontweight": weight}
     for text, points, style in (("■", 5, mark), (plain(name, _LONGEST_NAME), 17, word)):
@@ -259,13 +254,13 @@ def _draw_key(
 
 
 def _last(values: Floats) -> float:
-    """The last number of a curve; 0 where it has none."""
+    """Return the last number of a curve; 0 without one."""
     known = values[~np.isnan(values)]
     return float(known[-1]) if len(known) else 0.0
 
 
 def _apart(places: Sequence[float]) -> list[float]:
-    """Places moved, in their order, so that none is nearer than the gap to another and none above 1."""
+    """Return places moved apart, in their order, by at least the gap, and none above 1."""
     apart = list(places)
     order = sorted(range(len(places)), key=places.__getitem__)
     below = -np.inf
@@ -278,5 +273,5 @@ def _apart(places: Sequence[float]) -> list[float]:
 
 
 def _title(result: SpecResult) -> str:
-    robustness = robustness_text(result.robustness, result.lower, result.upper)
-    return plain(f"{title_of(result)}: {result.verdict}, robustness {robustness}")
+    robustness = _robustness_text(result.robustness, result.lower, result.upper)
+    return plain(f"{_title_of(result)}: {result.verdict}, robustness {robustness}")

@@ -1,6 +1,7 @@
-"""The one place that knows the library behind figures; it loads when something is drawn.
+"""Figures and HTML for notebooks.
 
-HTML for notebooks: texts are escaped, and what is shown suits light pages and dark ones.
+Only this module and what it draws depend on matplotlib, which loads with the first figure. Text in HTML is
+escaped, and colours suit light and dark pages.
 """
 
 from __future__ import annotations
@@ -19,21 +20,21 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap
 
 INK: Final = "#24292f"
-"""Of texts on light colours, whatever the style of the page."""
+"""Colour of text on light colours, in any style of page."""
 _MIDDLE: Final = (0.96, 0.96, 0.96)
 
 
 def new_panels(
     rows: int, columns: int, size: tuple[float, float], *, same_x: bool = False
 ) -> tuple[Axes, ...]:
-    """Axes in a new figure, row by row.
+    """Return the axes of a new figure, row by row.
 
     Args:
         size: width and height of the figure in inches.
-        same_x: whether all show the same times.
+        same_x: whether all axes share the time axis.
 
     Raises:
-        UsageError: the library is not installed.
+        UsageError: matplotlib is not installed.
     """
     _, grid = _pyplot().subplots(
         rows, columns, figsize=size, squeeze=False, sharex=same_x, layout="constrained"
@@ -42,23 +43,23 @@ def new_panels(
 
 
 def new_panel(size: tuple[float, float]) -> Axes:
-    """Axes that are alone in a new figure of some width and height in inches.
+    """Return the only axes of a new figure with this width and height in inches.
 
     Raises:
-        UsageError: the library is not installed.
+        UsageError: matplotlib is not installed.
     """
     return new_panels(1, 1, size)[0]
 
 
 def signed_colours() -> Colormap:
-    """From vermillion over almost white to blue: for numbers whose sign matters."""
+    """Return a colour map from vermillion over almost white to blue, for signed numbers."""
     from matplotlib.colors import LinearSegmentedColormap
 
     return LinearSegmentedColormap.from_list("robustness", [NEGATIVE, _MIDDLE, POSITIVE])
 
 
 def draw_curve(ax: Axes, points: Sequence[tuple[float, float]], colour: str) -> None:
-    """A chain of cubic Bézier curves, each from where the last one ends: 1 + 3n points."""
+    """Draw a chain of n cubic Bézier curves, given by 1 + 3n points."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
 
@@ -67,14 +68,14 @@ def draw_curve(ax: Axes, points: Sequence[tuple[float, float]], colour: str) -> 
 
 
 def draw_disc(ax: Axes, centre: tuple[float, float], radius: float, colour: str) -> None:
-    """A disc with an outline."""
+    """Draw a disc with an outline."""
     from matplotlib.patches import Circle
 
     ax.add_patch(Circle(centre, radius, facecolor=colour, edgecolor=INK, linewidth=1.0, zorder=3))
 
 
 def plain(text: str, longest: int = 72) -> str:
-    """A text that a figure shows as it stands, cut after so many characters."""
+    """Return text without special meaning for matplotlib, cut after `longest` characters."""
     return printable(text, longest).replace("$", r"\$")
 
 
@@ -83,7 +84,7 @@ def _pyplot() -> Any:
         from matplotlib import pyplot
     except ImportError:
         raise UsageError(
-            "figures take matplotlib, which is not installed: pip install 'spatial-replay[notebook]'"
+            "figures need matplotlib, which is not installed: pip install 'spatial-replay[notebook]'"
         ) from None
     return pyplot
 
@@ -95,42 +96,42 @@ _CELL: Final = "text-align:left; padding:0.1em 1em 0.1em 0; vertical-align:basel
 
 
 class Html(str):
-    """A text that is HTML already."""
+    """Text that is HTML already."""
 
     __slots__ = ()
 
 
 def element(tag: str, *content: str, **attributes: str) -> Html:
-    """An element with some content; texts in it that are not `Html` are escaped."""
+    """Return an element; content that is not `Html` is escaped."""
     written = "".join(f' {name}="{escape(value)}"' for name, value in attributes.items())
     inner = "".join(each if isinstance(each, Html) else escape(printable(each)) for each in content)
     return Html(f"<{tag}{written}>{inner}</{tag}>")
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Html:
-    """A table."""
+    """Return a table."""
     head = element("tr", *(element("th", each, style=_CELL) for each in headings))
     body = [element("tr", *(element("td", each, style=_CELL) for each in row)) for row in rows]
     return element("table", element("thead", head), element("tbody", *body), style="border-collapse:collapse")
 
 
 def code(*content: str) -> Html:
-    """Content in letters of one width, with all of its spaces."""
+    """Return content in a monospaced font, with all of its spaces."""
     return element("span", *content, style="font-family:ui-monospace,monospace; white-space:pre")
 
 
 def folded(summary: str, *content: str) -> Html:
-    """Content that unfolds where its summary is clicked."""
+    """Return content that unfolds on a click on its summary."""
     return element("details", element("summary", summary, style="cursor:pointer"), *content)
 
 
 def quiet(text: str) -> Html:
-    """A text that matters less."""
+    """Return text in a fainter colour."""
     return element("span", text, style="opacity:0.7")
 
 
 def verdict_mark(verdict: str) -> Html:
-    """A verdict behind its colour."""
+    """Return a verdict with its colour."""
     colour = hexadecimal(_VERDICT_COLOURS.get(verdict, NEUTRAL))
     mark = element("span", "■", style=f"color:{colour}")
     return element("span", mark, " ", verdict, style="white-space:nowrap")

@@ -1,7 +1,4 @@
-"""Gradient maps in notebooks: drawn over the scene, and counted.
-
-Decisions in notebooks: in words, and as the maps that they rest on.
-"""
+"""Gradient maps and decisions of a planner in notebooks, as pages and as figures over the scene."""
 
 from __future__ import annotations
 
@@ -40,28 +37,34 @@ if TYPE_CHECKING:
     from spatial_replay.planning.decisions import Target
 
 _HATCHES: Final = ("", "////", "xxxx", "....", "oooo")
-"""What covers blocked cells, by the number of the reason."""
+"""Hatches of blocked cells, by the number of the reason."""
 _BLOCKED: Final = "#e4e4e4"
 _HATCH: Final = "#9a9a9a"
+_MOST_EDGES: Final = 4
+_MOST_CANDIDATES: Final = 4
+_PANEL: Final = 3.4
+"""Side of a panel, in inches."""
+_LINE: Final = 40
+"""Characters in a line of a title."""
 
 
 @html.register(GradientMap)
-def map_html(found: GradientMap) -> Html:
-    """What a map is about, how good its best free cell is, and why how many cells are blocked."""
-    grid = found.grid
+def map_html(gradient: GradientMap) -> Html:
+    """Return the size of a map, its best robustness, and how many cells are blocked for each reason."""
+    grid = gradient.grid
     size = f"{grid.columns} x {grid.rows} cells of {grid.cell_size:g}"
-    turned = f", {counted(len(found.turns), 'orientation')}" if len(found.turns) > 1 else ""
-    best = found.best()
+    turned = f", {counted(len(gradient.turns), 'orientation')}" if len(gradient.turns) > 1 else ""
+    best = gradient.best()
     words = "no free cell" if best == -math.inf else f"robustness {best:.4g} at the best free cell"
-    counts = np.bincount(found.blocked.ravel(), minlength=len(REASONS)).tolist()
+    counts = np.bincount(gradient.blocked.ravel(), minlength=len(REASONS)).tolist()
     rows = [(f"{count:,}", reason) for count, reason in zip(counts, REASONS, strict=True) if count]
-    title = element("div", "gradient map of ", element("b", found.name), quiet(f" {size}{turned}"))
+    title = element("div", "gradient map of ", element("b", gradient.name), quiet(f" {size}{turned}"))
     return element("div", title, element("div", words), table(["cells", "which are"], rows))
 
 
 @plot.register(GradientMap)
 def draw_map(
-    found: GradientMap,
+    gradient: GradientMap,
     ax: Axes | None = None,
     *,
     turn: int | None = None,
@@ -71,59 +74,60 @@ def draw_map(
     """Draw a map: blue where the progress set would hold, vermillion where not, blocked cells hatched.
 
     Args:
-        turn: which orientation, by its place among the map's; that of the target or the best free cell by
-            default.
-        sample: whose objects are drawn over it.
-        target: where the object is to go; the way there is drawn too.
+        turn: index of the orientation; by default that of the target or of the best free cell.
+        sample: the sample with objects to draw over the map.
+        target: where the object is to go; its path is drawn too.
 
     Raises:
         UsageError: matplotlib is not installed.
     """
     ax = new_panel((6.4, 5.2)) if ax is None else ax
-    image = draw_cells(found, ax, best_turn(found, target) if turn is None else turn, reach_of([found]))
-    draw_objects(ax, sample, found.name)
+    image = _draw_cells(
+        gradient, ax, _best_turn(gradient, target) if turn is None else turn, _reach_of([gradient])
+    )
+    _draw_objects(ax, sample, gradient.name)
     if target is not None:
-        draw_target(ax, target, sample)
+        _draw_target(ax, target, sample)
     ax.figure.colorbar(image, ax=ax, label="robustness of what is to hold")
-    ax.set_title(plain(f"where {found.name} could go"), loc="left", fontsize=10)
+    ax.set_title(plain(f"where {gradient.name} could go"), loc="left", fontsize=10)
     ax.set_xlabel("x in the unit of the log")
     ax.set_ylabel("y in the unit of the log")
-    if keys := hatch_keys(ax, [found]):
+    if keys := _hatch_keys(ax, [gradient]):
         ax.legend(
             handles=keys, loc="upper left", bbox_to_anchor=(0.0, -0.14), ncols=2, frameon=False, fontsize=8.5
         )
     return ax
 
 
-def best_turn(found: GradientMap, target: Target | None) -> int:
-    """The orientation that the object is to have, or that of the best free cell, by its place."""
+def _best_turn(gradient: GradientMap, target: Target | None) -> int:
+    """Return the index of the target's orientation, or of that of the best free cell."""
     if target is not None:
-        return int(np.abs(found.turns - target.turn).argmin())
-    best = np.where(found.blocked == FREE, found.robustness, -np.inf).max(axis=(1, 2))
+        return int(np.abs(gradient.turns - target.turn).argmin())
+    best = np.where(gradient.blocked == FREE, gradient.robustness, -np.inf).max(axis=(1, 2))
     return int(best.argmax())
 
 
-def reach_of(maps: Sequence[GradientMap]) -> float:
-    """The greatest robustness in the free cells of some maps, whatever its sign: what colours reach up to."""
-    values = np.abs(np.concatenate([found.values.ravel() for found in maps]))
+def _reach_of(maps: Sequence[GradientMap]) -> float:
+    """Return the greatest absolute robustness in the free cells of some maps, the range of the colours."""
+    values = np.abs(np.concatenate([gradient.values.ravel() for gradient in maps]))
     return float(values[np.isfinite(values)].max(initial=0.0)) or 1.0
 
 
-def draw_cells(found: GradientMap, ax: Axes, turn: int, reach: float) -> AxesImage:
+def _draw_cells(gradient: GradientMap, ax: Axes, turn: int, reach: float) -> AxesImage:
     """Draw the cells of one orientation.
 
     Args:
-        reach: the robustness of the full colours.
+        reach: the absolute robustness that gets the full colours.
     """
-    grid = found.grid
+    grid = gradient.grid
     right, top = grid.xmin + grid.columns * grid.cell_size, grid.ymin + grid.rows * grid.cell_size
     ax.set_facecolor(_BLOCKED)
     image = ax.imshow(
-        found.values[turn], cmap=signed_colours(), vmin=-reach, vmax=reach, origin="lower",
+        gradient.values[turn], cmap=signed_colours(), vmin=-reach, vmax=reach, origin="lower",
         extent=(grid.xmin, right, grid.ymin, top), interpolation="nearest",
     )  # fmt: skip
     for reason, hatch in enumerate(_HATCHES):
-        cells = found.blocked[turn] == reason
+        cells = gradient.blocked[turn] == reason
         if hatch and cells.any() and min(cells.shape) > 1:
             x, y = (axis.reshape(grid.shape) for axis in grid.centres().T)
             hatched = ax.contourf(x, y, cells, levels=[0.5, 1.5], colors="none", hatches=[hatch])
@@ -131,8 +135,8 @@ def draw_cells(found: GradientMap, ax: Axes, turn: int, reach: float) -> AxesIma
     return image
 
 
-def draw_objects(ax: Axes, sample: Sample | None, name: str) -> None:
-    """Draw the objects of a sample, the one that is to be moved in bolder lines."""
+def _draw_objects(ax: Axes, sample: Sample | None, name: str) -> None:
+    """Draw the objects of a sample, the one to be moved with bolder lines."""
     for each, tracked in (sample.objects if sample is not None else {}).items():
         if isinstance(tracked, TrackedObject):
             _draw_footprint(ax, tracked.footprint, 2.0 if each == name else 1.0)
@@ -143,8 +147,8 @@ def draw_objects(ax: Axes, sample: Sample | None, name: str) -> None:
             )  # fmt: skip
 
 
-def draw_target(ax: Axes, target: Target, sample: Sample | None) -> None:
-    """Draw where an object is to go, and the way there."""
+def _draw_target(ax: Axes, target: Target, sample: Sample | None) -> None:
+    """Draw the target of an object and the path to it."""
     ax.plot(*zip(*target.waypoints, strict=True), color="white", linewidth=3.5, solid_capstyle="round")
     ax.plot(*zip(*target.waypoints, strict=True), color=INK, linewidth=1.5, solid_capstyle="round")
     ax.plot(target.x, target.y, "o", color="white", markeredgecolor=INK, markersize=6)
@@ -154,9 +158,9 @@ def draw_target(ax: Axes, target: Target, sample: Sample | None) -> None:
         _draw_footprint(ax, there.footprint, 1.5, "--")
 
 
-def hatch_keys(ax: Axes, maps: Sequence[GradientMap]) -> list[Artist]:
-    """What a legend says of the hatches that some maps have."""
-    reasons = np.unique(np.concatenate([found.blocked.ravel() for found in maps])).tolist()
+def _hatch_keys(ax: Axes, maps: Sequence[GradientMap]) -> list[Artist]:
+    """Return the legend's entries for the hatches in some maps."""
+    reasons = np.unique(np.concatenate([gradient.blocked.ravel() for gradient in maps])).tolist()
     return [
         ax.fill([], [], facecolor=_BLOCKED, edgecolor=_HATCH, hatch=_HATCHES[reason], label=REASONS[reason])[
             0
@@ -171,17 +175,9 @@ def _draw_footprint(ax: Axes, footprint: Footprint, width: float, style: str = "
         ax.fill(*ring.T, facecolor="none", edgecolor=INK, linewidth=width, linestyle=style)
 
 
-_MOST_EDGES: Final = 4
-_MOST_CANDIDATES: Final = 4
-_PANEL: Final = 3.4
-"""Its side, in inches."""
-_LINE: Final = 40
-"""Characters of a title's line."""
-
-
 @html.register(Step)
 def step_html(step: Step) -> Html:
-    """What was decided, on which edges and objects."""
+    """Return the decision, with the edges and objects considered."""
     states = ", ".join(map(str, step.states))
     title = element("b", f"step {step.number}: {step.kind}")
     place = quiet(f" at {step.time_ns / 1e9:.3f} s in state {states}")
@@ -195,13 +191,13 @@ def step_html(step: Step) -> Html:
 
 @plot.register(Step)
 def draw_step(step: Step, sample: Sample | None = None) -> tuple[Axes, ...]:
-    """Draw the maps that a step rests on: a row for each edge looked into, a column for each object.
+    """Draw the maps of a step: a row for each edge considered, a column for each object.
 
     Args:
-        sample: what was seen then; its objects are drawn over the maps.
+        sample: the sample of the decision; its objects are drawn over the maps.
 
     Returns:
-        The axes of each map; none where no map was needed.
+        The axes of each map; none if the step has no map.
 
     Raises:
         UsageError: matplotlib is not installed.
@@ -221,13 +217,13 @@ def draw_step(step: Step, sample: Sample | None = None) -> tuple[Axes, ...]:
     for panel in panels:
         panel.set_axis_off()
     drawn = tuple(panels[number] for number, _, _ in places)
-    reach = reach_of(maps)
+    reach = _reach_of(maps)
     images = [
         _draw_candidate(panel, edge, candidate, sample, reach)
         for panel, (_, edge, candidate) in zip(drawn, places, strict=True)
     ]
     drawn[0].figure.colorbar(images[0], ax=panels, label="robustness of what is to hold", shrink=0.6)
-    keys = hatch_keys(drawn[0], maps)
+    keys = _hatch_keys(drawn[0], maps)
     if keys:
         drawn[0].figure.legend(
             handles=keys, loc="outside lower left", ncols=len(keys), frameon=False, fontsize=8.5
@@ -238,22 +234,24 @@ def draw_step(step: Step, sample: Sample | None = None) -> tuple[Axes, ...]:
 def _draw_candidate(
     ax: Axes, edge: Consideration, candidate: Candidate, sample: Sample | None, reach: float
 ) -> AxesImage:
-    """Draw one map, and say what came of it."""
-    found = candidate.map
+    """Draw one map, titled with the choice made on it."""
+    gradient = candidate.map
     ax.set_axis_on()
-    image = draw_cells(found, ax, best_turn(found, candidate.target), reach)
-    draw_objects(ax, sample, candidate.name)
+    image = _draw_cells(gradient, ax, _best_turn(gradient, candidate.target), reach)
+    _draw_objects(ax, sample, candidate.name)
     if candidate.target is not None:
-        draw_target(ax, candidate.target, sample)
+        _draw_target(ax, candidate.target, sample)
     ax.set_title(
-        plain(f"{_arrow(edge)}: move {candidate.name}?") + "\n" + _came_of(candidate), fontsize=9, loc="left"
+        plain(f"{_arrow(edge)}: move {candidate.name}?") + "\n" + _choice_text(candidate),
+        fontsize=9,
+        loc="left",
     )
     ax.tick_params(labelsize=7.5)
     return image
 
 
-def _came_of(candidate: Candidate) -> str:
-    """Whether a candidate is the one to move, and how well that will do, or why not."""
+def _choice_text(candidate: Candidate) -> str:
+    """Return whether a candidate is chosen, with its robustness, or why it was rejected."""
     if candidate.target is None:
         return "\n".join(wrap(plain(f"no: {candidate.rejected}", 90), _LINE))
     choice = "chosen" if candidate.is_chosen else "possible"
@@ -265,10 +263,10 @@ def _arrow(edge: Consideration) -> str:
 
 
 def _edge(edge: Consideration) -> Html:
-    """An edge looked into, and a row for each object."""
+    """Return an edge considered, with a row for each object."""
     path = " → ".join(map(str, edge.path))
     rows = [
-        (element("b", each.name), f"{each.map.best():.4g}", _came_of(each).replace("\n", " "), _way(each))
+        (element("b", each.name), f"{each.map.best():.4g}", _choice_text(each).replace("\n", " "), _way(each))
         for each in edge.candidates
     ]
     lines = [f"to reach: {edge.progress}"]
@@ -294,13 +292,13 @@ def _way(candidate: Candidate) -> str:
 
 @plot.register(LoggedStep)
 def draw_logged_step(logged: LoggedStep) -> tuple[Axes, ...]:
-    """Draw the maps of a logged step with the objects as they were; see `draw_step`."""
+    """Draw the maps of a logged step with the objects of its sample; see `draw_step`."""
     return draw_step(logged.step, logged.sample)
 
 
 @html.register(LoggedStep)
 def logged_step_html(logged: LoggedStep) -> Html:
-    """The step, and how its execution went."""
+    """Return the step and its outcome."""
     parts = [step_html(logged.step)]
     if logged.outcome is not None and logged.end_ns is not None:
         how = "done" if logged.outcome.succeeded else "failed"

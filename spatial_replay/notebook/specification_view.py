@@ -1,4 +1,4 @@
-"""Specifications in notebooks: their trees, as a table and drawn."""
+"""Specifications in notebooks: their trees as tables and as figures."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _MOST_NODES: Final = 200
-"""Nodes in a table."""
+"""The most nodes in a table."""
 _MOST_DRAWN: Final = 60
-"""Nodes in a drawing."""
+"""The most nodes in a figure."""
 _DEEPEST: Final = 40
-"""Levels of a tree that a table indents."""
+"""The most levels that a table indents."""
 _GAP: Final = 0.6
-"""Rows between two trees."""
+"""Distance of two trees in a figure, in rows."""
 _PAPER: Final = (0.95, 0.95, 0.95)
 
 
 @html.register(Specification)
 def specification_html(specification: Specification) -> Html:
-    """What a specification is made of, and the trees of its results."""
+    """Return the declarations of a specification, and the trees of its results."""
     title = element("b", specification.filename)
     results = specification.results
     about = quiet(f" {counted(len(results), 'result')}, profile {specification.profile}")
@@ -47,7 +47,7 @@ def specification_html(specification: Specification) -> Html:
 
 
 def _trees(results: Sequence[NamedSpec]) -> Html:
-    """The trees below each other, as far as there is room."""
+    """Return the trees one below the other, up to the most nodes."""
     left = _MOST_NODES
     rows: list[tuple[str]] = []
     for spec in results:
@@ -58,7 +58,7 @@ def _trees(results: Sequence[NamedSpec]) -> Html:
 
 
 def tree_cell(stem: str, node: Formula) -> Html:
-    """A node in a tree, with its name in bold."""
+    """Return a node of a tree, with its name in bold."""
     indented = stem if len(stem) <= 3 * _DEEPEST else "⋯" + stem[-3:]
     name = [] if node.name is None else [element("b", node.name), " = "]
     return code(indented, *name, title_of(node))
@@ -69,11 +69,8 @@ def _left_out(results: Sequence[NamedSpec], shown: int) -> Html:
     return quiet(f"… and {counted(nodes - shown, 'node')} more") if shown < nodes else Html("")
 
 
-# ------------------------------------------------------------------------------------------- drawings
-
-
 class _Place(NamedTuple):
-    """Where a node is drawn: levels to the right, rows down; and where the node above it is."""
+    """The position of a node, in levels to the right and rows down, and that of its parent."""
 
     node: Formula
     x: float
@@ -108,7 +105,7 @@ def draw_specification(specification: Specification, ax: Axes | None = None) -> 
 
 
 def _places(results: Sequence[NamedSpec]) -> Iterator[_Place]:
-    """Where the first nodes of the trees are drawn, one tree below the other."""
+    """Iterate over the positions of the first nodes, one tree below the other."""
     left, first_row = _MOST_DRAWN, 0.0
     for spec in results:
         nodes = list(islice(iter_nodes(spec.formula), left))
@@ -123,7 +120,7 @@ def _places(results: Sequence[NamedSpec]) -> Iterator[_Place]:
 
 
 def _rows(parents: Sequence[int | None], first_row: float) -> tuple[list[float], int]:
-    """The row of each node, leaves one by one, others amid what is below; and how many rows."""
+    """Return the row of each node, leaves one by one and parents amid their children; and how many rows."""
     below: list[list[int]] = [[] for _ in parents]
     for identifier, parent in enumerate(parents):
         if parent is not None:
@@ -132,7 +129,7 @@ def _rows(parents: Sequence[int | None], first_row: float) -> tuple[list[float],
     leaves = [identifier for identifier, operands in enumerate(below) if not operands]
     for number, leaf in enumerate(leaves):
         rows[leaf] = first_row + number
-    # in the order of the text a node comes before what is below it
+    # parents come before their children, so that in reverse all children have their row
     for identifier in reversed(range(len(parents))):
         if below[identifier]:
             rows[identifier] = (rows[below[identifier][0]] + rows[below[identifier][-1]]) / 2

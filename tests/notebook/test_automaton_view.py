@@ -32,5 +32,5 @@ def test_texts_of_an_automaton_are_escaped():
 
 def test_a_page_without_graphviz_says_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert "drawing it takes Graphviz" in shown(automaton())
+    assert "install Graphviz to see it drawn" in shown(automaton())
     assert automaton()._repr_svg_() is None
