@@ -15,9 +15,8 @@ from pathlib import Path
 
 from spatial_replay.errors import GeometryError, LogError, UsageError
 from spatial_replay.geometry.footprint import Concave, Footprint
-from spatial_replay.logs.formats.tracks import ObjectReport, ReportColumns, finished_block
+from spatial_replay.logs.formats.tracks import ObjectReport, ReportedSample, iter_traces
 from spatial_replay.logs.formats.xml_elements import Element, iter_elements
-from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
@@ -148,21 +147,20 @@ def iter_scenario(path: Path, faults: FaultList, *, concave: Concave = "decompos
     steps = sorted({step for each in obstacles for step in each.moving}) or ([0] if obstacles else [])
     if not obstacles and not len(faults):
         raise UsageError(f"{path.name} is a scenario without obstacles; give one that has some")
-    columns = ReportColumns()
-    held = 0
+    samples = _iter_samples(path, faults, obstacles, steps, step_s)
+    yield from iter_traces(samples, faults, concave, most_reports=_BLOCK_REPORTS)
+
+
+def _iter_samples(
+    path: Path, faults: FaultList, obstacles: Sequence[_Obstacle], steps: Sequence[int], step_s: Fraction
+) -> Iterator[ReportedSample]:
     for step in steps:
         time_ns = round(step * step_s * 10**9)
         if time_ns > LATEST_NS:
             faults.add(f"{path.name}: time step {step} lies beyond what a time can be; it is left out")
             continue
         reports = [report for each in obstacles if (report := each.report(step)) is not None]
-        columns.add(time_ns, f"{path.name}: time step {step}", reports, {})
-        held += len(reports)
-        if len(columns) == BLOCK_SAMPLES or held >= _BLOCK_REPORTS:
-            yield finished_block(columns, faults, concave)
-            columns, held = ReportColumns(), 0
-    if len(columns):
-        yield finished_block(columns, faults, concave)
+        yield time_ns, f"{path.name}: time step {step}", reports, {}
 
 
 def _step_size(path: Path, root: Element) -> Fraction:

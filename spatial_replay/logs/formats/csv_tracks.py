@@ -9,8 +9,7 @@ from pathlib import Path
 
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.footprint import Concave
-from spatial_replay.logs.formats.tracks import ObjectReport, ReportColumns, finished_block, iter_lines
-from spatial_replay.logs.messages import BLOCK_SAMPLES
+from spatial_replay.logs.formats.tracks import ObjectReport, ReportedSample, iter_lines, iter_traces
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
@@ -30,17 +29,10 @@ def iter_csv(path: Path, faults: FaultList, *, concave: Concave = "decompose") -
     Raises:
         LogError: the first line does not name the columns.
     """
-    columns = ReportColumns()
-    for time_ns, place, reports in _samples(path, faults):
-        columns.add(time_ns, place, reports, {})
-        if len(columns) == BLOCK_SAMPLES:
-            yield finished_block(columns, faults, concave)
-            columns = ReportColumns()
-    if len(columns):
-        yield finished_block(columns, faults, concave)
+    return iter_traces(_samples(path, faults), faults, concave)
 
 
-def _samples(path: Path, faults: FaultList) -> Iterator[tuple[int, str, list[ObjectReport]]]:
+def _samples(path: Path, faults: FaultList) -> Iterator[ReportedSample]:
     lines = iter_lines(path, faults)
     order = _column_order(path, next(lines, (1, ""))[1])
     time_ns, place, reports, broken = -1, "", dict[str, ObjectReport](), False
@@ -56,7 +48,7 @@ def _samples(path: Path, faults: FaultList) -> Iterator[tuple[int, str, list[Obj
             continue
         if at > time_ns:
             if reports and not broken:
-                yield time_ns, place, list(reports.values())
+                yield time_ns, place, list(reports.values()), {}
             time_ns, place, reports, broken = at, here, {}, False
         try:
             report = _report(row)
@@ -67,7 +59,7 @@ def _samples(path: Path, faults: FaultList) -> Iterator[tuple[int, str, list[Obj
             faults.add(f"{here}: {error}; the sample at {at} ns is left out")
             broken = True
     if reports and not broken:
-        yield time_ns, place, list(reports.values())
+        yield time_ns, place, list(reports.values()), {}
 
 
 def _column_order(path: Path, header: str) -> list[str]:

@@ -9,11 +9,11 @@ from __future__ import annotations
 import gzip
 import json
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from math import nan
+from math import inf, nan
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import Any, BinaryIO, TypeAlias, cast
 
 import numpy as np
 
@@ -88,6 +88,10 @@ class ObjectReport:
     invalid: bool = False
 
 
+ReportedSample: TypeAlias = tuple[int, str, list[ObjectReport], dict[str, float]]
+"""Time, place in the file, objects and signals."""
+
+
 class ReportColumns:
     """Collects samples for the trace of a block."""
 
@@ -100,6 +104,10 @@ class ReportColumns:
 
     def __len__(self) -> int:
         return len(self.times)
+
+    @property
+    def report_count(self) -> int:
+        return len(self._reports)
 
     def add(self, time_ns: int, place: str, reports: list[ObjectReport], signals: dict[str, float]) -> None:
         """Add one sample; `place` says where it is in its file."""
@@ -160,7 +168,35 @@ class _NoSampleError(Exception):
 
 def iter_jsonl(path: Path, faults: FaultList, *, concave: Concave = "decompose") -> Iterator[Trace]:
     """Yield the samples of a `.jsonl` file in blocks; lines without a sample go to `faults`."""
+    return iter_traces(_jsonl_samples(path, faults), faults, concave)
+
+
+def iter_traces(
+    samples: Iterable[ReportedSample], faults: FaultList, concave: Concave, *, most_reports: float = inf
+) -> Iterator[Trace]:
+    """Yield reported samples in blocks; what has to be left out goes to `faults`.
+
+    Args:
+        most_reports: objects after which a block is closed, however few its samples are.
+    """
     columns = ReportColumns()
+    for sample in samples:
+        columns.add(*sample)
+        if len(columns) == BLOCK_SAMPLES or columns.report_count >= most_reports:
+            yield _trace_of(columns, faults, concave)
+            columns = ReportColumns()
+    if len(columns):
+        yield _trace_of(columns, faults, concave)
+
+
+def _trace_of(columns: ReportColumns, faults: FaultList, concave: Concave) -> Trace:
+    trace, left_out = columns.trace(concave=concave)
+    for fault in left_out:
+        faults.add(fault)
+    return trace
+
+
+def _jsonl_samples(path: Path, faults: FaultList) -> Iterator[ReportedSample]:
     latest = -1
     for number, line in iter_lines(path, faults):
         place = f"{path.name}:{number}"
@@ -172,20 +208,7 @@ def iter_jsonl(path: Path, faults: FaultList, *, concave: Concave = "decompose")
             faults.add(f"{place}: {error}")
             continue
         latest = time_ns
-        columns.add(time_ns, place, reports, signals)
-        if len(columns) == BLOCK_SAMPLES:
-            yield finished_block(columns, faults, concave)
-            columns = ReportColumns()
-    if len(columns):
-        yield finished_block(columns, faults, concave)
-
-
-def finished_block(columns: ReportColumns, faults: FaultList, concave: Concave) -> Trace:
-    """Return the trace of the collected samples; those that had to be left out go to `faults`."""
-    trace, left_out = columns.trace(concave=concave)
-    for fault in left_out:
-        faults.add(fault)
-    return trace
+        yield time_ns, place, reports, signals
 
 
 def _sample(line: str) -> tuple[int, list[ObjectReport], dict[str, float]]:

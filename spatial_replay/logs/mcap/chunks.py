@@ -217,17 +217,17 @@ def read_records(stream: BinaryIO, place: ChunkPlace) -> bytes:
 
 def iter_contents(
     stream: BinaryIO, places: Sequence[ChunkPlace]
-) -> Iterator[tuple[ChunkPlace, Callable[[], bytes]]]:
-    """Yield each place with its records, as `read_records` returns them when called.
+) -> Iterator[tuple[ChunkPlace, bytes | DamageError]]:
+    """Yield each place with its records, or with the damage that `read_records` raised.
 
     A second thread reads and decompresses the next places while the caller processes one, so the caller must
     not use the stream in between.
     """
     groups = [places[begin : begin + _TOGETHER] for begin in range(0, len(places), _TOGETHER)]
-    waiting: deque[tuple[Sequence[ChunkPlace], Future[list[Callable[[], bytes]]]]] = deque()
+    waiting: deque[tuple[Sequence[ChunkPlace], Future[list[bytes | DamageError]]]] = deque()
     with ThreadPoolExecutor(1, "chunk-reading") as reader:
         for group in groups:
-            waiting.append((group, reader.submit(_read_all, stream, group)))
+            waiting.append((group, reader.submit(_read_group, stream, group)))
             if len(waiting) > _AHEAD:
                 ready, contents = waiting.popleft()
                 yield from zip(ready, contents.result(), strict=True)
@@ -235,22 +235,14 @@ def iter_contents(
             yield from zip(ready, contents.result(), strict=True)
 
 
-def _read_all(stream: BinaryIO, places: Sequence[ChunkPlace]) -> list[Callable[[], bytes]]:
-    """Read some places; each result returns the records, or raises the damage."""
-    return [_outcome(stream, place) for place in places]
-
-
-def _outcome(stream: BinaryIO, place: ChunkPlace) -> Callable[[], bytes]:
-    try:
-        content = read_records(stream, place)
-    except DamageError as damage:
-        lost = damage
-
-        def fail() -> bytes:
-            raise lost
-
-        return fail
-    return lambda: content
+def _read_group(stream: BinaryIO, places: Sequence[ChunkPlace]) -> list[bytes | DamageError]:
+    contents: list[bytes | DamageError] = []
+    for place in places:
+        try:
+            contents.append(read_records(stream, place))
+        except DamageError as damage:
+            contents.append(damage)
+    return contents
 
 
 def _decompressed(compression: bytes, data: bytes, size: int) -> bytes:

@@ -175,14 +175,13 @@ class ChunkWalk:
             yield place, self._messages(place, content, passed_over)
 
     def _messages(
-        self, place: ChunkPlace, read: Callable[[], bytes], passed_over: frozenset[int]
+        self, place: ChunkPlace, records_read: bytes | DamageError, passed_over: frozenset[int]
     ) -> list[RawMessage]:
         span = f"messages between {place.start_ns} and {place.end_ns} ns"
-        try:
-            content = split_records(read(), passed_over)
-        except DamageError as damage:
-            self._fault(place, f"{damage}; the {span} are lost")
+        if isinstance(records_read, DamageError):
+            self._fault(place, f"{records_read}; the {span} are lost")
             return []
+        content = split_records(records_read, passed_over)
         if content.damage:
             self._fault(place, f"{content.damage}; of the {span}, {len(content.messages)} could be read")
         self._take_in(content.declarations)
