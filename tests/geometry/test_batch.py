@@ -1,4 +1,4 @@
-"""Footprints in flat arrays, and outlines straight from a file."""
+"""Footprints in flat arrays, and outlines read from a file."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from spatial_replay.errors import GeometryError
+from spatial_replay import Footprint, GeometryError
 from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.geometry.outline import EMPTY, NOT_CONVEX, NOT_FINITE, SOUND, normalise_polygons
 
 
@@ -22,7 +21,7 @@ def test_heights_stay_with_their_rows():
     assert chosen.footprint(0) == Footprint.disc(2, 0, 1)
 
 
-def test_arrays_are_views_that_cannot_be_written_to():
+def test_arrays_are_read_only_views():
     vertices = np.zeros((1, 2))
     batch = FootprintBatch([0, 1], [0, 1], vertices, [0.0], [math.nan], [math.nan])
     with pytest.raises(ValueError, match="read-only"):
@@ -40,7 +39,7 @@ def test_arrays_are_views_that_cannot_be_written_to():
         ("top", [], "top"),
     ],
 )
-def test_arrays_that_do_not_fit_together_are_refused(field, value, message):
+def test_arrays_of_inconsistent_shape_are_refused(field, value, message):
     arrays = {
         "part_start": [0, 1],
         "vertex_start": [0, 1],
@@ -53,7 +52,7 @@ def test_arrays_that_do_not_fit_together_are_refused(field, value, message):
         FootprintBatch(**{**arrays, field: value})
 
 
-def test_outlines_from_a_file_are_put_right_or_named():
+def test_raw_outlines_are_normalised_or_reported():
     square = [(0, 0), (1, 0), (1, 1), (0, 1)]
     dart = [(0, 0), (2, 1), (0, 2), (1, 1)]
     broken = [(0, 0), (1, math.nan), (1, 1)]

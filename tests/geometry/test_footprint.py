@@ -1,4 +1,4 @@
-"""What shapes people can write down, and what they are told when they cannot."""
+"""Valid footprints, and the errors for invalid ones."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from spatial_replay.errors import GeometryError
-from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
+from spatial_replay import ConvexPart, Footprint, GeometryError, TrackedObject
 
 SQUARE = [(0, 0), (2, 0), (2, 2), (0, 2)]
 L_SHAPE = [(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]
@@ -37,7 +36,7 @@ def test_spellings_of_one_square_are_equal(corners):
     assert hash(square) == hash(Footprint.box(0, 0, 2, 2))
 
 
-def test_what_is_in_order_is_kept_to_the_bit():
+def test_normal_vertices_are_returned_bit_for_bit():
     corners = np.array([(0.1, 0.2), (1.7, 0.3), (0.9, 1.1)])
     assert Footprint.polygon(corners).parts[0].vertices.tobytes() == corners.tobytes()
 
@@ -72,7 +71,7 @@ def test_a_boundary_that_crosses_itself_is_refused_by_place_and_remedy():
     assert Footprint.polygon(BOW_TIE, concave="hull") == Footprint.box(0, 0, 2, 2)
 
 
-def test_a_star_drawn_in_one_line_is_no_convex_polygon():
+def test_a_star_polygon_is_not_convex():
     star = [(math.cos(4 * math.pi * i / 5), math.sin(4 * math.pi * i / 5)) for i in range(5)]
     with pytest.raises(GeometryError, match="crosses"):
         Footprint.polygon(star)
@@ -98,12 +97,12 @@ def test_a_star_drawn_in_one_line_is_no_convex_polygon():
         (lambda: ConvexPart(np.array(L_SHAPE)), "Footprint.polygon"),
     ],
 )
-def test_what_makes_no_footprint_is_refused_with_its_value(make, message):
+def test_invalid_footprints_are_refused_with_their_value(make, message):
     with pytest.raises(GeometryError, match=message):
         make()
 
 
-def test_vertices_cannot_be_written_to_nor_follow_their_source():
+def test_vertices_are_read_only_copies():
     source = np.array(SQUARE, dtype=float)
     part = ConvexPart(source)
     source[0, 0] = 99
@@ -135,7 +134,7 @@ def test_footprints_compare_by_what_they_cover():
         ({"class_name": 7}, "class_name is 7"),
     ],
 )
-def test_a_tracked_object_checks_what_is_known_of_it(options, message):
+def test_a_tracked_object_checks_its_attributes(options, message):
     with pytest.raises(GeometryError, match=message):
         TrackedObject(Footprint.disc(0, 0, 1), **options)
 

@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from spatial_replay.errors import GeometryError
+from spatial_replay import Footprint, GeometryError
 from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 
 UNIT = Footprint.box(0, 0, 1, 1)
@@ -130,7 +129,7 @@ def test_prisms_count_when_both_have_heights():
 
 def test_empty_places_are_left_out_and_an_empty_union_is_infinitely_far():
     batch = FootprintBatch.from_footprints([UNIT, Footprint.box(3, 0, 4, 1), Footprint.box(9, 0, 10, 1)])
-    nobody, some = rows(-1, -7), rows(-1, 2, 1)
+    empty, some = rows(-1, -7), rows(-1, 2, 1)
     requests = [
         MeasureRequest("signed_distance", 0, 2),
         MeasureRequest("signed_distance", 0, 1),
@@ -142,7 +141,7 @@ def test_empty_places_are_left_out_and_an_empty_union_is_infinitely_far():
         MeasureRequest("max_x", 2),
         MeasureRequest("protrusion", 0, 1),
     ]
-    values = measure(batch, [rows(0), nobody, some], requests)[:, 0]
+    values = measure(batch, [rows(0), empty, some], requests)[:, 0]
     assert values.tolist() == [2, math.inf, -math.inf, math.inf, -math.inf, 10, math.inf]
     assert measure(batch, [rows(0), rows()], [MeasureRequest("signed_distance", 0, 1)])[0, 0] == math.inf
 
@@ -153,7 +152,7 @@ def test_each_sample_has_its_own_rows():
     assert measure(batch, operands, [MeasureRequest("signed_distance", 0, 1)]).tolist() == [[0.5, 1.5, 2.5]]
 
 
-def test_nothing_asked_is_nothing_answered():
+def test_no_requests_give_no_measurements():
     batch = FootprintBatch.from_footprints([])
     assert measure(batch, [], []).shape == (0, 0)
     assert measure(batch, [Operand(np.full((4, 1), -1))], [MeasureRequest("min_x", 0)]).tolist() == [
@@ -175,6 +174,6 @@ def test_nothing_asked_is_nothing_answered():
         ([rows(0)], MeasureRequest("width", 0), "'width'.*signed_distance"),
     ],
 )
-def test_what_cannot_be_measured_is_refused(operands, request_, message):
+def test_invalid_requests_are_refused(operands, request_, message):
     with pytest.raises(GeometryError, match=message):
         measure(FootprintBatch.from_footprints([UNIT]), operands, [request_])

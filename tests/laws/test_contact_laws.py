@@ -1,4 +1,4 @@
-"""Points that show a distance really are that far apart, and where they are said to be."""
+"""The points that show a distance are as far apart as measured, and lie where they should."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 from hypothesis import given
 
 from laws.strategies_geometry import footprints, radii
+from spatial_replay import Footprint
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.contact import contact, contacts, enlarged, protrusion_contact
-from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 
 TOLERANCE = 1e-6
@@ -38,7 +38,7 @@ def test_a_contact_is_the_signed_distance(a, b):
 
 
 @given(footprints, footprints)
-def test_a_push_parts_them(a, b):
+def test_the_contact_translation_separates_overlapping_footprints(a, b):
     found = contact(a, b)
     if found.distance < -TOLERANCE and len(a.parts) == len(b.parts) == 1:
         push = np.subtract(found.first, found.second)
@@ -49,7 +49,7 @@ def test_a_push_parts_them(a, b):
 
 
 @given(footprints, footprints)
-def test_what_sticks_out_is_the_protrusion(inner, outer):
+def test_the_protrusion_contact_has_the_measured_protrusion(inner, outer):
     found = protrusion_contact(inner, outer)
     protrusion = measured("protrusion", inner, outer)
     assert math.isclose(found.distance, protrusion, abs_tol=TOLERANCE)
@@ -57,7 +57,7 @@ def test_what_sticks_out_is_the_protrusion(inner, outer):
 
 
 @given(footprints, footprints, radii)
-def test_enlarging_takes_from_the_distance(a, b, radius):
+def test_enlarging_reduces_the_distance(a, b, radius):
     before, after = contact(a, b).distance, contact(a, enlarged(b, radius)).distance
     assert math.isclose(after, before - radius, abs_tol=TOLERANCE)
 
@@ -69,7 +69,7 @@ def many(first, second, *, is_protrusion):
 
 
 @given(footprints, footprints)
-def test_contacts_of_many_are_as_far_apart_as_is_measured(a, b):
+def test_contacts_of_many_samples_equal_the_measured_distances(a, b):
     for is_protrusion, quantity in ((False, "signed_distance"), (True, "protrusion")):
         *found, distance, top = many(a, b, is_protrusion=is_protrusion)
         assert math.isclose(distance, measured(quantity, a, b), abs_tol=TOLERANCE)
@@ -78,7 +78,7 @@ def test_contacts_of_many_are_as_far_apart_as_is_measured(a, b):
 
 
 @given(footprints, footprints)
-def test_contacts_lie_on_both_borders(a, b):
+def test_contacts_lie_on_both_boundaries(a, b):
     *found, distance, _ = many(a, b, is_protrusion=False)
     if distance > TOLERANCE:
         assert abs(to(found[:2], a)) < TOLERANCE

@@ -1,4 +1,4 @@
-"""What holds for every pair of footprints, against definitions and against another library."""
+"""Laws of every pair of footprints, against definitions and another library."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from laws.strategies_geometry import (
     radii,
     star_polygons,
 )
+from spatial_replay import ConvexPart, Footprint
 from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.footprint import ConvexPart, Footprint
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 from spatial_replay.geometry.outline import SOUND, normalise_polygons
 
@@ -96,14 +96,14 @@ def test_signed_distance_is_symmetric_to_the_bit(first, second, radius):
 
 
 @given(footprints, footprints, angles, points)
-def test_measurements_between_two_do_not_notice_a_motion_of_both(first, second, angle, shift):
+def test_measurements_are_invariant_under_a_common_motion(first, second, angle, shift):
     moved_first, moved_second = moved(first, angle, *shift), moved(second, angle, *shift)
     for of in (signed_distance, protrusion):
         assert of(moved_first, moved_second) == pytest.approx(of(first, second), abs=TOLERANCE)
 
 
 @given(footprints, footprints)
-def test_signed_distance_changes_no_faster_than_one_moves(first, second):
+def test_signed_distance_is_lipschitz_in_a_translation(first, second):
     nearer = moved(first, 0.0, 0.25, 0.0)
     assert abs(signed_distance(nearer, second) - signed_distance(first, second)) <= 0.25 + TOLERANCE
 
@@ -175,7 +175,7 @@ def test_prisms_combine_planar_distance_and_gap(first, second, low, high):
 
 
 @given(st.lists(footprints, min_size=2, max_size=5))
-def test_results_do_not_depend_on_what_else_is_asked(shapes):
+def test_results_do_not_depend_on_other_requests(shapes):
     batch = FootprintBatch.from_footprints(shapes)
     count = len(shapes)
     first = np.repeat(np.arange(count), count)[:, None]
@@ -208,7 +208,7 @@ def test_a_hull_is_the_smallest_convex_cover(corners):
 
 
 @given(st.lists(st.one_of(convex_vertices(), star_polygons()), min_size=1, max_size=6))
-def test_outlines_come_out_alike_alone_and_together_and_stay_as_they_are(outlines):
+def test_outlines_normalise_alike_alone_and_together_and_idempotently(outlines):
     start = np.concatenate([[0], np.cumsum([len(corners) for corners in outlines])])
     together = normalise_polygons(start, np.concatenate(outlines))
     for p, corners in enumerate(outlines):

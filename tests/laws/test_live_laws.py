@@ -1,4 +1,4 @@
-"""A monitor says what an evaluation says, whoever comes and goes."""
+"""A monitor equals an evaluation while objects appear and disappear."""
 
 from __future__ import annotations
 
@@ -10,12 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laws.strategies_monitor import NAMES, WORDS, specifications, tracked_objects
-from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.monitor.evaluate import evaluate
-from spatial_replay.monitor.monitor import Monitor
-from spatial_replay.spec.load import parse_specification
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay import Footprint, Monitor, Sample, Trace, TrackedObject, evaluate, parse_specification
 
 PASSERS_BY = (*(f"p{number}" for number in range(5)), "?", "?(0,) 0", "?(1,) 0")
 ANYONE = st.sets(st.sampled_from((*NAMES, *PASSERS_BY)), max_size=6)
@@ -59,7 +54,7 @@ def assert_monitor_agrees(specification, samples):
 
 @settings(max_examples=60)
 @given(specification=specifications_looking_back(), samples=crowds())
-def test_whoever_comes_and_goes_a_monitor_says_what_an_evaluation_says(specification, samples):
+def test_a_monitor_equals_an_evaluation_while_objects_appear_and_disappear(specification, samples):
     assert_monitor_agrees(specification, samples)
 
 
@@ -68,11 +63,11 @@ def test_whoever_comes_and_goes_a_monitor_says_what_an_evaluation_says(specifica
     specification=specifications(words=replace(WORDS, objects=(*NAMES, "p0")), templates=False),
     samples=crowds(),
 )
-def test_any_specification_over_a_crowd(specification, samples):
+def test_a_monitor_equals_an_evaluation_over_many_objects(specification, samples):
     assert_monitor_agrees(specification, samples)
 
 
-def test_more_kinds_of_crowds_than_a_monitor_remembers():
+def test_more_kinds_of_crowds_than_a_monitor_has_plans_for():
     kinds = [f"k{number}" for number in range(6)]
     specification = parse_specification(
         "".join(f'spec s{kind} = G forall x in class "{kind}": x dist a >= 3\n' for kind in kinds)

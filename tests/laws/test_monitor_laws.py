@@ -1,4 +1,4 @@
-"""What holds for every formula on every run, against a slow reading of the definitions."""
+"""Laws of every formula on every run, against a slow reading of the definitions."""
 
 from __future__ import annotations
 
@@ -27,13 +27,12 @@ from laws.strategies_monitor import (
     tracked_objects,
     widened,
 )
-from spatial_replay.monitor.evaluate import evaluate
+from spatial_replay import Monitor, Verdict, evaluate
 from spatial_replay.monitor.instances import find_instances
-from spatial_replay.monitor.monitor import Monitor
 from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.monitor.stream import EvaluationStream
-from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
+from spatial_replay.monitor.verdict import final_verdict, online_verdict
 from spatial_replay.spec.formula import Boolean, Temporal, Truth
 from spatial_replay.trace.sample import FOREVER
 
@@ -90,7 +89,7 @@ def either(*formulas):
 
 @settings(max_examples=500)
 @given(data=st.data(), formula=formulas_of_leaves, run=leaf_runs(), room=st.integers(2, 8))
-def test_every_node_on_every_prefix_is_what_the_definitions_say(data, formula, run, room):
+def test_every_node_on_every_prefix_equals_the_definitions(data, formula, run, room):
     series, final = run_of(formula, run, room=room, cuts=data.draw(cuts(len(run))))
     wide_leaf = run.wide_leaf if run.channels == 4 else run.nominal_leaf
     expected = numbers_of(formula, run.times_ns, run.nominal_leaf, wide_leaf)
@@ -99,7 +98,7 @@ def test_every_node_on_every_prefix_is_what_the_definitions_say(data, formula, r
 
 @settings(max_examples=150)
 @given(data=st.data(), specification=specifications(), recording=recordings())
-def test_specifications_over_recordings_are_what_the_definitions_say(data, specification, recording):
+def test_specifications_over_recordings_equal_the_definitions(data, specification, recording):
     times = [sample.time_ns for sample in recording.samples]
     begin = data.draw(st.integers(0, len(times) - 1))
     end = data.draw(st.integers(begin + 1, len(times)))
@@ -160,7 +159,7 @@ def assert_close(series, expected):
 
 
 @given(data=st.data(), formula=formulas_of_leaves, run=leaf_runs(max_size=40))
-def test_stretches_and_room_change_no_bit(data, formula, run):
+def test_blocks_and_room_change_no_bit(data, formula, run):
     whole = run_of(formula, run)
     parts = run_of(formula, run, room=data.draw(st.integers(2, 8)), cuts=data.draw(cuts(len(run))))
     assert [array.tobytes() for array in whole] == [array.tobytes() for array in parts]
@@ -168,7 +167,7 @@ def test_stretches_and_room_change_no_bit(data, formula, run):
 
 @few
 @given(data=st.data(), specification=specifications(), recording=recordings(max_size=8))
-def test_a_stream_in_stretches_says_what_an_evaluation_of_the_whole_says(data, specification, recording):
+def test_a_stream_in_blocks_equals_an_evaluation_of_the_whole(data, specification, recording):
     trace = recording.trace()
     start_ns = int(data.draw(st.sampled_from([0, *trace.times_ns])))
     each = {"ego": "all"} if specification.specs[0].parameter else {}
@@ -186,7 +185,7 @@ def test_a_stream_in_stretches_says_what_an_evaluation_of_the_whole_says(data, s
 
 @few
 @given(data=st.data(), specification=specifications(templates=False), recording=recordings())
-def test_a_monitor_says_sample_by_sample_what_an_evaluation_says(data, specification, recording):
+def test_a_monitor_equals_an_evaluation_sample_by_sample(data, specification, recording):
     assume(not recording.unreadable)
     trace = recording.trace()
     start_ns = int(data.draw(st.sampled_from([0, *trace.times_ns])))
@@ -291,7 +290,7 @@ def test_knowing_less_only_widens(data, formula, run):
 
 
 @given(formula=formulas_of_leaves, run=leaf_runs(max_size=6))
-def test_a_verdict_holds_for_whatever_was_unknown(formula, run):
+def test_a_verdict_holds_for_every_value_of_the_unknown(formula, run):
     """Any numbers in the place of what is unknown or uncertain lead to the verdict, where there is one."""
     run = replace(run, channels=4)
     verdict = final_verdict(*run_of(formula, run)[1][0])
@@ -366,7 +365,7 @@ CLOSED_WORDS = replace(WORDS, classes=(), groups=("pair", "people"), quantifiers
     recording=recordings(),
     stranger=tracked_objects(certain=True),
 )
-def test_an_object_that_no_group_takes_in_changes_nothing(data, specification, recording, stranger):
+def test_an_object_outside_every_open_group_changes_nothing(data, specification, recording, stranger):
     joined = tuple(
         replace(sample, objects={**sample.objects, "stranger": replace(stranger, class_name="bird")})
         if data.draw(st.booleans())
@@ -388,7 +387,7 @@ def bits(evaluation):
 
 @few
 @given(first=specifications(), second=specifications(), recording=recordings())
-def test_what_is_kept_with_a_trace_changes_no_later_evaluation(first, second, recording):
+def test_the_cache_of_a_trace_changes_no_later_evaluation(first, second, recording):
     trace = recording.trace()
     for specification in (first, second, first):
         each = {"ego": "all"} if specification.specs[0].parameter else None

@@ -1,4 +1,4 @@
-"""What holds for every formula over a finished stretch, against a slow reading of the definitions."""
+"""Robustness at every sample of finished logs, against a slow reading of the definitions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def stretch(run, leaf, begin, end):
 
 @settings(max_examples=400)
 @given(formula=formulas_of_leaves, run=leaf_runs())
-def test_every_node_at_every_sample_is_what_the_definitions_say(formula, run):
+def test_every_node_at_every_sample_equals_the_definitions(formula, run):
     order, times = compile_formula(formula).leaves, np.array(run.times_ns)
     leaves = run.values(order)
     done = evaluate_offline(formula, order, leaves, times)
@@ -47,7 +47,7 @@ def test_every_node_at_every_sample_is_what_the_definitions_say(formula, run):
 
 @settings(max_examples=200)
 @given(formula=formulas_of_leaves, run=leaf_runs(), width_ns=st.sampled_from([1, 100, 101, 300, 10**6]))
-def test_a_window_is_a_run_of_its_own(formula, run, width_ns):
+def test_a_window_equals_a_run_of_its_own(formula, run, width_ns):
     order, times = compile_formula(formula).leaves, np.array(run.times_ns)
     signal = window_signal(formula, order, run.values(order), times, width_ns)
     for t in range(len(run)):

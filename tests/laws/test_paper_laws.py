@@ -11,9 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from laws.strategies_monitor import LEAVES, WORDS, bounds, cuts, recordings, specifications
-from spatial_replay.errors import UsageError
-from spatial_replay.monitor.evaluate import evaluate
-from spatial_replay.monitor.monitor import Monitor
+from spatial_replay import Monitor, UsageError, evaluate
 from spatial_replay.monitor.paper.evaluator import PaperRun
 from spatial_replay.spec.formula import Atom, Boolean, Formula, Temporal, Truth, iter_nodes
 
@@ -156,7 +154,7 @@ def series_of(formula, run, ends):
 
 @settings(max_examples=300)
 @given(formulas, runs(), st.data())
-def test_every_node_on_every_prefix_is_what_the_definition_says(formula, run, data):
+def test_every_node_on_every_prefix_equals_the_definition(formula, run, data):
     size = len(run.times_ns)
     series = series_of(formula, run, data.draw(cuts(size)))
     for identifier, _, node in iter_nodes(formula):
@@ -166,7 +164,7 @@ def test_every_node_on_every_prefix_is_what_the_definition_says(formula, run, da
 
 
 @given(formulas, runs(), st.data())
-def test_how_the_samples_are_cut_changes_no_bit(formula, run, data):
+def test_the_size_of_blocks_changes_no_bit(formula, run, data):
     size = len(run.times_ns)
     whole = series_of(formula, run, (0, size))
     for ends in (data.draw(cuts(size)), range(size + 1)):
@@ -175,7 +173,7 @@ def test_how_the_samples_are_cut_changes_no_bit(formula, run, data):
 
 @settings(max_examples=50)
 @given(specifications(words=replace(WORDS, past=False), templates=False), recordings(), st.data())
-def test_a_monitor_says_sample_by_sample_what_an_evaluation_says(specification, recording, data):
+def test_a_monitor_equals_an_evaluation_sample_by_sample(specification, recording, data):
     assume(not recording.unreadable)
     trace = recording.trace()
     start_ns = int(data.draw(st.sampled_from([0, *trace.times_ns])))

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from laws.strategies_trace import certain_traces, traces
-from spatial_replay.trace.trace import Trace
+from spatial_replay import Trace
 
 
 @given(certain_traces())

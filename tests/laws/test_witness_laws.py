@@ -1,4 +1,4 @@
-"""A witness is true: its atom has the value it claims, and the change it tells flips the verdict."""
+"""A witness is true: its atom has the reported value, and the reported change flips the verdict."""
 
 from __future__ import annotations
 
@@ -12,16 +12,12 @@ from hypothesis import strategies as st
 from laws.strategies_monitor import formulas_of_leaves, leaf_runs, recordings, specifications
 from laws.strategies_spec import Vocabulary
 from laws.test_monitor_laws import observed_in
+from spatial_replay import Sample, Trace, Verdict, evaluate, parse_specification
 from spatial_replay.annotate.sentences import sentences_of
-from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.offline import evaluate_offline
 from spatial_replay.monitor.online.program import compile_formula
-from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.monitor.witness.path import End, deciding_path
 from spatial_replay.spec.formula import Number, iter_nodes
-from spatial_replay.spec.load import parse_specification
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
 
 SIGNALS = Vocabulary(objects=(), signals=("p", "q"), max_depth=4, delays=False)
 NUMBER = re.compile(r"(?<![\w.])-?\d+(\.\d+)?(?![\w.])")
@@ -58,7 +54,7 @@ def comparison_texts(draw) -> str:
 
 @settings(max_examples=400)
 @given(formula=formulas_of_leaves, run=leaf_runs())
-def test_the_way_down_ends_at_the_number_it_began_with(formula, run):
+def test_the_path_ends_at_the_number_it_began_with(formula, run):
     order, times = compile_formula(formula).leaves, np.array(run.times_ns)
     done = evaluate_offline(formula, order, run.values(order), times)
     for index, _ in enumerate(iter_nodes(formula)):
@@ -78,7 +74,7 @@ def test_the_way_down_ends_at_the_number_it_began_with(formula, run):
 
 
 @given(trace=signal_runs(), operator=st.sampled_from("GF"))
-def test_of_equal_samples_the_earliest_decides(trace, operator):
+def test_the_earliest_of_equal_samples_decides(trace, operator):
     result = evaluate(parse_specification(f"{operator} (p >= 0.5)"), trace).result()
     witness = result.witness()
     assume(witness.verdict is not Verdict.UNKNOWN)
@@ -145,12 +141,12 @@ def test_the_threshold_flips_the_verdict(text, trace):
     nearer = threshold.value + 0.999 * (threshold.flips_at - threshold.value)
     if abs(threshold.flips_at - threshold.value) > 1e-9:
         assert verdict_with(text, trace, witness, nearer) is witness.verdict
-    told = TOLD.search(sentences[2])
-    if told:
-        assert verdict_with(text, trace, witness, float(told[1])) is threshold.verdict
+    reported = REPORTED.search(sentences[2])
+    if reported:
+        assert verdict_with(text, trace, witness, float(reported[1])) is threshold.verdict
 
 
-TOLD = re.compile(r"(?:with|exactly) (-?[0-9.e-]+)(?: or more| or less|) in place of")
+REPORTED = re.compile(r"(?:with|exactly) (-?[0-9.e-]+)(?: or more| or less|) in place of")
 
 
 def verdict_with(text: str, trace: Trace, witness, new: float) -> Verdict:
@@ -207,9 +203,9 @@ def test_the_threshold_of_a_relation_flips_the_verdict(text, number, recording):
     evaluation = evaluated(number)
     witness = evaluation.witness()
     threshold = witness.threshold
-    told = TOLD.search(sentences_of(witness, first_ns=0)[-1])
-    if told and threshold is not None and threshold.value == number:
-        assert evaluated(float(told[1])).verdict is not evaluation.verdict
+    reported = REPORTED.search(sentences_of(witness, first_ns=0)[-1])
+    if reported and threshold is not None and threshold.value == number:
+        assert evaluated(float(reported[1])).verdict is not evaluation.verdict
     if threshold is not None and threshold.is_written and threshold.value == number:
         assert evaluated(threshold.flips_at).verdict is threshold.verdict
         assert threshold.verdict is not evaluation.verdict

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.monitor.evaluate import evaluate
-from spatial_replay.spec.load import parse_specification
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay import Footprint, Sample, Trace, TrackedObject, evaluate, parse_specification
 
 SECOND = 10**9
 

@@ -1,4 +1,4 @@
-"""Evaluating a specification over a trace: what comes back, over which samples, and what is refused."""
+"""Evaluating a specification over a trace: results, windows, and errors."""
 
 from __future__ import annotations
 
@@ -8,14 +8,10 @@ import numpy as np
 import pytest
 
 from monitor.scenes import SECOND, judged, numbers, points, root
-from spatial_replay.errors import UsageError
+from spatial_replay import Monitor, Trace, UsageError, Verdict, evaluate, parse_specification
 from spatial_replay.monitor.atoms.instructions import MAX_BINDINGS
-from spatial_replay.monitor.evaluate import evaluate
-from spatial_replay.monitor.monitor import Monitor
 from spatial_replay.monitor.online.operators import MAX_VARIABLES
-from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict, worst_verdict
-from spatial_replay.spec.load import parse_specification
-from spatial_replay.trace.trace import Trace
+from spatial_replay.monitor.verdict import final_verdict, online_verdict, worst_verdict
 
 TWO_SPECS = """\
 spec near = F a dist b <= 2
@@ -68,7 +64,7 @@ def test_every_node_of_the_tree_has_its_numbers(trace):
     assert [str(node.verdict) for node in nodes[:2]] == ["satisfied", "satisfied"]
 
 
-def test_a_node_is_found_by_the_name_of_its_spec(trace):
+def test_a_node_is_selected_by_the_name_of_its_spec(trace):
     evaluation = judged(TWO_SPECS, trace)
     assert evaluation.node("near").robustness == 1
     assert evaluation.result("both").node("low").robustness == 1
@@ -78,7 +74,7 @@ def test_a_node_is_found_by_the_name_of_its_spec(trace):
         evaluation.result("both").node("high")
 
 
-def test_a_name_that_no_node_has_is_answered_with_the_nearest(trace):
+def test_an_unknown_node_name_is_answered_with_the_nearest(trace):
     specification = parse_specification(TWO_SPECS)
     evaluation = evaluate(specification, trace)
     update = Monitor(specification).update(next(iter(trace.samples())))
@@ -89,7 +85,7 @@ def test_a_name_that_no_node_has_is_answered_with_the_nearest(trace):
             found.node("nera")
 
 
-def test_names_that_the_trace_never_has_are_remarked_on(trace):
+def test_names_missing_from_the_trace_are_reported(trace):
     text = "region b = box(0, 0, 1, 1)\nspec s = F (aa ovlp b) and G q >= 0 and F a ovlp b"
     evaluation = judged(text, trace)
     assert [(each.severity, each.line, each.message) for each in evaluation.remarks] == [
@@ -101,12 +97,12 @@ def test_names_that_the_trace_never_has_are_remarked_on(trace):
     assert judged(TWO_SPECS, trace).remarks == ()
 
 
-def test_a_window_without_an_object_that_the_trace_has_is_no_remark():
+def test_an_object_absent_only_from_the_window_is_not_reported():
     trace = points(a=[0, None, None], b=[1, 1, 1])
     assert judged("F a ovlp b", trace, start_ns=SECOND).remarks == ()
 
 
-def test_a_result_is_found_by_its_name(trace):
+def test_a_result_is_selected_by_name(trace):
     evaluation = judged(TWO_SPECS, trace)
     assert evaluation.result("high").robustness == -6
     with pytest.raises(UsageError, match=r"2 results fit name=None, object=None; there are both, high"):
@@ -170,7 +166,7 @@ def test_past_operators_start_with_the_window_and_terms_may_look_before_it():
     assert root("Y a dist a <= 0", trace, start_ns=3 * SECOND).now.tolist() == [-inf, 0]
 
 
-def test_a_term_earlier_by_samples_or_by_time():
+def test_terms_look_back_by_samples_or_by_time():
     trace = points(a=[0, 1, 3, 6, 10])
     np.testing.assert_array_equal(root("a dist a[-2] >= 0", trace).now, [nan, nan, 3, 5, 7])
     np.testing.assert_array_equal(root("a dist a[-2s] >= 0", trace).now, [nan, nan, 3, 5, 7])
@@ -178,7 +174,7 @@ def test_a_term_earlier_by_samples_or_by_time():
     np.testing.assert_array_equal(root("a dist a[-2.5s] >= 0", trace).now, [nan, nan, nan, 6, 9])
 
 
-def test_a_group_as_it_was_earlier():
+def test_groups_look_back():
     trace = points(a=[0, 0, 0], b=[1, None, None], c=[None, 7, 2])
     others = "(all except a)"
     assert root(f"a dist {others} >= 0", trace).now.tolist() == [1, 7, 2]
@@ -189,7 +185,7 @@ def test_a_group_as_it_was_earlier():
     np.testing.assert_array_equal(root(members, trace).now, [nan, nan, 1])
 
 
-def test_no_sample_to_evaluate_is_refused():
+def test_an_empty_window_is_refused():
     trace = numbers(p=[1, 2, 3])
     with pytest.raises(
         UsageError, match=r"no sample lies from 5 ns to before 9 ns; the trace runs from 0 to"
@@ -209,7 +205,7 @@ def test_unknown_semantics_are_refused():
 # -------------------------------------------------------------------------------------------- what is kept
 
 
-def test_an_edited_specification_over_the_same_trace():
+def test_an_edited_specification_reuses_the_measurements_of_a_trace():
     trace = points(a=[0, 0, 0], b=[5, 1, 4])
     judged("F a dist b <= 2", trace)
     assert root("G a dist b <= 6", trace).value.tolist() == [1, 1, 1]
@@ -218,7 +214,7 @@ def test_an_edited_specification_over_the_same_trace():
     assert root(moved.format(4), trace).robustness == 1
 
 
-def test_regions_of_one_name_and_of_one_shape_are_told_apart():
+def test_regions_with_equal_names_or_equal_shapes_are_not_confused():
     trace = points(a=[0])
     text = """\
 region {0} = box(2, 0, 2, 1)
@@ -232,7 +228,7 @@ spec s = a dist {0} <= 9 and a dist {1} <= 5
 # ------------------------------------------------------------------------------------------- what is too much
 
 
-def test_more_nested_operators_than_a_table_can_hold():
+def test_more_nested_operators_than_a_table_can_hold_are_refused():
     text = "G p >= 0"
     for _ in range(MAX_VARIABLES):
         text = f"G (q >= 0 or F ({text}))"
@@ -242,21 +238,21 @@ def test_more_nested_operators_than_a_table_can_hold():
         judged(text, numbers(p=[1], q=[1]))
 
 
-def test_as_many_nested_operators_as_a_table_can_hold():
+def test_the_most_nested_operators_a_table_can_hold_are_evaluated():
     text = "p >= 0"
     for _ in range(MAX_VARIABLES):
         text = f"F (q >= 0 and {text})"
     assert root(text, numbers(p=[1, 2], q=[3, 1])).value.tolist() == [1, 1]
 
 
-def test_both_polarities_at_every_level_stay_in_proportion():
+def test_tables_grow_linearly_with_both_polarities_at_every_level():
     text = "p >= 0"
     for _ in range(40):
         text = f"(F[0,1] p >= 0) xor ({text})"
     assert root(f"G {text}", numbers(p=[1, -1])).verdict in ("satisfied", "violated")
 
 
-def test_more_bindings_than_a_trace_can_be_asked_for():
+def test_too_many_bindings_are_refused():
     many = points(**{f"o{n}": [n] for n in range(30)})
     with pytest.raises(UsageError, match=rf"x, y, z over 30 objects brings .* {MAX_BINDINGS} is the limit"):
         judged("forall x, y, z in all: x dist y >= 0", many)
@@ -265,7 +261,7 @@ def test_more_bindings_than_a_trace_can_be_asked_for():
 
 
 @pytest.mark.parametrize("given", ["F a ovlp b", None, Trace.from_samples([])])
-def test_something_else_than_a_specification_is_refused(trace, given):
+def test_an_argument_that_is_no_specification_is_refused(trace, given):
     remedy = r"specification is .*; give a Specification, from parse_specification\(text\)"
     with pytest.raises(UsageError, match=remedy):
         evaluate(given, trace)
@@ -274,7 +270,7 @@ def test_something_else_than_a_specification_is_refused(trace, given):
 
 
 @pytest.mark.parametrize("given", [[1], "log.mcap", None])
-def test_something_else_than_a_trace_is_refused(given):
+def test_an_argument_that_is_no_trace_is_refused(given):
     with pytest.raises(UsageError, match=r"trace is .*; give a Trace, from read_trace\(path\)") as caught:
         evaluate(parse_specification("F a ovlp b"), given)
     assert f"trace is {given!r};" in str(caught.value)

@@ -8,11 +8,7 @@ from math import inf
 import pytest
 
 from monitor.scenes import SECOND
-from spatial_replay.errors import TraceError, UsageError
-from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.monitor.monitor import Monitor
-from spatial_replay.spec.load import parse_specification
-from spatial_replay.trace.sample import Sample
+from spatial_replay import Footprint, Monitor, Sample, TraceError, UsageError, parse_specification
 
 
 def at(second, **signals):
@@ -34,7 +30,7 @@ def test_a_verdict_settles_as_samples_come():
     assert third.node("up").value == 1
 
 
-def test_samples_before_the_start_are_there_to_be_looked_back_at():
+def test_terms_look_back_before_the_start_of_a_monitor():
     monitor = Monitor(parse_specification("H a dist a[-1] <= 2"), start_ns=SECOND)
     before = monitor.update(Sample(0, {"a": Footprint.disc(0, 0, 0)}))
     assert (before.verdict, before.specs[0].nodes) == ("pending", ())
@@ -42,7 +38,7 @@ def test_samples_before_the_start_are_there_to_be_looked_back_at():
     assert (started.verdict, started.specs[0].nodes[0].value) == ("satisfied", 0.5)
 
 
-def test_what_a_monitor_refuses():
+def test_a_monitor_refuses_invalid_arguments_and_samples():
     with pytest.raises(UsageError, match=r"s\(ego\) is a template; name its object"):
         Monitor(parse_specification("spec s(ego) = G ego ovlp ego"))
     with pytest.raises(UsageError, match="no semantics 'stl'"):
@@ -59,7 +55,7 @@ def test_what_a_monitor_refuses():
         Monitor(parse_specification("p >= 0"), start_ns=1.5)
 
 
-def test_nothing_is_kept_per_sample():
+def test_memory_does_not_grow_with_the_samples():
     monitor = Monitor(
         parse_specification(
             "group everything = all\n"

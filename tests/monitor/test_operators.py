@@ -1,4 +1,4 @@
-"""What each operator says over a few numbers, worked out by hand."""
+"""Operators over a few numbers, computed by hand."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from monitor.scenes import SECOND, numbers, root
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay import Sample, Trace
 
 P = [1, -2, 3, -4, 5]
 Q = [-5, 4, -3, 2, -1]
@@ -119,7 +118,7 @@ def test_a_window_of_centuries_is_still_open():
     assert node.value.tolist() == [-5, -8, -3, -10, -1]
 
 
-def test_a_single_sample():
+def test_operators_over_a_single_sample():
     trace = numbers(p=[2])
     for formula in ("F p >= 0", "G p >= 0", "WX p >= 0", "H p >= 0", "G[0,3] p >= 0", "G F[0,3] p >= 0"):
         assert root(formula, trace).verdict == "satisfied", formula

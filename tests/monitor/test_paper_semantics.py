@@ -10,14 +10,9 @@ import pytest
 
 from monitor.scenes import SECOND, judged, numbers, points, root
 from monitor.test_published import SCENES, TOLERANCE, sample_from_frame
-from spatial_replay.errors import UsageError
-from spatial_replay.monitor.evaluate import evaluate
-from spatial_replay.monitor.monitor import Monitor
+from spatial_replay import Monitor, Trace, UsageError, evaluate, parse_specification, read_trace
 from spatial_replay.monitor.paper.evaluator import PaperRun
-from spatial_replay.sources.open_log import read_trace
 from spatial_replay.spec.formula import Atom, Signal, Temporal
-from spatial_replay.spec.load import parse_specification
-from spatial_replay.trace.trace import Trace
 
 
 def value(text, trace, **options):
@@ -76,7 +71,7 @@ def test_scenes_of_the_paper_at_every_sample(data_folder, scene):
     assert np.stack(updates[expected["start_sample"] :], axis=-1).tobytes() == result.series.tobytes()
 
 
-def test_objects_that_come_into_view_one_by_one_leave_the_table_undetermined(data_folder):
+def test_objects_that_appear_one_by_one_leave_the_robustness_undetermined(data_folder):
     expected = json.loads((data_folder / "paper" / "expected.json").read_text())["table_scene5_parked"]
     trace = read_trace(data_folder / "paper" / "table_scene5.jsonl.gz")
     result = evaluate(parse_specification(expected["spec"]), trace, semantics="paper").result()
@@ -116,7 +111,7 @@ def test_windows_in_seconds_go_by_the_samples_times():
     assert same(value("F[2s,inf] p >= 0", trace), [nan, nan, 2, 2])
 
 
-def test_what_looks_back_to_before_the_log_is_left_out():
+def test_terms_that_look_back_before_the_log_are_left_out():
     trace = points(a=[0, 3, 4, 9])
     assert same(value("a dist a[-1] <= 2", trace), [nan] * 4)
     assert same(value("G a dist a[-1] <= 2", trace), [nan, -1, -1, -3])
@@ -134,7 +129,7 @@ def test_quantifiers_are_left_out_as_a_whole():
 # --------------------------------------------------------------------------- windows and until, to the letter
 
 
-def test_a_bounded_operator_sees_nothing_after_its_window():
+def test_a_bounded_operator_ignores_samples_after_its_window():
     trace = numbers(p=[5, 4, 3, 2, 1], q=[-1, -1, 4, -1, -1])
     assert same(value("F[0,1] G p >= 0", trace), [5, 4, 4, 4, 4])
     assert root("F[0,1] G p >= 0", trace).value.tolist() == [5, 4, 3, 2, 1]
@@ -148,7 +143,7 @@ def test_the_left_operand_of_until_holds_up_to_the_end_and_there_too():
     assert root("p >= 0 U q >= 0", trace).value.tolist() == [-5, -5, 3, 3]
 
 
-def test_the_left_operand_of_until_sees_nothing_after_the_end():
+def test_the_left_operand_of_until_ignores_samples_after_the_end():
     trace = numbers(p=[-1, 5, -1], q=[2, 2, 2])
     assert same(value("(F p >= 0) U q >= 0", trace), [-1, 2, 2])
     trace = numbers(p=[4, 3, -9], q=[1, 2, 5])
@@ -164,7 +159,7 @@ def test_a_bounded_until_begins_with_its_window():
     assert same(value("p >= 0 U[1,2] q >= 0", trace), [nan, 5, 5, 5])
 
 
-def test_of_until_what_is_left_out_is_left_out():
+def test_until_leaves_out_operands_beyond_the_run():
     trace = numbers(p=[3, -2, 5], q=[4, 4, 4])
     assert same(value("(X p >= 0) U q >= 0", trace), [4, 4, 4])
     assert same(value("p >= 0 U X q >= 0", trace), [3, 3, 3])
@@ -191,7 +186,7 @@ def test_now_is_the_node_at_the_newest_sample_alone():
     assert same(always.value.tolist(), [-1, -2, -3])
 
 
-def test_what_is_not_known_leaves_undetermined_whatever_depends_on_it():
+def test_numbers_that_depend_on_something_unknown_are_undetermined():
     trace = points(a=[0, 0, 0, 0], b=[1, None, 1, 1])
     result = judged("G a dist b <= 2", trace, semantics="paper").result()
     assert same(result.nodes[0].value.tolist(), [1, nan, nan, nan])

@@ -7,13 +7,17 @@ import json
 import numpy as np
 import pytest
 
-from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
-from spatial_replay.monitor.evaluate import evaluate
-from spatial_replay.monitor.monitor import Monitor
-from spatial_replay.sources.open_log import read_trace
-from spatial_replay.spec.load import parse_specification
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay import (
+    ConvexPart,
+    Footprint,
+    Monitor,
+    Sample,
+    Trace,
+    TrackedObject,
+    evaluate,
+    parse_specification,
+    read_trace,
+)
 
 TOLERANCE = 1e-6
 

@@ -1,4 +1,4 @@
-"""Samples in stretches, as a monitor or a replay of a long log takes them in."""
+"""Samples in blocks, as a monitor or a replay of a long log adds them."""
 
 from __future__ import annotations
 
@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 
 from monitor.scenes import SECOND, numbers, points
-from spatial_replay.errors import TraceError
-from spatial_replay.geometry.footprint import Footprint
+from spatial_replay import Footprint, Sample, Trace, TraceError, parse_specification
 from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.stream import EvaluationStream
-from spatial_replay.spec.load import parse_specification
-from spatial_replay.trace.sample import FOREVER, Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.sample import FOREVER
 
 
 def stream_of(text, *, start_ns=0, end_ns=FOREVER, traces=(), each=None):
@@ -22,7 +19,7 @@ def stream_of(text, *, start_ns=0, end_ns=FOREVER, traces=(), each=None):
     return EvaluationStream(instances, specification.regions)
 
 
-def test_terms_look_back_across_stretches():
+def test_terms_look_back_across_blocks():
     trace = points(a=[0, 1, 3, 6, 10, 15])
     stream = stream_of("H (a dist a[-2] >= 0 and a dist a[-1.5s] >= 0)")
     now = [stream.extend(trace.slice(t, t + 1))[0].series[0, 1, 0] for t in range(6)]
@@ -32,7 +29,7 @@ def test_terms_look_back_across_stretches():
     np.testing.assert_array_equal(now, [np.nan, np.nan, np.nan, 6, 9, 12])
 
 
-def test_terms_look_back_by_the_clock_across_stretches():
+def test_terms_look_back_by_time_across_blocks():
     times, places = [0, 1000, 1100, 1900, 2150], [0, 1, 3, 6, 10]
     trace = Trace.from_samples(
         Sample(ms * 10**6, {"a": Footprint.disc(x, 0, 0)}) for ms, x in zip(times, places, strict=True)
@@ -42,7 +39,7 @@ def test_terms_look_back_by_the_clock_across_stretches():
     np.testing.assert_array_equal(now, [np.nan, 1, 3, 6, 7])
 
 
-def test_what_is_known_so_far():
+def test_a_stream_reports_its_numbers_so_far():
     trace = numbers(p=[-1, 2, 1])
     stream = stream_of("F p >= 0")
     going = stream.streams[0]
@@ -62,7 +59,7 @@ def test_samples_outside_the_window_are_looked_at_but_not_evaluated():
     assert stretches[1].series[0, 1].tolist() == [1]
 
 
-def test_each_instance_of_a_template_has_its_own_stretch():
+def test_each_instance_of_a_template_has_its_own_samples():
     trace = points(a=[0, 0, None], b=[None, 3, 3])
     stream = stream_of("spec s(ego) = G ego dist ego <= 0", traces=[trace], each={"ego": "all"})
     stretches = stream.extend(trace)
@@ -70,7 +67,7 @@ def test_each_instance_of_a_template_has_its_own_stretch():
     assert [stretch.times_ns.tolist() for stretch in stretches] == [[0, SECOND], [SECOND, 2 * SECOND]]
 
 
-def test_an_empty_stretch_changes_nothing():
+def test_an_empty_block_changes_nothing():
     trace = numbers(p=[1])
     stream = stream_of("G p >= 0")
     stream.extend(trace)
@@ -86,7 +83,7 @@ def test_samples_out_of_order_are_refused():
         stream.extend(trace.slice(1, 2))
 
 
-def test_how_far_terms_look_back():
+def test_look_back_is_the_farthest_of_all_terms():
     def reach(text):
         return look_back([spec.formula for spec in parse_specification(text).specs])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from monitor.scenes import SECOND, judged, points
-from spatial_replay.errors import UsageError
+from spatial_replay import UsageError
 
 ALONE = "group g = all\nspec alone(ego) = G (ego dist (g except ego) >= 2)"
 CLASSES = {"a": "Person", "b": "person", "c": "cart"}
@@ -16,7 +16,7 @@ def trace():
     return points(a=[0, 0, 0, None], b=[None, 3, 1, 2], c=[9, 9, None, None], classes=CLASSES)
 
 
-def test_one_result_for_each_object_over_its_samples(trace):
+def test_a_template_has_one_result_per_object_over_its_samples(trace):
     evaluation = judged(ALONE, trace, each={"ego": "all"})
     assert [(r.name, r.object, (r.times_ns // SECOND).tolist(), r.robustness) for r in evaluation] == [
         ("alone", "a", [0, 1, 2], -1),
@@ -26,18 +26,18 @@ def test_one_result_for_each_object_over_its_samples(trace):
     assert repr(evaluation.result("alone", "c")) == "<alone for c: satisfied, robustness 4>"
 
 
-def test_objects_of_a_class_without_regard_to_case(trace):
+def test_a_class_is_matched_without_regard_to_case(trace):
     assert [r.object for r in judged(ALONE, trace, each={"ego": "class:PERSON"})] == ["a", "b"]
     assert [r.object for r in judged(ALONE, trace, each={"ego": "class:dog"})] == []
 
 
-def test_a_window_limits_who_appears_and_when(trace):
+def test_a_window_limits_the_objects_and_their_times(trace):
     evaluation = judged(ALONE, trace, each={"ego": "all"}, start_ns=2 * SECOND)
     spans = {r.object: (r.times_ns // SECOND).tolist() for r in evaluation}
     assert spans == {"a": [2], "b": [2, 3]}
 
 
-def test_an_object_that_is_gone_for_a_while_is_unknown_there():
+def test_an_object_is_unknown_while_it_is_absent():
     trace = points(ego=[None, 0, None, 0], b=[5, 5, 5, 5])
     text = "spec near(ego) = G ego dist b <= 6"
     result = judged(text, trace, each={"ego": "all"}).result("near", "ego")
@@ -52,7 +52,7 @@ def test_terms_look_before_an_object_appears():
     assert result.nodes[0].now.tolist() == [4, 5]
 
 
-def test_a_template_beside_a_spec(trace):
+def test_a_template_and_a_spec_are_evaluated_together(trace):
     evaluation = judged(f"{ALONE}\nspec seen = F a ovlp a", trace, each={"ego": "class:cart"})
     assert [(r.name, r.object) for r in evaluation] == [("alone", "c"), ("seen", None)]
     assert evaluation.result("seen").object is None
@@ -72,7 +72,7 @@ def test_a_template_needs_its_objects(trace):
         judged(ALONE, trace)
 
 
-def test_a_parameter_that_no_template_has(trace):
+def test_an_unknown_parameter_is_refused(trace):
     with pytest.raises(UsageError, match=r"no template has a parameter 'car'; templates here: alone\(ego\)"):
         judged(ALONE, trace, each={"ego": "all", "car": "all"})
     with pytest.raises(UsageError, match="templates here: none"):
@@ -80,6 +80,6 @@ def test_a_parameter_that_no_template_has(trace):
 
 
 @pytest.mark.parametrize("choice", ["", "everyone", "class:", "person"])
-def test_a_choice_that_chooses_nothing(trace, choice):
+def test_an_invalid_choice_of_objects_is_refused(trace, choice):
     with pytest.raises(UsageError, match=r"chooses no objects; write ego=all or ego=class:NAME"):
         judged(ALONE, trace, each={"ego": choice})

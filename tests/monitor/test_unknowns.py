@@ -1,4 +1,4 @@
-"""What is not seen, not readable or not certain never reads as satisfied or violated."""
+"""Unknown, unreadable and uncertain data never read as satisfied or violated."""
 
 from __future__ import annotations
 
@@ -8,20 +8,18 @@ import numpy as np
 import pytest
 
 from monitor.scenes import numbers, points, root, with_unreadable
-from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay import Footprint, Sample, Trace, TrackedObject
 
 
-def test_an_object_that_is_not_seen():
+def test_an_absent_object_is_unknown():
     node = root("G a dist b <= 5", points(a=[0, 0, 0], b=[1, None, 2]))
     np.testing.assert_array_equal(node.now, [4, nan, 3])
     assert node.verdict == "unknown"
     assert (node.final_lower, node.final_upper) == (-inf, 3)
 
 
-def test_an_object_or_signal_that_the_log_never_has():
-    assert root("a ovlp nobody", points(a=[0])).verdict == "unknown"
+def test_an_object_or_signal_missing_from_the_log_is_unknown():
+    assert root("a ovlp ghost", points(a=[0])).verdict == "unknown"
     assert root("F charge >= 0", numbers(p=[1])).verdict == "unknown"
 
 
@@ -41,7 +39,7 @@ def test_an_unreadable_observation_keeps_its_class():
     assert root('(class "person") dist a >= 0', trace).verdict == "unknown"
 
 
-def test_a_named_group_needs_all_of_its_members_and_an_open_one_whoever_is_there():
+def test_a_named_group_needs_all_members_and_an_open_one_those_present():
     trace = points(a=[0], b=[3], c=[None], classes={"b": "cup", "c": "cup"})
     named = "group g = b, c\nspec s = a dist g <= 4"
     opened = 'group g = class "cup"\nspec s = a dist g <= 4'
@@ -50,7 +48,7 @@ def test_a_named_group_needs_all_of_its_members_and_an_open_one_whoever_is_there
     assert root("group g = b, c\nspec s = a dist (g except c) <= 4", trace).robustness == 1
 
 
-def test_a_group_with_nobody_in_it():
+def test_an_empty_group_is_infinitely_far():
     trace = points(a=[0])
     assert root('a dist (class "cup") <= 4', trace).robustness == -inf
     assert root('a dist (class "cup") >= 4', trace).robustness == inf
@@ -83,7 +81,7 @@ def test_each_term_of_a_relation_is_uncertain_and_a_group_as_its_least_certain_m
     assert (left.final_lower, left.final_upper) == pytest.approx((4 - 0.6, 4 + 0.6))
 
 
-def test_orientation_is_needed_where_it_is_asked_for_and_has_no_uncertainty():
+def test_a_missing_orientation_is_unknown_and_has_no_uncertainty():
     def turned(yaw):
         return TrackedObject(Footprint.disc(0, 0, 1), yaw=yaw, uncertainty=3.0)
 
@@ -108,12 +106,12 @@ def test_relations_along_z_need_heights():
 
 def test_a_verdict_needs_no_more_than_what_decides_it():
     trace = points(a=[0], b=[1])
-    assert root("a dist b <= 5 or nobody ovlp a", trace).verdict == "satisfied"
-    assert root("a dist b >= 5 and nobody ovlp a", trace).verdict == "violated"
-    assert isnan(root("a dist b <= 5 or nobody ovlp a", trace).robustness)
-    assert root("nobody ovlp a or not nobody ovlp a", trace).verdict == "unknown"
+    assert root("a dist b <= 5 or ghost ovlp a", trace).verdict == "satisfied"
+    assert root("a dist b >= 5 and ghost ovlp a", trace).verdict == "violated"
+    assert isnan(root("a dist b <= 5 or ghost ovlp a", trace).robustness)
+    assert root("ghost ovlp a or not ghost ovlp a", trace).verdict == "unknown"
 
 
-def test_a_region_looked_back_at_from_the_start_is_as_unknown_as_an_object():
+def test_a_region_looked_back_at_from_the_first_sample_is_unknown():
     node = root("region goal = box(0, -1, 9, 1)\nspec s = a enclosedin goal[-1]", points(a=[5, 5]))
     np.testing.assert_array_equal(node.now, [nan, 1])

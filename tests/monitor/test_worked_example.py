@@ -1,4 +1,4 @@
-"""The example in the documentation prints what stands beside it."""
+"""The documented example prints the documented output."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 PAGE = Path(__file__).parents[2] / "docs" / "semantics.md"
 
 
-def test_the_worked_example_prints_what_the_page_says():
+def test_the_worked_example_prints_the_documented_output():
     found = re.search(r"```python\n(.*?)```\s+```text\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL)
     assert found is not None
     printed = subprocess.run(

@@ -1,4 +1,4 @@
-"""Traces refuse columns that do not fit together."""
+"""Traces refuse columns of inconsistent shape."""
 
 from __future__ import annotations
 
@@ -7,10 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from spatial_replay.errors import TraceError
-from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay import Footprint, Sample, Trace, TraceError
 
 BOX = Footprint.box(0, 0, 1, 1)
 
@@ -19,7 +16,7 @@ def two_samples():
     return Trace.from_samples([Sample(0, {"a": BOX}, {"force": 1.0}), Sample(5, {"b": BOX})])
 
 
-def test_objects_that_are_not_there_are_absent():
+def test_missing_objects_are_absent():
     assert two_samples().rows.tolist() == [[0, -1], [-1, 1]]
     assert np.isnan(two_samples().signals["force"][1])
 
@@ -55,5 +52,5 @@ def test_joined_traces_must_follow_each_other():
         Trace.concatenate([two_samples(), two_samples()])
 
 
-def test_it_says_what_it_is():
+def test_a_trace_describes_itself():
     assert repr(two_samples()) == "<Trace: 2 samples, 0 to 5 ns; objects a, b>"
