@@ -51,9 +51,9 @@ from spatial_replay.trace.trace import Trace
 
 
 class Annotator:
-    """Says in messages what an evaluation found, sample after sample.
+    """Encodes the results of an evaluation as messages, sample after sample.
 
-    Into how many stretches the samples are cut changes no message.
+    Cutting the samples into blocks changes no message.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Annotator:
             leaf_pairs(instance, requirements, files[tree.file].regions)
             for tree, instance, requirements in zip(trees, instances, self._requirements, strict=True)
         ]
-        self._tellers = [
+        self._reporters = [
             EventReporter(tree, instance, files[tree.file], semantics)
             for tree, instance in zip(trees, instances, strict=True)
         ]
@@ -101,34 +101,34 @@ class Annotator:
         """What a viewer shows after the messages so far."""
         return self._scene
 
-    def messages(self, trace: Trace, stretches: Sequence[SeriesBlock]) -> list[Messages]:
-        """What to write beside the next samples.
+    def messages(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
+        """Return what to write beside the next samples.
 
         Args:
-            stretches: what the evaluation says of them, one for each tree.
+            blocks: their evaluation, one for each tree.
         """
         if not len(trace):
             return []
         messages = []
         if self._trees and not self._written[SPECIFICATION]:
             messages.append(self._messages(_SPECIFICATION, trace.times_ns[:1], [self.specification()]))
-        messages.append(self._robustness(stretches))
-        messages.append(self._automaton_states(stretches))
-        messages += self._events(self._told(stretches))
-        messages.append(self._drawn(trace, stretches))
+        messages.append(self._robustness(blocks))
+        messages.append(self._automaton_states(blocks))
+        messages += self._events(self._changes(blocks))
+        messages.append(self._scene_messages(trace, blocks))
         return messages
 
-    def pass_over(self, trace: Trace, stretches: Sequence[SeriesBlock]) -> list[Messages]:
-        """Take in the next samples and write nothing of them but the events."""
+    def pass_over(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
+        """Take in the next samples and return only their events."""
         if not len(trace):
             return []
-        for run, stretch in zip(self._runs, stretches, strict=True):
+        for run, block in zip(self._runs, blocks, strict=True):
             if run is not None:
-                run.pass_over(stretch)
-        return self._events(self._told(stretches))
+                run.pass_over(block)
+        return self._events(self._changes(blocks))
 
     def end(self, time_ns: int, finals: Sequence[Floats]) -> list[Messages]:
-        """What to write when the samples have ended: the verdicts that samples after them could have changed.
+        """Return what to write after the last sample: the verdicts that were still pending.
 
         Args:
             time_ns: when the log ends, the last sample's time or later.
@@ -137,55 +137,50 @@ class Annotator:
         return self._events(
             [
                 each
-                for teller, final in zip(self._tellers, finals, strict=True)
-                for each in teller.end(time_ns, final)
+                for reporter, final in zip(self._reporters, finals, strict=True)
+                for each in reporter.end(time_ns, final)
             ]
         )
 
     def specification(self) -> bytes:
-        """The message that says what was evaluated."""
+        """Return the message of the specifications and the trees of their results."""
         propositions = [() if run is None else run.propositions for run in self._runs]
         return encode_specification(self._files, self._trees, propositions=propositions)
 
-    def _robustness(self, stretches: Sequence[SeriesBlock]) -> Messages:
-        """One message per sample and result."""
+    def _robustness(self, blocks: Sequence[SeriesBlock]) -> Messages:
+        """Return one message per sample and result."""
         encoded = [
-            encode_robustness(tree.name, tree.object, names, stretch.times_ns, stretch.series)
-            for tree, names, stretch in zip(self._trees, self._names, stretches, strict=True)
+            encode_robustness(tree.name, tree.object, names, block.times_ns, block.series)
+            for tree, names, block in zip(self._trees, self._names, blocks, strict=True)
         ]
-        return self._in_order(_ROBUSTNESS, stretches, encoded)
+        return self._in_order(_ROBUSTNESS, blocks, encoded)
 
-    def _told(self, stretches: Sequence[SeriesBlock]) -> list[EncodedEvent]:
-        """What changed, by time, then in the order of results and of their nodes."""
-        told = [
+    def _changes(self, blocks: Sequence[SeriesBlock]) -> list[EncodedEvent]:
+        """Return the events, by time, then in the order of results and of their nodes."""
+        events = [
             each
-            for teller, stretch in zip(self._tellers, stretches, strict=True)
-            for each in teller.tell(stretch)
+            for reporter, block in zip(self._reporters, blocks, strict=True)
+            for each in reporter.extend(block)
         ]
-        return sorted(told, key=lambda each: each.time_ns)
+        return sorted(events, key=lambda each: each.time_ns)
 
-    def _events(self, told: Sequence[EncodedEvent]) -> list[Messages]:
-        times_ns = np.array([each.time_ns for each in told], np.int64)
+    def _events(self, events: Sequence[EncodedEvent]) -> list[Messages]:
+        times_ns = np.array([each.time_ns for each in events], np.int64)
         return [
-            self._messages(_EVENTS, times_ns, [each.event for each in told]),
-            self._messages(_EVENT_LOG, times_ns, [each.log for each in told]),
+            self._messages(_EVENTS, times_ns, [each.event for each in events]),
+            self._messages(_EVENT_LOG, times_ns, [each.log for each in events]),
         ]
 
-    def _automaton_states(self, stretches: Sequence[SeriesBlock]) -> Messages:
-        """One message per sample and result that has an automaton."""
-        running = [
-            (run, stretch) for run, stretch in zip(self._runs, stretches, strict=True) if run is not None
-        ]
-        encoded = [run.encode(stretch) for run, stretch in running]
-        return self._in_order(_AUTOMATON, [stretch for _, stretch in running], encoded)
+    def _automaton_states(self, blocks: Sequence[SeriesBlock]) -> Messages:
+        """Return one message per sample and result that has an automaton."""
+        running = [(run, block) for run, block in zip(self._runs, blocks, strict=True) if run is not None]
+        encoded = [run.encode(block) for run, block in running]
+        return self._in_order(_AUTOMATON, [block for _, block in running], encoded)
 
-    def _drawn(self, trace: Trace, stretches: Sequence[SeriesBlock]) -> Messages:
-        """The scene."""
+    def _scene_messages(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> Messages:
         results = [
             EvaluatedResult(requirements, block, pairs)
-            for requirements, block, pairs in zip(
-                self._requirements, stretches, self._leaf_pairs, strict=True
-            )
+            for requirements, block, pairs in zip(self._requirements, blocks, self._leaf_pairs, strict=True)
         ]
         drawn = self._encoder.encode(trace, results, self._scene)
         if drawn.frames is not None:
@@ -194,10 +189,10 @@ class Annotator:
         return self._messages(_SCENE, drawn.times_ns, drawn.payloads)
 
     def _in_order(
-        self, channel: Channel, stretches: Sequence[SeriesBlock], encoded: Sequence[Sequence[bytes]]
+        self, channel: Channel, blocks: Sequence[SeriesBlock], encoded: Sequence[Sequence[bytes]]
     ) -> Messages:
-        """Messages of stretches by time, numbered in the order of results however the samples are cut."""
-        times_ns = np.concatenate([np.empty(0, np.int64), *(stretch.times_ns for stretch in stretches)])
+        """Order the messages of results by time; among equal times the order of results stays."""
+        times_ns = np.concatenate([np.empty(0, np.int64), *(block.times_ns for block in blocks)])
         payloads = [payload for own in encoded for payload in own]
         order = np.argsort(times_ns, kind="stable")
         return self._messages(channel, times_ns[order], [payloads[index] for index in order.tolist()])
@@ -209,7 +204,7 @@ class Annotator:
 
 
 def shown_regions(files: Sequence[Specification]) -> Mapping[str, Outline]:
-    """The regions of all files; where two files differ on a name, the later one carries its file's name."""
+    """Return the regions of all files; where two differ on a name, the later one gets its file's name."""
     shown: dict[str, Outline] = {}
     for file in files:
         for name, outline in file.regions.items():
@@ -227,9 +222,9 @@ _EVENT_LOG = protobuf_channel(EVENT_LOG, Log)
 
 
 class AnnotatedEvaluation:
-    """Specifications evaluated over samples as they come, with the messages that say so.
+    """Specifications evaluated over samples as they come, with the messages of an annotated log.
 
-    Into how many stretches the samples are cut changes neither numbers nor messages.
+    Cutting the samples into blocks changes neither numbers nor messages.
 
     Attributes:
         trees: every result, under the name it is reported by.
@@ -249,7 +244,7 @@ class AnnotatedEvaluation:
 
         Args:
             instances: what to evaluate of each file.
-            compiled_before: gives the attachments of a log; automata among them need no MONA.
+            compiled_before: returns the attachments of a log; automata among them are not compiled with MONA.
             known: automata of specs of these files, which are not compiled again.
             show: takes what the messages of the scene show.
         """
@@ -268,14 +263,14 @@ class AnnotatedEvaluation:
         self._has_samples = False
 
     def extend(self, trace: Trace) -> list[SeriesBlock]:
-        """Take in the next samples; one stretch for each of `trees`."""
-        return [stretch for evaluation in self._evaluations for stretch in evaluation.extend(trace)]
+        """Take in the next samples; return one block for each of `trees`."""
+        return [block for evaluation in self._evaluations for block in evaluation.extend(trace)]
 
-    def messages(self, trace: Trace, stretches: Sequence[SeriesBlock]) -> list[Messages]:
-        """Return what to write beside samples, from the stretches that `extend` gave for them."""
+    def messages(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
+        """Return what to write beside samples, from the blocks that `extend` returned for them."""
         self._extent = SceneBounds.of(trace, self._extent)
         self._has_samples |= len(trace) > 0
-        return self._annotator.messages(trace, stretches)
+        return self._annotator.messages(trace, blocks)
 
     @property
     def finals(self) -> list[Floats]:
@@ -283,7 +278,7 @@ class AnnotatedEvaluation:
         return [stream.final for stream in self.streams]
 
     def end(self, time_ns: int) -> Messages:
-        """What to write after everything else of a log.
+        """Return what to write after everything else of a log.
 
         Args:
             time_ns: that of its last sample or message, whichever is later.
@@ -319,16 +314,16 @@ class AnnotatedEvaluation:
         return layout_attachment(self.contents(self._extent, topics))
 
     def automata_metadata(self) -> Mapping[str, str]:
-        """For each spec, how large its automaton is, or why there is none."""
+        """Return the size of each spec's automaton, or the reason why it has none."""
         return automata_metadata(self.automata)
 
     def automata_attachments(self, prefix: str) -> list[Attachment]:
-        """The automata, to be kept beside the specifications of `specification_attachments`."""
+        """Return the automata as attachments, beside those of `specification_attachments`."""
         return automata_attachments(self.automata, prefix)
 
     @cached_property
     def automata(self) -> Sequence[SpecAutomaton]:
-        """Of each tree; compiled when first asked for, since not every evaluation is written down."""
+        """Of each tree; compiled on first use, since not every evaluation is written to a log."""
         return automata_of(self._files, self.trees, self._semantics, self._compiled_before(), self._known)
 
     def annotator(self, scene: SceneState | None = None) -> Annotator:

@@ -1,7 +1,4 @@
-"""Where automata are after every sample → messages of /spatial/automaton.
-
-Which results have an automaton, and what a log keeps of it.
-"""
+"""Automata of results: their states after every sample → messages of /spatial/automaton, and their files."""
 
 from __future__ import annotations
 
@@ -28,7 +25,7 @@ from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Atom, Formula, NamedSpec, Quantified, Specification, iter_nodes
 
 _NOW = 1
-"""Where `now` stands among the numbers of a node."""
+"""The place of `now` among the numbers of a node."""
 
 _MOST_TEMPLATES = 4096
 
@@ -40,9 +37,9 @@ _TRUTHS = np.array(
 
 
 class AutomatonRun:
-    """One automaton on its way through the samples, and the messages that say where it is.
+    """The run of one automaton over the samples, and its messages.
 
-    Into how many stretches the samples are cut changes no message.
+    Cutting the samples into blocks changes no message.
 
     Attributes:
         propositions: the nodes that are the automaton's propositions.
@@ -62,7 +59,7 @@ class AutomatonRun:
             name: the specification's name.
             object: the object that a template's parameter stands for, or None.
             formula: what the automaton is of.
-            order: which leaf of a stretch is which.
+            order: the leaves, in the order of a block's.
         """
         self._name, self._object = name, object
         self._automaton = automaton
@@ -76,41 +73,41 @@ class AutomatonRun:
         about = (automaton.accepting, automaton.can_accept, automaton.can_reject)
         self._about = np.array([[state in each for each in about] for state in automaton.states], np.bool_)
 
-    def encode(self, stretch: SeriesBlock) -> list[bytes]:
-        """Take in the next samples; one message for each."""
-        if not len(stretch.times_ns):
+    def encode(self, block: SeriesBlock) -> list[bytes]:
+        """Take in the next samples; return one message for each."""
+        if not len(block.times_ns):
             return []
-        values = self._values(stretch)
+        values = self._values(block)
         before, after = self._steps(values)
         keys, groups = _distinct(before, after)
-        payloads = [b""] * len(stretch.times_ns)
+        payloads = [b""] * len(block.times_ns)
         for number, key in enumerate(keys):
             members = np.flatnonzero(groups == number)
             template = self._template(key, before[members[0]], after[members[0]])
             marks = np.empty((len(members), len(self.propositions) + 3), np.uint8)
             marks[:, :-3] = _TRUTHS[values[:, members]].T
             marks[:, -3:] = self._summary(after[members[0]])
-            words = stretch.times_ns[members].astype(np.uint64)[:, None]
+            words = block.times_ns[members].astype(np.uint64)[:, None]
             for index, payload in zip(
                 members.tolist(), payloads_of(template.fill(words, marks)), strict=True
             ):
                 payloads[index] = payload
         return payloads
 
-    def pass_over(self, stretch: SeriesBlock) -> None:
+    def pass_over(self, block: SeriesBlock) -> None:
         """Take in the next samples without a message."""
-        if len(stretch.times_ns):
-            self._steps(self._values(stretch))
+        if len(block.times_ns):
+            self._steps(self._values(block))
 
-    def _values(self, stretch: SeriesBlock) -> Flags:
-        """(P, T): whether each proposition is true in each sample, or unknown."""
-        now = stretch.series[list(self.propositions), _NOW]
+    def _values(self, block: SeriesBlock) -> Flags:
+        """Return (P, T): whether each proposition is true in each sample, or unknown."""
+        now = block.series[list(self.propositions), _NOW]
         values = np.where(now >= 0.0, TRUE, FALSE).astype(np.int8)
         unclear = np.isnan(now)
         for number in np.flatnonzero(unclear.any(axis=1)).tolist():
-            # a number that is not determined can still have a sign that is
+            # a number that is not determined can still have a determined sign
             formula = self._automaton.propositions[number].formula
-            done = evaluate_offline(formula, self._order, stretch.leaves, stretch.times_ns)
+            done = evaluate_offline(formula, self._order, block.leaves, block.times_ns)
             low, high = done.ends(0, wide=False)
             values[number, unclear[number]] = UNKNOWN
             values[number, unclear[number] & (low >= 0.0)] = TRUE
@@ -118,7 +115,7 @@ class AutomatonRun:
         return values
 
     def _steps(self, values: Flags) -> tuple[NDArray[np.bool_] | Integers, NDArray[np.bool_] | Integers]:
-        """Where the run is before and after each sample: as states (T,), or as sets of them (T, S)."""
+        """Return the states before and after each sample: (T,), or as sets of states (T, S)."""
         states = np.flatnonzero(self._possible)
         if len(states) == 1 and not (values == UNKNOWN).any():
             first = int(states[0])
@@ -132,7 +129,7 @@ class AutomatonRun:
         return before, sets
 
     def _summary(self, after: NDArray[np.bool_] | Integers) -> NDArray[np.uint8]:
-        """(3,): whether accepting, able to accept and able to reject, of a state or of a set of them."""
+        """Return (3,): whether a state or set of states is accepting, can accept and can reject."""
         about = self._about[_members(after)]
         values = np.where(about.all(axis=0), TRUE, np.where(about.any(axis=0), UNKNOWN, FALSE))
         return _TRUTHS[values]
@@ -148,7 +145,7 @@ class AutomatonRun:
         return self._templates[key]
 
     def _message(self, sources: list[int], targets: list[int]) -> AutomatonState:
-        """A message of one step, with something in every field that differs between samples."""
+        """Return the message of one step, with a value in every field that differs between samples."""
         message = AutomatonState(
             time_ns=1, specification=self._name, object=self._object or "", states=targets
         )
@@ -170,14 +167,14 @@ def _shortened(text: str) -> str:
 
 
 def _members(states: NDArray[np.bool_] | Integers) -> Integers:
-    """The numbers of the states in a set, or of one."""
+    """Return the numbers of the states in a set, or of one."""
     return np.atleast_1d(np.flatnonzero(states) if states.ndim else states.astype(np.int64))
 
 
 def _distinct(
     before: NDArray[np.bool_] | Integers, after: NDArray[np.bool_] | Integers
 ) -> tuple[list[bytes], Integers]:
-    """What steps there are, each with a key, and which of them (T,) each sample takes."""
+    """Return the distinct steps, each with a key, and which of them (T,) each sample takes."""
     if before.ndim == 1:
         both = np.stack([before, after], axis=1)
         rows = np.ascontiguousarray(both).view(np.uint8).reshape(len(both), -1)
@@ -189,7 +186,7 @@ def _distinct(
 
 _STORED = ".json"
 _MOST_LITERALS = 50_000
-"""Of an automaton whose guards have more literals, only what a replay needs is kept."""
+"""An automaton whose guards have more literals is stored only in the form that a replay reads."""
 
 
 @dataclass(frozen=True)
@@ -212,7 +209,7 @@ class SpecAutomaton:
 
     @property
     def summary(self) -> str:
-        """What there is, in a few words."""
+        """Its size, or the reason why there is none."""
         if self.automaton is None:
             return f"none: {self.details or self.reason}"
         return size_words(self.automaton)
@@ -225,10 +222,10 @@ def automata_of(
     compiled_before: Sequence[Attachment] = (),
     known: Sequence[SpecAutomaton] = (),
 ) -> list[SpecAutomaton]:
-    """The automaton of each tree's spec, one for each of `trees`; instances of a template share theirs.
+    """Return the automaton of each tree's spec; instances of a template share theirs.
 
     Args:
-        compiled_before: attachments of a log; an automaton among them is taken where it would take MONA.
+        compiled_before: attachments of a log; an automaton among them is used where it would take MONA.
         known: automata of specs of these files, which are not compiled again.
     """
     stored = [each.data for each in compiled_before if _is_stored(each)]
@@ -242,18 +239,18 @@ def automata_of(
 
 
 def automata_metadata(automata: Sequence[SpecAutomaton]) -> Mapping[str, str]:
-    """For each spec, how large its automaton is, or why there is none."""
+    """Return the size of each spec's automaton, or the reason why it has none."""
     return {each.name: each.summary for each in automata}
 
 
 def automata_attachments(automata: Sequence[SpecAutomaton], prefix: str) -> list[Attachment]:
-    """The automata as files: for a replay, for Graphviz, for tools of automata theory.
+    """Return the automata as files: JSON for a replay, DOT for Graphviz, HOA for other tools.
 
     Args:
         prefix: what the names of the specification's own attachments begin with.
     """
     attachments = []
-    for each in {kept.name: kept for kept in automata}.values():
+    for each in {each.name: each for each in automata}.values():
         if each.automaton is None:
             continue
         texts = {_STORED: ("application/json", stored_text(each.automaton, each.specification, each.spec))}

@@ -1,9 +1,7 @@
-"""Certificates: hashes that say what an evaluation was made of and what it found.
+"""Certificates: hashes of what an evaluation read and of its results.
 
-Every hash is over content, not over how it happens to be cut into blocks, chunks or files: one recording in
-two containers has one sample hash.
-
-SHA-256 of much data beside other work.
+Every hash is over content, however that is cut into blocks, chunks or files: one recording in two containers
+has one sample hash.
 """
 
 from __future__ import annotations
@@ -26,14 +24,14 @@ from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.trace import ABSENT, Trace
 
 _MOST_WAITING = 64
-"""How many buffers may wait to be hashed, so that memory stays bounded."""
+"""Buffers that may wait to be hashed, so that memory stays bounded."""
 
 
 class Hashing:
-    """Takes buffers into hashes in their order, on a thread of its own.
+    """Hashes buffers in their order on a thread of its own.
 
-    Hashing a large buffer leaves the interpreter to others, so that on two cores it costs a replay next to
-    nothing.
+    `hashlib` releases the interpreter lock while it hashes a large buffer, so that on two cores a replay does
+    not wait for its certificate.
     """
 
     def __init__(self) -> None:
@@ -54,7 +52,7 @@ class Hashing:
 
 
 class SampleHash:
-    """SHA-256 of samples: of every column of every object and signal, and these by name."""
+    """SHA-256 of samples: every column of every object and signal, in the order of their names."""
 
     def __init__(self, hashing: Hashing | None = None) -> None:
         self._hashing = hashing or Hashing()
@@ -107,11 +105,11 @@ class SampleHash:
 
 
 class MessageHash:
-    """SHA-256 of messages in their order: topic, time and bytes of each."""
+    """SHA-256 of messages in order: topic, time and bytes of each."""
 
     def __init__(self, hashing: Hashing | None = None) -> None:
         self._hashing = hashing or Hashing()
-        # a hash for each column, so that many messages are taken in at once, however they are cut
+        # one hash per column, so that many messages are hashed at once however they are cut into blocks
         self._topics, self._times = hashlib.sha256(), hashlib.sha256()
         self._lengths, self._payloads = hashlib.sha256(), hashlib.sha256()
 
@@ -158,7 +156,7 @@ class ResultHash:
 
 
 def specification_sha256(files: Sequence[Specification]) -> str:
-    """SHA-256 of the canonical texts."""
+    """Return the SHA-256 of the canonical texts."""
     total = hashlib.sha256()
     for file in files:
         total.update(_text(format_specification(file)))
@@ -166,7 +164,7 @@ def specification_sha256(files: Sequence[Specification]) -> str:
 
 
 def specifications_json(files: Sequence[Specification]) -> str:
-    """Specifications as a log's metadata lists them, in JSON: name and SHA-256 of the canonical text."""
+    """Return specifications as metadata lists them, in JSON: name and SHA-256 of the canonical text."""
     texts = [format_specification(file).encode("utf-8", "surrogatepass") for file in files]
     hashes = [hashlib.sha256(text).hexdigest() for text in texts]
     listed = zip(files, hashes, strict=True)
@@ -176,7 +174,7 @@ def specifications_json(files: Sequence[Specification]) -> str:
 def certificate(
     samples: SampleHash, messages: MessageHash, files: Sequence[Specification], results: ResultHash
 ) -> Mapping[str, str]:
-    """The certificate of an evaluation that has taken in everything."""
+    """Return the certificate of a finished evaluation."""
     return {
         "samples_sha256": samples.hexdigest(),
         "messages_sha256": messages.hexdigest(),
@@ -187,12 +185,12 @@ def certificate(
 
 
 def _integers(values: Integers) -> NDArray[np.generic]:
-    """A little-endian copy."""
+    """Return a little-endian copy."""
     return np.array(values, "<i8", order="C")
 
 
 def _floats(values: Floats) -> NDArray[np.generic]:
-    """A little-endian copy; every NaN is the same one."""
+    """Return a little-endian copy in which every NaN is the same one."""
     copy = np.array(values, "<f8", order="C")
     unknown = np.isnan(copy)
     if unknown.any():
@@ -201,7 +199,7 @@ def _floats(values: Floats) -> NDArray[np.generic]:
 
 
 def _text(text: str | None) -> bytes:
-    """A text that cannot be taken for another one, or for none."""
+    """Encode a text with its length, so that no two sequences of texts have the same bytes."""
     if text is None:
         return b"\xff" * 8
     encoded = text.encode("utf-8", "surrogatepass")

@@ -24,7 +24,7 @@ _FEWEST_POINTS: Final = 64
 
 
 class Thinning:
-    """Which points of long curves are sent: the least and the greatest of equally many samples."""
+    """Thins long curves to the least and the greatest point of equally many samples."""
 
     def __init__(self, times_ns: Integers, most: int) -> None:
         """Cut up the samples of a log.
@@ -40,12 +40,12 @@ class Thinning:
         self._ends = np.append(self._starts[1:], count) - 1
 
     def seconds(self, first_ns: int) -> Floats:
-        """The times of the points, counted from a first one."""
+        """Return the times of the points, counted from a first one."""
         seconds = (self._times_ns - first_ns) / 1e9
         return self._paired(seconds[self._starts], seconds[self._ends]) if self._is_needed else seconds
 
     def points(self, times_ns: Integers, numbers: Floats) -> Floats:
-        """The points of one curve.
+        """Return the points of one curve.
 
         Args:
             times_ns: (S,) int64, a stretch of the log's samples.
@@ -66,7 +66,7 @@ class Thinning:
 
 
 def encode_curves(times_ns: Integers, results: Sequence[SpecResult], first_ns: int) -> bytes:
-    """The message that shows all of a log at once.
+    """Return the message with the curves of a whole log.
 
     Args:
         times_ns: (T,) int64, of all samples, at least one.
@@ -82,7 +82,7 @@ def encode_curves(times_ns: Integers, results: Sequence[SpecResult], first_ns: i
 
 
 def curved_nodes(formula: Formula) -> dict[int, Formula]:
-    """The nodes that have curves, by id: the root, and those with a name that no other node has."""
+    """Return the nodes that have curves, by id: the root, and those with a name that no other node has."""
     nodes = [(identifier, node) for identifier, _, node in iter_nodes(formula)]
     names = [node.name for _, node in nodes]
     return {

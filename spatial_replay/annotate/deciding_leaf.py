@@ -1,14 +1,11 @@
-"""Which leaf a number of a formula is the number of.
+"""The leaf that gives a node its number, found by comparing numbers instead of walking through the log.
 
-Robustness is made of minima and maxima, so each number is that of some leaf at some sample, perhaps with
-its sign turned. Where that sample is the newest, comparing numbers finds the leaf, without a walk through
-the log.
+Robustness is made of minima and maxima, so each number is that of some leaf at some sample, perhaps with its
+sign turned. If that sample is the newest, `find_leaf` compares the numbers of the leaves there.
 
-The leaf that a number over the whole log is that of, found without a walk through the log.
-
-Boolean operators join parts to a formula, and its number is that of one of them. A part, being a leaf or
-temporal, has the number that it has from the sample at which its value changed for the last time: in most
-formulas that is the sample of the leaf that decides, and comparing numbers says which leaf, if any.
+Over a whole log, `DecidingLeaves` does the same for Boolean combinations: an operand that is a leaf or
+temporal has the number of the sample at which its value last changed, which in most formulas is the sample of
+the leaf that decides. Where no number is equal, no leaf is reported.
 """
 
 from __future__ import annotations
@@ -50,7 +47,7 @@ class LeafValue(NamedTuple):
 
 
 def leaves_below(formula: Formula, leaves: Sequence[Formula]) -> list[LeavesBelow]:
-    """For each node of a formula, by id, what is below it.
+    """Return the leaves below each node of a formula, by id.
 
     Args:
         leaves: the program's leaves, of which equal ones are one.
@@ -74,11 +71,11 @@ def leaves_below(formula: Formula, leaves: Sequence[Formula]) -> list[LeavesBelo
 def find_leaf(
     below: LeavesBelow, ends: tuple[Floats, Floats], number: float, *, low: bool
 ) -> LeafValue | None:
-    """The first leaf below a node that is what the node is, in one sample.
+    """Return the first leaf below a node that has the node's number, in one sample.
 
     Args:
         ends: (A,) low and high end of each of the program's leaves in that sample.
-        number: of the node; an infinite one says nothing of a leaf.
+        number: of the node; an infinite one identifies no leaf.
         low: whether the number is the low end of the node's interval, or the high one.
     """
     if not np.isfinite(number):
@@ -97,26 +94,26 @@ def _columns(entries: Sequence[tuple[int, int]]) -> LeavesBelow:
 
 
 def _key(leaf: Formula) -> tuple[object, ...]:
-    """What makes two leaves one."""
+    """Return what equal leaves have in common."""
     if isinstance(leaf, Quantified):
         return leaf.quantifier, leaf.variables, leaf.group, leaf.body
     if isinstance(leaf, Atom):
         return (leaf.expression,)
-    raise TypeError(f"{leaf!r} is no leaf")
+    raise TypeError(f"{leaf!r} is not a leaf")
 
 
 class DecidingLeaves:
-    """The parts of some nodes of a formula, each with the sample that its value is from.
+    """The operands of some nodes of a formula, each with the leaves at the sample that its value is from.
 
-    Into how many stretches the samples are cut changes nothing.
+    Cutting the samples into blocks changes nothing.
     """
 
     def __init__(self, formula: Formula, below: Sequence[LeavesBelow], nodes: Collection[int]) -> None:
-        """Before the first sample.
+        """Start before the first sample.
 
         Args:
             below: of each node of the formula, its leaves.
-            nodes: ids of those whose parts are followed.
+            nodes: ids of those whose leaves may be asked for.
         """
         self._below = below
         self._nodes = [node for _, _, node in iter_nodes(formula)]
@@ -133,21 +130,21 @@ class DecidingLeaves:
         self._values = np.full(len(self._parts), np.nan)
         self._leaves: dict[int, Floats] = {}
 
-    def extend(self, stretch: SeriesBlock) -> None:
+    def extend(self, block: SeriesBlock) -> None:
         """Take in the next samples, at least one."""
-        values = stretch.series[self._parts, 0]
+        values = block.series[self._parts, 0]
         before = np.concatenate([self._values[:, None], values[:, :-1]], axis=1)
         changes = (values != before) & ~(np.isnan(values) & np.isnan(before))
         self._values = values[:, -1].copy()
         last = values.shape[1] - 1 - changes[:, ::-1].argmax(axis=1)
         changed = np.flatnonzero(changes.any(axis=1))
-        # parts that changed together share the numbers of that sample
-        samples = {t: stretch.leaves[:, :, t].copy() for t in set(last[changed].tolist())}
+        # operands that changed together share the numbers of that sample
+        samples = {t: block.leaves[:, :, t].copy() for t in set(last[changed].tolist())}
         for part, t in zip(self._parts[changed].tolist(), last[changed].tolist(), strict=True):
             self._leaves[part] = samples[t]
 
     def find_leaf(self, node: int, ends: Floats, *, low: bool, wide: bool) -> LeafValue | None:
-        """The leaf whose number is an end of a node's interval, if it is one's at the sample it is from.
+        """Return the leaf that gives an end of a node's interval; None if comparing numbers finds none.
 
         Args:
             ends: (N, 2), lower and upper end of each node.

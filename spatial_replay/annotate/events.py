@@ -1,7 +1,4 @@
-"""Changes of verdicts and of signs, and the end of a log → messages of /spatial/events and /spatial/log.
-
-Changes of a node, and what it is in the end, as sentences.
-"""
+"""Events: changes of verdicts and signs, final verdicts → messages of /spatial/events and /spatial/log."""
 
 from __future__ import annotations
 
@@ -57,7 +54,7 @@ _NOW: Final[Mapping[int, str]] = {
 
 
 def leaf_words(text: str, number: float, *, past: bool = False) -> str:
-    """A leaf and its number, as in "`a closeto[1] b` fails by 3.2"."""
+    """Return a leaf and its number in words, as in "`a closeto[1] b` fails by 3.2"."""
     if number == 0.0:
         return f"`{text}` just {'held' if past else 'holds'}"
     holds, fails = ("held", "failed") if past else ("holds", "fails")
@@ -65,7 +62,7 @@ def leaf_words(text: str, number: float, *, past: bool = False) -> str:
 
 
 def change_sentence(title: str, after: Period, witness: str) -> str:
-    """What has begun.
+    """Return a sentence on what has begun.
 
     Args:
         title: what the node is called.
@@ -78,7 +75,7 @@ def change_sentence(title: str, after: Period, witness: str) -> str:
 
 
 def end_sentence(title: str, verdict: Verdict, ends: tuple[float, float], witness: str) -> str:
-    """What it is over the finished log.
+    """Return a sentence on the verdict over the finished log.
 
     Args:
         ends: of the interval of its value; NaN where that is not determined.
@@ -94,7 +91,7 @@ def end_sentence(title: str, verdict: Verdict, ends: tuple[float, float], witnes
 
 
 def past_sentence(before: Period, until_ns: int, witness: str) -> str:
-    """What was before, until something else began."""
+    """Return a sentence on the period before, until another began."""
     did = "held" if before.code == HOLDING else "failed"
     seconds = f"{(until_ns - before.start_ns) / 1e9:.3f} s"
     worst = ""
@@ -107,7 +104,7 @@ def past_sentence(before: Period, until_ns: int, witness: str) -> str:
 
 
 class ReportedNode(NamedTuple):
-    """A node whose changes are told.
+    """A node whose changes are reported.
 
     Attributes:
         node: its id.
@@ -125,7 +122,7 @@ class ReportedNode(NamedTuple):
 
 
 class PeriodText(NamedTuple):
-    """What is said of a period: its number as that of a leaf, "" if it is none's, and a sentence."""
+    """A period in words: the leaf that gives its number, "" if none does, and a sentence."""
 
     period: Period
     witness: str
@@ -133,7 +130,7 @@ class PeriodText(NamedTuple):
 
 
 class EncodedEvent(NamedTuple):
-    """One change, encoded for both topics, and when it is told."""
+    """One change, encoded for both topics, and the time at which it is confirmed."""
 
     time_ns: int
     event: bytes
@@ -141,103 +138,101 @@ class EncodedEvent(NamedTuple):
 
 
 class EventReporter:
-    """Tells what becomes of one result's root and of the specs that it is made of, up to the end of the log.
+    """Reports the changes of one result's root and of the named specs in it, up to the end of the log.
 
-    What it keeps from one stretch of samples to the next is a few numbers for each of these, and for each of
-    their parts those of the leaves at one sample.
+    Its state between blocks is small: a few numbers for each of these nodes, and for each operand of theirs
+    the numbers of the leaves at one sample.
     """
 
     def __init__(
         self, tree: ReportedTree, instance: Instance, file: Specification, semantics: Semantics = "ltlf"
     ) -> None:
         """Before the first sample."""
-        self._settles = semantics == "ltlf"  # the paper's knows no continuation, and so no verdict that stays
+        self._settles = semantics == "ltlf"  # the paper's semantics has no verdict over all continuations
         self._tree, self._filename = tree, "" if file.filename == "<text>" else file.filename
         self._leaves = instance.program.leaves
         below = leaves_below(tree.formula, self._leaves)
-        self._watched = _reported_nodes(tree, below, file)
-        self._nodes = np.array([each.node for each in self._watched], np.int64)
-        self._parts = DecidingLeaves(tree.formula, below, self._nodes.tolist())
+        self._reported = _reported_nodes(tree, below, file)
+        self._nodes = np.array([each.node for each in self._reported], np.int64)
+        self._leaf_finder = DecidingLeaves(tree.formula, below, self._nodes.tolist())
         self._bindings = instance.bindings
         self._relations = RELATION_NAMES | file.relations
-        self._standings = NodeStates.begin(len(self._watched))
+        self._states = NodeStates.begin(len(self._reported))
         self._carried: dict[tuple[int, int], LeafValue | None] = {}
         self._last_ns: int | None = None
 
-    def tell(self, stretch: SeriesBlock) -> list[EncodedEvent]:
-        """Take in the next samples; the changes that they confirm, by node, then in the order of time."""
-        if not len(stretch.times_ns) or self._standings.are_final:
+    def extend(self, block: SeriesBlock) -> list[EncodedEvent]:
+        """Take in the next samples; return the changes that they confirm, by node, then by time."""
+        if not len(block.times_ns) or self._states.are_final:
             return []
-        self._last_ns = int(stretch.times_ns[-1])
-        self._parts.extend(stretch)
-        followed = track(
-            self._standings, stretch.times_ns, stretch.series, self._nodes, settles=self._settles
-        )
-        self._standings = followed.standings
-        told = [self._told(change, stretch) for change in followed.changes]
+        self._last_ns = int(block.times_ns[-1])
+        self._leaf_finder.extend(block)
+        tracked = track(self._states, block.times_ns, block.series, self._nodes, settles=self._settles)
+        self._states = tracked.states
+        events = [self._event(change, block) for change in tracked.changes]
         carried = {}
-        for node, places in enumerate(followed.places.tolist()):
-            codes = followed.standings.integers[node, [0, 3]].tolist()
+        for node, places in enumerate(tracked.places.tolist()):
+            codes = tracked.states.integers[node, [0, 3]].tolist()
             for slot, (code, place) in enumerate(zip(codes, places, strict=True)):
-                period = Period(code, 0, 0, float(followed.standings.worst[node, slot]), place)
-                carried[node, (OF_CURRENT, OF_CANDIDATE)[slot]] = self._attained(node, period, stretch)
+                period = Period(code, 0, 0, float(tracked.states.worst[node, slot]), place)
+                carried[node, (OF_CURRENT, OF_CANDIDATE)[slot]] = self._deciding_leaf(node, period, block)
         self._carried = carried
-        return told
+        return events
 
     def end(self, time_ns: int, final: Floats) -> list[EncodedEvent]:
-        """What the end of the log makes of the nodes that samples after it could still change.
+        """Return the final verdicts of the nodes that were still pending.
 
         Args:
-            time_ns: when that is told; not before the last sample.
+            time_ns: the time of these events; not before the last sample.
             final: (N, 2), lower and upper end of each node's value over the finished log.
         """
         if self._last_ns is None:
             return []
-        return [self._told_at_end(node, time_ns, self._last_ns, final) for node in self._standings.pending]
+        return [self._final_event(node, time_ns, self._last_ns, final) for node in self._states.pending]
 
-    def _attained(self, node: int, period: Period, stretch: SeriesBlock) -> LeafValue | None:
-        """The leaf that a period's worst number is that of, if it is one's at the sample in which it came."""
+    def _deciding_leaf(self, node: int, period: Period, block: SeriesBlock) -> LeafValue | None:
+        """Return the leaf that gives a period its worst number, if comparing numbers finds one."""
         if period.place < 0:
             return self._carried.get((node, period.place))
-        leaves = stretch.leaves[:, :, period.place]
+        leaves = block.leaves[:, :, period.place]
         low, high = low_and_high(len(leaves), wide=period.code in (SATISFIED, VIOLATED))
         ends = leaves[low], leaves[high]
-        return find_leaf(self._watched[node].below, ends, period.worst, low=period.code != VIOLATED)
+        return find_leaf(self._reported[node].below, ends, period.worst, low=period.code != VIOLATED)
 
-    def _told(self, change: Change, stretch: SeriesBlock) -> EncodedEvent:
-        watched, after, before = self._watched[change.node], change.after, change.before
-        witness = self._words(self._attained(change.node, after, stretch))
-        now = PeriodText(after, witness, change_sentence(watched.title, after, witness))
+    def _event(self, change: Change, block: SeriesBlock) -> EncodedEvent:
+        reported, after, before = self._reported[change.node], change.after, change.before
+        witness = self._words(self._deciding_leaf(change.node, after, block))
+        now = PeriodText(after, witness, change_sentence(reported.title, after, witness))
         past = None
         if before is not None:
-            past = self._past(before, after.start_ns, self._attained(change.node, before, stretch))
-        return self._encoded(watched, int(stretch.times_ns[change.sample]), now, past)
+            past = self._past(before, after.start_ns, self._deciding_leaf(change.node, before, block))
+        return self._encoded(reported, int(block.times_ns[change.sample]), now, past)
 
-    def _told_at_end(self, node: int, time_ns: int, last_ns: int, final: Floats) -> EncodedEvent:
-        watched, before = self._watched[node], self._standings.period(node)
-        lower, upper = final[watched.node].tolist()
+    def _final_event(self, node: int, time_ns: int, last_ns: int, final: Floats) -> EncodedEvent:
+        reported, before = self._reported[node], self._states.period(node)
+        lower, upper = final[reported.node].tolist()
         verdict = final_verdict(lower, upper)
         low, found = verdict is not Verdict.VIOLATED, None
         if verdict is not Verdict.UNKNOWN:
-            found = self._parts.find_leaf(watched.node, final, low=low, wide=self._settles)
+            found = self._leaf_finder.find_leaf(reported.node, final, low=low, wide=self._settles)
         after = Period(_ENDED[verdict], last_ns, last_ns, lower if low else upper, OF_CURRENT)
         witness = self._words(found)
-        now = PeriodText(after, witness, end_sentence(watched.title, verdict, (lower, upper), witness))
+        now = PeriodText(after, witness, end_sentence(reported.title, verdict, (lower, upper), witness))
         past = None
         if before.code != START and before.start_ns < last_ns:
             past = self._past(before, last_ns, self._carried[node, OF_CURRENT])
-        return self._encoded(watched, time_ns, now, past)
+        return self._encoded(reported, time_ns, now, past)
 
     def _past(self, period: Period, until_ns: int, worst: LeafValue | None) -> PeriodText:
-        """What was, before something else began."""
+        """Put a period that has ended into words."""
         witness = self._words(worst, past=True)
         return PeriodText(period, witness, past_sentence(period, until_ns, witness))
 
     def _encoded(
-        self, watched: ReportedNode, time_ns: int, now: PeriodText, past: PeriodText | None
+        self, reported: ReportedNode, time_ns: int, now: PeriodText, past: PeriodText | None
     ) -> EncodedEvent:
         period, witness, sentence = now
-        facts = self._facts(watched) | self._facts_of(period, witness, "")
+        facts = self._facts(reported) | self._facts_of(period, witness, "")
         if past is not None:
             before, sentence = past.period, f"{sentence} {past.sentence}"
             facts |= self._facts_of(before, past.witness, "_before")
@@ -249,22 +244,22 @@ class EventReporter:
             timestamp=_stamp(time_ns),
             level=_LEVELS[period.code],
             message=sentence,
-            name=watched.name,
+            name=reported.name,
             file=self._filename,
-            line=watched.line,
+            line=reported.line,
         )
         return EncodedEvent(time_ns, *(each.SerializeToString(deterministic=True) for each in (event, log)))
 
     def _words(self, found: LeafValue | None, *, past: bool = False) -> str:
-        """A leaf and its number in words; "" for none."""
+        """Return a leaf and its number in words; "" for none."""
         if found is None:
             return ""
         leaf: Formula = substitute(self._leaves[found.leaf], self._bindings)
         return leaf_words(format_formula(leaf, relations=self._relations), found.number, past=past)
 
-    def _facts(self, watched: ReportedNode) -> dict[str, str]:
+    def _facts(self, reported: ReportedNode) -> dict[str, str]:
         of = {} if self._tree.object is None else {"object": self._tree.object}
-        return {"specification": self._tree.name, **of, "node": str(watched.node), "name": watched.name}
+        return {"specification": self._tree.name, **of, "node": str(reported.node), "name": reported.name}
 
     def _facts_of(self, period: Period, witness: str, suffix: str) -> dict[str, str]:
         if period.code == START:
@@ -282,7 +277,7 @@ class EventReporter:
 def _reported_nodes(
     tree: ReportedTree, below: Sequence[LeavesBelow], file: Specification
 ) -> list[ReportedNode]:
-    """The root, and each named part that later samples can change, once.
+    """Return the root, and once each named node that later samples can change.
 
     Args:
         below: of each node of the tree, its leaves.
@@ -318,7 +313,7 @@ _ENDED: Final[Mapping[Verdict, int]] = {
     Verdict.VIOLATED: VIOLATED,
     Verdict.UNKNOWN: START,
 }
-"""How a node stands in a log that has ended: where its verdict is unknown, nothing is known of it."""
+"""The state of a node when the log has ended."""
 
 _LEVELS: Final[Mapping[int, Log.Level.ValueType]] = {
     START: Log.WARNING,

@@ -1,10 +1,6 @@
-"""A viewer's layout for one log: what to open so that everything in it is seen at once.
+"""The layout of a log for Foxglove and Lichtblick: panels by id, and a tree of splits that places them.
 
-The form is the one that Foxglove and Lichtblick import: panels by id, and a tree of splits that places them.
-
-The panels of a viewer's layout: what each shows of a log.
-
-Their kinds, the part of an identifier before `!`, are those that Foxglove and Lichtblick both have.
+The kind of a panel, the part of its identifier before `!`, is one that both viewers have.
 """
 
 from __future__ import annotations
@@ -38,10 +34,10 @@ from spatial_replay.trace.trace import Trace
 
 _MOST_CURVES: Final = 12
 _MOST_STRIPS: Final = 8
-"""More curves, or strips of states, than these nobody tells apart."""
+"""More curves, or strips of states, cannot be distinguished."""
 
 _LEGEND_PIXELS: Final = 150
-"""The width of a legend; beside the curves it hides none."""
+"""The width of a legend, beside the curves so that it hides none."""
 
 Config = dict[str, Any]
 
@@ -54,7 +50,7 @@ class Panel(NamedTuple):
 
 
 def scene_panel(camera: Mapping[str, Any], topics: Collection[str]) -> Panel:
-    """The scene from above; under it the planner's map in the colours that it brings, over it the path."""
+    """Return the scene from above, with the planner's map below it and its path above."""
     shown: dict[str, Config] = {SCENE: {}, GRADIENT_MAP: {"colorMode": "rgba-fields"}, PLAN_PATH: {}}
     config = {
         "cameraState": camera,
@@ -69,13 +65,13 @@ def scene_panel(camera: Mapping[str, Any], topics: Collection[str]) -> Panel:
 
 
 def result_curves(trees: Sequence[ReportedTree]) -> Panel:
-    """The value of each result."""
+    """Return the curves of each result's value."""
     paths = [(_label(tree), node_path(tree, id=0)) for tree in trees]
     return Panel("Plot!robustness", _plot(paths[:_MOST_CURVES]))
 
 
 def part_curves(trees: Sequence[ReportedTree]) -> Panel | None:
-    """Each spec that results are made of, what does not look ahead as it is now; None if there is none."""
+    """Return the curves of named specs: `now` of those that do not look ahead; None without any."""
     paths = [
         (f"{name} in {_title(tree)}", node_path(tree, name=name, field="value" if ahead else "now"))
         for tree in trees
@@ -85,7 +81,7 @@ def part_curves(trees: Sequence[ReportedTree]) -> Panel | None:
 
 
 def whole_curves(trees: Sequence[ReportedTree]) -> Panel:
-    """The value of each result, then what it is made of, over the whole log, from the newest message."""
+    """Return the curves over the whole log of each result, then of its named specs."""
     labelled = [(_label(tree), f"{_curves_path(tree, 0)}.value[:]") for tree in trees]
     labelled += [
         (f"{node.name} in {_title(tree)}", f"{_curves_path(tree, identifier)}.{_shown_number(node)}[:]")
@@ -99,8 +95,7 @@ def whole_curves(trees: Sequence[ReportedTree]) -> Panel:
 
 
 def state_strips(trees: Sequence[ReportedTree], has_states: Sequence[bool]) -> Panel:
-    """The verdict of each result over time and, where it has an automaton, the state of that; then the
-    verdicts of the specs that results are made of."""
+    """Return strips of each result's verdict and automaton state, then of its named specs' verdicts."""
     strips = []
     for tree, has_state in zip(trees, has_states, strict=True):
         strips.append((f"{_title(tree)}: verdict", node_path(tree, id=0, field="verdict")))
@@ -120,44 +115,46 @@ def state_strips(trees: Sequence[ReportedTree], has_states: Sequence[bool]) -> P
 
 
 def node_table(tree: ReportedTree) -> Panel:
-    """The numbers and verdicts of every node of a result, at the time looked at.
+    """Return the table of a result's nodes, with their numbers and verdicts at the cursor.
 
-    Viewers take the newest message of the topic, so that a table finds the last of several results only.
+    Viewers take the newest message of the topic, so only the table of the last of several results has rows.
     """
     return Panel("Table!nodes", {"topicPath": f"{ROBUSTNESS}{_of(tree)}.nodes"})
 
 
 def event_list() -> Panel:
-    """What changed, in words."""
+    """Return the list of events."""
     return Panel("RosOut!events", {"minLogLevel": 1, "searchTerms": [], "topicToRender": EVENT_LOG})
 
 
 def specification_text() -> Panel:
-    """The specification, with the table of nodes."""
+    """Return the text of the specification, with its nodes."""
     return Panel("RawMessages!specification", {"topicPath": SPECIFICATION})
 
 
-def decision_words() -> Panel:
-    """The planner's decision in words."""
+def decision_reason() -> Panel:
+    """Return the reason of the planner's decision."""
     return Panel("RawMessages!decision", {"topicPath": f"{PLAN_DECISION}.reason"})
 
 
 def constants() -> Panel:
-    """What a live server lets one change."""
+    """Return the constants that a live server lets a viewer edit."""
     return Panel("Parameters!constants", {"title": "Constants of the specification"})
 
 
 def node_path(
     tree: ReportedTree, *, id: int | None = None, name: str | None = None, field: str = "value"
 ) -> str:
-    """The message path of one number of a node, by its id or by its name."""
+    """Return the message path of one number of a node, by its id or by its name."""
     which = f"id=={id}" if name is None else f"name=={_quoted(name)}"
     return f"{ROBUSTNESS}{_of(tree)}.nodes[:]{{{which}}}.{field}"
 
 
 def named_parts(tree: ReportedTree) -> dict[str, bool]:
-    """Names that one node of a tree has, the root aside, so that a path by name finds it; with whether it
-    looks ahead."""
+    """Return the names that exactly one node below the root has, each with whether it looks ahead.
+
+    A message path by name would otherwise find several nodes.
+    """
     named = [(node.name, node) for _, _, node in iter_nodes(tree.formula) if node.name]
     names = [name for name, _ in named]
     return {name: looks_ahead(node) for name, node in named[1:] if names.count(name) == 1}
@@ -166,7 +163,7 @@ def named_parts(tree: ReportedTree) -> dict[str, bool]:
 def _plot(labelled: Sequence[tuple[str, str]]) -> Config:
     paths = [
         {
-            # samples are dots of this colour darkened, and cover the curve where they are many
+            # viewers draw samples as dots of this colour darkened, which cover a dense curve
             "color": lighter(CURVES[index % len(CURVES)]),
             "enabled": True,
             "label": label,
@@ -203,7 +200,7 @@ def _title(tree: ReportedTree) -> str:
 
 
 def _label(tree: ReportedTree) -> str:
-    """With the unit, where it is not that of footprints."""
+    """Return the title, with the unit where it is not that of footprints."""
     unit = unit_of(tree.formula, {})
     return f"{_title(tree)} [{unit}]" if unit else _title(tree)
 
@@ -220,7 +217,7 @@ _MARGIN = 1.5
 
 
 class SceneBounds(NamedTuple):
-    """The box that a log's footprints have covered so far, in footprint units."""
+    """The box that a log's footprints lie in, in footprint units."""
 
     xmin: float
     ymin: float
@@ -229,7 +226,7 @@ class SceneBounds(NamedTuple):
 
     @classmethod
     def of(cls, trace: Trace, before: SceneBounds | None = None) -> SceneBounds | None:
-        """The box of some samples and of those before; None while nothing was seen."""
+        """Return the box of some samples and of those before; None without any footprint."""
         vertices = trace.footprints.vertices
         low, high = _corners(vertices)
         if not np.isfinite([low, high]).all():
@@ -244,7 +241,7 @@ class SceneBounds(NamedTuple):
 
 
 class LayoutContents(NamedTuple):
-    """What a log has that a layout shows.
+    """What a layout shows of a log.
 
     Attributes:
         trees: its results.
@@ -260,56 +257,56 @@ class LayoutContents(NamedTuple):
 
 
 def layout_attachment(contents: LayoutContents) -> Attachment:
-    """The layout of a log as a file to be kept in it (see `viewer_layout`)."""
+    """Return the layout of a log as a file to attach to it (see `viewer_layout`)."""
     return _attachment(viewer_layout(contents))
 
 
 def live_layout_attachment(contents: LayoutContents) -> Attachment:
-    """The layout for a server that replays a log as a file (see `layout_for_live`)."""
+    """Return the layout for a server that replays a log as a file (see `layout_for_live`)."""
     return _attachment(layout_for_live(contents))
 
 
 def viewer_layout(contents: LayoutContents) -> dict[str, Any]:
-    """The layout of a log: the scene on the left, what is said of it on the right.
+    """Return the layout of a log: the scene on the left, its evaluation on the right.
 
-    Where a planner's decisions are in the log, its map lies under the scene and its words below.
+    If the log has a planner's decisions, its map lies under the scene, and the reasons are listed below it.
     """
-    return _layout(_shown(contents), _said(contents))
+    return _layout(_scene_panels(contents), _evaluation_panels(contents))
 
 
 def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
-    """The layout for a server that replays a log: the same, with the curves of the whole log at any time, and
-    the constants that it lets one change."""
-    said = _said(contents)
-    if said:
-        # what was played so far is part of the whole
-        said[:1] = [(whole_curves(contents.trees), 3.0)]
-    return _layout([*_shown(contents), (constants(), 1.0)], said)
+    """Return the layout for a server that replays a log: with the curves of the whole log at any time, and
+    the constants that a viewer may edit."""
+    panels = _evaluation_panels(contents)
+    if panels:
+        # the curves of the whole log include those played so far
+        panels[:1] = [(whole_curves(contents.trees), 3.0)]
+    return _layout([*_scene_panels(contents), (constants(), 1.0)], panels)
 
 
 _Weighted = tuple[Panel, float]
-"""A panel, and its share of the room beside its neighbours."""
+"""A panel, and its share of the space beside its neighbours."""
 
 
-def _shown(contents: LayoutContents) -> list[_Weighted]:
-    """The scene and, of a planner, its words."""
+def _scene_panels(contents: LayoutContents) -> list[_Weighted]:
+    """Return the scene and, of a planner, its reasons."""
     scene = scene_panel(_camera(contents.extent), contents.topics)
-    return [(scene, 4.0), *([(decision_words(), 1.0)] if PLAN_DECISION in contents.topics else [])]
+    return [(scene, 4.0), *([(decision_reason(), 1.0)] if PLAN_DECISION in contents.topics else [])]
 
 
-def _said(contents: LayoutContents) -> list[_Weighted]:
-    """What is said of the samples, from above to below."""
+def _evaluation_panels(contents: LayoutContents) -> list[_Weighted]:
+    """Return the panels of the evaluation, from top to bottom."""
     trees = contents.trees
     if not trees:
         return []
-    said = [(result_curves(trees), 3.0)]
+    panels = [(result_curves(trees), 3.0)]
     parts = part_curves(trees)
     if parts is not None:
-        said.append((parts, 2.0))
-    said.append((state_strips(trees, contents.has_states), 3.0))
+        panels.append((parts, 2.0))
+    panels.append((state_strips(trees, contents.has_states), 3.0))
     if EVENT_LOG in contents.topics:
-        said.append((event_list(), 2.0))
-    return [*said, (node_table(trees[-1]), 2.0), (specification_text(), 1.0)]
+        panels.append((event_list(), 2.0))
+    return [*panels, (node_table(trees[-1]), 2.0), (specification_text(), 1.0)]
 
 
 def _attachment(layout: dict[str, Any]) -> Attachment:
@@ -331,7 +328,7 @@ def _layout(left: Sequence[_Weighted], right: Sequence[_Weighted]) -> dict[str, 
 
 
 def _column(panels: Sequence[_Weighted]) -> str | dict[str, Any]:
-    """Panels one below the other, as splits in two."""
+    """Return panels one below the other, as nested splits."""
     (first, share), *rest = panels
     if not rest:
         return first.identifier
@@ -345,14 +342,14 @@ def _column(panels: Sequence[_Weighted]) -> str | dict[str, Any]:
 
 
 def _corners(vertices: Floats) -> tuple[list[float], list[float]]:
-    """The least and the greatest coordinates (V, 2); of no vertices, none that is finite."""
+    """Return the least and the greatest coordinates of vertices (V, 2); infinite without any."""
     columns = [vertices[:, axis] for axis in (0, 1)]
     low = [float(column.min(initial=np.inf)) for column in columns]
     return low, [float(column.max(initial=-np.inf)) for column in columns]
 
 
 def _camera(extent: SceneBounds | None) -> dict[str, Any]:
-    """From straight above, so that the box fits."""
+    """Return a camera that looks straight down and fits the box."""
     box = extent or SceneBounds(-1.0, -1.0, 1.0, 1.0)
     distance = _MARGIN * max(box.xmax - box.xmin, box.ymax - box.ymin) or 1.0
     return {
@@ -360,7 +357,7 @@ def _camera(extent: SceneBounds | None) -> dict[str, Any]:
         "distance": distance,
         "phi": 0,
         "thetaOffset": 0,
-        # viewers put the target where the followed frame is; what is looked at is the offset from it
+        # viewers place the target at the followed frame, so the offset moves the view
         "target": [0, 0, 0],
         "targetOffset": [(box.xmin + box.xmax) / 2, (box.ymin + box.ymax) / 2, 0],
         "targetOrientation": [0, 0, 0, 1],

@@ -19,12 +19,12 @@ from spatial_replay.monitor.verdict import Verdict
 Codes = NDArray[np.uint8]
 
 VERDICTS = (Verdict.UNKNOWN, Verdict.PENDING, Verdict.SATISFIED, Verdict.VIOLATED, Verdict.UNKNOWN)
-"""What the codes of a message's verdicts mean; 0 is that of a message that says nothing."""
+"""The verdicts by their codes in messages; 0 is the default of protobuf, a verdict that is not set."""
 
 
 @dataclass(frozen=True, eq=False)
 class RobustnessSeries:
-    """What a log says of one specification, or of one object's instance of a template.
+    """The numbers that a log has of one specification, or of one object's instance of a template.
 
     Attributes:
         specification: its name.
@@ -50,7 +50,7 @@ class RobustnessSeries:
 def encode_robustness(
     name: str, object: str | None, names: Sequence[str | None], times_ns: Integers, series: Floats
 ) -> list[bytes]:
-    """One message for each sample.
+    """Return one message for each sample.
 
     Args:
         name: the specification's name.
@@ -78,7 +78,7 @@ def encode_robustness(
 
 
 def online_codes(lower: Floats, upper: Floats) -> Codes:
-    """The codes of the verdicts while samples still come, as `online_verdict` gives them."""
+    """Return the codes of the verdicts that `online_verdict` gives while more samples may come."""
     codes = np.full(lower.shape, Robustness_pb2.VERDICT_PENDING, np.uint8)
     codes[upper < 0.0] = Robustness_pb2.VERDICT_VIOLATED
     codes[lower >= 0.0] = Robustness_pb2.VERDICT_SATISFIED
@@ -87,14 +87,14 @@ def online_codes(lower: Floats, upper: Floats) -> Codes:
 
 
 def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:
-    """What messages say, one entry for each specification and object, in order of first appearance.
+    """Decode messages: one entry for each specification and object, in order of first appearance.
 
     Messages of one specification with other nodes than before, as of another run, make another entry.
 
     Raises:
-        LogError: a message that is none of these.
+        LogError: a message of another type, or with a verdict of a later version.
     """
-    found: dict[_Heading, list[_Rows]] = {}
+    rows_by_heading: dict[_Heading, list[_Rows]] = {}
     waiting = _by_length(payloads)
     while waiting:
         indices = waiting.pop()
@@ -107,10 +107,10 @@ def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:
             encoded = rows_of([payloads[index] for index in indices.tolist()])
             taken = template.matches(encoded)
             rows = _template_rows(template, encoded[taken])
-        found.setdefault(_heading(first), []).append((indices[taken], *rows))
+        rows_by_heading.setdefault(_heading(first), []).append((indices[taken], *rows))
         if not taken.all():
             waiting.append(indices[~taken])
-    ordered = sorted(found.items(), key=lambda entry: min(int(rows[0][0]) for rows in entry[1]))
+    ordered = sorted(rows_by_heading.items(), key=lambda entry: min(int(rows[0][0]) for rows in entry[1]))
     return [_joined(heading, rows) for heading, rows in ordered]
 
 
@@ -129,7 +129,7 @@ def _parse(payload: bytes, index: int) -> Robustness:
         return Robustness.FromString(payload)
     except DecodeError as error:
         raise LogError(
-            f"message {index} of {len(payload)} bytes is no spatial_replay.Robustness; "
+            f"message {index} of {len(payload)} bytes is not a spatial_replay.Robustness; "
             "write the annotated log again from its source"
         ) from error
 
@@ -140,7 +140,7 @@ def _heading(message: Robustness) -> _Heading:
 
 
 def _template(message: Robustness) -> WireTemplate | None:
-    """The layout, if every number is in it; None where one takes its default by absence."""
+    """Return the byte layout of a message; None if a number is absent because it is its default."""
     try:
         template = WireTemplate.of(message)
     except LayoutError:

@@ -1,10 +1,9 @@
-"""Messages of /spatial/scene of one layout: the same entities with the same primitives, many at once.
+"""Templates of messages of /spatial/scene, and how the entities in them are drawn.
 
-Entities of a scene: what a viewer draws of one object or region.
+Messages of one layout have the same entities with the same primitives. Their template is encoded once, with
+NaN where coordinates and colours belong; filling in those numbers makes many messages at once.
 
-Coordinates and colours that are NaN are left to be filled in; see `layout`.
-
-Footprints as polygons that a viewer draws: every part as one ring of points.
+Every part of a footprint is drawn as one ring of points.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ ARROW_HEAD: Final = 0.15
 
 OBJECT_OPACITY: Final = 0.55
 REGION_OPACITY: Final = 0.3
-"""Of faces; objects stand out from the regions that they lie in."""
+"""Of faces: objects are more opaque than the regions that they lie in."""
 
 _LINE_PIXELS: Final = 2.0
 _LABEL_PIXELS: Final = 14.0
@@ -43,7 +42,7 @@ _NAN: Final = float("nan")
 
 
 class Elevation(NamedTuple):
-    """Where an entity lies along the vertical axis, in footprint units; NaN to be filled in.
+    """The heights of an entity, in footprint units; NaN to be filled in.
 
     Attributes:
         fill: of its filled face, the upper one of a prism.
@@ -67,11 +66,11 @@ def draw(
 ) -> None:
     """Add outlines, filled faces and the label to an entity; every colour but the label's is to be filled in.
 
-    The order in which numbers are to be filled in is that of `words_of_object` in `layout`.
+    `words_of_object` fills in the numbers in this order.
 
     Args:
         outlines, faces: rings (n, 2); a face is convex.
-        anchor: where the label stands.
+        anchor: the position of the label.
         opacity: of the faces.
     """
     for ring in outlines:
@@ -95,10 +94,10 @@ def draw(
 
 
 def point_at(entity: SceneEntity, label: str, lift: float) -> None:
-    """Add an arrow and its label to an entity; where they are and how long is to be filled in.
+    """Add an arrow and its label to an entity; their positions and the arrow's length are to be filled in.
 
     Args:
-        lift: what is drawn above the plane, and a fifth of an arrow's width.
+        lift: height of flat objects above the plane, and a fifth of an arrow's width.
     """
     arrow = entity.arrows.add(
         shaft_length=_NAN, shaft_diameter=5.0 * lift, head_length=_NAN, head_diameter=12.0 * lift
@@ -177,14 +176,14 @@ class Rings(NamedTuple):
 
 
 class Form(NamedTuple):
-    """What footprints have in common that are drawn with the same primitives."""
+    """The primitives of a footprint: the lengths of its rings, and whether it has a height."""
 
     rings: tuple[int, ...]
     has_height: bool
 
 
 def rings_of(footprints: FootprintBatch, point_radius: float) -> Rings:
-    """The rings of some footprints; a bare point is drawn as a disc of the given radius."""
+    """Return the rings of footprints; a bare point becomes a disc of the given radius."""
     counts = np.diff(footprints.vertex_start)
     is_round = (counts == 1) | (footprints.radius > 0.0)
     lengths = np.where(is_round, ROUND, counts)
@@ -204,12 +203,12 @@ def rings_of(footprints: FootprintBatch, point_radius: float) -> Rings:
 
 
 def outlines_of(footprint: Footprint) -> list[Floats]:
-    """The ring (n, 2) of each part of one footprint."""
+    """Return the ring (n, 2) of each part of one footprint."""
     return list(rings_of(FootprintBatch.from_footprints([footprint]), 0.0).rings_of(0))
 
 
 def extents(footprints: FootprintBatch) -> Floats:
-    """(R,) the longer side of each footprint's bounding box."""
+    """Return (R,) the longer side of each footprint's bounding box."""
     owner = np.repeat(np.arange(len(footprints)), np.diff(footprints.part_start))
     vertex_part = np.repeat(np.arange(len(owner)), np.diff(footprints.vertex_start))
     radius = footprints.radius[vertex_part][:, None]
@@ -225,7 +224,7 @@ _DIRECTIONS: Final = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 
 
 def _rounded(corners: Floats, radius: Floats) -> Floats:
-    """Rings (M, ROUND, 2) of M parts: the outermost point in each direction.
+    """Return the rings (M, ROUND, 2) of M parts: the outermost point in each direction.
 
     Args:
         corners: (M, n, 2).
@@ -238,7 +237,7 @@ def _rounded(corners: Floats, radius: Floats) -> Floats:
 
 
 def _forms(footprints: FootprintBatch, lengths: Integers) -> tuple[Integers, tuple[Form, ...]]:
-    """(R,) the form of each footprint, and what the forms are."""
+    """Return (R,) the form of each footprint, and the forms."""
     part_counts = np.diff(footprints.part_start)
     has_height = ~np.isnan(footprints.bottom)
     key = part_counts * 2 + has_height
@@ -263,19 +262,19 @@ REGION: Final = "region/"
 WITNESS: Final = "witness"
 
 LABEL_LENGTH: Final = 8
-"""Characters of a witness' number, spaces around it included."""
+"""Characters of an arrow's number, including the spaces around it."""
 
 _LABEL_LIFT: Final = 0.01
-"""How far above a region its name stands, by the region's size."""
+"""The height of a region's name above it, by the region's size."""
 
 
 class SceneLayout(NamedTuple):
-    """What decides where the numbers of a message stand.
+    """What decides at which bytes the numbers of a message are.
 
     Attributes:
-        deleted: objects that were in the message before and are not seen now.
-        objects: name and form of those seen.
-        witness: whether the worst violation is pointed at; or, with None, was so in the message before.
+        deleted: objects that were in the message before and are gone.
+        objects: name and form of those observed.
+        witness: whether an arrow points at the worst violation; None deletes that of the message before.
     """
 
     deleted: tuple[str, ...]
@@ -288,7 +287,7 @@ class Region(NamedTuple):
 
     Attributes:
         name: its name.
-        outline: its border, as the specification says it.
+        outline: its border, as in the specification.
         rings: its convex parts, each (n, 2).
     """
 
@@ -302,15 +301,15 @@ class SceneTemplate:
     """Messages of one layout, but for their times, coordinates and colours.
 
     Attributes:
-        template: its words are what is to be filled in.
-        stamps: where a timestamp's content begins.
+        template: its words are to be filled in.
+        stamps: offsets of the timestamps' contents.
     """
 
     template: WireTemplate
     stamps: tuple[int, ...]
 
     def fill(self, times_ns: Integers, words: Floats) -> Bytes:
-        """(S,) times and (S, W) numbers → (S, L) encoded messages."""
+        """Encode messages (S, L) from times (S,) and numbers (S, W)."""
         rows = self.template.fill(words.view(np.uint64))
         stamps = _encoded_stamps(times_ns)
         for begin in self.stamps:
@@ -319,10 +318,10 @@ class SceneTemplate:
 
 
 def make_template(layout: SceneLayout, regions: tuple[Region, ...], lift: float) -> SceneTemplate:
-    """The template of a layout.
+    """Return the template of a layout.
 
     Args:
-        lift: how far flat objects are drawn above the plane, so that they cover regions.
+        lift: height of flat objects above the plane, so that they cover regions.
     """
     message = SceneUpdate()
     for name in layout.deleted:
@@ -348,7 +347,7 @@ def make_template(layout: SceneLayout, regions: tuple[Region, ...], lift: float)
 
 
 def words_of_region(region: Region, colour: Floats) -> list[Floats]:
-    """What a template leaves open in a region: the colours (S, 3) of its lines and faces."""
+    """Return what to fill in for a region: the colours (S, 3) of its lines and faces."""
     primitives = _region_entity(region)
     return [colour] * (len(primitives.lines) + len(primitives.triangles))
 
@@ -361,13 +360,13 @@ def border_of(region: Region) -> list[Floats]:
 def words_of_object(
     form: Form, points: Floats, bottom: Floats, top: Floats, colour: Floats, lift: float
 ) -> list[Floats]:
-    """What a template leaves open in an object, in the order of its primitives' fields.
+    """Return what to fill in for an object, in the order of its primitives' fields.
 
     Args:
         points: (S, P, 2), its rings, one after the other.
         bottom, top: (S,) its height interval, if it has one.
         colour: (S, 3).
-        lift: how far above the top the name stands.
+        lift: height of the name above the top.
 
     Returns:
         columns (S, n), each of one or more words.
@@ -390,11 +389,11 @@ def words_of_object(
 
 
 def words_of_witness(points: Floats, z: Floats, scale: float, labels: Sequence[str]) -> list[Floats]:
-    """What a template leaves open in the arrow at the worst violation.
+    """Return what to fill in for the arrow at the worst violation.
 
     Args:
-        points: (S, 2, 2), where it begins and where it ends.
-        z: (S,), how high.
+        points: (S, 2, 2), its begin and its end.
+        z: (S,), its height.
         scale: the size of objects in the scene.
         labels: S texts, of at most `LABEL_LENGTH` ASCII characters.
 
@@ -417,9 +416,9 @@ def _add_entity(message: SceneUpdate, identifier: str) -> SceneEntity:
 
 
 def _add_region(entity: SceneEntity, region: Region) -> None:
-    """A region's border as it was written, or for a disc its ring, and its convex parts as faces.
+    """Add a region: its border, its convex parts as faces, and its name at the upper edge.
 
-    The name stands at its upper edge, where objects inside do not cover it.
+    There, objects inside do not cover the name.
     """
     bottom, top = region.outline.height or (0.0, 0.0)
     sides = None if region.outline.height is None else (bottom, top - bottom)
@@ -461,7 +460,7 @@ def _flat(ring: Floats) -> Floats:
 
 
 def _raised(ring: Floats, height: Floats) -> Floats:
-    """(S, n, 2) points and (S,) heights → (S, 3 n): x, y, z, x, y, z …"""
+    """Return points (S, n, 2) at heights (S,) as (S, 3 n): x, y, z, x, y, z …"""
     z = np.broadcast_to(height[:, None, None], (*ring.shape[:2], 1))
     return _flat(np.concatenate([ring, z], axis=2))
 
@@ -490,7 +489,7 @@ def _stamp_offsets(payload: bytes) -> tuple[int, ...]:
 
 
 def _encoded_stamps(times_ns: Integers) -> Bytes:
-    """(S,) nanoseconds → (S, 12) the contents of timestamps."""
+    """Encode nanoseconds (S,) as the contents (S, 12) of timestamps."""
     rows = np.tile(np.frombuffer(_STAMP_BYTES, np.uint8), (len(times_ns), 1))
     shifts = np.arange(0, 35, 7)
     more = np.array([0x80, 0x80, 0x80, 0x80, 0x00])

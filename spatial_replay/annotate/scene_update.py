@@ -51,11 +51,11 @@ _LEAST: Final = 0.4
 """How far the colour of the slightest robustness is from grey, so that its sign shows."""
 
 _OPACITY: Final = 0.6
-"""Of a map's cells: what lies over them stands out."""
+"""Of a map's cells, so that the scene above them stays visible."""
 
 
 def colours(robustness: ArrayLike, scale: ArrayLike) -> Floats:
-    """The colours (..., 3) of robustness (...): full where it is as large as `scale`, grey where NaN.
+    """Return the colours (..., 3) of robustness (...): full at `scale`, grey where NaN.
 
     Args:
         scale: above 0, in the unit of the robustness; one, or an array that goes with it.
@@ -69,7 +69,7 @@ def colours(robustness: ArrayLike, scale: ArrayLike) -> Floats:
 
 
 def cell_colours(robustness: Floats) -> NDArray[np.uint8]:
-    """Red, green, blue and alpha (..., 4) of cells (...): full where the map is largest, clear where NaN."""
+    """Return the colours (..., 4) of cells (...): full where the map is largest, transparent where NaN."""
     largest = float(np.abs(robustness[np.isfinite(robustness)]).max(initial=0.0))
     opacity = np.where(np.isnan(robustness), 0.0, _OPACITY)
     shares = np.concatenate([colours(robustness, largest or 1.0), opacity[..., None]], axis=-1)
@@ -77,7 +77,7 @@ def cell_colours(robustness: Floats) -> NDArray[np.uint8]:
 
 
 PERIOD_NS: Final = 20_000_000
-"""The least time between two messages: what viewers draw without a warning."""
+"""The least time between two messages; viewers warn of more."""
 
 _LIFT: Final = 0.01
 _POINT: Final = 0.02
@@ -97,7 +97,7 @@ class SceneState:
     Attributes:
         written_ns: the time of the last message, or None before the first.
         shown: the objects in it.
-        is_pointing: whether it points at a violation.
+        is_pointing: whether it has an arrow at a violation.
         scale: the robustness at which colours are full: the median size (longer side of the bounding box) of
             the objects in the first message that shows any; None before that.
         templates: those of the layouts so far; a cache that changes no message.
@@ -290,7 +290,7 @@ class SceneEncoder:
         regions: Floats,
         scale: float,
     ) -> Floats:
-        """(S, W) what the layout's template leaves open."""
+        """Return (S, W) what to fill in the layout's template."""
         columns = []
         for index, region in enumerate(self._drawn):
             columns += words_of_region(region, regions[samples, index])
@@ -302,7 +302,7 @@ class SceneEncoder:
             colour = objects[samples, column]
             columns += words_of_object(form, points, bottom, top, colour, _LIFT * scale)
         if layout.witness:
-            columns += _words_of_witness(content.violations, samples, scale)
+            columns += _words_of_arrow(content.violations, samples, scale)
         return np.concatenate([np.empty((len(samples), 0)), *columns], axis=1)
 
 
@@ -328,14 +328,14 @@ class _SceneContent(NamedTuple):
     arrow: Integers
 
 
-def _words_of_witness(found: Violations, samples: Integers, scale: float) -> list[Floats]:
+def _words_of_arrow(found: Violations, samples: Integers, scale: float) -> list[Floats]:
     z = np.fmax(found.top[samples], 0.0) + 3.0 * _LIFT * scale
     labels = [_label(number) for number in found.robustness[samples].tolist()]
     return words_of_witness(found.points[samples], z, scale, labels)
 
 
 def _label(number: float) -> str:
-    """A number in as many digits, up to three, as there is room for."""
+    """Return a number with three digits, or as many as fit."""
     text = f"{number:.3g}"
     if len(text) > LABEL_LENGTH:
         text = next(text for digits in (2, 1) if len(text := f"{number:.{digits}g}") <= LABEL_LENGTH)
@@ -352,7 +352,7 @@ def _bytes(colour: Floats) -> tuple[int, int, int]:
 
 
 def _spaced(times_ns: Integers, written_ns: int | None) -> Integers:
-    """Indices of the samples to write: each at least a period after the one written before."""
+    """Return the indices of the samples to write: each at least a period after the one before."""
     if not len(times_ns):
         return np.empty(0, np.int64)
     earliest = int(times_ns[0]) if written_ns is None else written_ns + PERIOD_NS
@@ -391,14 +391,14 @@ def _content(
     names = tuple(sorted({*trace.names, *before.shown}))
     of_all = np.full((len(rows), len(names)), -1, np.int64)
     of_all[:, [names.index(name) for name in trace.names]] = rows
-    is_seen = of_all >= 0
-    was_seen = np.concatenate([[[name in before.shown for name in names]], is_seen[:-1]])
-    footprints = trace.footprints.select(of_all[is_seen])
+    is_present = of_all >= 0
+    was_present = np.concatenate([[[name in before.shown for name in names]], is_present[:-1]])
+    footprints = trace.footprints.select(of_all[is_present])
     rings = rings_of(footprints, _POINT * scale)
     observations = np.full(of_all.shape, -1, np.int64)
-    observations[is_seen] = np.arange(len(footprints))
-    forms = np.where(was_seen, _DELETED, _ABSENT)
-    forms[is_seen] = _FIRST_FORM + rings.form
+    observations[is_present] = np.arange(len(footprints))
+    forms = np.where(was_present, _DELETED, _ABSENT)
+    forms[is_present] = _FIRST_FORM + rings.form
     was_pointing = np.append(before.is_pointing, found.is_shown[:-1])
     witness = np.where(found.is_shown, _FIRST_FORM, np.where(was_pointing, _DELETED, _ABSENT))
     return _SceneContent(names, of_all, forms, observations, footprints, rings, found, witness)
@@ -411,7 +411,7 @@ def _class_codes(trace: Trace, rows: Integers) -> Integers:
 
 
 def _by_layout(content: _SceneContent) -> Iterator[tuple[SceneLayout, Integers]]:
-    """The layouts, and the samples (S,) that have each."""
+    """Yield the layouts, each with its samples (S,)."""
     forms = np.column_stack([content.forms, content.arrow])
     if (forms == forms[0]).all():
         yield _layout(content, forms[0]), np.arange(len(forms))
@@ -424,8 +424,8 @@ def _by_layout(content: _SceneContent) -> Iterator[tuple[SceneLayout, Integers]]
 def _layout(content: _SceneContent, forms: NDArray[np.int64]) -> SceneLayout:
     *of_objects, witness = forms.tolist()
     listed: list[tuple[str, int]] = list(zip(content.names, of_objects, strict=True))
-    seen: list[tuple[str, Form]] = [
+    shown: list[tuple[str, Form]] = [
         (name, content.rings.forms[form - _FIRST_FORM]) for name, form in listed if form >= _FIRST_FORM
     ]
     deleted = tuple(name for name, form in listed if form == _DELETED)
-    return SceneLayout(deleted, tuple(seen), None if witness == _DELETED else witness == _FIRST_FORM)
+    return SceneLayout(deleted, tuple(shown), None if witness == _DELETED else witness == _FIRST_FORM)

@@ -1,4 +1,4 @@
-"""Witnesses in plain sentences."""
+"""Witnesses in words: what decided a verdict, and what would flip it."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from spatial_replay.monitor.witness.witness import Witness, WitnessStep
 
 _DIGITS = 6
 _LONGEST = 60
-"""Characters of a formula that is only mentioned."""
+"""Characters of a formula that is only mentioned, at most."""
 _EDGES = {"min_x": "left", "max_x": "right", "min_y": "lower", "max_y": "upper"}
 
 
 def sentences_of(
     witness: Witness, *, first_ns: int, since_ns: int | None = None, is_open: bool = False
 ) -> tuple[str, ...]:
-    """Why a node has its verdict: what decided it, and what would flip it.
+    """Return sentences on why a node has its verdict: what decided it, and what would flip it.
 
     Args:
-        first_ns: the time that others are told from.
+        first_ns: the time that others are counted from.
         since_ns: since when it has had its verdict, if that is known.
         is_open: whether samples after those evaluated may change it.
     """
@@ -42,12 +42,12 @@ def sentences_of(
 
 
 def number_text(number: float) -> str:
-    """A number as people read it: six digits."""
+    """Return a number with six digits."""
     return f"{number:.{_DIGITS}g}"
 
 
 def time_text(time_ns: int, first_ns: int) -> str:
-    """A time as seconds since another."""
+    """Return a time in seconds since another."""
     return f"{(time_ns - first_ns) / 1e9:.3f} s"
 
 
@@ -81,7 +81,7 @@ def _end(witness: Witness, deciding: DecidingAtom) -> float:
 
 
 def _in_time(witness: Witness) -> str:
-    """Which temporal operator the sample was chosen by."""
+    """Name the temporal operator that chose the sample."""
     for step in reversed(witness.path[:-1]):
         if step.operator in ("F", "G", "U", "R", "W", "X", "WX", "O", "H", "S", "Y"):
             return f" (within `{_shortened(step)}`)"
@@ -89,7 +89,7 @@ def _in_time(witness: Witness) -> str:
 
 
 def _in_time_of_all(witness: Witness) -> str:
-    """The same, and that the atom is nowhere greater or less there, where that is so."""
+    """Name it, and say that the atom is greatest or least within it, where that is so."""
     passed: set[str] = set()
     for step in reversed(witness.path[:-1]):
         if step.operator in ("F", "O") and passed <= {"or", "spec"}:
@@ -156,21 +156,21 @@ def _flip(witness: Witness, deciding: DecidingAtom, threshold: Threshold | None)
 
 
 def _change(threshold: Threshold) -> str:
-    """The numbers that flip a verdict."""
+    """Return the numbers that flip a verdict."""
     if threshold.is_exact:
         return f"exactly {threshold.flips_at!r}"
     rises = threshold.flips_at > threshold.value
     if threshold.flips_at == 0.0:
         return "0"
     for limit in (threshold.value, 0.0):
-        # what is told of rounding's sake would be hard to read
+        # a change that is only a rounding error is left out of the number
         if abs(threshold.flips_at - limit) <= 1e-12 * max(abs(threshold.value), 1.0):
             return f"anything {'above' if rises else 'below'} {number_text(limit)}"
     return f"{_rounded(threshold.flips_at, up=rises)} or {'more' if rises else 'less'}"
 
 
 def _rounded(number: float, *, up: bool) -> str:
-    """Six digits, rounded so that the change is no smaller."""
+    """Return six digits, rounded so that the change is no smaller."""
     rounding = ROUND_CEILING if up else ROUND_FLOOR
     rounded = Context(prec=_DIGITS, rounding=rounding).create_decimal(Decimal(number))
     is_plain = -5 <= rounded.adjusted() < 2 * _DIGITS
@@ -192,7 +192,7 @@ def _uncertain(witness: Witness, deciding: DecidingAtom, first_ns: int) -> str:
 
 
 def _open_end(deciding: DecidingAtom, time_ns: int, first_ns: int) -> str:
-    """What leaves open by how much a formula is satisfied or violated."""
+    """Name what leaves the robustness open, where the verdict is known."""
     when = time_text(time_ns, first_ns)
     if deciding.unknown:
         return (

@@ -1,4 +1,4 @@
-"""Specifications and the trees of their results → the message of /spatial/specification."""
+"""Specifications as a log has them: their texts, and the trees of their results → /spatial/specification."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class ReportedTree(NamedTuple):
 def reported_trees(
     files: Sequence[Specification], instances: Sequence[Sequence[Instance]]
 ) -> list[ReportedTree]:
-    """Every result of every file; where two files have a spec of one name, after their files' stems.
+    """Return every result of every file; specs of one name in two files get their files' stems as prefix.
 
     Args:
         instances: of each file, in the order in which they are evaluated.
@@ -76,7 +76,7 @@ def encode_specification(
     signal_units: Mapping[str, str] | None = None,
     propositions: Sequence[Sequence[int]] | None = None,
 ) -> bytes:
-    """The message that says what a log was evaluated against; equal arguments give equal bytes.
+    """Return the message with the specifications of a log; equal arguments give equal bytes.
 
     Args:
         signal_units: units of the log's signals, where known.
@@ -98,9 +98,9 @@ def encode_specification(
 
 
 def unit_of(formula: Formula, signal_units: Mapping[str, str]) -> str:
-    """The unit of a formula's robustness: that of its atoms, if they share one.
+    """Return the unit of a formula's robustness: that of its atoms, if they share one.
 
-    Footprint units are "", numbers without a unit "1"; a signal whose unit nobody stated has "units of
+    Footprint units are "", numbers without a unit "1"; a signal without a known unit has "units of
     NAME". A formula over atoms of several units has "mixed".
     """
     units = {
@@ -138,7 +138,7 @@ def _atom_unit(expression: Expression, signal_units: Mapping[str, str]) -> str:
 
 
 def _units(expression: Expression, signal_units: Mapping[str, str]) -> Iterator[str]:
-    """The units of everything measured in an expression; its constants take those."""
+    """Yield the units of everything measured in an expression; constants have none of their own."""
     stack = [expression]
     while stack:
         match stack.pop():
@@ -159,12 +159,12 @@ def _units(expression: Expression, signal_units: Mapping[str, str]) -> Iterator[
 
 
 def logged_specifications(files: Sequence[Specification]) -> list[Specification]:
-    """The specifications as a log keeps them, so that who reads it back gets equal ones of equal names.
+    """Return the specifications as a log stores them, so that reading it gives equal ones of equal names.
 
-    Each has a file name whose stem no other has. A text that would not be read back as the same specification
-    (it was parsed with a profile or constants of its own) gives way to the canonical one.
+    Each has a file name with a stem of its own. A text that does not parse to the same specification
+    (it was parsed with another profile or constants) is replaced by the canonical one.
     """
-    kept: list[Specification] = []
+    logged: list[Specification] = []
     stems: set[str] = set()
     for file in files:
         path = PurePath(file.filename)
@@ -174,12 +174,12 @@ def logged_specifications(files: Sequence[Specification]) -> list[Specification]
             count += 1
             stem = f"{own}-{count}"
         stems.add(stem)
-        kept.append(replace(_self_contained(file), filename=f"{stem}{suffix}"))
-    return kept
+        logged.append(replace(_self_contained(file), filename=f"{stem}{suffix}"))
+    return logged
 
 
 def specification_attachments(files: Sequence[Specification], prefix: str) -> list[Attachment]:
-    """The texts of `logged_specifications`, to be kept in a log under names that begin with `prefix`."""
+    """Return the texts of `logged_specifications` as attachments whose names begin with `prefix`."""
     return [Attachment(f"{prefix}{file.filename}", "text/plain", file.source.encode()) for file in files]
 
 
@@ -191,5 +191,5 @@ def _self_contained(file: Specification) -> Specification:
             continue
         if read_back == file:
             return file if text == file.source else read_back
-    # relations given in Python cannot be written down
+    # relations defined in Python have no text
     return file

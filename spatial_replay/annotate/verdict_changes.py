@@ -1,8 +1,8 @@
-"""How a node stands from sample to sample, and the changes of it that are worth telling.
+"""Changes of verdicts and of signs, from sample to sample.
 
-A verdict that no continuation can change counts at once; the sign of a value that is still pending counts
-once it lasts `LASTING` samples in a row. What is carried from one stretch of samples to the next is a few
-numbers for each node, and into how many stretches a run is cut changes nothing.
+A verdict that no continuation can change counts at once. The sign of a value that is still pending counts
+once it lasts `LASTING` samples in a row, so that noise around zero is no event. The state between blocks of
+samples is a few numbers for each node, and cutting a run into blocks changes nothing.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from spatial_replay.compiled import kernel
 from spatial_replay.geometry.arrays import Floats, Integers
 
 LASTING: Final = 3
-"""How many samples in a row a sign must last."""
+"""Samples in a row that a sign must last."""
 
 START, HOLDING, FAILING, SATISFIED, VIOLATED = 0, 1, 2, 3, 4
 """Nothing known yet; pending, with a value of at least 0; pending, below 0; and the final ones."""
 
 OF_CURRENT, OF_CANDIDATE = -1, -2
-"""In place of a sample of the stretch: one before it, that at which what was carried was worst."""
+"""In place of a sample of the block: the worst sample lies before it and is part of the state."""
 
 _CODE, _SINCE, _UNTIL, _NEXT, _COUNT, _NEXT_SINCE = range(6)
 
 
 class Period(NamedTuple):
-    """A time during which a node stood in one way.
+    """A time during which a node was in one state.
 
     Attributes:
-        code: how.
+        code: the state.
         start_ns, end_ns: its first and its last sample.
         worst: the least number: of the value; of a final verdict, the end of the interval that decides.
-        place: the first sample of the stretch that has it, or where it was carried.
+        place: the first sample of the block that has it, or `OF_CURRENT`, `OF_CANDIDATE`.
     """
 
     code: int
@@ -45,13 +45,13 @@ class Period(NamedTuple):
 
 
 class Change(NamedTuple):
-    """A node stands in another way than before.
+    """A node is in another state than before.
 
     Attributes:
-        node: index among the nodes watched.
-        sample: index in the stretch, where it is confirmed.
+        node: index among the nodes tracked.
+        sample: index in the block, where it is confirmed.
         before: None where nothing was known before.
-        after: what has begun, up to the sample that confirms it.
+        after: the new period, up to the sample that confirms it.
     """
 
     node: int
@@ -62,12 +62,12 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class NodeStates:
-    """How some nodes stand.
+    """The states of some nodes, each with a candidate for the next one.
 
     Attributes:
-        integers: (K, 6) int64: of each node, how it stands, since when, at which sample the last time; how it
-            would stand next, for how many samples in a row, since when.
-        worst: (K, 2): the least number of the one and of the other.
+        integers: (K, 6) int64: of each node, its state, since when, its last sample; the candidate, for how
+            many samples in a row, since when.
+        worst: (K, 2): the least number of the state and of the candidate.
     """
 
     integers: Integers
@@ -75,7 +75,7 @@ class NodeStates:
 
     @classmethod
     def begin(cls, nodes: int) -> NodeStates:
-        """Before the first sample."""
+        """Return the states before the first sample."""
         return cls(np.zeros((nodes, 6), np.int64), np.full((nodes, 2), np.inf))
 
     @property
@@ -89,21 +89,21 @@ class NodeStates:
         return np.flatnonzero(self.integers[:, _CODE] < SATISFIED).tolist()
 
     def period(self, node: int) -> Period:
-        """How a node stands, up to the last sample at which it stood so; its worst is carried."""
+        """Return the current period of a node, up to the last sample in that state."""
         code, since, until = self.integers[node, [_CODE, _SINCE, _UNTIL]].tolist()
         return Period(code, since, until, float(self.worst[node, 0]), OF_CURRENT)
 
 
 class TrackedChanges(NamedTuple):
-    """What a stretch did to some nodes.
+    """The states of some nodes after a block, and the changes in it.
 
     Attributes:
-        changes: by node, then in the order of time.
-        places: (K, 2) int64, where each of `standings.worst` is: a sample of the stretch, or where it was
-            carried.
+        changes: by node, then by time.
+        places: (K, 2) int64, where each of `states.worst` is: a sample of the block, or `OF_CURRENT`,
+            `OF_CANDIDATE`.
     """
 
-    standings: NodeStates
+    states: NodeStates
     changes: list[Change]
     places: Integers
 
@@ -116,14 +116,14 @@ def track(
     Args:
         times_ns: (T,).
         series: (N, 4, T): value, now, lower, upper.
-        nodes: (K,) int64, ids of the nodes that are watched.
+        nodes: (K,) int64, ids of the nodes that are tracked.
         settles: whether an interval on one side of 0 is a verdict that stays.
     """
     integers, worst = before.integers.copy(), before.worst.copy()
     places = np.tile(np.array([OF_CURRENT, OF_CANDIDATE], np.int64), (len(nodes), 1))
     room = len(nodes) * (len(times_ns) // LASTING + 2)
     found, numbers = np.empty((room, 10), np.int64), np.empty((room, 2))
-    count = _follow(times_ns, series, nodes, settles, integers, worst, places, found, numbers)
+    count = _track(times_ns, series, nodes, settles, integers, worst, places, found, numbers)
     changes = []
     for row, (worst_before, worst_after) in zip(
         found[:count].tolist(), numbers[:count].tolist(), strict=True
@@ -136,7 +136,7 @@ def track(
 
 
 @kernel
-def _follow(
+def _track(
     times_ns: Integers,
     series: Floats,
     nodes: Integers,

@@ -78,7 +78,7 @@ def test_every_sample_says_where_the_automaton_is() -> None:
         assert message.can_reject == (TRUE if state in machine.can_reject else FALSE)
 
 
-def test_the_guard_of_a_change_is_told_in_words() -> None:
+def test_the_guard_of_a_change_is_in_words() -> None:
     assert [message.guard for message in states_of(RUN)] == [
         "", "", "cube enclosedin goal and battery >= 0.2", "", "not (battery >= 0.2)", "",
     ]  # fmt: skip

@@ -64,7 +64,7 @@ def facts(event: Event) -> dict[str, str]:
     return {pair.key: pair.value for pair in event.metadata}
 
 
-def test_a_sign_is_told_when_it_lasts_three_samples(tmp_path):
+def test_a_sign_is_reported_when_it_lasts_three_samples(tmp_path):
     charges = [1.0, -1.0, -2.0, 1.0, -3.0, -4.0, -2.0, -1.0, 5.0]
     [(number, event, line)] = told(tmp_path, "spec last = F G battery >= 0", *charges)
     assert number == 6
@@ -93,7 +93,7 @@ def test_a_sign_is_told_when_it_lasts_three_samples(tmp_path):
     assert (line.level, line.name, line.file, line.line) == (Log.WARNING, "last", "battery.spatial", 1)
 
 
-def test_a_verdict_is_told_at_once(tmp_path):
+def test_a_verdict_is_reported_at_once(tmp_path):
     text = "# a comment\nspec kept = G battery >= 0"
     [(number, event, line)] = told(tmp_path, text, 2.0, 1.0, -1.0, 5.0, -7.0)
     assert number == 2
@@ -128,7 +128,7 @@ def test_without_a_witness_in_the_same_sample_there_is_none(tmp_path):
     assert line.message.startswith("`soon` is violated, whatever comes, by 1.")
 
 
-def test_named_parts_that_later_samples_can_change_are_told_too(tmp_path):
+def test_named_parts_that_later_samples_can_change_are_reported_too(tmp_path):
     text = (
         "spec full = battery >= 1\nspec filled = F full\nspec never_empty = G battery >= 0\n"
         "spec both = filled and never_empty"
@@ -199,7 +199,7 @@ def test_what_is_pending_is_decided_by_the_end(tmp_path):
     assert (line.level, line.name, line.file, line.line) == (Log.ERROR, "full", "battery.spatial", 1)
 
 
-def test_what_no_sample_could_change_is_not_told_again_at_the_end(tmp_path):
+def test_what_no_sample_could_change_is_not_repeated_at_the_end(tmp_path):
     text = "spec full = F battery >= 5\nspec kept = G battery >= 0\nspec both = full or kept"
     assert [line.message for *_, line in told_at_end(tmp_path, text, 1.0, 6.0, 2.0)] == [
         "`kept` in `both` is satisfied, for the log has ended: `battery >= 0` holds by 1. "
@@ -253,7 +253,7 @@ def test_the_end_of_a_window_is_an_end(tmp_path):
     assert number == 2
 
 
-def test_the_verdict_of_an_object_that_left_is_told_at_the_end_and_is_of_its_time(tmp_path):
+def test_the_verdict_of_an_object_that_left_is_reported_at_the_end_and_is_of_its_time(tmp_path):
     box = sr.Footprint.box(0, 0, 1, 1)
     samples = [sr.Sample(10**9 + t * STEP_NS, {"a": box, **({"b": box} if t < 3 else {})}) for t in range(6)]
     found = written(tmp_path, "spec away(x) = F not x closeto[2] a", samples, each={"x": "all"})

@@ -253,7 +253,7 @@ def test_pressing_on_a_lane_or_the_curves_moves_the_cursor(open_page: Open) -> N
         page.keyboard.press("End")
 
 
-def test_lanes_and_curves_stand_one_below_the_other(open_page: Open) -> None:
+def test_lanes_and_curves_share_one_time_axis(open_page: Open) -> None:
     for width in (1280, 360):
         page = open_page("violated", width=width)
         edges = [
@@ -305,17 +305,17 @@ def test_the_scene_says_what_is_violated_now(open_page: Open) -> None:
     expect(caption).to_have_text("nothing is violated now; table_set was before")
 
 
-def test_of_a_run_that_is_thinned_the_keys_go_through_what_is_kept(open_page: Open) -> None:
+def test_the_keys_step_through_the_kept_samples_of_a_thinned_run(open_page: Open) -> None:
     for name, words in (("thinned", "a kept sample back, on"), ("violated", "a sample back, on")):
         page = open_page(name)
         page.get_by_role("button", name="Keys").click()
         expect(page.locator(".keys")).to_contain_text(words)
 
 
-def test_what_no_arrow_can_point_at_is_told_too(open_page: Open) -> None:
+def test_a_violation_without_an_arrow_is_reported_too(open_page: Open) -> None:
     for time, words in (
         (0.5, "nothing is violated now"),
-        (1.2, "nothing that can be seen is violated now; a dist b >= 1 of apart is unknown"),
+        (1.2, "no violation is known now; a dist b >= 1 of apart is unknown"),
         (2, "battery >= 0.5 of power fails by 0.1 now; no arrow can show it"),
     ):
         caption = open_page("unseen", at=f"#t={time}").locator(".caption")

@@ -1,4 +1,4 @@
-"""Changes that are told: which they are, and that it does not matter how a run is cut."""
+"""Events: which changes are reported, and that cutting a run changes none."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def stands(draw: st.DrawFn) -> np.ndarray:
     return series
 
 
-def _told(series: np.ndarray) -> list[tuple[int, int, int, float]]:
+def _expected(series: np.ndarray) -> list[tuple[int, int, int, float]]:
     """Confirmed at, code, since, worst: by reading the rule aloud."""
     codes = []
     for value, _, lower, upper in series[0].T:
@@ -70,48 +70,48 @@ def test_a_verdict_counts_at_once_and_a_sign_when_it_lasts(series: np.ndarray, d
     count = series.shape[2]
     times_ns = np.arange(count, dtype=np.int64) * 10
     ends = data.draw(cuts(count))
-    standings, found = NodeStates.begin(1), []
+    states, found = NodeStates.begin(1), []
     for begin, end in pairwise(ends):
         part = np.ascontiguousarray(series[:, :, begin:end])
-        followed = track(standings, times_ns[begin:end], part, np.array([0]))
-        standings = followed.standings
+        tracked = track(states, times_ns[begin:end], part, np.array([0]))
+        states = tracked.states
         found += [
             (begin + each.sample, each.after.code, each.after.start_ns // 10, each.after.worst)
-            for each in followed.changes
+            for each in tracked.changes
         ]
-    assert found == _told(series)
+    assert found == _expected(series)
 
 
 def _choices(spec: Specification) -> dict[str, str]:
     return {one.parameter: "all" for one in spec.results if one.parameter is not None}
 
 
-def _all_told(
+def _all_events(
     spec: Specification, recording: Recording, ends: list[int], semantics: Semantics = "ltlf"
 ) -> list[EncodedEvent]:
-    """What is told of each result, one after the other, its end included."""
+    """The events of each result, one after the other, including its end."""
     trace = recording.trace()
     instances = find_instances(spec, _choices(spec), [trace], 0, 2**63 - 1)
     evaluation = EvaluationStream(instances, spec.regions, semantics)
     trees = reported_trees([spec], [instances])
-    tellers = [
+    reporters = [
         EventReporter(tree, stream.instance, spec, semantics)
         for tree, stream in zip(trees, evaluation.streams, strict=True)
     ]
-    told: list[list[EncodedEvent]] = [[] for _ in tellers]
+    events: list[list[EncodedEvent]] = [[] for _ in reporters]
     for begin, end in pairwise(ends):
-        for own, teller, stretch in zip(
-            told, tellers, evaluation.extend(trace.slice(begin, end)), strict=True
+        for own, reporter, stretch in zip(
+            events, reporters, evaluation.extend(trace.slice(begin, end)), strict=True
         ):
-            own += teller.tell(stretch)
+            own += reporter.extend(stretch)
     last_ns = int(trace.times_ns[-1])
-    for own, teller, stream in zip(told, tellers, evaluation.streams, strict=True):
-        own += teller.end(last_ns, stream.final)
-    return [one for own in told for one in sorted(own, key=lambda each: each.time_ns)]
+    for own, reporter, stream in zip(events, reporters, evaluation.streams, strict=True):
+        own += reporter.end(last_ns, stream.final)
+    return [one for own in events for one in sorted(own, key=lambda each: each.time_ns)]
 
 
-def _facts(told: EncodedEvent) -> dict[str, str]:
-    return {pair.key: pair.value for pair in Event.FromString(told.event).metadata}
+def _facts(event: EncodedEvent) -> dict[str, str]:
+    return {pair.key: pair.value for pair in Event.FromString(event.event).metadata}
 
 
 @settings(max_examples=60)
@@ -120,9 +120,9 @@ def test_how_a_run_is_cut_changes_no_event(
     spec: Specification, recording: Recording, data: st.DataObject
 ) -> None:
     count = len(recording.trace())
-    whole = _all_told(spec, recording, [0, count])
-    assert _all_told(spec, recording, list(range(count + 1))) == whole
-    assert _all_told(spec, recording, data.draw(cuts(count))) == whole
+    whole = _all_events(spec, recording, [0, count])
+    assert _all_events(spec, recording, list(range(count + 1))) == whole
+    assert _all_events(spec, recording, data.draw(cuts(count))) == whole
 
 
 @settings(max_examples=60)
@@ -133,8 +133,8 @@ def test_what_is_told_last_of_a_result_is_its_verdict(
     with contextlib.suppress(UsageError):
         checked_semantics(semantics, [spec])
         result = evaluate(spec, recording.trace(), each=_choices(spec), semantics=semantics)
-        told = map(_facts, _all_told(spec, recording, [0, len(recording.trace())], semantics))
-        last = {(each["name"], each.get("object")): each["verdict"] for each in told if each["node"] == "0"}
+        events = map(_facts, _all_events(spec, recording, [0, len(recording.trace())], semantics))
+        last = {(each["name"], each.get("object")): each["verdict"] for each in events if each["node"] == "0"}
         assert last == {(each.name, each.object): each.verdict for each in result.results}
 
 
@@ -142,8 +142,8 @@ def test_what_is_told_last_of_a_result_is_its_verdict(
 @given(recordings(max_size=12))
 def test_the_witness_of_a_change_has_its_number(recording: Recording) -> None:
     spec = parse_specification("spec s = F battery >= 0.5\nspec t = G not battery >= 0.75")
-    for told in _all_told(spec, recording, [0, len(recording.trace())]):
-        facts = _facts(told)
+    for event in _all_events(spec, recording, [0, len(recording.trace())]):
+        facts = _facts(event)
         if facts["verdict"] == "unknown":
             continue
         number = abs(float(facts["robustness"]))
