@@ -142,10 +142,10 @@ def test_every_nth_sample_of_the_log_counts() -> None:
 def test_bounds_and_delays_in_samples_count_selected_ones() -> None:
     text = "spec s = F[1, 1] (cube[-1] leftof cube)"
     (all_samples,) = _replayed(text, Window()).results
-    (kept,) = _replayed(text, Window(every=4)).results
+    (selected,) = _replayed(text, Window(every=4)).results
     # the cube is a unit wide and moves half a unit a sample
-    assert all_samples.robustness[0] == pytest.approx(0.5 - 1)
-    assert kept.robustness[0] == pytest.approx(4 * 0.5 - 1)
+    assert all_samples.robustness == pytest.approx(0.5 - 1)
+    assert selected.robustness == pytest.approx(4 * 0.5 - 1)
 
 
 def test_an_every_below_one_and_an_empty_window_are_refused() -> None:
