@@ -1,4 +1,4 @@
-"""Which formulas are evaluated over which samples: specs, and templates once per object."""
+"""The instances to evaluate: one per spec, and one per object for a template."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Instance:
         name: the spec's name.
         object: the object that the template's parameter stands for, or None.
         bindings: that object by the parameter's name.
-        start_ns, end_ns: it is evaluated over the samples from the one to before the other.
+        start_ns, end_ns: it is evaluated over the samples from start to before end.
     """
 
     name: str
@@ -36,10 +36,10 @@ class Instance:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Which objects a template's parameter stands for: all, or those of a class.
+    """The objects that a template's parameter stands for: all, or those of a class.
 
     Attributes:
-        class_name: compared without regard to case; None for all.
+        class_name: the class, in any case; None for all objects.
     """
 
     class_name: str | None
@@ -69,11 +69,11 @@ def find_instances(
 ) -> list[Instance]:
     """Return the instances of a specification over the samples from `start_ns` to before `end_ns`.
 
-    A template has one per object chosen, in order of names, over the samples from the object's first to its
-    last appearance among them.
+    A template has one per chosen object, by name, over the samples from the object's first to its last
+    appearance among them.
 
     Args:
-        traces: the samples, in stretches; read only if there is a template.
+        traces: the samples, in blocks; read only if there is a template.
 
     Raises:
         UsageError: no choice for a template's parameter, a choice for a parameter that no template has.

@@ -1,4 +1,4 @@
-"""A monitor: a specification beside a running system, sample by sample."""
+"""Monitor a running system: a specification evaluated sample by sample."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from spatial_replay.trace.sample import Sample, require_time
 
 
 class NodeUpdate(NamedTuple):
-    """One node after one sample (see `NodeResult` for what the numbers mean)."""
+    """One node after one sample (see `NodeResult` for the meaning of the numbers)."""
 
     id: int
     name: str | None
@@ -32,7 +32,7 @@ class NodeUpdate(NamedTuple):
 
     @property
     def verdict(self) -> Verdict:
-        """Satisfied or violated where no continuation can change that, pending otherwise."""
+        """Satisfied or violated if no continuation can change that, pending otherwise."""
         return online_verdict(self.lower, self.upper)
 
 
@@ -55,7 +55,7 @@ class SpecUpdate:
         if self.numbers is None:
             return ()
         columns = zip(range(len(self.names)), self.names, *self.numbers.T.tolist(), strict=True)
-        # in place of its constructor, which takes longer than all the rest of a sample
+        # bypasses the constructor, which would take longer than the rest of a sample
         return tuple([tuple.__new__(NodeUpdate, column) for column in columns])
 
     def node(self, identifier: int) -> NodeUpdate:
@@ -74,11 +74,11 @@ class SpecUpdate:
 
 @dataclass(frozen=True, eq=False)
 class Update:
-    """What a monitor says after a sample.
+    """The numbers and verdicts after a sample.
 
     Attributes:
         specs: one for each result spec, in the order of the text.
-        places: which of `specs`, and which node of it, has a name.
+        places: for each name, its index in `specs` and its node.
     """
 
     time_ns: int
@@ -105,9 +105,9 @@ class Update:
 class Monitor:
     """Evaluates a specification as samples come.
 
-    It gives the same bits as a replay of the log. A sample costs the same however long the run is, and what
-    is kept depends on the specification alone: the samples that windows and delays (`a[-3]`) span. Only
-    under the paper's semantics, temporal operators below others look at every sample again.
+    Gives the same bits as a replay of the log. Time per sample and memory depend on the specification alone,
+    not on the length of the run: on the samples that windows and delays (`a[-3]`) span. Only the paper's
+    semantics makes temporal operators below others read every sample again.
     """
 
     def __init__(

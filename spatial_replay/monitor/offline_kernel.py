@@ -101,6 +101,7 @@ def _slide(
             end += 1
         while first < end and _distance(steps, unit, first, i) > far:
             first += 1
+        # the older stack is used up: move the recent steps into it, with running extrema from the newest down
         if first >= middle:
             extremum = -np.inf
             for step in range(end - 1, first - 1, -1):

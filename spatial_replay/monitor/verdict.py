@@ -7,10 +7,10 @@ from enum import StrEnum
 
 
 class Verdict(StrEnum):
-    """What is known of a formula.
+    """The verdict of a formula.
 
-    At the end of a log a formula is satisfied, violated or unknown. While samples still come it is
-    satisfied or violated where no continuation can change that, and pending otherwise.
+    At the end of a log it is satisfied, violated or unknown. While samples still come it is satisfied or
+    violated if no continuation can change that, and pending otherwise.
     """
 
     SATISFIED = "satisfied"
@@ -29,13 +29,14 @@ def final_verdict(lower: float, upper: float) -> Verdict:
 def online_verdict(lower: float, upper: float) -> Verdict:
     """Return the verdict while samples still come, from the interval over every continuation.
 
-    Without such an interval (NaN: the paper's semantics knows no continuation) it is unknown.
+    Without an interval (NaN: the paper's semantics has no continuations) it is unknown.
     """
     if lower >= 0.0:
         return Verdict.SATISFIED
     if upper < 0.0:
         return Verdict.VIOLATED
-    return Verdict.PENDING if lower == lower else Verdict.UNKNOWN
+    is_nan = lower != lower
+    return Verdict.UNKNOWN if is_nan else Verdict.PENDING
 
 
 def worst_verdict(verdicts: Iterable[Verdict]) -> Verdict:

@@ -105,6 +105,7 @@ def run_instructions(
                         target[k] = max(first[k], second[k])
                     else:
                         value = second[k]
+                        # unknown membership: the body may or may not count, so its interval is all reals
                         if members[c, t + k] < 0:
                             value = np.inf if channel % 2 else -np.inf
                         if members[c, t + k] == 0:

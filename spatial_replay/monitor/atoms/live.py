@@ -252,7 +252,7 @@ class SampleLeaves:
         counts = {classes: _room(len(names)) for classes, names in unnamed.items()}
         try:
             plan = self._plan_for(counts)
-        except UsageError:
+        except UsageError:  # the rounded-up counts exceed the limit of bindings; the exact ones may not
             counts = {classes: len(names) for classes, names in unnamed.items()}
             plan = self._plan_for(counts)
         stands_for: dict[str, str] = {}

@@ -1,17 +1,10 @@
-"""A stretch of samples taken through a program in one call: signals, then parts, then the tree.
+"""One program on one stream of samples: the compiled step that monitors and replays share.
 
-Subformulas without future operators: settled at each sample, computed forwards.
+Samples are run in tiles: first the signals of a tile (subformulas without future operators, final at each
+sample), then each part, then the tree as the user wrote it. A tile of one sample and a tile of many give the
+same bits, because the only arithmetic is minima, maxima and negation.
 
-The tree that the user sees: every node's numbers, from signals, parts and operands.
-
-`memory.NUMBERS` says which numbers a node has at a sample.
-
-One program on one stream of samples: the compiled step that a monitor and a replay share.
-
-Samples are run in tiles: first the signals of a tile, then each part, then the tree. A tile of one
-sample and a tile of many give the same bits, because the only arithmetic is minima, maxima and negation.
-
-Numbers are kept in as many channels as are needed so far (see `channels`).
+Each node has the numbers listed at `state.NUMBERS`, in as many channels as needed so far (see `codes`).
 """
 
 from __future__ import annotations
@@ -354,15 +347,14 @@ def step_with_windows(
 class OnlineRun:
     """The state that a compiled formula carries from sample to sample.
 
-    Its size depends on the formula and on how many samples its windows span, never on how long the stream
-    is. It is the one place that changes while a monitor or a replay goes on.
+    Its size depends on the formula and on how many samples its windows span, not on the length of the stream.
     """
 
     def __init__(self, program: Program, *, room: int = 2 * TILE, tile: int = TILE) -> None:
         """Start before the first sample.
 
         Args:
-            room: for how many recent samples there is room at first (it doubles when needed).
+            room: the number of recent samples there is room for at first (it doubles when needed).
             tile: how many samples are run together, at most. Samples that come one by one are faster with 1,
                 since the numbers worked with then lie closer together.
         """
@@ -393,10 +385,9 @@ class OnlineRun:
         """Add samples.
 
         Args:
-            leaves: (C, A, T), the program's leaves: with C = 1 exact values, with C = 2 the ends of the
-                interval that what is unknown leaves open, with C = 4 those and the same ends with
-                uncertainty.
-            times_ns: (T,), increasing, also beyond the samples before.
+            leaves: (C, A, T), the program's leaves: exact values for C = 1, the ends of the interval given
+                what is unknown for C = 2, those and the same ends with uncertainty for C = 4.
+            times_ns: (T,), increasing and after the previous samples.
 
         Returns:
             (N, 4, T): value, now, lower and upper of each node.

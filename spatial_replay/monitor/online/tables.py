@@ -46,12 +46,14 @@ def read_table(table: Floats, variables: int, point: Floats, order: Integers) ->
     """Read a table at a point: walk its corners in descending order of the coordinates."""
     if variables == 1:
         return float(max(table[0], min(point[0], table[1])))
+    # insertion sort into `order`: there are only a few variables
     for j in range(variables):
         k = j
         while k > 0 and point[order[k - 1]] < point[j]:
             order[k] = order[k - 1]
             k -= 1
         order[k] = j
+    # a monotone lattice polynomial is the maximum over the chain of corners of min(coordinate, entry)
     result = table[0]
     corner = 0
     for k in range(variables):

@@ -401,7 +401,7 @@ def step_windows(
     """Run a part with windows over `count` samples, the first of them at `position`.
 
     Args:
-        numbers: (NUMBERS, TILE), receives what the part says; how the run would end, for the last one only.
+        numbers: (NUMBERS, TILE), filled with the part's numbers; those of an ending run for the last sample.
     """
     nominal_high = 1 if channels > 1 else 0
     wide_low = 2 if channels > 2 else 0
@@ -412,6 +412,7 @@ def step_windows(
         reach(nodes, part, memory, scratch, base, last, offset, last)
         scratch.high[:nodes_of_part] = last
         for which in range(NUMBERS):
+            # numbers 2 and 3 (now) come with 0 and 1; those of an ending run count for the last sample only
             if which in (2, 3) or (which >= 6 and k < count - 1):
                 continue
             if which == 1 and channels == 1:

@@ -29,7 +29,7 @@ from spatial_replay.spec.formula import (
 _TILE = 256
 _FIRST_ROOM = 1024
 MAX_PAIRS = 1 << 27
-"""Pairs of samples that untils may keep a number for: some 16,000 samples, 1.2 GB."""
+"""The most pairs of samples that untils may store a number for: about 16,000 samples, 1.2 GB."""
 
 
 class PaperRun:
@@ -76,6 +76,7 @@ class PaperRun:
         Raises:
             UsageError: more pairs of samples than allowed.
         """
+        # Def. 16 knows no uncertainty: nominal ends only, and a number is lost where they differ
         low, high = low_and_high(len(leaves), wide=False)
         numbers = np.ascontiguousarray(leaves[low])
         lost = ((numbers != leaves[high]) & ~np.isnan(numbers)).astype(np.int8)

@@ -123,10 +123,10 @@ class Measured:
 
     Attributes:
         quantity: "signed_distance", "protrusion", "max_x", …, "misalignment", "signal".
-        names: the objects or regions that it is of, each with its delay and enlargement; or the signal.
+        names: the objects or regions measured, each with its delay and enlargement; or the signal.
         value: the number.
-        spread: how far it may be off, for the uncertainty of the objects.
-        contact: for distances, where they are attained; None for others.
+        spread: its uncertainty, from that of the objects.
+        contact: for distances, where they are attained; otherwise None.
     """
 
     quantity: str
@@ -143,12 +143,12 @@ class DecidingAtom:
     Attributes:
         atom: with the objects that its variables stand for.
         end: which end of its interval decides.
-        value: its robustness with every uncertainty at 0; NaN where it is unknown.
+        value: its robustness with every uncertainty at 0; NaN if unknown.
         lower, upper: the ends of its interval.
-        branch: what its number is the sum of there: numbers, signals and measurements, each with its sign;
-            empty where it is unknown.
+        branch: the summands of its number: numbers, signals and measurements, each with its sign; empty if
+            it is unknown.
         measured: the signals and measurements among them.
-        unknown: why it is unknown, in words.
+        unknown: the reasons why it is unknown.
     """
 
     atom: Atom = field(repr=False)
