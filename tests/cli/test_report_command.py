@@ -89,7 +89,7 @@ def test_options_that_cannot_work_leave_no_report(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="holds no specification of its own"):
         call("report", log, "-o", output)
     spec = tmp_path / "s.spatial"
-    spec.write_text("spec s = F (nobody ovlp plate)\n")
+    spec.write_text("spec s = F (no_such_thing ovlp plate)\n")
     with pytest.raises(SpecificationError):
         call("report", log, "--spec", spec, "-o", output)
     with pytest.raises(UsageError, match="is an input"):

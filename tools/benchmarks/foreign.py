@@ -147,7 +147,7 @@ def bench_foreign_reading(measure: Any) -> None:
 
 
 def _write_large(path: Path, size: int) -> Path:
-    """A log of poses among pictures that nobody asks for, about `size` bytes long."""
+    """A log of poses among pictures that no mapping reads, about `size` bytes long."""
     picture = os.urandom(2**20)
     with path.open("wb") as stream:
         writer = McapWriter(stream, chunk_size=2**22, compression=CompressionType.NONE)

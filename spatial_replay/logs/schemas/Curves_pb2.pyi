@@ -15,7 +15,7 @@ DESCRIPTOR: google.protobuf.descriptor.FileDescriptor
 @typing.final
 class Curves(google.protobuf.message.Message):
     """The robustness of whole specifications over a whole log, on the topic /spatial/curves of a live server: sent
-    again whenever a constant has changed, and to whoever subscribes. No log has it.
+    again whenever a constant has changed, and to each new subscriber. No log has it.
     """
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor

@@ -60,7 +60,7 @@ class ObjectState(google.protobuf.message.Message):
     UNCERTAINTY_FIELD_NUMBER: builtins.int
     name: builtins.str
     class_name: builtins.str
-    """What the object is; absent where nobody knows."""
+    """What the object is; absent if unknown."""
     yaw: builtins.float
     """Orientation in radians, counter-clockwise from the x axis; absent for an object without one."""
     uncertainty: builtins.float

@@ -39,7 +39,7 @@ class PlanDecision(google.protobuf.message.Message):
         KIND_HOLD: PlanDecision._Kind.ValueType  # 2
         """Nothing: the specification is satisfied."""
         KIND_WAIT: PlanDecision._Kind.ValueType  # 3
-        """Nothing yet: too little is seen to tell where the automaton is, or time has to pass."""
+        """Nothing yet: the state of the automaton is uncertain, or time has to pass."""
         KIND_NO_PATH: PlanDecision._Kind.ValueType  # 4
         """Nothing any more: no way to satisfy the specification is left."""
 
@@ -52,7 +52,7 @@ class PlanDecision(google.protobuf.message.Message):
     KIND_HOLD: PlanDecision.Kind.ValueType  # 2
     """Nothing: the specification is satisfied."""
     KIND_WAIT: PlanDecision.Kind.ValueType  # 3
-    """Nothing yet: too little is seen to tell where the automaton is, or time has to pass."""
+    """Nothing yet: the state of the automaton is uncertain, or time has to pass."""
     KIND_NO_PATH: PlanDecision.Kind.ValueType  # 4
     """Nothing any more: no way to satisfy the specification is left."""
 
@@ -77,7 +77,7 @@ class PlanDecision(google.protobuf.message.Message):
     """The decision in words."""
     @property
     def states(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]:
-        """Where the automaton is; more than one where not enough was seen to tell."""
+        """States of the automaton; several if its state is uncertain."""
 
     @property
     def considered(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PlanEdge]:
@@ -368,7 +368,7 @@ class PlanOutcome(google.protobuf.message.Message):
     end_ns: builtins.int
     """Time in nanoseconds of the last sample before its end."""
     succeeded: builtins.bool
-    """Whether the object is where it was to be, as far as its controller can tell; whether a wait went on to its
+    """Whether the object is where it was to be, as far as its controller knows; whether a wait went on to its
     end.
     """
     reason: builtins.str
