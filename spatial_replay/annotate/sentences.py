@@ -129,7 +129,7 @@ def _measured(measured: Measured) -> str:
         case "signal":
             return f"{names[0]} is {number_text(value)}"
     if math.isinf(value):
-        return f"nobody is in {names[0]}"
+        return f"no object is in {names[0]}"
     axis = measured.quantity[-1]
     if measured.quantity.startswith("centroid"):
         return f"the centroid of {names[0]} is at {axis} = {number_text(value)}"
@@ -212,5 +212,5 @@ def _dead_end(step: WitnessStep, first_ns: int) -> str:
         case "Y":
             return f"What decides is `{step.text}` at {when}: there is no sample before."
         case "forall" | "exists":
-            return f"What decides is `{step.text}` at {when}: nobody is in its group."
+            return f"What decides is `{step.text}` at {when}: no object is in its group."
     return f"What decides is `{step.text}` at {when}: no sample lies in its window."

@@ -14,7 +14,7 @@ from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 
 MOST_STATES: Final = 60
-"""How many states a page draws at most: those that the run is in, and then those nearest to the start."""
+"""States that a page draws, at most: those of the run, then those nearest to the start."""
 _MOST_MOVES: Final = 300
 _LONGEST_GUARD: Final = 300
 _SWEEPS: Final = 4
@@ -22,7 +22,7 @@ _SWEEPS: Final = 4
 
 @dataclass(frozen=True, eq=False)
 class StatePath:
-    """Where a run is after each of some samples.
+    """The states of a run after each of some samples.
 
     Attributes:
         times_ns: (T,) int64.
@@ -36,7 +36,7 @@ class StatePath:
 
 
 class StatePathCollector:
-    """Takes the states of one result from its messages as they come."""
+    """Collects the states of one result from its messages as they come."""
 
     def __init__(self) -> None:
         self._times_ns: list[int] = []
@@ -56,7 +56,7 @@ class StatePathCollector:
 
 
 def automaton_value(automaton: Automaton, path: StatePath) -> Mapping[str, Any]:
-    """An automaton as the page draws it: its states with their places, its moves with their guards."""
+    """Return an automaton as the page draws it: states with their places, transitions with their guards."""
     shown = _shown_states(automaton, path)
     places = _places(automaton, shown)
     visited = _visited(path)
@@ -94,7 +94,7 @@ def _shown_states(automaton: Automaton, path: StatePath) -> list[int]:
 
 
 def _places(automaton: Automaton, shown: Sequence[int]) -> Mapping[int, tuple[int, float]]:
-    """Column and row of each state: columns as moves lead on, rows so that moves cross little."""
+    """Return column and row of each state: columns follow the transitions, rows make few of them cross."""
     kept = set(shown)
     successors = {state: [each for each in automaton.successors[state] if each in kept] for state in shown}
     column = _columns(successors, automaton.initial)
@@ -109,7 +109,7 @@ def _places(automaton: Automaton, shown: Sequence[int]) -> Mapping[int, tuple[in
 
 
 def _columns(successors: Mapping[int, Sequence[int]], initial: int) -> Mapping[int, int]:
-    """For each state, how many moves it takes at most to get there, without those that lead back."""
+    """Return for each state the longest way there, in transitions that do not lead back."""
     ended: list[int] = []
     on_way: set[int] = set()
     back: set[tuple[int, int]] = set()
@@ -137,13 +137,13 @@ def _columns(successors: Mapping[int, Sequence[int]], initial: int) -> Mapping[i
 
 
 def _heights(layer: Sequence[int]) -> Iterator[tuple[int, float]]:
-    """The states of a column, one below the other around the middle."""
+    """Yield the states of a column with their rows, around the middle."""
     for place, state in enumerate(layer):
         yield state, place - (len(layer) - 1) / 2.0
 
 
 def _middle(row: Mapping[int, float], successors: Mapping[int, Sequence[int]], state: int) -> float:
-    """The mean row of the states that lead to one, or its own."""
+    """Return the mean row of the states that lead to one, or its own."""
     found = [row[each] for each, targets in successors.items() if each != state and state in targets]
     return sum(found) / len(found) if found else row[state]
 

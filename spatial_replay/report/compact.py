@@ -1,6 +1,6 @@
-"""Arrays as a page carries them: little-endian bytes one after the other, compressed, in Base64.
+"""The compact forms of what a page carries: arrays, JSON, and sentences with formulas in them.
 
-Sentences with formulas in them → what of them is text, and what is code.
+Arrays are little-endian bytes one after the other, compressed, in Base64.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Packing:
         self._size = 0
 
     def add(self, array: NDArray[Any], kind: Kind) -> Reference:
-        """Take in an array, flattened by rows; where the page finds it."""
+        """Take in an array, flattened by rows, and return where the page finds it."""
         data = np.ascontiguousarray(array, _TYPES[kind]).tobytes()
         reference = {"kind": kind, "offset": self._size, "length": int(np.size(array))}
         self._pieces += [data, bytes(-len(data) % _ALIGNMENT)]
@@ -44,12 +44,12 @@ class Packing:
         return reference
 
     def text(self) -> str:
-        """Everything taken in, as a text without any sign that means something in HTML."""
+        """Return everything taken in as a text without characters that HTML interprets."""
         return base64.b64encode(zlib.compress(b"".join(self._pieces), _LEVEL)).decode("ascii")
 
 
 def singles(numbers: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Numbers in half the room; one below 0 stays below 0, however near."""
+    """Return numbers in single precision; one below 0 stays below 0, however near."""
     with np.errstate(over="ignore", under="ignore"):
         near = numbers.astype(np.float32)
     smallest = np.finfo(np.float32).smallest_subnormal
@@ -57,7 +57,7 @@ def singles(numbers: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def json_text(value: Any) -> str:
-    """JSON that may stand within a script element, whatever texts are in it."""
+    """Return JSON that is safe within a script element, with any texts in it."""
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     for sign in "<>&":
         text = text.replace(sign, f"\\u{ord(sign):04x}")
@@ -76,8 +76,8 @@ _CODE: Final = re.compile(
 
 
 def sentence_parts(sentence: str) -> list[str]:
-    """The parts of a sentence: text and code, in turn, beginning with text.
+    """Split a sentence into text and code, in turn, beginning with text.
 
-    Code stands between backquotes, which names of objects may have in them, too.
+    Code is between backquotes, which names of objects may contain, too.
     """
     return _CODE.split(sentence)

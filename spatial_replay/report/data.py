@@ -1,6 +1,6 @@
-"""A report → what its page reads: facts, numbers, and what there was no room for.
+"""A report as data of its page: facts in JSON, numbers in packed arrays, and notes on what is left out.
 
-Which samples of a long run a page keeps.
+Of a long run, `choose_samples` chooses those that the page has.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from spatial_replay.report.tree_panel import (
 
 
 class NodeSeries(NamedTuple):
-    """What is to be seen of some nodes.
+    """The numbers of some nodes, which the chosen samples must represent.
 
     Attributes:
-        times_ns: (T,) int64, a stretch of the run's samples.
+        times_ns: (T,) int64, consecutive samples of the run.
         series: (K, 4, T): value, now, lower, upper.
     """
 
@@ -43,7 +43,7 @@ class NodeSeries(NamedTuple):
 
 
 def choose_samples(times_ns: Integers, curves: Sequence[NodeSeries], most: int) -> Integers:
-    """Indices of the samples to keep, in order: all of them, or at most `most`.
+    """Return the indices of the samples to keep, in order: all of them, or at most `most`.
 
     Of a run that is too long those are the first and the last of all and of each curve, others at equal
     distances, those before and after changes of sign, and those in which a curve has its least and its
@@ -79,7 +79,7 @@ def _choose(chosen: NDArray[np.bool_], samples: Integers, most: int) -> None:
 
 
 def _turns(series: Floats) -> Integers:
-    """The samples on both sides of a change of sign: of a number, or of an end of its interval."""
+    """Return the samples on both sides of a change of sign: of a number, or of an end of its interval."""
     found = [np.empty(0, np.int64)]
     for numbers in series.reshape(-1, series.shape[-1]):
         sign = np.where(np.isnan(numbers), 0, np.where(numbers >= 0.0, 1, -1))
@@ -89,7 +89,7 @@ def _turns(series: Floats) -> Integers:
 
 
 def _extremes(series: Floats, stretches: int) -> Integers:
-    """Where value and now are least and greatest within each of so many stretches."""
+    """Return where value and now are least and greatest within each of so many stretches."""
     count = series.shape[-1]
     starts = np.unique(np.linspace(0, count, stretches, endpoint=False).astype(np.int64))
     found = [np.empty(0, np.int64)]
@@ -105,17 +105,17 @@ def _extremes(series: Floats, stretches: int) -> Integers:
 
 
 MOST_VALUES: Final = 4_000_000
-"""How many numbers of nodes at samples a page holds; of a longer run it keeps fewer samples."""
+"""Numbers of nodes at samples in a page, at most; a longer run keeps fewer samples."""
 _FEWEST_SAMPLES: Final = 200
 
 
 @dataclass(frozen=True)
 class PageData:
-    """What the page reads: facts that JSON can hold, numbers, and what it does not have.
+    """What the page reads: facts in JSON, numbers, and notes on what is left out.
 
     Attributes:
         numbers: of `Packing.text`.
-        omissions: sentences on what is left out for the sake of its size.
+        omissions: sentences on what is left out to limit the size of the page.
     """
 
     facts: Mapping[str, Any]
@@ -124,7 +124,7 @@ class PageData:
 
 
 def page_data(report: RunReport) -> PageData:
-    """Everything that the page draws; equal reports give equal data."""
+    """Return everything that the page draws; equal reports give equal data."""
     packing = Packing()
     drawn = report.drawn
     times_ns = np.unique(
@@ -156,7 +156,7 @@ def page_data(report: RunReport) -> PageData:
 
 
 def _room(results: Sequence[ReportedResult], samples: int) -> int:
-    """How many samples there is room for."""
+    """Return how many samples fit."""
     values = sum(4 * len(shown_nodes(each.result.formula)) * len(each.result.times_ns) for each in results)
     return max(_FEWEST_SAMPLES, MOST_VALUES * max(samples, 1) // max(values, 1))
 

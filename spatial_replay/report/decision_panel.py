@@ -1,4 +1,4 @@
-"""Messages of a planner → its decisions as the page tells them, with their maps."""
+"""Messages of a planner → its decisions as the page shows them, with their maps."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from spatial_replay.planning.decisions import Reason
 from spatial_replay.report.compact import Packing, singles
 
 MOST_CELLS: Final = 1_500_000
-"""How many cells the maps of a page have at most, all together; those of what was chosen come first."""
+"""Cells of all maps of a page together, at most; maps of chosen targets come first."""
 _MOST_GUARDS: Final = 4
 
 
 @dataclass(frozen=True, eq=False)
 class ReportedDecisions:
-    """What a log tells of decisions.
+    """The decisions in a log, with the gradient maps.
 
     Attributes:
         decisions: in order, each with its outcome if it has one.
@@ -45,19 +45,19 @@ class ReportedDecisions:
 
 
 class DecisionCollector:
-    """Takes decisions and maps from messages as they come."""
+    """Collects decisions and maps from messages as they come."""
 
     def __init__(self) -> None:
         self._decisions: list[PlanDecision] = []
         self._maps: dict[int, Grid] = {}
 
     def add_decision(self, payload: bytes) -> None:
-        """Take in a decision; one that cannot be read tells nothing."""
+        """Take in a decision; one that cannot be decoded is skipped."""
         with suppress(LogError):
             self._decisions.append(decision_from_payload(payload))
 
     def add_map(self, number: int, payload: bytes) -> None:
-        """Take in a gradient map; one that cannot be read is none."""
+        """Take in a gradient map; one that cannot be decoded is skipped."""
         try:
             self._maps[number] = Grid.FromString(payload)
         except DecodeError:
@@ -70,7 +70,7 @@ class DecisionCollector:
 
 
 class _Owner(NamedTuple):
-    """Whose map one is.
+    """The candidate that a map belongs to.
 
     Attributes:
         edge, place: of the edge among those considered, and of the candidate among the edge's.
@@ -84,7 +84,7 @@ class _Owner(NamedTuple):
 
     @property
     def target(self) -> PlanTarget | None:
-        """Where the candidate is to go, if that was found on this map."""
+        """The candidate's target, if it was found on this map."""
         candidate = self.candidate
         return (
             candidate.target if candidate.HasField("target") and candidate.target.turn == self.turn else None
@@ -97,7 +97,7 @@ class _Drawn(NamedTuple):
     Attributes:
         values: (rows, columns), NaN where blocked.
         low, high: where its corners lie.
-        owner: None where the log does not say.
+        owner: None if the log does not record it.
         is_chosen: whether the decision's target was found on it.
     """
 
@@ -111,7 +111,7 @@ class _Drawn(NamedTuple):
 def decisions_value(
     plan: ReportedDecisions, first_ns: int, packing: Packing, most_cells: int = MOST_CELLS
 ) -> Mapping[str, Any]:
-    """The decisions as the page reads them, and how many maps there was no room for."""
+    """Return the decisions as the page reads them, and how many maps did not fit."""
     drawn = [list(_maps_of(plan, decision)) for decision in plan.decisions]
     kept = _kept([each for maps in drawn for each in maps], most_cells)
     decisions = []
@@ -122,7 +122,7 @@ def decisions_value(
 
 
 def _kept(maps: Sequence[_Drawn], most_cells: int) -> set[int]:
-    """Which maps there is room for, by identity: those of what was chosen, then the others, in order."""
+    """Return the maps that fit, by identity: those of chosen targets, then the others, in order."""
     kept: set[int] = set()
     cells = 0
     for each in sorted(maps, key=lambda each: not each.is_chosen):
@@ -133,7 +133,7 @@ def _kept(maps: Sequence[_Drawn], most_cells: int) -> set[int]:
 
 
 def _maps_of(plan: ReportedDecisions, decision: PlanDecision) -> Iterator[_Drawn]:
-    """The maps that a decision rests on; of a log that does not say whose they are, those of its time."""
+    """Yield the maps of a decision; if the log does not record their owners, those of its time."""
     owners = {
         named.number: _Owner(edge, place, candidate, named.turn)
         for edge, considered in enumerate(decision.considered)
@@ -156,7 +156,7 @@ def _is_of_time(grid: Grid, decision: PlanDecision) -> bool:
 
 
 def _is_chosen(owner: _Owner | None, decision: PlanDecision, maps: int) -> bool:
-    """Whether a decision's target was found on a map; where maps have no owners, on the only one."""
+    """Return whether a decision's target was found on a map; without owners, on the only one."""
     if not decision.HasField("target"):
         return False
     if owner is None:
@@ -166,7 +166,7 @@ def _is_chosen(owner: _Owner | None, decision: PlanDecision, maps: int) -> bool:
 
 
 def _drawn(grid: Grid, owner: _Owner | None, is_chosen: bool) -> _Drawn | None:
-    """A map's robustness; None of a message whose sizes do not fit together, or make no rectangle."""
+    """Return a map's robustness; None if the sizes in the message are inconsistent or empty."""
     columns, cell, row = grid.column_count, grid.cell_stride, grid.row_stride
     rows = len(grid.data) // row if row else 0
     offset = next((field.offset for field in grid.fields if field.name.startswith("robustness")), cell)
@@ -264,7 +264,7 @@ def _candidate_value(candidate: PlanCandidate) -> Mapping[str, Any]:
 
 
 def _target_value(target: PlanTarget) -> Mapping[str, Any]:
-    """A target in words, and as points to be drawn: none of them if one is not finite."""
+    """Return a target in words, and as points to draw unless one is not finite."""
     points = [target.x, target.y, *target.waypoints]
     is_drawn = bool(np.isfinite(points).all())
     turned = f", turned by {math.degrees(target.turn):.3g}°" if target.turn else ""

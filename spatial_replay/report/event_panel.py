@@ -10,7 +10,7 @@ from foxglove_schemas_protobuf.Event_pb2 import Event
 from spatial_replay.report.compact import sentence_parts
 
 MOST_EVENTS: Final = 2_000
-"""How many events a page lists at most: the first ones."""
+"""Events of a page, at most: the first ones."""
 
 
 class ReportedEvent(NamedTuple):
@@ -18,7 +18,7 @@ class ReportedEvent(NamedTuple):
 
     Attributes:
         start_ns: the first sample of what began.
-        facts: what the event says, by key.
+        facts: the metadata of the event, by key.
     """
 
     start_ns: int
@@ -26,14 +26,14 @@ class ReportedEvent(NamedTuple):
 
 
 def event_of(payload: bytes) -> ReportedEvent:
-    """A message of /spatial/events."""
+    """Decode a message of /spatial/events."""
     event = Event.FromString(payload)
     facts = {each.key: each.value for each in event.metadata}
     return ReportedEvent(event.start_time.ToNanoseconds(), facts)
 
 
 def event_values(events: Sequence[ReportedEvent], first_ns: int) -> list[Mapping[str, Any]]:
-    """The list as the page reads it, in the order in which things began."""
+    """Return the list as the page reads it, by start time."""
     ordered = sorted(events, key=lambda each: each.start_ns)
     return [
         {

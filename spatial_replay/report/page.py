@@ -1,8 +1,6 @@
-"""A report → one HTML page that needs nothing else.
+"""The HTML page of a report: header, verdicts and explanations as text, panels for the scripts to fill.
 
-What a page says before any script runs: what it is about, verdicts and why, panels to be filled.
-
-The page's colours, on light ground and on dark.
+The page needs nothing else: styles, scripts and data are in it, and its policy lets the browser load nothing.
 """
 
 from __future__ import annotations
@@ -26,17 +24,17 @@ from spatial_replay.report.data import page_data
 from spatial_replay.text import counted, printable
 
 _CALENDAR_NS: Final = 500_000_000 * 10**9
-"""Times of logs from here on count from 1970; other clocks began when something was switched on."""
+"""Times from here on count from 1970; smaller ones are of clocks that start at power-on."""
 _MANY: Final = 6
-"""Of more results than these only the first explanation is unfolded, else those of the gravest verdict."""
+"""With more results, only the first explanation is unfolded, else all of the worst verdict."""
 _WITHOUT_SCRIPTS: Final = "Without scripts this page shows verdicts and explanations alone."
 
 
 def header(report: RunReport, omissions: Sequence[str]) -> Html:
-    """Which run this is, and what a reader has to know before the verdicts.
+    """Return the header: the run, and notices that a reader needs before the verdicts.
 
     Args:
-        omissions: what the page leaves out for the sake of its size.
+        omissions: what the page leaves out to limit its size.
     """
     title = element("div", element("h1", text(report.log)), _chip(report.verdict), **{"class": "title"})
     return element(
@@ -51,7 +49,7 @@ def header(report: RunReport, omissions: Sequence[str]) -> Html:
 
 
 def panels(report: RunReport) -> Html:
-    """The verdicts, and a place for everything that is drawn."""
+    """Return the verdicts, and a place for each panel that is drawn."""
     has_automaton = any(result.automaton is not None for result in report.drawn)
     sections = [
         _panel("verdicts", "Verdicts", *_verdicts(report)),
@@ -67,7 +65,7 @@ def panels(report: RunReport) -> Html:
 
 
 def footer(report: RunReport) -> Html:
-    """The texts of the specifications, and the certificate."""
+    """Return the texts of the specifications, and the certificate."""
     texts = [
         element("details", element("summary", text(file.filename)), element("pre", text(file.source)))
         for file in report.files
@@ -81,7 +79,7 @@ def footer(report: RunReport) -> Html:
 
 
 def text(words: str) -> Html:
-    """A text of any length, escaped; within its lines, signs that do not show give way to spaces."""
+    """Return a text escaped, with spaces for characters that do not show."""
     return Html("\n".join(escape(printable(line, len(line))) for line in words.split("\n")))
 
 
@@ -125,7 +123,7 @@ def _panel(name: str, title: str, *content: Html, kind: str = "panel") -> Html:
 
 def _verdicts(report: RunReport) -> Iterator[Html]:
     if not report.results:
-        yield element("p", "No object was there for a template to stand for.")
+        yield element("p", "The templates matched no objects.")
     places = {id(result): place for place, result in enumerate(report.drawn)}
     are_many = len(report.results) > _MANY
     worst = worst_first([each.result.verdict for each in report.results])
@@ -155,7 +153,7 @@ def _summary(each: ReportedResult, first_ns: int) -> Html:
 
 
 def _with_code(sentence: str) -> Iterator[Html]:
-    """A sentence whose quoted parts are code."""
+    """Yield a sentence with its quoted parts as code."""
     for number, part in enumerate(sentence_parts(sentence)):
         yield element("code", text(part)) if number % 2 else text(part)
 
@@ -203,11 +201,11 @@ DARK: Final[Mapping[str, str]] = MappingProxyType(
         "negative-text": "#ffa35c",
     }
 )
-"""By their names in the style sheets; texts in them stand out from paper and panel by 4.5 to 1 or more."""
+"""By their names in the style sheets; texts have a contrast of at least 4.5 to 1 on paper and panel."""
 
 
 def theme() -> str:
-    """The colours as a style sheet: those of the system, unless the page was asked for the other ones."""
+    """Return the colours as a style sheet: the system's theme, unless the reader chose the other one."""
     light = _rule({"color-scheme": "light", **_variables(_BOTH), **_variables(LIGHT)})
     dark = _rule({"color-scheme": "dark", **_variables(DARK)})
     return (
@@ -234,7 +232,7 @@ _SCRIPTS: Final = (
 
 
 def page(report: RunReport) -> bytes:
-    """The page, in UTF-8; equal reports give equal bytes."""
+    """Return the page, in UTF-8; equal reports give equal bytes."""
     data = page_data(report)
     style = "\n".join([theme(), *map(_asset, _STYLES)])
     library, script = _asset(_LIBRARY), _script()
@@ -262,13 +260,13 @@ def _asset(name: str) -> str:
 
 
 def _script() -> str:
-    """Our scripts as one, whose names nobody else sees."""
+    """Return our scripts as one, in a scope of its own."""
     scripts = "\n".join(_asset(f"browser/{name}.js") for name in _SCRIPTS)
     return f'(() => {{\n"use strict";\n{scripts}\n}})();\n'
 
 
 def _policy(scripts: Sequence[str], style: str) -> str:
-    """That the browser loads nothing, and runs nothing but what the page was made with."""
+    """Return the policy: the browser loads nothing, and runs only the scripts of the page."""
     allowed = " ".join(map(_digest, scripts))
     return (
         f"default-src 'none'; script-src {allowed}; style-src {_digest(style)}; "

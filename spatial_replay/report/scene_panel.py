@@ -75,7 +75,7 @@ class _Box(NamedTuple):
     size: Floats
 
     def steps(self, points: Floats) -> Floats:
-        """Points (n, 2) as the page has them: in steps of the box."""
+        """Return points (n, 2) in steps of the box."""
         return np.asarray(np.round((points - self.low) / self.size * _STEPS))
 
 
@@ -115,12 +115,12 @@ def scene_value(
 
 
 def _drawing_order(item: tuple[str, Any]) -> tuple[bool, str]:
-    """Regions lie below objects."""
+    """Order regions before objects, which are drawn over them."""
     return not item[0].startswith(REGION), item[0]
 
 
 def _entities(frames: Sequence[SceneFrame]) -> Mapping[str, dict[int, DrawnEntity]]:
-    """By entity and frame, what is drawn."""
+    """Return what is drawn, by entity and frame."""
     found: dict[str, dict[int, DrawnEntity]] = {}
     for number, frame in enumerate(frames):
         for identifier, drawn in frame.entities.items():
@@ -138,14 +138,14 @@ def _box(entities: Mapping[str, Mapping[int, DrawnEntity]], arrows: Sequence[Dra
 
 
 def _joined(points: Sequence[Floats]) -> Floats:
-    """All points, (n, 2)."""
+    """Return all points, (n, 2)."""
     return np.concatenate([np.empty((0, 2)), *points])
 
 
 def _entity_value(
     identifier: str, shown: Mapping[int, DrawnEntity], frames: int, box: _Box, packing: Packing
 ) -> Mapping[str, Any]:
-    """One entity: in which form it is shown in each frame, and the points and colours of those frames."""
+    """Return one entity: its form in each frame, and its points and colours in the frames that have it."""
     forms: dict[tuple[int, ...], int] = {}
     of_frame = np.full(frames, _ABSENT, np.int64)
     for number, each in shown.items():

@@ -1,4 +1,4 @@
-"""A formula's nodes as the page lists them, and their numbers at the samples that it keeps."""
+"""A formula's nodes as the page lists them, and their numbers at the samples that it has."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Boolean, Formula, Temporal, iter_nodes, operands_of, operator_of
 
 MOST_NODES: Final = 400
-"""How many nodes of a tree a page shows at most."""
+"""Nodes of a tree that a page shows, at most."""
 _LONGEST: Final = 400
 """Characters after which the text of a node is cut."""
 _PLACE: Final = "…"
 
 
 def shown_nodes(formula: Formula) -> tuple[int, ...]:
-    """Ids of the nodes on the page, in order: all of them or, of a large tree, the uppermost."""
+    """Return the ids of the nodes on the page, in order: all of them or, of a large tree, the uppermost."""
     nodes = list(iter_nodes(formula))
     if len(nodes) <= MOST_NODES:
         return tuple(range(len(nodes)))
@@ -49,7 +49,7 @@ def initial_nodes(formula: Formula) -> frozenset[int]:
 def tree_value(
     formula: Formula, robustness: Floats, final: Floats, relations: frozenset[str]
 ) -> list[Mapping[str, Any]]:
-    """The shown nodes, each with its text and with how it stands when the log has ended.
+    """Return the shown nodes, each with its text and its final verdict.
 
     Args:
         robustness: (N,), each node's value on the whole log.
@@ -95,7 +95,7 @@ def requirement_values(formula: Formula, object: str | None) -> list[Mapping[str
 
 
 def final_text(robustness: float, lower: float, upper: float) -> str:
-    """A node's robustness when the log has ended, or the ends that it lies between."""
+    """Return a node's final robustness, or the ends of its interval."""
     if math.isnan(robustness) or not (lower == upper == robustness):
         if math.isnan(lower):
             return "" if math.isnan(robustness) else number_text(robustness)
@@ -104,7 +104,7 @@ def final_text(robustness: float, lower: float, upper: float) -> str:
 
 
 def named_nodes(formula: Formula) -> tuple[int, ...]:
-    """The root and the named nodes among those shown: what curves are drawn of."""
+    """Return the nodes that have curves: the root and the named nodes among those shown."""
     shown = set(shown_nodes(formula))
     return tuple(
         identifier
@@ -114,12 +114,12 @@ def named_nodes(formula: Formula) -> tuple[int, ...]:
 
 
 def series_of(series: Floats, formula: Formula, samples: np.ndarray[Any, np.dtype[np.int64]]) -> Floats:
-    """The numbers (nodes, 4, samples) of the shown nodes at some samples."""
+    """Return the numbers (nodes, 4, samples) of the shown nodes at some samples."""
     return np.asarray(series[list(shown_nodes(formula))][:, :, samples])
 
 
 def _head(node: Formula, relations: frozenset[str]) -> str:
-    """A node's own part of its text: its operands give way to dots."""
+    """Return a node's text with dots for its operands."""
     if isinstance(node, Boolean):
         return operator_of(node)
     text = format_formula(node, relations=relations)

@@ -368,7 +368,7 @@ def test_a_template_that_stands_for_nobody_says_so(tmp_path: Path) -> None:
         window=Window(start_ns=1),
     )
     assert page.facts["results"] == []
-    assert "No object was there for a template to stand for." in page.within("section#verdicts")
+    assert "The templates matched no objects." in page.within("section#verdicts")
 
 
 def test_objects_far_away_are_drawn(tmp_path: Path) -> None:
