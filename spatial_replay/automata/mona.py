@@ -9,13 +9,13 @@ import re
 import resource
 import shutil
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import cache
 from threading import Timer
 from types import MappingProxyType
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from spatial_replay.automata.diagrams import Diagrams
 from spatial_replay.automata.ltlf import Kind, Node, Skeleton
@@ -102,16 +102,12 @@ def _text(nodes: Sequence[Node], number: int) -> str:
     return f"({_text(nodes, first)}) {_SIGNS[kind]} ({_text(nodes, second)})"
 
 
-class _Parser(Protocol):
-    def __call__(self, text: str) -> object: ...
-
-
 @cache
-def _parser() -> _Parser:
+def _parser() -> Callable[[str], object]:
     """Return the parser of LTLf, which takes longer to make than to use."""
     from ltlf2dfa.parser.ltlf import LTLfParser
 
-    parser: _Parser = LTLfParser()
+    parser: Callable[[str], object] = LTLfParser()
     return parser
 
 
@@ -138,21 +134,16 @@ def compiled_by_mona(skeleton: Skeleton, propositions: int) -> Machine:
         NoAutomatonError: MONA is not installed, fails or takes too long; a formula too large for it.
     """
     require_translatable(skeleton)
-    executable = _executable()
+    # looked for before ltlf2dfa is imported, which takes longer than all else here
+    executable = shutil.which("mona")
+    if executable is None:
+        raise NoAutomatonError("it is not installed, and may still compile it: apt-get install mona")
     program = mona_program(skeleton)
     if len(program) > _MAX_PROGRAM:
         raise NoAutomatonError(
             f"its program has {len(program)} characters, at most {_MAX_PROGRAM} are given to it"
         )
     return _machine(_output(executable, program), propositions)
-
-
-def _executable() -> str:
-    """Find MONA."""
-    executable = shutil.which("mona")
-    if executable is None:
-        raise NoAutomatonError("it is not installed, and may still compile it: apt-get install mona")
-    return executable
 
 
 def _output(executable: str, program: str) -> str:

@@ -16,6 +16,7 @@ from spatial_replay.spec.formula import (
     expand,
     operands_of,
 )
+from spatial_replay.spec.walks import is_spatial
 
 
 @dataclass(frozen=True)
@@ -49,11 +50,6 @@ class Proposition:
 def _bracketed(formula: Formula) -> str:
     text = format_formula(formula)
     return f"({text})" if isinstance(formula, (Boolean, Quantified)) else text
-
-
-def is_spatial(formula: Formula) -> bool:
-    """Return whether a formula is about one sample: no operator in it looks ahead or back."""
-    return not isinstance(formula, Temporal) and all(is_spatial(each) for each in operands_of(formula))
 
 
 class Propositions:

@@ -151,16 +151,10 @@ def _cropped(message: str) -> str:
     return f"{message[:half]} ... {message[-half:]}"
 
 
-def nearest_name(name: str, known: Iterable[str]) -> str | None:
-    """Return the known name most like `name`, if one is like it at all."""
-    if len(name) > _LONGEST_COMPARED:
-        return None
-    comparable = [candidate for candidate in known if len(candidate) <= _LONGEST_COMPARED]
-    matches = difflib.get_close_matches(name, comparable, n=1)
-    return matches[0] if matches else None
-
-
 def nearest_hint(name: str, known: Iterable[str]) -> str:
     """Return a hint with the known name most like `name`, or ""."""
-    match = nearest_name(name, known)
-    return f"did you mean {match!r}?" if match is not None else ""
+    if len(name) > _LONGEST_COMPARED:
+        return ""
+    comparable = [candidate for candidate in known if len(candidate) <= _LONGEST_COMPARED]
+    matches = difflib.get_close_matches(name, comparable, n=1)
+    return f"did you mean {matches[0]!r}?" if matches else ""

@@ -78,19 +78,12 @@ class QuantifierBuilder:
             hint = "quantify over the group, and write the delay or enlarge in the body"
             message = f"{written.quantifier} runs over the members of a group, whose names never change"
             self.resolver.fault(written.group.span, scope, message, hint)
-        elif not self._is_unknown(written.group, scope):
+        elif not self.resolver.is_unknown(written.group, scope):
             hint = 'define it: group NAME = a, b, or group NAME = class "name"'
             message = f"{written.quantifier} runs over a group, and this is not one"
             self.resolver.fault(written.group.span, scope, message, hint)
         self._body_of_any(written, scope)
         return Truth(True)
-
-    def _is_unknown(self, group: TermSyntax, scope: Scope) -> bool:
-        if not isinstance(group, Name):
-            return False
-        local = scope.values.get(group.text)
-        broken = isinstance(self.names.definitions.get(group.text), BrokenStatement)
-        return isinstance(local, Anything) or (local is None and broken)
 
     def _body_of_any(self, written: QuantifierSyntax, scope: Scope) -> None:
         """Check a body for faults although it has no members."""

@@ -160,9 +160,9 @@ class Namespace:
             message = f"const {name!r} is defined in terms of itself"
             self.faults.add(user.value.span, message, "give it a number")
         else:
-            self.report_not_a_number(Name(name, user.value.span), statement)
+            self._report_not_a_number(Name(name, user.value.span), statement)
 
-    def report_not_a_number(self, name: Name, statement: Statement | None) -> None:
+    def _report_not_a_number(self, name: Name, statement: Statement | None) -> None:
         """Report that a name, and the statement that defines it if one does, is not a number."""
         if statement is None:
             consts = (each for each, what in self.definitions.items() if isinstance(what, ConstStatement))
@@ -171,23 +171,25 @@ class Namespace:
         elif not isinstance(statement, BrokenStatement):
             self.faults.add(name.span, f"{name.text!r} is {kind_of(statement)}; a number is expected here")
 
-    def plain_number(self, quantity: Quantity) -> float:
+    def quantity(self, written: Quantity) -> float | Duration:
+        """Return the number or duration written, or that of a constant; 0 after a fault."""
+        if isinstance(written, NumberSyntax):
+            return written.value
+        self.used.add(written.text)
+        statement = self.definitions.get(written.text)
+        if not isinstance(statement, ConstStatement):
+            self._report_not_a_number(written, statement)
+            return 0.0
+        return self.constant(written.text) or 0.0
+
+    def plain_number(self, written: Quantity) -> float:
         """Return a number written outside of formulas; 0 after a fault."""
-        value: float | Duration | None
-        if isinstance(quantity, Name):
-            self.used.add(quantity.text)
-            statement = self.definitions.get(quantity.text)
-            if not isinstance(statement, ConstStatement):
-                self.report_not_a_number(quantity, statement)
-                return 0.0
-            value = self.constant(quantity.text)
-        else:
-            value = quantity.value
+        value = self.quantity(written)
         if isinstance(value, Duration):
             message = "a duration, where a plain number is expected"
-            self.faults.add(quantity.span, message, "leave out its unit")
+            self.faults.add(written.span, message, "leave out its unit")
             return 0.0
-        return value or 0.0
+        return value
 
     def _region(self, statement: RegionStatement, effort: outline.Effort) -> Outline:
         shape = statement.shape
@@ -355,7 +357,7 @@ class Resolver:
         group = self.term(written.group, scope)
         excluded = [self._named(name, scope) for name in written.excluded]
         if not isinstance(group, Group):
-            if not self._is_open_question(written.group, scope):
+            if not self.is_unknown(written.group, scope):
                 self.fault(written.group.span, scope, "only a group can leave something out with except")
             return group
         left_out = dict.fromkeys(group.excluded)
@@ -366,7 +368,7 @@ class Resolver:
                 self.fault(name.span, scope, f"except leaves out one object; {name.text!r} is not an object")
         return replace(group, excluded=tuple(left_out))
 
-    def _is_open_question(self, written: TermSyntax, scope: Scope) -> bool:
+    def is_unknown(self, written: TermSyntax, scope: Scope) -> bool:
         """Return whether a name is of unknown meaning: a parameter of `Anything`, a broken definition."""
         if not isinstance(written, Name):
             return False
@@ -401,23 +403,15 @@ class Resolver:
     # --------------------------------------------------------------------------------------- numbers
 
     def quantity(self, written: Quantity, scope: Scope) -> float | Duration:
-        """Return the number or duration that stands somewhere; 0 after a fault."""
-        if isinstance(written, NumberSyntax):
-            return written.value
-        value = scope.values.get(written.text)
+        """Return the number or duration at a place; 0 after a fault."""
+        value = scope.values.get(written.text) if isinstance(written, Name) else None
+        if value is None:
+            return self.names.quantity(written)
         if isinstance(value, (float, Duration)):
             return value
-        if isinstance(value, Anything):
-            return 0.0
-        if value is not None:
+        if isinstance(written, Name) and not isinstance(value, Anything):
             self.fault(written.span, scope, f"{written.text!r} is an object; a number is expected here")
-            return 0.0
-        self.names.used.add(written.text)
-        statement = self.names.definitions.get(written.text)
-        if not isinstance(statement, ConstStatement):
-            self.names.report_not_a_number(written, statement)
-            return 0.0
-        return self.names.constant(written.text) or 0.0
+        return 0.0
 
     def number(self, written: Quantity, scope: Scope) -> float:
         """Return a plain number; a duration in its place is a fault."""

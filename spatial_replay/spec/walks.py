@@ -106,6 +106,11 @@ def iter_formulas(formula: Formula) -> Iterator[Formula]:
                 stack.append(current.body)
 
 
+def is_spatial(formula: Formula) -> bool:
+    """Return whether a formula is about one sample: no operator in it looks ahead or back."""
+    return not any(isinstance(each, Temporal) for each in iter_formulas(formula))
+
+
 def iter_terms(formulas: Iterable[Formula]) -> Iterator[Term]:
     """Yield the terms that atoms measure and the groups of open quantifiers, in the order of the text."""
     for formula in formulas:

@@ -24,8 +24,8 @@ from spatial_replay.spec.formula import (
     Temporal,
     Truth,
     iter_nodes,
-    operands_of,
 )
+from spatial_replay.spec.walks import is_spatial
 
 # columns of the table
 CODE, FIRST, END, IS_IN_NS, LOW, HIGH, IS_PLAIN, COLUMN, INNER, PAIRS, LEAF = range(11)
@@ -69,7 +69,7 @@ def paper_table(formula: Formula, leaves: Sequence[Atom | Quantified]) -> PaperT
     for identifier, (_, parent) in enumerate(nodes):
         if parent is not None:
             operands[parent].append(identifier)
-    is_plain = [_is_plain(node) for node, _ in nodes]
+    is_plain = [is_spatial(node) for node, _ in nodes]
     has_column = _columns(nodes, operands, is_plain)
     rows = np.zeros((len(nodes), WIDTH), np.int64)
     columns = pairs = begin = 0
@@ -94,10 +94,6 @@ def paper_table(formula: Formula, leaves: Sequence[Atom | Quantified]) -> PaperT
             if has_column[identifier] and is_until_nested and not is_plain[own[0]]:
                 row[PAIRS], pairs = pairs, pairs + 1
     return PaperTable(rows, np.array([i for own in operands for i in own], np.int64), columns, pairs)
-
-
-def _is_plain(formula: Formula) -> bool:
-    return not isinstance(formula, Temporal) and all(map(_is_plain, operands_of(formula)))
 
 
 def _columns(
