@@ -142,7 +142,7 @@ def _recorded(
 
 
 def bench_online_peers(bench: Any) -> None:
-    """The least of a signal over the last samples, by our monitor and by others, value for value the same."""
+    """Compare our monitor with others on the minimum of a signal over a window; all give equal values."""
     values = random.Random(0)
     signal = [values.uniform(-1, 5) for _ in range(5000)]
     for window in (10, 1000):
