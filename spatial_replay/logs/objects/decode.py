@@ -196,7 +196,7 @@ def decode_objects(
     Args:
         payloads: T messages.
         times_ns: (T,) int64, their log times, which increase.
-        concave: what becomes of polygons that are not convex; our own logs hold none.
+        concave: how polygons that are not convex are handled; our own logs hold none.
 
     Returns:
         the trace of the messages that can be used, and what is wrong with the others, each with its time.
