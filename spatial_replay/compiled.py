@@ -77,6 +77,14 @@ def compile_ahead() -> None:
     _process.interprets = False
 
 
+def kernels() -> Iterator[_Kernel[..., Any]]:
+    """Yield the kernels of all modules that are loaded, without the pieces that only kernels call."""
+    for module in tuple(sys.modules.values()):
+        for value in tuple(vars(module).values()) if module.__name__.startswith(__package__) else ():
+            if isinstance(value, _Kernel) and value.__module__ == module.__name__ and value.is_entry:
+                yield value
+
+
 @contextmanager
 def only(form: Literal["compiled", "interpreted"]) -> Iterator[None]:
     """Run kernels in one form only, while this lasts."""
@@ -126,6 +134,16 @@ class _Kernel(Generic[_Arguments, _Result]):
         self._spent_s += took
         self._element_s = max(took / elements, self._element_s or 0.0)
         return result
+
+    @property
+    def is_entry(self) -> bool:
+        """Whether Python code may call it, too."""
+        return "no_cpython_wrapper" not in self._options
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether there is machine code for the arguments of at least one call."""
+        return bool(getattr(self._compiled, "signatures", ()))
 
     def _may_interpret(self, elements: int) -> bool:
         if _process.only is not None:
@@ -197,7 +215,7 @@ class _Process:
     def is_warm(self) -> bool:
         """Whether an earlier process has left machine code in the cache."""
         if self._is_warm is None:
-            self._folder = _cache_folder()
+            self._folder = cache_folder()
             self._is_warm = self._folder is not None and _holds_code(self._folder)
         return self._is_warm
 
@@ -236,7 +254,7 @@ def _required_form() -> str | None:
     return value if value in ("compiled", "interpreted") else None
 
 
-def _cache_folder() -> Path | None:
+def cache_folder() -> Path | None:
     """Return the folder for machine code of these sources, made if need be; None if none can be written.
 
     Code in it is loaded as it is, so it lies where only the user, or who installed the package, writes.

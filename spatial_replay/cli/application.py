@@ -45,6 +45,7 @@ COMMANDS: dict[str, str] = {
     "report": "Write an HTML report of a run.",
     "serve": "Replay live to a viewer, with tunable constants.",
     "verify": "Recompute a log's certificate and compare.",
+    "warmup": "Compile everything once, for images.",
 }
 """Name and summary; `spatial_replay/cli/NAME.py` defines the command under its name."""
 

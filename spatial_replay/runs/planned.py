@@ -245,7 +245,7 @@ def record_plan(
     with closing(make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, gui=gui)) as world:
         refuse_unknown_names([kept], world.sample())
         planner = Planner(kept, settings_for(world), name=name)
-        _warm_up_planner()
+        warm_up_planner()
         with run_log(output, [kept], about, inputs, _known(kept, planner.automaton)) as log:
             log.add_metadata(PLAN_METADATA, _plan(planner, kept))
             loop = PlanLoop(BlackBox(planner), log, WorldExecutor(world, world.skill), world.step)
@@ -294,7 +294,7 @@ def _known(file: Specification, automaton: Automaton) -> list[SpecAutomaton]:
     ]
 
 
-def _warm_up_planner() -> None:
+def warm_up_planner() -> None:
     """Plan a push that is not executed, so that the first decision does not wait for the compiler.
 
     With an empty compiler cache this takes many seconds, otherwise a fraction of one.

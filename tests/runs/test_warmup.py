@@ -1,0 +1,37 @@
+"""After a warm-up, nothing is compiled any more."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+_EVERY_KERNEL = """
+import importlib, pkgutil
+import spatial_replay
+from spatial_replay.compiled import compile_ahead, kernels
+from spatial_replay.runs.warmup import TASKS
+
+compile_ahead()
+for run in TASKS.values():
+    run()
+for module in pkgutil.walk_packages(spatial_replay.__path__, "spatial_replay."):
+    if not module.name.endswith("__main__"):
+        importlib.import_module(module.name)
+print(*sorted(f"{each.__module__}.{each.__name__}" for each in kernels() if not each.is_compiled))
+"""
+
+
+def test_a_warm_up_compiles_every_kernel():
+    done = subprocess.run([sys.executable, "-c", _EVERY_KERNEL], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
+
+
+def test_the_command_says_where_the_code_is(tmp_path):
+    environment = os.environ | {"SPATIAL_REPLAY_CACHE": str(tmp_path)}
+    command = [sys.executable, "-m", "spatial_replay", "warmup", "--jobs", "2"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    (folder,) = tmp_path.iterdir()
+    assert done.stdout == f"compiled into {folder}\n"
+    assert list(folder.rglob("*.nbi"))
