@@ -14,13 +14,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from spatial_replay.bags.columns import (
-    Columns,
-    MessageColumns,
-    in_order,
-    places_in,
-    unnumbered,
-)
+from spatial_replay.bags.columns import Columns, MessageColumns, in_order, places_in, unnumbered
 from spatial_replay.bags.decoders import topics_by_name
 from spatial_replay.bags.reader import MessageReader
 from spatial_replay.bags.ros1_index import (

@@ -53,12 +53,7 @@ class FootprintBatch:
         for name in ("vertices", "radius", "bottom", "top"):
             object.__setattr__(self, name, read_only_floats(getattr(self, name)))
         rows, parts, vertices = len(self.part_start) - 1, len(self.vertex_start) - 1, len(self.vertices)
-        expected = {
-            "vertices": (vertices, 2),
-            "radius": (parts,),
-            "bottom": (rows,),
-            "top": (rows,),
-        }
+        expected = {"vertices": (vertices, 2), "radius": (parts,), "bottom": (rows,), "top": (rows,)}
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
                 actual = getattr(self, name).shape
@@ -73,9 +68,7 @@ class FootprintBatch:
 
     @classmethod
     def from_footprints(
-        cls,
-        footprints: Sequence[Footprint],
-        heights: Sequence[tuple[float, float] | None] | None = None,
+        cls, footprints: Sequence[Footprint], heights: Sequence[tuple[float, float] | None] | None = None
     ) -> FootprintBatch:
         """Build one row per footprint, with its height interval (bottom, top) if it has one."""
         parts = [part for footprint in footprints for part in footprint.parts]

@@ -41,11 +41,7 @@ from spatial_replay.mapping.message_types import MessageLayout
 from spatial_replay.mapping.model import TopicMapping
 from spatial_replay.mapping.names import Codes, Namer, class_codes
 
-_SOLIDS_OF = {
-    "marker": solids_of_marker,
-    "scene": solids_of_entity,
-    "primitive": solids_of_perceived_object,
-}
+_SOLIDS_OF = {"marker": solids_of_marker, "scene": solids_of_entity, "primitive": solids_of_perceived_object}
 
 
 class _Objects(NamedTuple):
@@ -70,13 +66,7 @@ class Extractor:
     """
 
     def __init__(
-        self,
-        layout: MessageLayout,
-        mapping: TopicMapping,
-        names: Codes,
-        classes: Codes,
-        *,
-        needs_frame: bool,
+        self, layout: MessageLayout, mapping: TopicMapping, names: Codes, classes: Codes, *, needs_frame: bool
     ) -> None:
         self.noted_frames: set[str] = set()
         self._layout = layout

@@ -87,12 +87,7 @@ class Events:
 
 
 def events_from_messages(
-    detections: Detections,
-    times_ns: Integers,
-    rows: Integers,
-    *,
-    alive: Events,
-    is_complete: bool,
+    detections: Detections, times_ns: Integers, rows: Integers, *, alive: Events, is_complete: bool
 ) -> Events:
     """Return the events of messages in order: detections, deletions, and objects that lists leave out.
 

@@ -185,11 +185,7 @@ class TopicReader:
                 raise self._misfit_error(first)
 
     def _read_each(
-        self,
-        read: Callable[[Any], Any],
-        items: Sequence[Any],
-        log_times_ns: Sequence[int],
-        good: Booleans,
+        self, read: Callable[[Any], Any], items: Sequence[Any], log_times_ns: Sequence[int], good: Booleans
     ) -> list[Any]:
         """Apply `read` to the good items; report those that fail, and clear their flags."""
         results: list[Any] = [None] * len(items)

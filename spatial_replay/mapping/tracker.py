@@ -210,11 +210,7 @@ class Tracker:
                 missing = missing[self._is_relevant(reader, missing)]
                 if len(missing):
                     self._remarks.count_missing(
-                        reader.name,
-                        frame,
-                        len(missing),
-                        int(missing[0]),
-                        is_known=frame in self._tree.names,
+                        reader.name, frame, len(missing), int(missing[0]), is_known=frame in self._tree.names
                     )
         return result
 

@@ -98,11 +98,7 @@ class GradientMap(Displayed):
 
 
 def gradient_map(
-    maps: PropositionMaps,
-    progress: Cubes,
-    constraints: Cubes,
-    workspace: Workspace,
-    margin: float = 0.0,
+    maps: PropositionMaps, progress: Cubes, constraints: Cubes, workspace: Workspace, margin: float = 0.0
 ) -> GradientMap:
     """Return the map of a progress set, blocked where the constraint set would hold.
 

@@ -17,12 +17,7 @@ SCENARIOS: tuple[str, ...] = ("push", "pick-place", "table-setting")
 
 
 def make_world(
-    name: str,
-    *,
-    seed: int = 0,
-    noise_m: float = 0.0,
-    injections: Sequence[Injection] = (),
-    gui: bool = False,
+    name: str, *, seed: int = 0, noise_m: float = 0.0, injections: Sequence[Injection] = (), gui: bool = False
 ) -> Tabletop:
     """Create the world of a scenario at time 0; for the arguments see `Tabletop`.
 
