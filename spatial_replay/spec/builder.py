@@ -110,6 +110,13 @@ def read_number(text: str, span: Span) -> float | Duration:
     return Duration(int(ns))
 
 
+def _title(token: Token) -> str:
+    text: str = token.value.strip()
+    if not text:
+        raise StatementError(span_of(token), "a title is empty", 'write "REQ-12: what must hold", or nothing')
+    return text
+
+
 class TreeBuilder:
     """Builds a node from the pieces of each rule, tokens included; lark calls a method by the rule's name."""
 
@@ -137,7 +144,8 @@ class TreeBuilder:
         return DefStatement(children[1], children[3] or (), children[6])
 
     def spec(self, children: list[Any]) -> SpecStatement:
-        return SpecStatement(children[1], children[3] or (), children[6])
+        _, name, _, parameters, _, title, _, formula = children
+        return SpecStatement(name, parameters or (), formula, None if title is None else _title(title))
 
     def names(self, children: list[Any]) -> tuple[Name, ...]:
         return tuple(child for child in children if isinstance(child, Name))

@@ -162,6 +162,16 @@ def first_repeated(names: Sequence[Name]) -> Name | None:
     return None
 
 
+def _split_title(text: str | None) -> tuple[str | None, str | None]:
+    """Return the requirement's id, which stands before ": " and has no blanks, and the title."""
+    if text is None:
+        return None, None
+    identifier, _, rest = text.partition(": ")
+    if not rest or not identifier or any(character.isspace() for character in identifier):
+        return None, text
+    return identifier, rest.strip()
+
+
 _UNBOUNDED = frozenset({"X", "WX", "Y"})
 
 
@@ -242,7 +252,9 @@ class Elaborator:
             formula = Boolean("spec", (formula,), span=statement.formula.span)
             self.deepest += 1
         formula = replace(formula, name=name)
-        spec = NamedSpec(name, formula, parameter, span=statement.name.span)
+        requirement, title = _split_title(statement.title)
+        span = statement.name.span
+        spec = NamedSpec(name, formula, parameter, span=span, id=requirement, title=title)
         size = self.resolver.size - before + self.shared
         self.known[name] = _Known(spec, order, size, self.deepest)
 

@@ -172,7 +172,13 @@ def format_specification(specification: Specification) -> str:
 def _format_spec(spec: NamedSpec, relations: frozenset[str]) -> str:
     parameter = f"({written_name(spec.parameter, relations)})" if spec.parameter is not None else ""
     formula = format_formula(spec.formula, references=True, relations=relations)
-    return f"spec {written_name(spec.name, relations)}{parameter} = {formula}"
+    title = f" {quoted(title_text(spec))}" if spec.title is not None else ""
+    return f"spec {written_name(spec.name, relations)}{parameter}{title} = {formula}"
+
+
+def title_text(spec: NamedSpec) -> str:
+    """Return the requirement id and the title of a spec as one text; "" for none."""
+    return ": ".join(each for each in (spec.id, spec.title) if each is not None)
 
 
 def _format_outline(outline: Outline) -> str:

@@ -52,13 +52,12 @@ class RegionName:
 class Group:
     """A set of tracked objects; as a term, the union of its members' footprints.
 
-    Exactly one of `members` (a named group) and `class_name` (an open group) is given; for the open
-    group of every object, `class_name` is `ANY_CLASS`.
+    Exactly one of `members` (a named group) and `class_name` (an open group) is given.
 
     Attributes:
         name: the name it was declared under; "" for one written in place.
         members: names of the members, in the order written; None for an open group.
-        class_name: objects of this class in the sample (compared without regard to case).
+        class_name: objects of this class in the sample, ignoring case; `ANY_CLASS` for every object.
         excluded: members left out, by name or by variable.
     """
 
@@ -463,6 +462,7 @@ class NamedSpec:
     Attributes:
         parameter: the object parameter of a template, or None.
         is_result: whether no other spec of the file uses it; these are the results listed.
+        id, title: "REQ-12" and "no one is hit" of `spec calm "REQ-12: no one is hit" = ...`, or None.
     """
 
     name: str
@@ -470,14 +470,15 @@ class NamedSpec:
     parameter: str | None = None
     is_result: bool = True
     span: Span = field(default=_NO_SPAN, compare=False)
+    id: str | None = None
+    title: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Constant:
-    """What a `const` statement stands for: a number, or a duration.
+    """What a `const` statement stands for: a number, or the seconds of a duration.
 
     Attributes:
-        value: the number; of a duration, its seconds.
         duration_ns: None for a number.
     """
 

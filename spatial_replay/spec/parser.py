@@ -255,7 +255,7 @@ _EXPECTATIONS: tuple[tuple[frozenset[str], str], ...] = (
 _SIGN_OF: Mapping[str, str] = MappingProxyType({
     "LPAR": "'('", "RPAR": "')'", "LSQB": "'['", "RSQB": "']'", "COMMA": "','", "COLON": "':'",
     "EQUAL": "'='", "MINUS": "'-'", "IN": "'in'", "THAN": "'than'", "DIST": "'dist'",
-    "$END": "the end of the statement", "HEIGHT": "'height'",
+    "TITLE": "a title in quotes", "$END": "the end of the statement", "HEIGHT": "'height'",
     "POLYGON": "'polygon'", "BOX": "'box'", "CIRCLE": "'circle'", "CLASS": "'class'",
 })  # fmt: skip
 _COVERED: Mapping[str, frozenset[str]] = MappingProxyType(
@@ -313,6 +313,9 @@ def _report(
         faults.add(span, f"{token.value!r} needs an object, region or group on its left", hint)
     elif "NAME" in accepted and (token.value in KEYWORDS or token.type == "RELATION"):
         hint = f"that word is reserved; an object of its name is written in quotes: {quoted(token.value)}"
+        faults.add(span, found, hint)
+    elif "TITLE" in accepted and token.type == "NAME":
+        hint = 'a title is written in quotes: spec NAME "REQ-12: what must hold" = ...'
         faults.add(span, found, hint)
     elif "NAME" in accepted and token.type == "NUMBER":
         hint = f"a name that begins with a digit is written in quotes: {quoted(token.value)}"

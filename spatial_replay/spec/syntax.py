@@ -255,11 +255,12 @@ class DefStatement:
 
 @dataclass(frozen=True, slots=True)
 class SpecStatement:
-    """`spec name = formula`; with a parameter, a template."""
+    """`spec name "title" = formula`; with a parameter, a template."""
 
     name: Name
     parameters: tuple[Name, ...]
     formula: FormulaSyntax
+    title: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

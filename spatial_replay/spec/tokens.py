@@ -126,7 +126,8 @@ def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token
         elif kind == "sign":
             token_type = _SIGNS[value]
         elif kind == "quoted":
-            token_type, value = "NAME", _unquoted(value, span, faults)
+            token_type = "TITLE" if _is_title_expected(tokens) else "NAME"
+            value = _unquoted(value, span, faults)
         elif kind == "unknown":
             _report_unknown(value, span, faults)
             token_type = "ERROR"
@@ -139,6 +140,16 @@ def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token
                 value = value[: -len(unit)]
         tokens.append(Token(token_type, value, span.start, line, None, line, None, span.end))
     return _join_published_spellings(tokens)
+
+
+def _is_title_expected(before: list[Token]) -> bool:
+    """Return whether a quoted text is the title of a spec: behind its name, or its parameter."""
+    if not before:
+        return False
+    if before[-1].type == "NAME":
+        return len(before) > 1 and before[-2].type == "SPEC"
+    # no quoted name can follow a closing bracket
+    return before[-1].type == "RPAR"
 
 
 def _unquoted(literal: str, span: Span, faults: Faults) -> str:

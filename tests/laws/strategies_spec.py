@@ -20,6 +20,7 @@ PLAIN_RELATIONS = (
     "ovlp", "enclosedin", "partovlp", "leftof", "rightof", "below", "above", "partleftof", "partrightof",
     "partbelow", "partabove",
 )  # fmt: skip
+TITLES = (' "REQ-12: no one is hit"', ' "id: a: b"', ' "no id: here"', r' "\"quoted\" \\ text"', ' ":  x "')
 COMPARISONS = ("<=", "<", ">=", ">", "==")
 
 
@@ -213,6 +214,7 @@ def specification_texts(draw: st.DrawFn) -> str:
     profile = draw(st.sampled_from(["", "use paper", "use spatial_spec"]))
     argument = draw(st.sampled_from(_FULL.objects))
     height = draw(st.sampled_from(["", " height (0, near)"]))
+    title = draw(st.sampled_from(["", *TITLES]))
     named = replace(_FULL, objects=(*_FULL.objects, "r", "q"), quantifiers=False)
     in_macro = replace(_FULL, objects=(*_FULL.objects, "p"))
     template = replace(_FULL, objects=(*_FULL.objects, "ego"))
@@ -230,8 +232,8 @@ def specification_texts(draw: st.DrawFn) -> str:
         f"spec first = {draw(formula_texts(_FULL))}",
         f"spec each = forall r, q in (reds except a): {draw(formula_texts(named))}",
         f"spec both = F[0, settle] first ->\n    (each or near_it({argument}, near))",
-        f"spec ahead(ego) = {draw(formula_texts(template))}",
-        "spec again = both",
+        f"spec ahead(ego){title} = {draw(formula_texts(template))}",
+        f"spec again{title} = both",
     ]
     end = draw(st.sampled_from(["\n", "\r\n"]))
     return draw(st.sampled_from(["", "\ufeff"])) + end.join(lines) + end

@@ -34,6 +34,8 @@ spec template(ego) = ego ovlp goal
 @pytest.mark.parametrize(
     ("statement", "where", "message", "hint"),
     [
+        ("spec s hit = a ovlp b", "hit", "'=' or a title in quotes", 'spec NAME "REQ-12: what must hold" ='),
+        ('spec s " " = a ovlp b', '" "', "a title is empty", '"REQ-12: what must hold"'),
         ("spec s = a closto b", "closto", "unknown relation 'closto'", "did you mean 'closeto'?"),
         ("spec s = a closeto b", "closeto", "takes 1 parameter, not 0", "write a closeto[e] b"),
         ("spec s = a prec b", "prec", "takes 1 parameter, not 0", "write a prec[x] b"),

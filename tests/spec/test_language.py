@@ -15,7 +15,7 @@ from spatial_replay import (
     load_specification,
     parse_specification,
 )
-from spatial_replay.spec import format_formula, instantiate
+from spatial_replay.spec import check_names, format_formula, format_specification, instantiate
 from spatial_replay.spec.formula import (
     ANY_CLASS,
     Atom,
@@ -258,3 +258,34 @@ def test_the_package_exports_every_name_of_the_language(name: str) -> None:
 def test_the_package_has_no_other_names() -> None:
     with pytest.raises(AttributeError, match="no attribute 'parse_everything'"):
         _ = spatial_replay.spec.parse_everything
+
+
+# ------------------------------------------------------------------------------------------------ titles
+
+
+@pytest.mark.parametrize(
+    ("text", "identifier", "title"),
+    [
+        ("spec calm = a ovlp b", None, None),
+        ('spec calm "REQ-12: no one is hit" = a ovlp b', "REQ-12", "no one is hit"),
+        ('spec calm "no one is hit" = a ovlp b', None, "no one is hit"),
+        ('spec calm "REQ-12" = a ovlp b', None, "REQ-12"),
+        ('spec calm "in short: no one is hit" = a ovlp b', None, "in short: no one is hit"),
+        ('spec calm "R-1: first: then" = a ovlp b', "R-1", "first: then"),
+        ('spec calm(ego) "REQ-12: no one is hit" = ego ovlp b', "REQ-12", "no one is hit"),
+    ],
+)
+def test_a_spec_has_the_id_of_its_requirement_and_a_title(
+    text: str, identifier: str | None, title: str | None
+) -> None:
+    specification = parse_specification(text)
+    spec = specification.specs[0]
+    assert (spec.id, spec.title) == (identifier, title)
+    again = parse_specification(format_specification(specification)).specs[0]
+    assert (again.id, again.title) == (identifier, title)
+
+
+def test_a_title_names_no_object() -> None:
+    specification = parse_specification('spec calm "cup" = G (cup ovlp plate)')
+    (diagnosis,) = check_names(specification, ["plate"], [])
+    assert diagnosis.column == len('spec calm "cup" = G (') + 1
