@@ -146,10 +146,10 @@ class Monitor:
 
         Raises:
             TraceError: a time that does not come after the last one's.
-            UsageError: what is no sample; more objects in open groups than can be bound.
+            UsageError: not a sample; more objects in open groups than can be bound.
         """
         if not isinstance(sample, Sample):
-            raise UsageError(f"{sample!r} is no sample; give a Sample(time_ns, objects)")
+            raise UsageError(f"{sample!r} is not a sample; give a Sample(time_ns, objects)")
         if self._last_ns is not None and sample.time_ns <= self._last_ns:
             raise TraceError(
                 f"a sample at {sample.time_ns} ns follows one at {self._last_ns} ns; "

@@ -129,7 +129,7 @@ class Planner:
                 neither settings nor objects.
         """
         if not isinstance(sample, Sample):
-            raise UsageError(f"{sample!r} is no sample; give a Sample(time_ns, objects)")
+            raise UsageError(f"{sample!r} is not a sample; give a Sample(time_ns, objects)")
         if self._sample is not None and sample.time_ns <= self._sample.time_ns:
             raise TraceError(
                 f"a sample at {sample.time_ns} ns follows one at {self._sample.time_ns} ns; give times that "

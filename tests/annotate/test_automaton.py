@@ -65,9 +65,9 @@ def states_of(samples: list[Sample], text: str = TEXT, pieces: int | None = None
 def test_every_sample_says_where_the_automaton_is() -> None:
     machine = automaton(SPEC)
     state = machine.initial
-    told = states_of(RUN)
+    messages = states_of(RUN)
     symbols = [(False, True), (False, True), (True, True), (False, True), (False, False), (True, True)]
-    for index, (message, symbol) in enumerate(zip(told, symbols, strict=True)):
+    for index, (message, symbol) in enumerate(zip(messages, symbols, strict=True)):
         assert (message.time_ns, message.specification) == (index * 10**9, "done")
         assert message.source == state
         state = machine.step(state, symbol)
@@ -85,20 +85,20 @@ def test_the_guard_of_a_change_is_in_words() -> None:
 
 
 def test_what_was_not_seen_leaves_several_states_until_it_is_decided() -> None:
-    told = states_of(HIDDEN)
-    assert [len(message.states) for message in told] == [1, 2, 2, 1]
-    assert [message.propositions[0] for message in told] == [FALSE, UNKNOWN, FALSE, TRUE]
-    assert [message.accepting for message in told] == [FALSE, UNKNOWN, UNKNOWN, TRUE]
-    assert [message.HasField("source") for message in told] == [True, True, False, False]
-    assert [message.can_accept for message in told] == [TRUE] * 4
+    messages = states_of(HIDDEN)
+    assert [len(message.states) for message in messages] == [1, 2, 2, 1]
+    assert [message.propositions[0] for message in messages] == [FALSE, UNKNOWN, FALSE, TRUE]
+    assert [message.accepting for message in messages] == [FALSE, UNKNOWN, UNKNOWN, TRUE]
+    assert [message.HasField("source") for message in messages] == [True, True, False, False]
+    assert [message.can_accept for message in messages] == [TRUE] * 4
 
 
 def test_the_sign_of_what_is_not_determined_may_be_known() -> None:
     # the second of the two is unknown in a sample, the first holds
     text = "region goal = box(0, 0, 10, 10)\nspec s = F (battery >= 0.5 or cube enclosedin goal)"
-    told = states_of([sample(0, 20, 0.1), sample(1, None, 0.9)], text)
-    assert [list(message.propositions) for message in told] == [[FALSE], [TRUE]]
-    assert told[-1].accepting == TRUE
+    messages = states_of([sample(0, 20, 0.1), sample(1, None, 0.9)], text)
+    assert [list(message.propositions) for message in messages] == [[FALSE], [TRUE]]
+    assert messages[-1].accepting == TRUE
 
 
 @pytest.mark.parametrize("samples", [RUN, HIDDEN])
@@ -158,7 +158,7 @@ def about_automata(path: Path) -> dict[str, str]:
 
 
 def test_a_replay_takes_over_what_was_compiled_before(tmp_path: Path) -> None:
-    # only MONA compiles this one; told apart from what that gives by being wrong: it accepts everything
+    # only MONA compiles this one; distinguished from a wrong result: it accepts everything
     text = "spec done = G (battery >= 0.1 -> F[13, 13] battery >= 0.5)"
     spec = parse_specification(text, filename="done.spatial")
     propositions = tuple(Propositions(spec.results[0].formula).all)

@@ -1,4 +1,4 @@
-"""What is told of a run: which changes, when, and in which words."""
+"""Events of a run: which changes are reported, when, and in which words."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ Found = list[tuple[int, Event, Log]]
 END = "for the log has ended"
 
 
-def told(tmp_path: Path, text: str, *charges: float | None, **options: object) -> Found:
+def events_of(tmp_path: Path, text: str, *charges: float | None, **options: object) -> Found:
     """The events and sentences of a run of batteries, with the number of the sample they are logged at, but
     for what its end brings."""
     found = written(tmp_path, text, batteries(*charges), **options)
     return [each for each in found if END not in each[2].message]
 
 
-def told_at_end(tmp_path: Path, text: str, *charges: float | None, **options: object) -> Found:
+def events_at_end(tmp_path: Path, text: str, *charges: float | None, **options: object) -> Found:
     """What the end of such a run brings."""
     found = written(tmp_path, text, batteries(*charges), **options)
     return [each for each in found if END in each[2].message]
@@ -66,7 +66,7 @@ def facts(event: Event) -> dict[str, str]:
 
 def test_a_sign_is_reported_when_it_lasts_three_samples(tmp_path):
     charges = [1.0, -1.0, -2.0, 1.0, -3.0, -4.0, -2.0, -1.0, 5.0]
-    [(number, event, line)] = told(tmp_path, "spec last = F G battery >= 0", *charges)
+    [(number, event, line)] = events_of(tmp_path, "spec last = F G battery >= 0", *charges)
     assert number == 6
     assert event.start_time.ToNanoseconds() == 10**9 + 4 * STEP_NS
     assert event.end_time.ToNanoseconds() == line.timestamp.ToNanoseconds() == 10**9 + 6 * STEP_NS
@@ -95,7 +95,7 @@ def test_a_sign_is_reported_when_it_lasts_three_samples(tmp_path):
 
 def test_a_verdict_is_reported_at_once(tmp_path):
     text = "# a comment\nspec kept = G battery >= 0"
-    [(number, event, line)] = told(tmp_path, text, 2.0, 1.0, -1.0, 5.0, -7.0)
+    [(number, event, line)] = events_of(tmp_path, text, 2.0, 1.0, -1.0, 5.0, -7.0)
     assert number == 2
     assert event.start_time == event.end_time
     assert facts(event)["verdict"] == "violated"
@@ -104,25 +104,27 @@ def test_a_verdict_is_reported_at_once(tmp_path):
 
 
 def test_a_verdict_of_the_first_sample_has_nothing_before(tmp_path):
-    [(number, event, line)] = told(tmp_path, "spec kept = G battery >= 0", -1.0, 1.0)
+    [(number, event, line)] = events_of(tmp_path, "spec kept = G battery >= 0", -1.0, 1.0)
     assert number == 0
     assert not any(key.endswith("_before") for key in facts(event))
     assert line.message == "`kept` is violated, whatever comes: `battery >= 0` fails by 1."
 
 
 def test_how_it_begins_is_no_change(tmp_path):
-    assert not told(tmp_path, "spec last = F G battery >= 0", 1.0, 1.0, 1.0, 1.0)
+    assert not events_of(tmp_path, "spec last = F G battery >= 0", 1.0, 1.0, 1.0, 1.0)
 
 
 def test_samples_that_say_nothing_are_no_sign(tmp_path):
     charges = [1.0, -1.0, None, -1.0, -1.0, None, -1.0, -1.0, -1.0]
-    [(number, *_)] = told(tmp_path, "spec last = F G battery >= 0", *charges)
+    [(number, *_)] = events_of(tmp_path, "spec last = F G battery >= 0", *charges)
     assert number == 8
 
 
 def test_without_a_witness_in_the_same_sample_there_is_none(tmp_path):
     # what decides is the second sample; that it does is known when the window closes
-    [(number, event, line)] = told(tmp_path, "spec soon = F[0s, 0.3s] battery >= 5", 1.0, 4.0, 3.0, 2.0, 1.0)
+    [(number, event, line)] = events_of(
+        tmp_path, "spec soon = F[0s, 0.3s] battery >= 5", 1.0, 4.0, 3.0, 2.0, 1.0
+    )
     assert number == 3
     assert "witness" not in facts(event)
     assert line.message.startswith("`soon` is violated, whatever comes, by 1.")
@@ -133,7 +135,7 @@ def test_named_parts_that_later_samples_can_change_are_reported_too(tmp_path):
         "spec full = battery >= 1\nspec filled = F full\nspec never_empty = G battery >= 0\n"
         "spec both = filled and never_empty"
     )
-    names = [(line.name, line.message) for *_, line in told(tmp_path, text, 0.5, 2.0, 2.0, 2.0, 2.0)]
+    names = [(line.name, line.message) for *_, line in events_of(tmp_path, text, 0.5, 2.0, 2.0, 2.0, 2.0)]
     assert [name for name, _ in names] == ["filled", "both"]
     assert names[0][1].startswith("`filled` in `both` is satisfied")
 
@@ -150,13 +152,13 @@ def test_a_template_says_for_whom(tmp_path):
 
 
 def test_negated_and_implied_atoms_are_witnesses_in_their_own_sign(tmp_path):
-    [(_, event, _)] = told(tmp_path, "spec spared = G not battery >= 2", 1.0, 3.0)
+    [(_, event, _)] = events_of(tmp_path, "spec spared = G not battery >= 2", 1.0, 3.0)
     assert facts(event)["robustness"] == "-1.0"
     assert facts(event)["witness"] == "`battery >= 2` holds by 1"
 
 
 def test_the_paper_semantics_knows_signs_only(tmp_path):
-    found = told(tmp_path, "spec kept = G battery >= 0", 2.0, -1.0, -1.0, -1.0, semantics="paper")
+    found = events_of(tmp_path, "spec kept = G battery >= 0", 2.0, -1.0, -1.0, -1.0, semantics="paper")
     [(number, event, _)] = found
     assert (number, facts(event)["verdict"], facts(event)["sign"]) == (3, "violated", "negative")
 
@@ -165,14 +167,14 @@ def test_the_paper_semantics_knows_signs_only(tmp_path):
 def test_events_come_in_the_order_of_time(tmp_path, semantics):
     text = "spec last = F G battery >= 0\nspec high = F battery >= 3\nspec kept = G battery >= -4"
     charges = [1.0, *[-1.0] * 4, *[2.0] * 4, *[-2.0] * 4, *[3.0] * 4, *[-5.0] * 3]
-    numbers = [number for number, *_ in told(tmp_path, text, *charges, semantics=semantics)]
+    numbers = [number for number, *_ in events_of(tmp_path, text, *charges, semantics=semantics)]
     assert len(numbers) >= 5
     assert all(first <= second for first, second in pairwise(numbers))
 
 
 def test_what_is_pending_is_decided_by_the_end(tmp_path):
     charges = [-3.0, -1.0, -2.0, -5.0]
-    [(number, event, line)] = told_at_end(tmp_path, "spec full = F battery >= 0", *charges)
+    [(number, event, line)] = events_at_end(tmp_path, "spec full = F battery >= 0", *charges)
     assert number == 3
     assert event.start_time == event.end_time == line.timestamp
     assert line.timestamp.ToNanoseconds() == 10**9 + 3 * STEP_NS
@@ -201,7 +203,7 @@ def test_what_is_pending_is_decided_by_the_end(tmp_path):
 
 def test_what_no_sample_could_change_is_not_repeated_at_the_end(tmp_path):
     text = "spec full = F battery >= 5\nspec kept = G battery >= 0\nspec both = full or kept"
-    assert [line.message for *_, line in told_at_end(tmp_path, text, 1.0, 6.0, 2.0)] == [
+    assert [line.message for *_, line in events_at_end(tmp_path, text, 1.0, 6.0, 2.0)] == [
         "`kept` in `both` is satisfied, for the log has ended: `battery >= 0` holds by 1. "
         "Before, it held for 0.200 s; its worst was that `battery >= 0` held by 1."
     ]
@@ -209,21 +211,21 @@ def test_what_no_sample_could_change_is_not_repeated_at_the_end(tmp_path):
 
 def test_the_end_finds_the_witness_in_whichever_part_decides(tmp_path):
     text = "spec both = not F battery >= 5 and (G battery >= -4 or F (battery <= -8 and F battery >= 9))"
-    [(_, event, _)] = told_at_end(tmp_path, text, 1.0, 3.0, -2.0, 4.0, 0.0)
+    [(_, event, _)] = events_at_end(tmp_path, text, 1.0, 3.0, -2.0, 4.0, 0.0)
     assert facts(event)["robustness"] == "1.0"
     assert facts(event)["witness"] == "`battery >= 5` fails by 1"
 
 
-def test_without_a_witness_the_end_tells_the_number(tmp_path):
+def test_without_a_witness_the_end_reports_the_number(tmp_path):
     # the first sample decides; that it does is known from the second one on
     text = "spec later = F (battery <= 2 and F battery >= 8)"
-    [(_, event, line)] = told_at_end(tmp_path, text, 3.0, 9.0, 9.0)
+    [(_, event, line)] = events_at_end(tmp_path, text, 3.0, 9.0, 9.0)
     assert "witness" not in facts(event)
     assert line.message.startswith("`later` is violated by 1, for the log has ended. Before, ")
 
 
 def test_what_stays_unknown_is_said_at_the_end(tmp_path):
-    [(number, event, line)] = told_at_end(tmp_path, "spec kept = G battery >= 0", 1.0, None, 2.0)
+    [(number, event, line)] = events_at_end(tmp_path, "spec kept = G battery >= 0", 1.0, None, 2.0)
     assert number == 2
     assert facts(event)["verdict"] == "unknown"
     assert not {"sign", "robustness", "witness"} & set(facts(event))
@@ -232,14 +234,14 @@ def test_what_stays_unknown_is_said_at_the_end(tmp_path):
 
 
 def test_a_run_of_one_sample_has_nothing_before_its_end(tmp_path):
-    [(_, event, line)] = told_at_end(tmp_path, "spec full = F battery >= 0", -1.0)
+    [(_, event, line)] = events_at_end(tmp_path, "spec full = F battery >= 0", -1.0)
     assert not any(key.endswith("_before") for key in facts(event))
     assert line.message == "`full` is violated, for the log has ended: `battery >= 0` fails by 1."
 
 
-def test_under_the_paper_semantics_the_end_tells_every_verdict(tmp_path):
+def test_under_the_paper_semantics_the_end_reports_every_verdict(tmp_path):
     text = "spec kept = G battery >= 0\nspec full = F battery >= 3"
-    found = told_at_end(tmp_path, text, 2.0, -1.0, 1.0, semantics="paper")
+    found = events_at_end(tmp_path, text, 2.0, -1.0, 1.0, semantics="paper")
     assert [facts(event)["verdict"] for _, event, _ in found] == ["violated", "violated"]
     assert [facts(event)["witness"] for _, event, _ in found] == [
         "`battery >= 0` fails by 1",
@@ -249,7 +251,7 @@ def test_under_the_paper_semantics_the_end_tells_every_verdict(tmp_path):
 
 def test_the_end_of_a_window_is_an_end(tmp_path):
     window = Window(end_ns=10**9 + 3 * STEP_NS)
-    [(number, *_)] = told_at_end(tmp_path, "spec full = F battery >= 5", *range(6), window=window)
+    [(number, *_)] = events_at_end(tmp_path, "spec full = F battery >= 5", *range(6), window=window)
     assert number == 2
 
 

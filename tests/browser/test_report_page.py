@@ -142,7 +142,7 @@ def test_the_run_is_first_shown_where_it_went_wrong(open_page: Open) -> None:
     expect(readout(open_page("satisfied"))).to_have_text("9.967 s / 9.967 s")
 
 
-def test_when_the_run_has_ended_the_tree_tells_verdicts(open_page: Open) -> None:
+def test_when_the_run_has_ended_the_tree_shows_verdicts(open_page: Open) -> None:
     page = open_page("violated")
     page.keyboard.press("End")
     expect(readout(page)).to_have_text("9.967 s / 9.967 s")

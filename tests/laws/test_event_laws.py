@@ -127,7 +127,7 @@ def test_how_a_run_is_cut_changes_no_event(
 
 @settings(max_examples=60)
 @given(specifications(), recordings(max_size=12), st.sampled_from(["ltlf", "paper"]))
-def test_what_is_told_last_of_a_result_is_its_verdict(
+def test_the_last_event_of_a_result_is_its_verdict(
     spec: Specification, recording: Recording, semantics: Semantics
 ) -> None:
     with contextlib.suppress(UsageError):

@@ -88,5 +88,5 @@ def test_nodes_are_read_one_by_one_or_as_numbers():
     assert spec.node(1) == spec.nodes[1]
     with pytest.raises(ValueError, match="read-only"):
         spec.numbers[0, 0] = 1
-    with pytest.raises(UsageError, match="3 is no sample"):
+    with pytest.raises(UsageError, match="3 is not a sample"):
         monitor.update(3)

@@ -229,7 +229,7 @@ def test_wrong_types_of_arguments_are_refused():
     with pytest.raises(UsageError, match="settings is 'x'; give Settings"):
         planner("F (cup enclosedin plate)", "x")
     one = planner("F (cup enclosedin plate)")
-    with pytest.raises(UsageError, match="None is no sample; give a Sample"):
+    with pytest.raises(UsageError, match="None is not a sample; give a Sample"):
         one.observe(None)
     one.observe(sr.Sample(0, THINGS))
     one.next_step()

@@ -343,7 +343,7 @@ def test_of_a_large_tree_the_uppermost_nodes_are_shown(tmp_path: Path) -> None:
     assert "the uppermost 400 are shown" in page.within("header#")
 
 
-def test_what_a_log_says_of_its_samples_is_told(tmp_path: Path) -> None:
+def test_remarks_on_the_samples_are_shown(tmp_path: Path) -> None:
     log = tmp_path / "run.jsonl"
     square = '{"name": "%s", "polygon": [[0, 0], [1, 0], [%s, 1]]}'
     rows = [
@@ -357,7 +357,7 @@ def test_what_a_log_says_of_its_samples_is_told(tmp_path: Path) -> None:
     )
 
 
-def test_a_template_that_stands_for_nobody_says_so(tmp_path: Path) -> None:
+def test_a_template_without_instances_is_listed(tmp_path: Path) -> None:
     car = sr.TrackedObject(sr.Footprint.disc(0, 0, 1), class_name="car")
     samples = [sr.Sample(t, {} if t else {"a": car}) for t in range(4)]
     page = report_of_samples(

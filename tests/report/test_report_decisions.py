@@ -1,4 +1,4 @@
-"""Decisions on a report's page, whatever a log tells of them."""
+"""Decisions on the page of a report, also from incomplete logs."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def decision(time_ns: int, *maps: PlanMap, target: PlanTarget | None = None) -> 
     )
 
 
-def value_of(told: PlanDecision, *grids: Grid) -> dict:
+def value_of(reported: PlanDecision, *grids: Grid) -> dict:
     maker = DecisionCollector()
-    maker.add_decision(told.SerializeToString())
+    maker.add_decision(reported.SerializeToString())
     for number, each in enumerate(grids):
         maker.add_map(number, each.SerializeToString())
     value = decisions_value(maker.decisions, 0, Packing())
@@ -51,27 +51,27 @@ def value_of(told: PlanDecision, *grids: Grid) -> dict:
     return dict(value)
 
 
-def test_what_was_tried_in_vain_is_told() -> None:
-    (told,) = value_of(decision(10**9, PlanMap(number=0)), grid(10**9))["decisions"]
-    assert (told["time"], told["kind"], told["target"]) == (1.0, "no path", None)
-    (edge,) = told["edges"]
+def test_failed_attempts_are_listed() -> None:
+    (reported,) = value_of(decision(10**9, PlanMap(number=0)), grid(10**9))["decisions"]
+    assert (reported["time"], reported["kind"], reported["target"]) == (1.0, "no path", None)
+    (edge,) = reported["edges"]
     assert (edge["path"], edge["aim"], edge["pruned"]) == ([0, 1], False, "no object can do it")
     assert edge["candidates"][0]["best"] == "nowhere free"
-    assert [(each["title"], each["edge"], each["candidate"]) for each in told["maps"]] == [("cup", 0, 0)]
+    assert [(each["title"], each["edge"], each["candidate"]) for each in reported["maps"]] == [("cup", 0, 0)]
 
 
 def test_maps_of_several_orientations_say_which() -> None:
     maps = [PlanMap(number=0, turn=0.0), PlanMap(number=1, turn=math.pi / 2)]
-    (told,) = value_of(decision(0, *maps), grid(), grid())["decisions"]
-    assert [each["title"] for each in told["maps"]] == ["cup, turned by 0°", "cup, turned by 90°"]
+    (reported,) = value_of(decision(0, *maps), grid(), grid())["decisions"]
+    assert [each["title"] for each in reported["maps"]] == ["cup, turned by 0°", "cup, turned by 90°"]
 
 
-def test_maps_that_nobody_names_are_those_of_the_decisions_time() -> None:
-    (told,) = value_of(decision(5), grid(4), grid(5))["decisions"]
-    assert [(each["title"], each["edge"]) for each in told["maps"]] == [("", None)]
+def test_maps_without_a_decision_belong_to_the_one_of_their_time() -> None:
+    (reported,) = value_of(decision(5), grid(4), grid(5))["decisions"]
+    assert [(each["title"], each["edge"]) for each in reported["maps"]] == [("", None)]
 
 
-def test_what_cannot_be_read_tells_nothing() -> None:
+def test_an_unreadable_decision_is_left_out() -> None:
     maker = DecisionCollector()
     maker.add_decision(b"\xff\xff")
     maker.add_map(0, b"\xff\xff")
@@ -91,11 +91,11 @@ def test_a_map_whose_sizes_do_not_fit_is_not_drawn() -> None:
     assert value["maps_left_out"] == 0
 
 
-def test_a_target_that_is_nowhere_is_told_and_not_drawn() -> None:
+def test_a_target_without_a_place_is_listed_and_not_drawn() -> None:
     target = PlanTarget(object="cup", x=math.nan, y=0.0, turn=0.0, waypoints=[math.inf, 0.0], robustness=1.0)
-    (told,) = value_of(decision(0, target=target))["decisions"]
-    assert told["target"]["words"] == "(nan, 0)"
-    assert (told["target"]["at"], told["target"]["way"]) == (None, [])
+    (reported,) = value_of(decision(0, target=target))["decisions"]
+    assert reported["target"]["words"] == "(nan, 0)"
+    assert (reported["target"]["at"], reported["target"]["way"]) == (None, [])
 
 
 def test_no_more_cells_are_kept_than_there_is_room_for() -> None:
@@ -127,12 +127,12 @@ def several(time_ns: int, first: int, chosen: int) -> PlanDecision:
 @pytest.mark.parametrize(("most_cells", "shown"), [(36, 6), (24, 4), (18, 3), (12, 2), (11, 1), (5, 0)])
 def test_where_room_is_short_the_maps_of_what_was_chosen_stay(most_cells: int, shown: int) -> None:
     maker = DecisionCollector()
-    for told in (several(0, 0, 1), several(10**9, 3, 2)):
-        maker.add_decision(told.SerializeToString())
+    for reported in (several(0, 0, 1), several(10**9, 3, 2)):
+        maker.add_decision(reported.SerializeToString())
     for number in range(6):
         maker.add_map(number, grid().SerializeToString())
     value = decisions_value(maker.decisions, 0, Packing(), most_cells)
-    kept = [[(each["title"], each["chosen"]) for each in told["maps"]] for told in value["decisions"]]
+    kept = [[(each["title"], each["chosen"]) for each in reported["maps"]] for reported in value["decisions"]]
     chosen = [[title for title, is_chosen in maps if is_chosen] for maps in kept]
     assert chosen == [["cup1"] if shown else [], ["cup2"] if shown > 1 else []]
     assert sum(map(len, kept)) == shown
@@ -141,7 +141,7 @@ def test_where_room_is_short_the_maps_of_what_was_chosen_stay(most_cells: int, s
 
 def test_the_only_map_of_a_decisions_time_is_the_chosen_one() -> None:
     target = PlanTarget(object="cup", robustness=1.0)
-    (told,) = value_of(decision(5, target=target), grid(5))["decisions"]
-    assert [each["chosen"] for each in told["maps"]] == [True]
-    (told,) = value_of(decision(5, target=target), grid(5), grid(5))["decisions"]
-    assert [each["chosen"] for each in told["maps"]] == [False, False]
+    (reported,) = value_of(decision(5, target=target), grid(5))["decisions"]
+    assert [each["chosen"] for each in reported["maps"]] == [True]
+    (reported,) = value_of(decision(5, target=target), grid(5), grid(5))["decisions"]
+    assert [each["chosen"] for each in reported["maps"]] == [False, False]
