@@ -67,24 +67,21 @@ __all__ = [
     "read_trace",
 ]
 
-_HOMES = {
-    "Automaton": "spatial_replay.automata.automaton",
-    "ConvexPart": "spatial_replay.geometry.footprint",
-    "Evaluation": "spatial_replay.monitor.evaluate",
-    "Footprint": "spatial_replay.geometry.footprint",
-    "Monitor": "spatial_replay.monitor.monitor",
-    "Planner": "spatial_replay.planning.planner",
-    "Recorder": "spatial_replay.recording.recorder",
-    "Sample": "spatial_replay.trace.sample",
-    "Specification": "spatial_replay.spec.formula",
-    "Trace": "spatial_replay.trace.trace",
-    "TrackedObject": "spatial_replay.geometry.footprint",
-    "Verdict": "spatial_replay.monitor.verdict",
-    "automaton": "spatial_replay.automata.compile",
-    "evaluate": "spatial_replay.monitor.evaluate",
-    "load_specification": "spatial_replay.spec.load",
-    "parse_specification": "spatial_replay.spec.load",
-    "read_trace": "spatial_replay.sources.open_log",
-}
-
-__getattr__, __dir__ = loaded_when_used(globals(), _HOMES)
+__getattr__, __dir__ = loaded_when_used(
+    globals(),
+    {
+        "automata.automaton": ("Automaton",),
+        "automata.compile": ("automaton",),
+        "geometry.footprint": ("ConvexPart", "Footprint", "TrackedObject"),
+        "monitor.evaluate": ("Evaluation", "evaluate"),
+        "monitor.monitor": ("Monitor",),
+        "monitor.verdict": ("Verdict",),
+        "planning.planner": ("Planner",),
+        "recording.recorder": ("Recorder",),
+        "sources.open_log": ("read_trace",),
+        "spec.formula": ("Specification",),
+        "spec.load": ("load_specification", "parse_specification"),
+        "trace.sample": ("Sample",),
+        "trace.trace": ("Trace",),
+    },
+)

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
 
 def loaded_when_used(
-    package: dict[str, Any], homes: Mapping[str, str]
+    package: dict[str, Any], names_by_module: Mapping[str, Sequence[str]]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return the `__getattr__` and `__dir__` of a package (PEP 562).
 
     Args:
         package: its `globals()`, where loaded names are stored.
-        homes: for each name, the module that defines it.
+        names_by_module: the names that each module defines; modules are relative to the package.
     """
+    home = package["__name__"]
+    modules = {name: f"{home}.{module}" for module, names in names_by_module.items() for name in names}
 
     def load(name: str) -> Any:
-        if name not in homes:
-            raise AttributeError(f"module {package['__name__']!r} has no attribute {name!r}")
-        package[name] = getattr(import_module(homes[name]), name)
+        if name not in modules:
+            raise AttributeError(f"module {home!r} has no attribute {name!r}")
+        package[name] = getattr(import_module(modules[name]), name)
         return package[name]
 
     def names() -> list[str]:

@@ -28,13 +28,12 @@ __all__ = [
     "words_text",
 ]
 
-_HOMES = {
-    **dict.fromkeys(("Compiler", "automaton_from", "chosen_spec", "stored_text"), "compile"),
-    **dict.fromkeys(("dot_text", "hoa_text", "svg_text", "words_text"), "dot_hoa"),
-    "Transition": "guards",
-    "TransitionTable": "automaton",
-}
-
 __getattr__, __dir__ = loaded_when_used(
-    globals(), {name: f"spatial_replay.automata.{home}" for name, home in _HOMES.items()}
+    globals(),
+    {
+        "automaton": ("TransitionTable",),
+        "compile": ("Compiler", "automaton_from", "chosen_spec", "stored_text"),
+        "dot_hoa": ("dot_text", "hoa_text", "svg_text", "words_text"),
+        "guards": ("Transition",),
+    },
 )

@@ -5,8 +5,6 @@ Names are loaded when they are first used.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from spatial_replay.lazy import loaded_when_used
@@ -19,14 +17,12 @@ if TYPE_CHECKING:
 
 __all__ = ["Decoder", "Message", "MessageReader", "Topic", "open_messages"]
 
-_HOMES: Mapping[str, str] = MappingProxyType(
+__getattr__, __dir__ = loaded_when_used(
+    globals(),
     {
-        "Decoder": "spatial_replay.bags.topic",
-        "Message": "spatial_replay.bags.columns",
-        "MessageReader": "spatial_replay.bags.reader",
-        "Topic": "spatial_replay.bags.topic",
-        "open_messages": "spatial_replay.bags.open",
-    }
+        "columns": ("Message",),
+        "open": ("open_messages",),
+        "reader": ("MessageReader",),
+        "topic": ("Decoder", "Topic"),
+    },
 )
-
-__getattr__, __dir__ = loaded_when_used(globals(), _HOMES)

@@ -5,8 +5,6 @@ Names are loaded when they are first used: a command that reads a track file nee
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from spatial_replay.lazy import loaded_when_used
@@ -36,22 +34,15 @@ __all__ = [
     "summarise_mcap",
 ]
 
-_HOMES: Mapping[str, str] = MappingProxyType(
+__getattr__, __dir__ = loaded_when_used(
+    globals(),
     {
-        "Attachment": "spatial_replay.logs.messages",
-        "Block": "spatial_replay.logs.messages",
-        "Channel": "spatial_replay.logs.messages",
-        "LogWriter": "spatial_replay.logs.mcap.writer",
-        "McapSource": "spatial_replay.logs.mcap.reader",
-        "MemorySink": "spatial_replay.logs.messages",
-        "MemorySource": "spatial_replay.logs.source",
-        "Messages": "spatial_replay.logs.messages",
-        "Schema": "spatial_replay.logs.messages",
-        "Source": "spatial_replay.logs.source",
-        "decode_objects": "spatial_replay.logs.objects.decode",
-        "encode_objects": "spatial_replay.logs.objects.encode",
-        "summarise_mcap": "spatial_replay.logs.mcap.summary",
-    }
+        "mcap.reader": ("McapSource",),
+        "mcap.summary": ("summarise_mcap",),
+        "mcap.writer": ("LogWriter",),
+        "messages": ("Attachment", "Block", "Channel", "MemorySink", "Messages", "Schema"),
+        "objects.decode": ("decode_objects",),
+        "objects.encode": ("encode_objects",),
+        "source": ("MemorySource", "Source"),
+    },
 )
-
-__getattr__, __dir__ = loaded_when_used(globals(), _HOMES)

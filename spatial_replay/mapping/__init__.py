@@ -5,8 +5,6 @@ Names are loaded when they are first used.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from spatial_replay.lazy import loaded_when_used
@@ -30,17 +28,14 @@ __all__ = [
     "suggest_topics",
 ]
 
-_HOMES: Mapping[str, str] = MappingProxyType(
+__getattr__, __dir__ = loaded_when_used(
+    globals(),
     {
-        "Assembler": "spatial_replay.mapping.assemble",
-        "LogMapping": "spatial_replay.mapping.model",
-        "MappedSource": "spatial_replay.mapping.mapped_source",
-        "ReadingPlan": "spatial_replay.mapping.reading_plan",
-        "load_mapping": "spatial_replay.mapping.mapping_file",
-        "parse_mapping": "spatial_replay.mapping.mapping_file",
-        "suggest_mapping": "spatial_replay.mapping.suggest",
-        "suggest_topics": "spatial_replay.mapping.suggest",
-    }
+        "assemble": ("Assembler",),
+        "mapped_source": ("MappedSource",),
+        "mapping_file": ("load_mapping", "parse_mapping"),
+        "model": ("LogMapping",),
+        "reading_plan": ("ReadingPlan",),
+        "suggest": ("suggest_mapping", "suggest_topics"),
+    },
 )
-
-__getattr__, __dir__ = loaded_when_used(globals(), _HOMES)

@@ -5,8 +5,6 @@ Nothing here depends on a robot or a simulator. Names are loaded when they are f
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from spatial_replay.lazy import loaded_when_used
@@ -59,36 +57,17 @@ __all__ = [
     "text_from_settings",
 ]
 
-_HOMES: Mapping[str, str] = MappingProxyType(
+__getattr__, __dir__ = loaded_when_used(
+    globals(),
     {
-        "FREE": "spatial_replay.planning.maps",
-        "MOST_MOTIONS": "spatial_replay.planning.planner",
-        "PLAN_METADATA": "spatial_replay.planning.decision_log",
-        "BlackBox": "spatial_replay.planning.decision_log",
-        "Candidate": "spatial_replay.planning.decisions",
-        "Executor": "spatial_replay.planning.decisions",
-        "GradientMap": "spatial_replay.planning.maps",
-        "Grid": "spatial_replay.planning.workspace",
-        "LoggedStep": "spatial_replay.planning.read",
-        "Outcome": "spatial_replay.planning.decisions",
-        "Planner": "spatial_replay.planning.planner",
-        "Reason": "spatial_replay.planning.decisions",
-        "Settings": "spatial_replay.planning.settings",
-        "Step": "spatial_replay.planning.decisions",
-        "Target": "spatial_replay.planning.decisions",
-        "Workspace": "spatial_replay.planning.workspace",
-        "centre_of": "spatial_replay.planning.maps",
-        "gradient_map": "spatial_replay.planning.maps",
-        "moved_object": "spatial_replay.planning.maps",
-        "planner_of": "spatial_replay.planning.read",
-        "proposition_maps": "spatial_replay.planning.maps",
-        "read_decisions": "spatial_replay.planning.read",
-        "read_steps": "spatial_replay.planning.read",
-        "recompute_decisions": "spatial_replay.planning.recompute",
-        "settings_from_text": "spatial_replay.planning.settings",
-        "shortest_path": "spatial_replay.planning.paths",
-        "text_from_settings": "spatial_replay.planning.settings",
-    }
+        "decision_log": ("PLAN_METADATA", "BlackBox"),
+        "decisions": ("Candidate", "Executor", "Outcome", "Reason", "Step", "Target"),
+        "maps": ("FREE", "GradientMap", "centre_of", "gradient_map", "moved_object", "proposition_maps"),
+        "paths": ("shortest_path",),
+        "planner": ("MOST_MOTIONS", "Planner"),
+        "read": ("LoggedStep", "planner_of", "read_decisions", "read_steps"),
+        "recompute": ("recompute_decisions",),
+        "settings": ("Settings", "settings_from_text", "text_from_settings"),
+        "workspace": ("Grid", "Workspace"),
+    },
 )
-
-__getattr__, __dir__ = loaded_when_used(globals(), _HOMES)

@@ -8,8 +8,6 @@ Names are loaded when they are first used.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from spatial_replay.lazy import loaded_when_used
@@ -46,28 +44,16 @@ __all__ = [
     "verify_certificate",
 ]
 
-_HOMES: Mapping[str, str] = MappingProxyType(
+__getattr__, __dir__ = loaded_when_used(
+    globals(),
     {
-        "QUANTITIES": "spatial_replay.replay.table",
-        "Explanation": "spatial_replay.replay.document",
-        "Playback": "spatial_replay.replay.playback",
-        "Replay": "spatial_replay.replay.engine",
-        "ReplayOptions": "spatial_replay.replay.selection",
-        "Replayed": "spatial_replay.replay.engine",
-        "Tuned": "spatial_replay.replay.tuning",
-        "Tuning": "spatial_replay.replay.tuning",
-        "Window": "spatial_replay.replay.selection",
-        "constant_text": "spatial_replay.replay.tuning",
-        "constant_values": "spatial_replay.replay.tuning",
-        "document_from_replay": "spatial_replay.replay.document",
-        "explain_results": "spatial_replay.replay.document",
-        "export_table": "spatial_replay.replay.table",
-        "first_sample_ns": "spatial_replay.replay.selection",
-        "has_samples_from": "spatial_replay.replay.selection",
-        "load_files": "spatial_replay.replay.annotated",
-        "run_replay": "spatial_replay.replay.annotated",
-        "verify_certificate": "spatial_replay.replay.verification",
-    }
+        "annotated": ("load_files", "run_replay"),
+        "document": ("Explanation", "document_from_replay", "explain_results"),
+        "engine": ("Replay", "Replayed"),
+        "playback": ("Playback",),
+        "selection": ("ReplayOptions", "Window", "first_sample_ns", "has_samples_from"),
+        "table": ("QUANTITIES", "export_table"),
+        "tuning": ("Tuned", "Tuning", "constant_text", "constant_values"),
+        "verification": ("verify_certificate",),
+    },
 )
-
-__getattr__, __dir__ = loaded_when_used(globals(), _HOMES)

@@ -8,8 +8,6 @@ Names are loaded when they are first used.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from spatial_replay.lazy import loaded_when_used
@@ -19,8 +17,4 @@ if TYPE_CHECKING:
 
 __all__ = ["Serving", "open_server"]
 
-_HOMES: Mapping[str, str] = MappingProxyType(
-    {"Serving": "spatial_replay.serve.serving", "open_server": "spatial_replay.serve.serving"}
-)
-
-__getattr__, __dir__ = loaded_when_used(globals(), _HOMES)
+__getattr__, __dir__ = loaded_when_used(globals(), {"serving": ("Serving", "open_server")})

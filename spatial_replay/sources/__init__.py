@@ -5,8 +5,6 @@ Names are loaded when they are first used.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from spatial_replay.lazy import loaded_when_used
@@ -17,14 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["messages_in", "open_source", "overview_of", "read_trace", "survey"]
 
-_HOMES: Mapping[str, str] = MappingProxyType(
-    {
-        "messages_in": "spatial_replay.sources.overview",
-        "open_source": "spatial_replay.sources.open_log",
-        "overview_of": "spatial_replay.sources.overview",
-        "read_trace": "spatial_replay.sources.open_log",
-        "survey": "spatial_replay.sources.overview",
-    }
+__getattr__, __dir__ = loaded_when_used(
+    globals(),
+    {"open_log": ("open_source", "read_trace"), "overview": ("messages_in", "overview_of", "survey")},
 )
-
-__getattr__, __dir__ = loaded_when_used(globals(), _HOMES)

@@ -25,12 +25,11 @@ __all__ = [
     "signal_names",
 ]
 
-_HOMES = {
-    **dict.fromkeys(("check_names", "instantiate", "object_names", "signal_names"), "checks"),
-    **dict.fromkeys(("format_formula", "format_specification"), "format"),
-    **dict.fromkeys(("load_specification", "parse_specification"), "load"),
-}
-
 __getattr__, __dir__ = loaded_when_used(
-    globals(), {name: f"spatial_replay.spec.{home}" for name, home in _HOMES.items()}
+    globals(),
+    {
+        "checks": ("check_names", "instantiate", "object_names", "signal_names"),
+        "format": ("format_formula", "format_specification"),
+        "load": ("load_specification", "parse_specification"),
+    },
 )
