@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import cache
+from importlib.util import find_spec
 from threading import Timer
 from types import MappingProxyType
 from typing import NamedTuple
@@ -138,6 +139,10 @@ def compiled_by_mona(skeleton: Skeleton, propositions: int) -> Machine:
     executable = shutil.which("mona")
     if executable is None:
         raise NoAutomatonError("it is not installed, and may still compile it: apt-get install mona")
+    if find_spec("ltlf2dfa") is None:
+        raise NoAutomatonError(
+            "what writes its programs is not installed: pip install 'spatial-replay[mona]'"
+        )
     program = mona_program(skeleton)
     if len(program) > _MAX_PROGRAM:
         raise NoAutomatonError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import stat
+import sys
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -83,6 +84,13 @@ def test_mona_takes_over_where_this_package_reaches_its_limits(
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(NoAutomatonError, match=r"more than 5000 states; MONA: .*apt-get install mona"):
         automaton(specification)
+
+
+@needs_mona
+def test_without_the_translator_the_error_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ltlf2dfa", None)
+    with pytest.raises(NoAutomatonError, match=r"pip install 'spatial-replay\[mona\]'"):
+        sr.automaton(sr.parse_specification("F a ovlp b"), compiler="mona")
 
 
 def _program(folder: Path, name: str, script: str) -> None:
