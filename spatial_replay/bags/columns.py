@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple, TypeAlias
@@ -57,6 +57,8 @@ class MessageColumns:
         log_time_ns, publish_time_ns, sequence: (M,) int64.
         payloads: M messages, each in its topic's encoding.
         place: (M,) int64, numbers that increase in the order in which the messages were recorded.
+        channel: (M,) int64, the numbers of their channels in `MessageReader.channels`: several publishers
+            of one topic have several channels.
     """
 
     topics: Sequence[str] = ()
@@ -65,6 +67,7 @@ class MessageColumns:
     sequence: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
     payloads: Sequence[bytes] = ()
     place: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
+    channel: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __len__(self) -> int:
         return len(self.topics)
@@ -78,6 +81,7 @@ class MessageColumns:
             self.sequence[begin:end],
             self.payloads[begin:end],
             self.place[begin:end],
+            self.channel[begin:end],
         )
 
     def take(self, places: Integers) -> MessageColumns:
@@ -90,7 +94,13 @@ class MessageColumns:
             self.sequence[places],
             [self.payloads[place] for place in listed],
             self.place[places],
+            self.channel[places],
         )
+
+    def of_topics(self, topics: Collection[str]) -> MessageColumns:
+        """Return the messages of some topics, in the same order."""
+        places = [place for place, topic in enumerate(self.topics) if topic in topics]
+        return self if len(places) == len(self) else self.take(np.array(places, np.int64))
 
     def ordered(self) -> MessageColumns:
         """Return the same messages by log time, topic and sequence; equal ones keep their order."""
@@ -132,6 +142,7 @@ def joined(several: Sequence[MessageColumns]) -> MessageColumns:
         np.concatenate([np.zeros(0, np.int64), *(each.sequence for each in several)]),
         [payload for each in several for payload in each.payloads],
         np.concatenate([np.zeros(0, np.int64), *(each.place for each in several)]),
+        np.concatenate([np.zeros(0, np.int64), *(each.channel for each in several)]),
     )
 
 
@@ -149,10 +160,15 @@ def one_by_one(columns: Columns) -> Iterator[Message]:
 
 
 def unnumbered(
-    topics: Sequence[str], times_ns: Integers, payloads: Sequence[bytes], place: Integers
+    topics: Sequence[str],
+    times_ns: Integers,
+    payloads: Sequence[bytes],
+    place: Integers,
+    channel: Integers,
 ) -> MessageColumns:
     """Return messages of a container with one time and no sequence."""
-    return MessageColumns(topics, times_ns, times_ns, np.zeros(len(times_ns), np.int64), payloads, place)
+    sequence = np.zeros(len(times_ns), np.int64)
+    return MessageColumns(topics, times_ns, times_ns, sequence, payloads, place, channel)
 
 
 def places_in(part: int, within: Integers) -> Integers:
@@ -240,8 +256,11 @@ DISORDER_NS = 10**9
 """How far messages may be out of order: recorders write topics from several threads."""
 
 
-def without_jumps(columns: Columns, name: str) -> Columns:
+def without_jumps(columns: Columns, name: str, checked: Collection[str]) -> Columns:
     """Yield the messages as they are, which are in the order of time.
+
+    Args:
+        checked: the topics to check; others are only copied, in any order.
 
     Raises:
         LogError: those of a topic were not recorded in that order: some of them come more than a second
@@ -251,6 +270,8 @@ def without_jumps(columns: Columns, name: str) -> Columns:
     topics = dict[str, _Recorded]()
     for each in columns:
         for topic, rows in _rows_by_topic(each.topics):
+            if topic not in checked:
+                continue
             recorded = topics.setdefault(topic, _Recorded())
             jump = recorded.first_jump(each.log_time_ns[rows], each.place[rows])
             if jump is not None:

@@ -12,10 +12,10 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.message_factory import GetMessageClass
 
-from spatial_replay.bags.ros_types import ros_decoder, ros_definitions
+from spatial_replay.bags.ros_types import ros_decoder, ros_definitions, standard_schema
 from spatial_replay.bags.topic import Decoder, Topic
 from spatial_replay.errors import LogError
-from spatial_replay.logs.messages import Schema
+from spatial_replay.logs.messages import Channel, Schema
 
 _MOST_FILES = 1_000
 """Files that one descriptor set may hold."""
@@ -148,6 +148,22 @@ def topics_by_name(described: Iterable[Topic], distribution: str | None = None) 
         topic if topic.unreadable else replace(topic, unreadable=why_unreadable(topic, distribution))
         for _, topic in sorted(named.items())
     )
+
+
+def channel_of(topic: Topic, distribution: str | None = None) -> Channel:
+    """Return the channel on which a copy of a log has the messages of a topic, as they are.
+
+    Args:
+        distribution: the release of ROS that the log names, for types that it does not define.
+    """
+    schema = topic.schema
+    if topic.encoding in ("ros1", "cdr") and (schema is None or not schema.data.strip()):
+        try:
+            schema = standard_schema(topic.type, topic.encoding, distribution)  # type: ignore[arg-type]
+        except LogError:
+            # without a definition, viewers at least show the type
+            schema = schema or Schema(topic.type, "", b"")
+    return Channel(topic.name, topic.encoding, schema, topic.metadata)
 
 
 def _joined(one: Topic, other: Topic) -> Topic:

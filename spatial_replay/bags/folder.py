@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property, partial
+from itertools import accumulate
 from pathlib import Path
 from typing import TypeAlias
 
@@ -21,6 +22,7 @@ from spatial_replay.bags.topic import Topic
 from spatial_replay.bags.unpacking import ZSTD_MAGIC, temporary_folder, unpack_file, unpacked
 from spatial_replay.errors import LogError, MissingFileError
 from spatial_replay.logs.mcap.chunks import MAGIC
+from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.trace.sample import LATEST_NS
 
@@ -164,8 +166,29 @@ class BagFolder(MessageReader):
         self._compare_types(topics)
         yield from self._counted(columns, topics, f"{self.name}/{METADATA_FILE}")
 
-    @staticmethod
+    def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
+        """See `MessageReader.channels`; those of its files, one file after the other."""
+        return {
+            first + number: channel
+            for first, file in zip(self._first_channels, self._files, strict=True)
+            for number, channel in file.channels(topics).items()
+        }
+
+    def attachments(self) -> tuple[Attachment, ...]:
+        """See `MessageReader.attachments`."""
+        return tuple(each for file in self._files for each in file.attachments())
+
+    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
+        """See `MessageReader.metadata`."""
+        return tuple(each for file in self._files for each in file.metadata())
+
+    @cached_property
+    def _first_channels(self) -> tuple[int, ...]:
+        """The number of the first channel of each file."""
+        return tuple(accumulate((file.channel_count for file in self._files[:-1]), initial=0))
+
     def _read(
+        self,
         number: int,
         file: _File,
         topics: Collection[str],
@@ -174,7 +197,11 @@ class BagFolder(MessageReader):
         as_recorded: bool,
     ) -> Columns:
         for each in file.iter_columns(topics, start_ns, end_ns, as_recorded=as_recorded):
-            yield replace(each, place=(np.int64(number) << 48) + each.place)
+            yield replace(
+                each,
+                place=(np.int64(number) << 48) + each.place,
+                channel=self._first_channels[number] + each.channel,
+            )
 
     def _opened_files(self) -> Iterable[_File]:
         """Return the files that were opened so far."""

@@ -7,7 +7,7 @@ of a chunk at a time rather than one object for each message.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import BinaryIO
@@ -20,10 +20,11 @@ from spatial_replay.bags.decoders import topics_by_name
 from spatial_replay.bags.reader import MessageReader
 from spatial_replay.bags.ros_definitions import full_type_name
 from spatial_replay.bags.topic import Topic, is_latched
+from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.chunks import ChunkPlace, DamageError, read_records, walk_records
-from spatial_replay.logs.mcap.index import Directory, read_directory
+from spatial_replay.logs.mcap.index import Directory, iter_attachments, iter_metadata, read_directory
 from spatial_replay.logs.mcap.reader import ChunkWalk
-from spatial_replay.logs.messages import Channel
+from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.trace.sample import LATEST_NS
 
@@ -111,6 +112,35 @@ class McapLog(MessageReader):
                     f"{self.name}: it declares {total} messages in all; {self._walked} could be read"
                 )
 
+    def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
+        """See `MessageReader.channels`; they are as the log declares them, whatever they lack."""
+        declared = self._contents[1]
+        return {
+            rank: declared[number]
+            for rank, number in enumerate(self._numbers.tolist())
+            if declared[number].topic in topics
+        }
+
+    def attachments(self) -> tuple[Attachment, ...]:
+        """See `MessageReader.attachments`."""
+        with self._path.open("rb") as stream:
+            return tuple(iter_attachments(stream, self._contents[0], FaultList(), self.name))
+
+    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
+        """See `MessageReader.metadata`."""
+        with self._path.open("rb") as stream:
+            return tuple(iter_metadata(stream, self._contents[0], FaultList(), self.name))
+
+    @property
+    def channel_count(self) -> int:
+        """The number of channels, of whatever topics."""
+        return len(self._numbers)
+
+    @cached_property
+    def _numbers(self) -> Integers:
+        """The numbers of the channels, in order."""
+        return np.array(sorted(self._contents[1]), np.int64)
+
     def _messages(
         self, stream: BinaryIO, rank: int, place: ChunkPlace, wanted: dict[int, str], first: int, last: int
     ) -> MessageColumns:
@@ -141,6 +171,7 @@ class McapLog(MessageReader):
             heads.sequence[rows].view(np.int64),
             [content[begin:end] for begin, end in bounds],
             places_in(rank, np.flatnonzero(rows)),
+            np.searchsorted(self._numbers, heads.channel[rows].astype(np.int64)),
         )
 
     def _fault(self, place: ChunkPlace, what: str) -> None:

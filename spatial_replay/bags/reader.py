@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
 from spatial_replay.bags.columns import Columns, Message, iter_counted, one_by_one
 from spatial_replay.bags.decoders import decoder_of
 from spatial_replay.bags.topic import Decoder, Topic
 from spatial_replay.errors import LogError
+from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList
 
 
@@ -55,6 +56,22 @@ class MessageReader(ABC):
         Args:
             as_recorded: in the order of recording instead, which may jump back in time.
         """
+
+    @abstractmethod
+    def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
+        """Return the channels of some topics by the numbers of `MessageColumns.channel`, which are dense.
+
+        A copy of a log declares them: their schema, encoding and metadata are those of the log. ROS types
+        without a definition in the log get that of the standard type, if there is one.
+        """
+
+    def attachments(self) -> tuple[Attachment, ...]:
+        """Return the files in the log; those that are damaged are left out."""
+        return ()
+
+    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
+        """Return the metadata records of the log, with their names; those that are damaged are left out."""
+        return ()
 
     @property
     def name(self) -> str:

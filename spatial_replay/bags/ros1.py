@@ -7,7 +7,7 @@ which interrupted recorders leave behind. Here only the damaged chunks are lost,
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from functools import cached_property
 from types import MappingProxyType
 from typing import BinaryIO
@@ -15,7 +15,7 @@ from typing import BinaryIO
 import numpy as np
 
 from spatial_replay.bags.columns import Columns, MessageColumns, in_order, places_in, unnumbered
-from spatial_replay.bags.decoders import topics_by_name
+from spatial_replay.bags.decoders import channel_of, topics_by_name
 from spatial_replay.bags.reader import MessageReader
 from spatial_replay.bags.ros1_index import (
     MESSAGE,
@@ -29,8 +29,9 @@ from spatial_replay.bags.ros1_index import (
 )
 from spatial_replay.bags.ros_definitions import full_type_name
 from spatial_replay.bags.topic import Topic
+from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.chunks import DamageError
-from spatial_replay.logs.messages import Schema
+from spatial_replay.logs.messages import Channel, Schema
 from spatial_replay.trace.sample import LATEST_NS
 
 
@@ -86,6 +87,19 @@ class Ros1Bag(MessageReader):
             else:
                 yield from self._counted(columns, topics)
 
+    def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
+        """See `MessageReader.channels`; each connection is a channel."""
+        return {
+            rank: channel_of(self._topic(self._directory.connections[number], 0))
+            for rank, number in enumerate(self._numbers.tolist())
+            if self._directory.connections[number].topic in topics
+        }
+
+    @cached_property
+    def _numbers(self) -> Integers:
+        """The numbers of the connections, in order."""
+        return np.array(sorted(self._directory.connections), np.int64)
+
     def _messages(
         self,
         stream: BinaryIO,
@@ -123,6 +137,7 @@ class Ros1Bag(MessageReader):
             table.time_ns[rows],
             [content[begin:end] for begin, end in bounds],
             places_in(rank, np.flatnonzero(rows)),
+            np.searchsorted(self._numbers, table.connection[rows]),
         )
 
     def _topic(self, connection: Connection, count: int) -> Topic:

@@ -20,14 +20,15 @@ from urllib.parse import quote
 import numpy as np
 
 from spatial_replay.bags.columns import Columns, MessageColumns, unnumbered
-from spatial_replay.bags.decoders import topics_by_name
+from spatial_replay.bags.decoders import channel_of, topics_by_name
 from spatial_replay.bags.metadata import BagMetadata, bag_metadata_from_text
 from spatial_replay.bags.reader import MessageReader
 from spatial_replay.bags.ros_definitions import LONGEST_TEXT, full_type_name
 from spatial_replay.bags.topic import Topic, is_latched
 from spatial_replay.bags.unpacking import copy_beginning, temporary_folder
 from spatial_replay.errors import LogError
-from spatial_replay.logs.messages import Schema
+from spatial_replay.geometry.arrays import Integers
+from spatial_replay.logs.messages import Channel, Schema
 from spatial_replay.trace.sample import LATEST_NS
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
@@ -99,6 +100,25 @@ class SqliteBag(MessageReader):
         columns = self._messages(topics, first, last, "id" if as_recorded else "timestamp, id")
         yield from columns if (first, last) != (0, LATEST_NS) else self._counted(columns, topics)
 
+    def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
+        """See `MessageReader.channels`."""
+        described = self._tables.topics
+        return {
+            rank: channel_of(described[number], self._distribution)
+            for rank, number in enumerate(self._numbers.tolist())
+            if described[number].name in topics
+        }
+
+    @property
+    def channel_count(self) -> int:
+        """The number of channels, of whatever topics."""
+        return len(self._numbers)
+
+    @cached_property
+    def _numbers(self) -> Integers:
+        """The numbers of the topics, in order."""
+        return np.array(sorted(self._tables.topics), np.int64)
+
     def _messages(self, topics: Collection[str], first: int, last: int, order: str) -> Columns:
         wanted = {number: topic.name for number, topic in self._tables.topics.items() if topic.name in topics}
         query = (
@@ -122,7 +142,9 @@ class SqliteBag(MessageReader):
             self._faults.add(f"{self.name}: {len(rows) - len(good)} messages have no time or no content")
             return self._columns(good, wanted) if good else MessageColumns()
         topics = [wanted[number] for number in numbers]
-        return unnumbered(topics, np.array(times, np.int64), payloads, np.array(places, np.int64))
+        channel = np.searchsorted(self._numbers, np.array(numbers, np.int64))
+        place = np.array(places, np.int64)
+        return unnumbered(topics, np.array(times, np.int64), payloads, place, channel)
 
 
 @dataclass(frozen=True, slots=True)

@@ -277,7 +277,8 @@ def _columns(messages: Sequence[Message]) -> MessageColumns:
     log, publish, sequence = (
         np.array(each, np.int64) for each in (log_times_ns, publish_times_ns, sequences)
     )
-    return MessageColumns(topics, log, publish, sequence, payloads, np.arange(len(messages)))
+    place = np.arange(len(messages))
+    return MessageColumns(topics, log, publish, sequence, payloads, place, np.zeros(len(messages), np.int64))
 
 
 class _Stamped(NamedTuple):

@@ -6,7 +6,7 @@ The raw messages and their definitions go into copies of the log, so that viewer
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -17,8 +17,7 @@ import numpy as np
 from spatial_replay.bags.columns import Columns, MessageColumns, in_pieces, joined, without_jumps
 from spatial_replay.bags.open import open_messages
 from spatial_replay.bags.reader import MessageReader
-from spatial_replay.bags.ros_types import standard_schema
-from spatial_replay.bags.topic import Topic
+from spatial_replay.bags.topic import MAPPED, Topic, is_kept
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import Attachment, Block, Channel, Messages
@@ -39,13 +38,19 @@ _MOST_UNREAD = 20
 
 @dataclass(frozen=True)
 class MappedSource:
-    """An external log, with a mapping from its messages to objects."""
+    """An external log, with a mapping from its messages to objects.
+
+    Attributes:
+        keep: which messages its blocks hold for a copy, byte for byte: "mapped" for those of the topics that
+            the mapping reads, "all", or patterns of topics such as "/camera/*"; several add up.
+    """
 
     path: Path
     mapping: LogMapping
     kind: str
     concave: Concave = "decompose"
     on_time_jump: OnTimeJump = "error"
+    keep: tuple[str, ...] = (MAPPED,)
 
     @property
     def name(self) -> str:
@@ -60,7 +65,7 @@ class MappedSource:
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         """See `Source.iter_blocks`; of an indexed log, only what the window needs is read.
 
-        Blocks hold the messages of mapped topics, raw.
+        Blocks hold the messages that `keep` names, raw.
         """
         # no window if it covers everything: only a full read checks the counts that a log declares
         start_ns = start_ns or None
@@ -68,7 +73,10 @@ class MappedSource:
         reader = open_messages(self.path)
         topics = reader.topics()
         plan = self._plan(reader, topics)
-        read = [topic for topic in topics if topic.name in plan.topics]
+        mapped = frozenset(plan.topics)
+        kept = [topic.name for topic in topics if is_kept(topic.name, self.keep, mapped)]
+        copied = _CopiedMessages(reader.channels(kept), _WAITING_BYTES)
+        read = mapped | copied.topics
         assembler = Assembler(
             plan,
             reader.decoder,
@@ -78,14 +86,16 @@ class MappedSource:
             on_time_jump=self.on_time_jump,
             concave=self.concave,
         )
-        blocks = _Blocks(assembler, reader, _CopiedMessages(read, _WAITING_BYTES), start_ns, end_ns)
+        blocks = _Blocks(assembler, reader, copied, start_ns, end_ns)
         blocks.remarks.extend(_unread(self.name, topics, plan))
         as_recorded = self.on_time_jump == "split"
-        columns = _columns(reader, plan, start_ns, end_ns, as_recorded=as_recorded)
+        columns = _columns(reader, plan, read, start_ns, end_ns, as_recorded=as_recorded)
         if not as_recorded:
-            columns = without_jumps(columns, self.name)
+            columns = without_jumps(columns, self.name, mapped)
         for piece in in_pieces(columns):
-            yield from blocks.of(assembler.add(piece), piece)
+            # what is only copied neither makes samples nor moves their time
+            evaluated = piece if read == mapped else piece.of_topics(mapped)
+            yield from blocks.of(assembler.add(evaluated), piece)
             if assembler.is_finished:
                 break
         yield from blocks.of(assembler.finish(), MessageColumns(), last=True)
@@ -113,12 +123,12 @@ class MappedSource:
             raise
 
     def attachments(self) -> tuple[Attachment, ...]:
-        """See `Source.attachments`; external logs hold no specifications."""
-        return ()
+        """See `Source.attachments`."""
+        return open_messages(self.path).attachments()
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
         """See `Source.metadata`."""
-        return ()
+        return open_messages(self.path).metadata()
 
 
 class _Blocks:
@@ -167,25 +177,23 @@ class _Blocks:
 class _CopiedMessages:
     """Holds raw messages until the samples made of them are ready, and returns them in the order of time."""
 
-    def __init__(self, topics: Sequence[Topic], most_bytes: int) -> None:
-        channels = {
-            topic.name: _channel(topic)
-            for topic in topics
-            # the topics of our own names are written from the samples
-            if topic.name != OBJECTS and topic.name not in DERIVED
-        }
-        self._numbers = {topic: number for number, topic in enumerate(sorted(channels))}
-        self._channels = MappingProxyType({number: channels[name] for name, number in self._numbers.items()})
-        self._has_all = len(channels) == len(topics)
+    def __init__(self, channels: Mapping[int, Channel], most_bytes: int) -> None:
+        self._channels = MappingProxyType(
+            {
+                number: channel
+                for number, channel in channels.items()
+                # the topics of our own names are written from the samples
+                if channel.topic != OBJECTS and channel.topic not in DERIVED
+            }
+        )
+        self.topics = frozenset(channel.topic for channel in self._channels.values())
         self._most_bytes = most_bytes
         self._waiting: list[MessageColumns] = []
         self._waiting_bytes = 0
 
     def add(self, messages: MessageColumns) -> None:
-        """Add messages for a copy of the log."""
-        if not self._has_all:
-            copied = [place for place, topic in enumerate(messages.topics) if topic in self._numbers]
-            messages = messages.take(np.array(copied, np.int64))
+        """Add messages; those of topics that are not copied are left out."""
+        messages = messages.of_topics(self.topics)
         self._waiting.append(messages)
         self._waiting_bytes += sum(map(len, messages.payloads))
 
@@ -207,22 +215,12 @@ class _CopiedMessages:
         self._waiting_bytes = sum(map(len, rest.payloads))
         return Messages(
             channels=self._channels,
-            channel=np.fromiter(map(self._numbers.__getitem__, taken.topics), np.int64, len(taken)),
+            channel=taken.channel,
             sequence=taken.sequence,
             log_time_ns=taken.log_time_ns,
             publish_time_ns=taken.publish_time_ns,
             payloads=taken.payloads,
         )
-
-
-def _channel(topic: Topic) -> Channel:
-    schema = topic.schema
-    if topic.encoding in ("ros1", "cdr") and (schema is None or not schema.data.strip()):
-        try:
-            schema = standard_schema(topic.type, topic.encoding)  # type: ignore[arg-type]
-        except LogError:
-            schema = topic.schema
-    return Channel(topic.name, topic.encoding, schema, topic.metadata)
 
 
 def _unread(name: str, topics: Sequence[Topic], plan: ReadingPlan) -> list[str]:
@@ -239,17 +237,23 @@ def _unread(name: str, topics: Sequence[Topic], plan: ReadingPlan) -> list[str]:
 
 
 def _columns(
-    reader: MessageReader, plan: ReadingPlan, start_ns: int | None, end_ns: int | None, *, as_recorded: bool
+    reader: MessageReader,
+    plan: ReadingPlan,
+    topics: Collection[str],
+    start_ns: int | None,
+    end_ns: int | None,
+    *,
+    as_recorded: bool,
 ) -> Columns:
-    """Iterate over the messages that the samples of a window depend on."""
+    """Iterate over the messages of some topics that the samples of a window depend on, and those in it."""
     if not plan.by_log_time or (not start_ns and end_ns is None):
-        return reader.iter_columns(plan.topics, as_recorded=as_recorded)
+        return reader.iter_columns(topics, as_recorded=as_recorded)
     last = None if end_ns is None else end_ns + plan.margin_ns
     lookback = {topic: plan.lookback_ns(topic) for topic in plan.topics}
     known = [each for each in lookback.values() if each is not None]
     first = max(0, (start_ns or 0) - max(known, default=0))
     lasting = [topic for topic, each in lookback.items() if each is None]
-    window = reader.iter_columns(plan.topics, first or None, last, as_recorded=as_recorded)
+    window = reader.iter_columns(topics, first or None, last, as_recorded=as_recorded)
     if not lasting or not first:
         return window
     return chain(reader.iter_columns(lasting, None, first, as_recorded=as_recorded), window)
