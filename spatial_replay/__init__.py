@@ -24,12 +24,19 @@ if TYPE_CHECKING:
     from spatial_replay.automata.automaton import Automaton
     from spatial_replay.automata.compile import automaton
     from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
+    from spatial_replay.monitor.causes import Cause, LeastPart
     from spatial_replay.monitor.evaluate import Evaluation, evaluate
-    from spatial_replay.monitor.monitor import Monitor
+    from spatial_replay.monitor.monitor import Monitor, NodeUpdate, SpecUpdate, Update
+    from spatial_replay.monitor.result import NodeResult, SpecResult
+    from spatial_replay.monitor.vacuity import Vacuous
     from spatial_replay.monitor.verdict import Verdict
+    from spatial_replay.monitor.witness.atom import DecidingAtom, Measured
+    from spatial_replay.monitor.witness.threshold import Threshold
+    from spatial_replay.monitor.witness.witness import Witness, WitnessStep
     from spatial_replay.planning.planner import Planner
     from spatial_replay.recording.recorder import Recorder
     from spatial_replay.sources.open_log import read_trace
+    from spatial_replay.spec.diagnostics import Diagnostic
     from spatial_replay.spec.formula import Specification
     from spatial_replay.spec.load import load_specification, parse_specification
     from spatial_replay.trace.sample import Sample
@@ -39,26 +46,40 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Automaton",
+    "Cause",
     "ConvexPart",
+    "DecidingAtom",
+    "Diagnostic",
     "Evaluation",
     "Footprint",
     "GeometryError",
+    "LeastPart",
     "LogError",
+    "Measured",
     "MissingFileError",
     "Monitor",
     "NoAutomatonError",
+    "NodeResult",
+    "NodeUpdate",
     "OutputError",
     "Planner",
     "Recorder",
     "Sample",
     "SpatialReplayError",
+    "SpecResult",
+    "SpecUpdate",
     "Specification",
     "SpecificationError",
+    "Threshold",
     "Trace",
     "TraceError",
     "TrackedObject",
+    "Update",
     "UsageError",
+    "Vacuous",
     "Verdict",
+    "Witness",
+    "WitnessStep",
     "__version__",
     "automaton",
     "evaluate",
@@ -73,12 +94,19 @@ __getattr__, __dir__ = loaded_when_used(
         "automata.automaton": ("Automaton",),
         "automata.compile": ("automaton",),
         "geometry.footprint": ("ConvexPart", "Footprint", "TrackedObject"),
+        "monitor.causes": ("Cause", "LeastPart"),
         "monitor.evaluate": ("Evaluation", "evaluate"),
-        "monitor.monitor": ("Monitor",),
+        "monitor.monitor": ("Monitor", "NodeUpdate", "SpecUpdate", "Update"),
+        "monitor.result": ("NodeResult", "SpecResult"),
+        "monitor.vacuity": ("Vacuous",),
         "monitor.verdict": ("Verdict",),
+        "monitor.witness.atom": ("DecidingAtom", "Measured"),
+        "monitor.witness.threshold": ("Threshold",),
+        "monitor.witness.witness": ("Witness", "WitnessStep"),
         "planning.planner": ("Planner",),
         "recording.recorder": ("Recorder",),
         "sources.open_log": ("read_trace",),
+        "spec.diagnostics": ("Diagnostic",),
         "spec.formula": ("Specification",),
         "spec.load": ("load_specification", "parse_specification"),
         "trace.sample": ("Sample",),

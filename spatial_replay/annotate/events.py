@@ -18,7 +18,6 @@ from spatial_replay.annotate.deciding_leaf import (
     find_leaf,
     leaves_below,
 )
-from spatial_replay.annotate.sentences import number_text
 from spatial_replay.annotate.specification import ReportedTree
 from spatial_replay.annotate.verdict_changes import (
     FAILING,
@@ -40,6 +39,7 @@ from spatial_replay.monitor.online.operators import looks_ahead
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, final_verdict
+from spatial_replay.monitor.witness.sentences import number_text
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, Specification, iter_nodes
 from spatial_replay.spec.relations import RELATION_NAMES

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from reprlib import repr as shortened
 
-from spatial_replay.errors import UsageError
+from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.lazy import Displayed
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.result import NodeResult, SpecResult, no_such_node
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
 from spatial_replay.monitor.stream import EvaluationStream
+from spatial_replay.monitor.vacuity import Vacuous, no_instances
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.monitor.witness.path import Evidence
 from spatial_replay.monitor.witness.witness import Witness
@@ -43,11 +44,25 @@ class Evaluation(Displayed):
     def remarks(self) -> tuple[Diagnostic, ...]:
         """Diagnostics about the specification's names in this trace (see `check_names`).
 
-        An error for each object and signal that the trace never has, and which is therefore unknown in every
-        sample; a warning for each object hidden by a definition of the same name.
+        A warning for each object and signal that the trace never has, and which is therefore unknown in every
+        sample, and for each object hidden by a definition of the same name.
         """
         # computed on demand: it takes as long as the evaluation itself
-        return check_names(self.specification, self.objects, self.signals)
+        found = check_names(self.specification, self.objects, self.signals)
+        return tuple(replace(remark, severity="warning") for remark in found)
+
+    @cached_property
+    def vacuous(self) -> tuple[Vacuous, ...]:
+        """The templates without instances: no object fits them, so they decided nothing.
+
+        What decided nothing within a result is in its own `vacuous`.
+        """
+        evaluated = {result.name for result in self.results}
+        return tuple(
+            no_instances(spec.name, spec.parameter)
+            for spec in self.specification.results
+            if spec.parameter is not None and spec.name not in evaluated
+        )
 
     @property
     def verdict(self) -> Verdict:
@@ -126,6 +141,7 @@ def evaluate(
     start_ns: int | None = None,
     end_ns: int | None = None,
     each: Mapping[str, str] | None = None,
+    strict_names: bool = False,
 ) -> Evaluation:
     """Evaluate every result spec of a specification on every prefix of a trace.
 
@@ -137,8 +153,11 @@ def evaluate(
         start_ns, end_ns: evaluate the samples from start to before end; terms that look back (`a[-3]`) may
             look before the start.
         each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
+        strict_names: objects and signals that the trace never has are errors; otherwise they are unknown, and
+            `Evaluation.remarks` warns of them.
 
     Raises:
+        SpecificationError: with `strict_names`, names that the trace never has.
         UsageError: no sample in the window, a template without its objects, unknown semantics, an
             operator without a meaning, an argument of another type.
     """
@@ -151,6 +170,8 @@ def evaluate(
     begin, end = window_of(trace.times_ns, *window)
     if begin >= end:
         raise UsageError(_nothing_in_window(trace, start_ns, end_ns))
+    if strict_names:
+        _require_names(specification, trace)
     stream = EvaluationStream(
         find_instances(specification, each or {}, [trace], *window),
         specification.regions,
@@ -167,6 +188,13 @@ def _require_trace(value: object) -> None:
     if not isinstance(value, Trace):
         remedy = "give a Trace, from read_trace(path) or Trace.from_samples(samples)"
         raise UsageError(f"trace is {shortened(value)}; {remedy}")
+
+
+def _require_names(specification: Specification, trace: Trace) -> None:
+    remarks = check_names(specification, trace.names, tuple(trace.signals), where="trace")
+    missing = [remark for remark in remarks if remark.severity == "error"]
+    if missing:
+        raise SpecificationError(missing)
 
 
 def _nothing_in_window(trace: Trace, start_ns: int | None, end_ns: int | None) -> str:

@@ -11,9 +11,11 @@ import numpy as np
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
 from spatial_replay.lazy import Displayed
+from spatial_replay.monitor.causes import Cause, LeastPart, conjuncts_of, find_causes, find_least
 from spatial_replay.monitor.offline import full_signal, window_signal
 from spatial_replay.monitor.semantics import Semantics, require_ltlf
-from spatial_replay.monitor.stream import InstanceStream, SeriesBlock
+from spatial_replay.monitor.stream import NEVER, InstanceStream, SeriesBlock
+from spatial_replay.monitor.vacuity import Vacuous, find_vacuous
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.monitor.witness.path import Evidence
 from spatial_replay.monitor.witness.witness import Witness, find_witness
@@ -67,6 +69,7 @@ class SpecResult(Displayed):
         values: (N,), each node's value on the whole log.
         final: (N, 2), lower and upper end of each node for the finished log.
         first_satisfied_ns: the first sample with a value of at least 0, even if that is lost later, or None.
+        settled_ns: (N, 2), see `InstanceStream`.
         times_ns: (T,) int64, the samples evaluated; empty if nothing was stored of each sample.
         series: (N, 4, T): value, now, lower, upper of each node (see `NodeResult`); T = 0 if not stored.
         leaves: (C, A, T), the instance's leaves, from which the methods compute; None if not stored.
@@ -80,6 +83,7 @@ class SpecResult(Displayed):
     values: Floats
     final: Floats
     first_satisfied_ns: int | None
+    settled_ns: Integers
     times_ns: Integers
     series: Floats
     has_series: bool
@@ -115,6 +119,7 @@ class SpecResult(Displayed):
             read_only_floats(stream.robustness),
             read_only_floats(stream.final),
             stream.first_satisfied_ns,
+            read_only_integers(stream.settled_ns),
             read_only_integers(block.times_ns if block is not None else []),
             read_only_floats(block.series if block is not None and has_series else no_series),
             has_series,
@@ -176,6 +181,50 @@ class SpecResult(Displayed):
         return final_verdict(self.lower, self.upper)
 
     @property
+    def satisfied_at_ns(self) -> int | None:
+        """When it became certain that it is satisfied, whatever came after; None if only the end decided."""
+        at = int(self.settled_ns[0, 0])
+        return at if at != NEVER and self.verdict is Verdict.SATISFIED else None
+
+    @property
+    def violated_at_ns(self) -> int | None:
+        """When it became certain that it is violated, whatever came after; None if only the end decided."""
+        at = int(self.settled_ns[0, 1])
+        return at if at != NEVER and self.verdict is Verdict.VIOLATED else None
+
+    @cached_property
+    def causes(self) -> tuple[Cause, ...]:
+        """Why it is violated or unknown, one cause for each named spec that fails in it; else none.
+
+        Those that settled it come first, by time; then those that only the end of the log decided, the least
+        robustness first; then unknown ones.
+        """
+        if self.verdict is Verdict.SATISFIED:
+            return ()
+        conjuncts = conjuncts_of(self.formula, self.name)
+        return find_causes(conjuncts, self.values, self.final, self.settled_ns, self._cause_witness)
+
+    @cached_property
+    def least(self) -> LeastPart | None:
+        """The part with the least robustness, if that is another than the first cause."""
+        if not self.causes:
+            return None
+        return find_least(conjuncts_of(self.formula, self.name), self.values, self.final, self.causes[0])
+
+    @cached_property
+    def vacuous(self) -> tuple[Vacuous, ...]:
+        """The parts that decided nothing, by node; none under the paper's semantics.
+
+        Where the leaves were not stored, the log is read again.
+        """
+        if self.semantics != "ltlf":
+            return ()
+        if self.leaves is not None:
+            return find_vacuous(self.evidence, self.leaves, self.times_ns)
+        leaves = self.evidence.columns(self.evidence.instance.program.leaves)
+        return find_vacuous(self.evidence, leaves, self.evidence.times_ns())
+
+    @property
     def can_explain(self) -> bool:
         """Whether it has a witness: the leaves are stored, and the semantics is "ltlf"."""
         return self.leaves is not None and self.semantics == "ltlf"
@@ -212,6 +261,15 @@ class SpecResult(Displayed):
         if not 0 <= identifier < len(self.final):
             raise UsageError(f"no node has the id {identifier}; they go from 0 to {len(self.final) - 1}")
         return find_witness(self.evidence, leaves, self.times_ns, identifier)
+
+    def _cause_witness(self, node: int, settled_ns: int | None) -> Witness | None:
+        if self.leaves is None or not self.can_explain:
+            return None
+        if settled_ns is None:
+            return self.witness(node)
+        count = int(np.searchsorted(self.times_ns, settled_ns, side="right"))
+        leaves, times_ns = self.leaves[:, :, :count], self.times_ns[:count]
+        return find_witness(self.evidence, leaves, times_ns, node, goes_on=True)
 
     def _leaves(self, what: str) -> Floats:
         require_ltlf(self.semantics, what)

@@ -27,6 +27,9 @@ from spatial_replay.spec.formula import Outline, Specification
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace, window_of
 
+NEVER = -1
+"""In place of a time: no sample settled it."""
+
 
 @dataclass(frozen=True, eq=False)
 class SeriesBlock:
@@ -66,6 +69,8 @@ class InstanceStream:
     Attributes:
         semantics: which of them evaluates it.
         first_satisfied_ns: the first sample with a value of at least 0 at the root, or None.
+        settled_ns: (N, 2): when each node's satisfaction and its violation became certain, whatever comes;
+            `NEVER` where only the end of the log decides, and under the paper's semantics.
         robustness: (N,): each node's value on the samples so far.
     """
 
@@ -75,6 +80,7 @@ class InstanceStream:
         self.semantics: Semantics = semantics
         self.first_satisfied_ns: int | None = None
         self.robustness = np.full(len(instance.program.reports), np.nan)
+        self.settled_ns = np.full((len(instance.program.reports), 2), NEVER, np.int64)
         self._evaluator = Evaluator(instance.formula, instance.program, semantics)
         self._run = self._evaluator.begin()
 
@@ -108,10 +114,19 @@ class InstanceStream:
         leaves = self._evaluator.leaves_within_log(leaves, positions, times, first_ns)
         series = self._run.extend(leaves, times)
         self.robustness = series[:, 0, -1].copy()
+        if self._evaluator.has_open_end:
+            self._settle(times, series)
         if self.first_satisfied_ns is None:
             satisfied = np.flatnonzero(series[0, 0] >= 0.0)
             self.first_satisfied_ns = int(times[satisfied[0]]) if len(satisfied) else None
         return SeriesBlock(times, series, leaves)
+
+    def _settle(self, times_ns: Integers, series: Floats) -> None:
+        """Take the time of the first sample at which each node became certain."""
+        for column, settled in enumerate((series[:, 2] >= 0.0, series[:, 3] < 0.0)):
+            # what is certain stays so: only the newest sample needs to be looked at
+            nodes = np.flatnonzero(settled[:, -1] & (self.settled_ns[:, column] == NEVER))
+            self.settled_ns[nodes, column] = times_ns[settled[nodes].argmax(axis=1)]
 
 
 class EvaluationStream:

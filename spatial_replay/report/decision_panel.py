@@ -12,7 +12,6 @@ import numpy as np
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
 from google.protobuf.message import DecodeError
 
-from spatial_replay.annotate.sentences import number_text
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.logs.schemas.PlanDecision_pb2 import (
@@ -22,6 +21,7 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanGuard,
     PlanTarget,
 )
+from spatial_replay.monitor.witness.sentences import number_text
 from spatial_replay.planning.decision_log import decision_from_payload, latest_decisions
 from spatial_replay.planning.decisions import Reason
 from spatial_replay.report.compact import Packing, singles

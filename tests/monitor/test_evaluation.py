@@ -90,8 +90,8 @@ def test_names_missing_from_the_trace_are_reported(trace):
     evaluation = judged(text, trace)
     assert [(each.severity, each.line, each.message) for each in evaluation.remarks] == [
         ("warning", 1, "the log has an object 'b', which this definition hides"),
-        ("error", 2, "the log never has the object 'aa'"),
-        ("error", 2, "the log never has the signal 'q'"),
+        ("warning", 2, "the log never has the object 'aa'"),
+        ("warning", 2, "the log never has the signal 'q'"),
     ]
     assert "did you mean 'a'?" in evaluation.remarks[1].hint
     assert judged(TWO_SPECS, trace).remarks == ()

@@ -21,10 +21,13 @@ from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.offline import OfflineNodes
 from spatial_replay.monitor.online.codes import in_channels
+from spatial_replay.monitor.witness.unfinished import is_closed
 from spatial_replay.spec.formula import (
     Boolean,
     BooleanOperator,
+    Earlier,
     Formula,
+    Group,
     Outline,
     Temporal,
     Truth,
@@ -154,7 +157,7 @@ class DecidingPath:
 
 
 def deciding_path(
-    formula: Formula, done: OfflineNodes, times_ns: Integers, node: int, end: End
+    formula: Formula, done: OfflineNodes, times_ns: Integers, node: int, end: End, *, goes_on: bool = False
 ) -> DecidingPath:
     """Return the path to what decides a node at the first sample.
 
@@ -163,16 +166,18 @@ def deciding_path(
 
     Args:
         done: every node at every sample of `times_ns` (T,).
+        goes_on: whether samples may follow; `done` is then that of `evaluate_unfinished`.
     """
-    return _Walk(formula, done, times_ns).follow(node, 0, end)
+    return _Walk(formula, done, times_ns, goes_on=goes_on).follow(node, 0, end)
 
 
 class _Walk:
     """The tree of a formula with every node's numbers."""
 
-    def __init__(self, formula: Formula, done: OfflineNodes, times_ns: Integers) -> None:
+    def __init__(self, formula: Formula, done: OfflineNodes, times_ns: Integers, *, goes_on: bool) -> None:
         self._done = done
         self._times = times_ns
+        self._goes_on = goes_on
         self._nodes: list[Formula] = []
         self._operands: list[list[int]] = []
         for identifier, parent, node in iter_nodes(formula):
@@ -193,7 +198,8 @@ class _Walk:
                 ]
                 below = min(paths, key=lambda path: path.steps[-1].sample)
             case Temporal() as temporal:
-                taken = self._taken(temporal, self._operands[node], sample, end)
+                lasting = self._lasting(node, sample, end) if self._goes_on else None
+                taken = lasting or self._taken(temporal, self._operands[node], sample, end)
                 if taken is None:
                     return DecidingPath((here,), end)
                 below = self.follow(taken.node, taken.sample, end)
@@ -230,6 +236,22 @@ class _Walk:
         left, right = operands
         is_ahead = formula.operator == "U"
         return self._until(SignedOperand(left), SignedOperand(right), sample, window, end, is_ahead=is_ahead)
+
+    def _lasting(self, node: int, sample: int, end: End) -> PathNode | None:
+        """Return where the left operand of an until, that later samples may still fulfil, was least so far.
+
+        None if the samples so far decide the until.
+        """
+        formula, left = self._nodes[node], SignedOperand(self._operands[node][0])
+        if not isinstance(formula, Temporal) or formula.operator not in ("U", "R"):
+            return None
+        low, high = self._interval(node, sample)
+        if formula.operator == "R":
+            left, end, high = SignedOperand(left.index, True), end.turned, -low
+        if end is End.LOW or is_closed(formula.bound, self._times)[sample]:
+            return None
+        lasting = self._ends(left, slice(sample, None))[1]
+        return PathNode(left.index, sample + int(np.argmin(lasting))) if lasting.min() == high else None
 
     def _window(self, formula: Temporal, sample: int) -> range:
         """Return the samples that an operator looks at."""
@@ -351,6 +373,25 @@ class Evidence:
             parts.append(leaf_values(scene, formulas, self.instance.bindings)[:, :, begin:end])
         channels = max(map(len, parts))
         return np.concatenate([in_channels(part, channels) for part in parts], axis=2)
+
+    def times_ns(self) -> Integers:
+        """Return the times of the samples, (T,)."""
+        parts = [scene.trace.times_ns[scene.skip :] for scene in self._scenes()]
+        times_ns = np.concatenate(parts)
+        begin, end = window_of(times_ns, self.instance.start_ns, self.instance.end_ns)
+        return times_ns[begin:end]
+
+    def have_members(self, groups: Sequence[Group | Earlier]) -> list[bool]:
+        """Return for each open group whether any of the samples has a member of it, or may have had one."""
+        found = [False] * len(groups)
+        for scene in self._scenes() if groups else ():
+            times_ns = scene.trace.times_ns[scene.skip :]
+            begin, end = window_of(times_ns, self.instance.start_ns, self.instance.end_ns)
+            for index, group in enumerate(groups):
+                if not found[index]:
+                    _, members, unknown = scene.members(group)
+                    found[index] = bool(members[begin:end].any() or unknown[begin:end].any())
+        return found
 
     def _scenes(self) -> Iterator[TraceScene]:
         """Iterate over the samples in blocks, each with the earlier ones that it may look back at."""

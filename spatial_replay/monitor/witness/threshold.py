@@ -14,9 +14,10 @@ import numpy as np
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.offline import evaluate_offline, new_leaves
 from spatial_replay.monitor.online.codes import in_channels
-from spatial_replay.monitor.verdict import Verdict, final_verdict
+from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom
 from spatial_replay.monitor.witness.path import End, Evidence
+from spatial_replay.monitor.witness.unfinished import evaluate_unfinished
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
@@ -205,6 +206,8 @@ def threshold_of(
     node: int,
     verdict: Verdict,
     deciding: DecidingAtom,
+    *,
+    goes_on: bool = False,
 ) -> Threshold | Obstacle | None:
     """Compute how far the deciding atom's number has to move to flip a verdict, or why no number does.
 
@@ -214,6 +217,7 @@ def threshold_of(
     Args:
         leaves: (C, A, T), the instance's leaves in each sample.
         node: whose verdict.
+        goes_on: whether samples may follow: then the verdict is that over every continuation.
 
     Returns:
         None of an atom that is itself open.
@@ -222,7 +226,7 @@ def threshold_of(
         return None
     if not math.isfinite(deciding.lower) or not math.isfinite(deciding.upper):
         return "infinity"
-    search = _Search(evidence, leaves, times_ns, node, verdict, deciding)
+    search = _Search(evidence, leaves, times_ns, node, verdict, deciding, goes_on=goes_on)
     flips_at = search.number()
     if flips_at is None:
         return "limits" if search.would_flip() else "others"
@@ -240,8 +244,12 @@ class _Search:
         node: int,
         verdict: Verdict,
         deciding: DecidingAtom,
+        *,
+        goes_on: bool,
     ) -> None:
         self._evidence = evidence
+        self._evaluate = evaluate_unfinished if goes_on else evaluate_offline
+        self._verdict_of = online_verdict if goes_on else final_verdict
         self._formula, self._order = evidence.instance.formula, evidence.instance.program.leaves
         self._leaves, self._times, self._node = leaves, times_ns, node
         self._verdict, self._deciding = verdict, deciding
@@ -277,7 +285,7 @@ class _Search:
 
         formula = rewritten(self._formula, self._is_meant, change)
         added = new_leaves(formula, self._order)
-        return self._evaluated(formula, added, self._evidence.columns(added)) is not self._verdict
+        return self._evaluated(formula, added, self._columns(added)) is not self._verdict
 
     def verdicts(self, numbers: Sequence[float]) -> list[Verdict]:
         """Return the verdict with each number in place of the dial's."""
@@ -286,7 +294,7 @@ class _Search:
         if self._is_uniform:
             columns = [self._shifted(leaves, number) for leaves, number in zip(added, numbers, strict=True)]
         else:
-            every = self._evidence.columns([leaf for leaves in added for leaf in leaves])
+            every = self._columns([leaf for leaves in added for leaf in leaves])
             ends = np.cumsum([0, *map(len, added)]).tolist()
             columns = [every[:, begin:end] for begin, end in pairwise(ends)]
         return [self._evaluated(*each) for each in zip(formulas, added, columns, strict=True)]
@@ -344,12 +352,15 @@ class _Search:
         indices = {self._turned_atom(atom, number).expression: index for index, atom in self._moving.items()}
         return self._leaves[:, [indices[leaf.expression] for leaf in added if isinstance(leaf, Atom)]] + shift
 
+    def _columns(self, formulas: Sequence[Formula]) -> Floats:
+        return self._evidence.columns(formulas)[:, :, : len(self._times)]
+
     def _evaluated(self, formula: Formula, added: Sequence[Atom | Quantified], columns: Floats) -> Verdict:
         channels = max(len(columns), len(self._leaves))
         leaves = np.concatenate([in_channels(self._leaves, channels), in_channels(columns, channels)], axis=1)
-        done = evaluate_offline(formula, (*self._order, *added), leaves, self._times)
+        done = self._evaluate(formula, (*self._order, *added), leaves, self._times)
         low, high = done.ends(self._node)
-        return final_verdict(float(low[0]), float(high[0]))
+        return self._verdict_of(float(low[0]), float(high[0]))
 
 
 def _atoms_of(formulas: Iterable[Formula]) -> Iterator[Atom]:

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.offline import evaluate_offline
-from spatial_replay.monitor.verdict import Verdict, final_verdict
+from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom, deciding_atom
 from spatial_replay.monitor.witness.path import End, Evidence, deciding_path
 from spatial_replay.monitor.witness.threshold import Obstacle, Threshold, threshold_of
+from spatial_replay.monitor.witness.unfinished import evaluate_unfinished
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Atom, Formula, Quantified, iter_nodes, operator_of
 
@@ -35,7 +36,7 @@ class WitnessStep:
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """What decides a node's verdict over a finished log.
+    """What decides a node's verdict over a finished log, or what settled it before the log ended.
 
     Robustness consists of minima and maxima, so one atom at one sample determines it: the upper end of a
     violated formula, the lower end of a satisfied one, the ends that leave an unknown one open.
@@ -51,6 +52,8 @@ class Witness:
         obstacle: why there is none, if there is an atom.
         open_end: for a settled verdict whose interval has an open end, the atom that leaves it open, and the
             time of its sample.
+        is_settled: whether it is about the samples up to the one that made the verdict certain, whatever
+            came after; verdict, interval and threshold are then those of that moment.
     """
 
     name: str
@@ -63,6 +66,7 @@ class Witness:
     threshold: Threshold | None
     obstacle: Obstacle | None
     open_end: tuple[DecidingAtom, int] | None
+    is_settled: bool = False
 
     @property
     def node(self) -> int:
@@ -75,7 +79,9 @@ class Witness:
         return self.path[-1].time_ns
 
 
-def find_witness(evidence: Evidence, leaves: Floats, times_ns: Integers, node: int = 0) -> Witness:
+def find_witness(
+    evidence: Evidence, leaves: Floats, times_ns: Integers, node: int = 0, *, goes_on: bool = False
+) -> Witness:
     """Return the witness of a node.
 
     Ties go to the earliest sample, then to the first operand.
@@ -85,16 +91,20 @@ def find_witness(evidence: Evidence, leaves: Floats, times_ns: Integers, node: i
         leaves: (C, A, T), the instance's leaves in them.
         times_ns: (T,), T at least 1.
         node: its id.
+        goes_on: whether samples may follow these, which settle the node's verdict whatever comes.
     """
     instance = evidence.instance
-    done = evaluate_offline(instance.formula, instance.program.leaves, leaves, times_ns)
+    evaluate, verdict_of = (
+        (evaluate_unfinished, online_verdict) if goes_on else (evaluate_offline, final_verdict)
+    )
+    done = evaluate(instance.formula, instance.program.leaves, leaves, times_ns)
     lower, upper = (float(end[0]) + 0.0 for end in done.ends(node))
-    verdict = final_verdict(lower, upper)
+    verdict = verdict_of(lower, upper)
     end = {Verdict.SATISFIED: End.LOW, Verdict.VIOLATED: End.HIGH}.get(verdict, End.OPEN)
     nodes = [evidence.bound(formula) for _, _, formula in iter_nodes(instance.formula)]
 
     def follow(end: End) -> tuple[tuple[WitnessStep, ...], DecidingAtom | None]:
-        found = deciding_path(instance.formula, done, times_ns, node, end)
+        found = deciding_path(instance.formula, done, times_ns, node, end, goes_on=goes_on)
         path = tuple(_step(step.node, nodes[step.node], int(times_ns[step.sample])) for step in found.steps)
         leaf = nodes[path[-1].node]
         if not isinstance(leaf, Atom | Quantified):
@@ -104,9 +114,9 @@ def find_witness(evidence: Evidence, leaves: Floats, times_ns: Integers, node: i
     path, deciding = follow(end)
     threshold = None
     if deciding is not None:
-        threshold = threshold_of(evidence, leaves, times_ns, node, verdict, deciding)
+        threshold = threshold_of(evidence, leaves, times_ns, node, verdict, deciding, goes_on=goes_on)
     open_end = None
-    if end is not End.OPEN and lower < upper:
+    if end is not End.OPEN and lower < upper and not goes_on:
         other_path, other = follow(end.turned)
         if other is not None and other.lower < other.upper:
             open_end = other, other_path[-1].time_ns
@@ -121,6 +131,7 @@ def find_witness(evidence: Evidence, leaves: Floats, times_ns: Integers, node: i
         threshold if isinstance(threshold, Threshold) else None,
         None if isinstance(threshold, Threshold) else threshold,
         open_end,
+        goes_on,
     )
 
 

@@ -1,0 +1,162 @@
+"""Why a result is not satisfied: one cause for each named spec that fails in it, what settled it first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.stream import NEVER
+from spatial_replay.monitor.verdict import Verdict, final_verdict
+from spatial_replay.monitor.witness.witness import Witness
+from spatial_replay.spec.format import format_formula
+from spatial_replay.spec.formula import Boolean, Formula, iter_nodes
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """One reason why a result is violated or unknown.
+
+    Attributes:
+        spec: the innermost named spec that the conjunct belongs to.
+        node: id of the conjunct.
+        text: its canonical text.
+        verdict: violated, or unknown.
+        robustness: of the conjunct on the whole log; NaN if not determined.
+        settled_ns: when its violation became certain, whatever came after; None if only the end of the log
+            decided.
+        witness: the atom that decides it: at `settled_ns`, on the samples up to there, or else on the
+            whole log. None if the leaves were not stored, and under the paper's semantics.
+    """
+
+    spec: str
+    node: int
+    text: str
+    verdict: Verdict
+    robustness: float
+    settled_ns: int | None
+    witness: Witness | None
+
+
+@dataclass(frozen=True, slots=True)
+class LeastPart:
+    """The conjunct of a result that has the least robustness.
+
+    Attributes:
+        spec: the innermost named spec that it belongs to.
+        name: what to call it: the spec's name, or its own text if the first cause is of the same spec.
+        node: its id.
+    """
+
+    spec: str
+    name: str
+    node: int
+    robustness: float
+
+
+@dataclass(frozen=True, slots=True)
+class Conjunct:
+    """A part of a formula that has to hold for the formula to hold.
+
+    Attributes:
+        node: its id.
+        spec: the innermost named spec that it belongs to.
+    """
+
+    node: int
+    spec: str
+    formula: Formula
+
+
+def conjuncts_of(formula: Formula, name: str) -> tuple[Conjunct, ...]:
+    """Split a formula at its conjunctions, through named specs, in the order of the text.
+
+    Args:
+        name: what the formula itself is called.
+    """
+    specs: dict[int, str] = {}
+    found = []
+    for identifier, parent, node in iter_nodes(formula):
+        if parent is None:
+            specs[identifier] = name
+        elif parent in specs:
+            specs[identifier] = node.name or specs[parent]
+        else:
+            continue
+        if not (isinstance(node, Boolean) and node.operator in ("and", "spec")):
+            found.append(Conjunct(identifier, specs.pop(identifier), node))
+    return tuple(found)
+
+
+def find_causes(
+    conjuncts: Sequence[Conjunct],
+    values: Floats,
+    final: Floats,
+    settled_ns: Integers,
+    witness: Callable[[int, int | None], Witness | None],
+) -> tuple[Cause, ...]:
+    """Return one cause for each named spec with a conjunct that is not satisfied.
+
+    First come those that were violated for certain before the log ended, by that time; then those that only
+    its end decided, the least robustness first; then unknown ones.
+
+    Args:
+        values: (N,), each node's value on the whole log.
+        final: (N, 2), the ends of each node's interval for the finished log.
+        settled_ns: (N, 2), see `InstanceStream`.
+        witness: returns the witness of a node: what settled it at a time, or on the whole log.
+    """
+    failing = [each for each in conjuncts if _verdict(final, each.node) is not Verdict.SATISFIED]
+    first: dict[str, Conjunct] = {}
+    for each in sorted(failing, key=lambda each: _order(each.node, values, final, settled_ns)):
+        first.setdefault(each.spec, each)
+    causes = []
+    for each in first.values():
+        at = settled_time(settled_ns, each.node)
+        causes.append(
+            Cause(
+                each.spec,
+                each.node,
+                format_formula(each.formula),
+                _verdict(final, each.node),
+                float(values[each.node]),
+                at,
+                witness(each.node, at),
+            )
+        )
+    return tuple(causes)
+
+
+def find_least(
+    conjuncts: Sequence[Conjunct], values: Floats, final: Floats, first: Cause
+) -> LeastPart | None:
+    """Return the conjunct that has the least robustness; None if that is the first cause."""
+    least = min(conjuncts, key=lambda each: _number(each.node, values, final))
+    robustness = _number(least.node, values, final)
+    if least.node == first.node or not robustness < _number(first.node, values, final):
+        return None
+    name = format_formula(least.formula) if least.spec == first.spec else least.spec
+    return LeastPart(least.spec, name, least.node, robustness)
+
+
+def settled_time(settled_ns: Integers, node: int) -> int | None:
+    """Return when the violation of a node became certain, or None."""
+    at = int(settled_ns[node, 1])
+    return None if at == NEVER else at
+
+
+def _verdict(final: Floats, node: int) -> Verdict:
+    return final_verdict(*final[node].tolist())
+
+
+def _number(node: int, values: Floats, final: Floats) -> float:
+    value = float(values[node])
+    return float(final[node, 1]) if math.isnan(value) else value
+
+
+def _order(node: int, values: Floats, final: Floats, settled_ns: Integers) -> tuple[int, float, int]:
+    if _verdict(final, node) is not Verdict.VIOLATED:
+        return 2, 0.0, node
+    at = settled_time(settled_ns, node)
+    return (1, _number(node, values, final), node) if at is None else (0, at, node)

@@ -1,0 +1,266 @@
+"""The parts of a result that decided nothing: empty windows, antecedents that never held, empty groups."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline
+from spatial_replay.monitor.online.codes import low_and_high
+from spatial_replay.monitor.witness.path import End, Evidence, deciding_path
+from spatial_replay.spec.format import format_formula, format_term
+from spatial_replay.spec.formula import (
+    FUTURE_OPERATORS,
+    Atom,
+    Boolean,
+    Bound,
+    Earlier,
+    Formula,
+    Group,
+    Quantified,
+    Temporal,
+    TrackedName,
+    iter_nodes,
+    operands_of,
+)
+from spatial_replay.spec.walks import iter_terms, without_enlargement
+
+Reason: TypeAlias = Literal[
+    "empty window", "antecedent never held", "no members", "past the end", "no instances"
+]
+_Samples: TypeAlias = NDArray[np.bool_]
+_NEXT = {"X": "next sample", "WX": "next sample", "Y": "sample before"}
+
+
+@dataclass(frozen=True, slots=True)
+class Vacuous:
+    """A part of a formula that decided nothing, since what it is about never was.
+
+    Attributes:
+        node: its id; None for a template without instances.
+        text: its canonical text.
+        reason: "empty window": no sample ever lies in the window of an operator; "antecedent never held": of
+            an implication; "no members": an open group is empty; "past the end": the result is infinite, for
+            what decides looks past an end of the log; "no instances": a template that no object fits.
+        message: a sentence.
+    """
+
+    node: int | None
+    text: str
+    reason: Reason
+    message: str
+
+
+def no_instances(name: str, parameter: str) -> Vacuous:
+    """Return the entry of a template that no object fits."""
+    text = f"{name}({parameter})"
+    message = f"`{text}` was never evaluated: no object stands for {parameter}"
+    return Vacuous(None, text, "no instances", message)
+
+
+def find_vacuous(evidence: Evidence, leaves: Floats, times_ns: Integers) -> tuple[Vacuous, ...]:
+    """Return the parts of an instance's formula that decided nothing, in the order of the text.
+
+    Args:
+        evidence: the samples that it was evaluated over.
+        leaves: (C, A, T), its leaves in them.
+        times_ns: (T,), T at least 1.
+    """
+    instance = evidence.instance
+    nodes = [node for _, _, node in iter_nodes(instance.formula)]
+    done = evaluate_offline(instance.formula, instance.program.leaves, leaves, times_ns)
+    scopes = _scopes(instance.formula, times_ns)
+    found = [
+        *_empty_windows(nodes, scopes, times_ns),
+        *_idle_implications(nodes, scopes, done, instance.formula),
+        *_idle_bodies(nodes, scopes, evidence),
+        *_empty_groups(nodes, scopes, evidence),
+    ]
+    if done.ends(0)[0][0] == np.inf:
+        path = deciding_path(instance.formula, done, times_ns, 0, End.LOW)
+        node, sample = path.steps[-1].node, path.steps[-1].sample
+        if node not in {each.node for each in found}:
+            found += _infinite(node, nodes[node], (int(times_ns[sample]) - int(times_ns[0])) / 1e9)
+    bound = [format_formula(evidence.bound(node)) for node in nodes]
+    named = (
+        replace(each, text=bound[each.node or 0], message=each.message.replace("{}", bound[each.node or 0]))
+        for each in found
+    )
+    return tuple(sorted(named, key=lambda each: each.node or 0))
+
+
+# ---------------------------------------------------------------------------------------------- scopes
+
+
+def _scopes(formula: Formula, times_ns: Integers) -> list[_Samples]:
+    """Return for each node the samples (T,) at which the number of the formula depends on it."""
+    count = len(times_ns)
+    scopes: list[_Samples] = []
+    operands_passed: list[int] = []
+    nodes: list[Formula] = []
+    for _, parent, node in iter_nodes(formula):
+        nodes.append(node)
+        operands_passed.append(0)
+        if parent is None:
+            scopes.append(np.arange(count) == 0)
+            continue
+        place = operands_passed[parent]
+        operands_passed[parent] += 1
+        above = nodes[parent]
+        within = scopes[parent]
+        scopes.append(_below(above, place, within, times_ns) if isinstance(above, Temporal) else within)
+    return scopes
+
+
+def _below(formula: Temporal, place: int, scope: _Samples, times_ns: Integers) -> _Samples:
+    """Return the samples at which an operand counts, if its operator does so in the samples of `scope`."""
+    begin, end = windows_of(formula, times_ns)
+    here = np.flatnonzero(scope & (begin < end))
+    begin, end = begin[here], end[here]
+    if place < len(formula.operands) - 1:
+        # the left operand holds from each sample to the one before the right one's
+        if formula.operator == "S":
+            begin, end = begin + 1, here + 1
+        else:
+            begin = here
+            end = end - (formula.operator != "W")
+    edges = np.zeros(len(scope) + 1, np.int64)
+    there = begin < end
+    np.add.at(edges, begin[there], 1)
+    np.add.at(edges, end[there], -1)
+    covered: _Samples = np.cumsum(edges[:-1]) > 0
+    return covered
+
+
+def windows_of(formula: Temporal, times_ns: Integers) -> tuple[Integers, Integers]:
+    """Return the first sample (T,) in an operator's window at each sample, and the one after the last."""
+    count = len(times_ns)
+    here = np.arange(count, dtype=np.int64)
+    is_ahead = formula.operator in FUTURE_OPERATORS
+    bound = formula.bound or Bound(0, None, "samples")
+    if formula.operator in _NEXT:
+        bound = Bound(1, 1, "samples")
+    # as distances from the first sample, and no further than the last: sums stay below 64 bits
+    places = here if bound.unit == "samples" else times_ns - times_ns[0]
+    furthest = int(places[-1]) + 1
+    near = min(bound.lower, furthest)
+    far = furthest if bound.upper is None else min(bound.upper, furthest)
+    low, high = (places + near, places + far) if is_ahead else (places - far, places - near)
+    begin = np.searchsorted(places, low, side="left").astype(np.int64)
+    return begin, np.searchsorted(places, high, side="right").astype(np.int64)
+
+
+# --------------------------------------------------------------------------------------------- reasons
+
+
+def _empty_windows(
+    nodes: Sequence[Formula], scopes: Sequence[_Samples], times_ns: Integers
+) -> Iterator[Vacuous]:
+    for identifier, (node, scope) in enumerate(zip(nodes, scopes, strict=True)):
+        if not isinstance(node, Temporal) or not scope.any():
+            continue
+        begin, end = windows_of(node, times_ns)
+        if not (begin < end)[scope].any():
+            what = f"the log has no {_NEXT[node.operator]}" if node.operator in _NEXT else _NO_SAMPLE
+            yield Vacuous(identifier, "", "empty window", f"`{{}}` was never tested: {what}")
+
+
+_NO_SAMPLE = "no sample of the log lies in its window"
+
+
+def _idle_implications(
+    nodes: Sequence[Formula], scopes: Sequence[_Samples], done: OfflineNodes, formula: Formula
+) -> Iterator[Vacuous]:
+    antecedents: dict[int, int] = {}
+    for identifier, parent, _ in iter_nodes(formula):
+        if parent is not None:
+            antecedents.setdefault(parent, identifier)
+    for identifier, (node, scope) in enumerate(zip(nodes, scopes, strict=True)):
+        if isinstance(node, Boolean) and node.operator == "->" and scope.any():
+            high = done.ends(antecedents[identifier])[1]
+            if not (high[scope] >= 0.0).any():
+                yield _idle(identifier, node)
+
+
+def _idle(identifier: int, implication: Boolean) -> Vacuous:
+    antecedent = format_formula(implication.operands[0])
+    return Vacuous(
+        identifier, "", "antecedent never held", f"`{{}}` was never tested: `{antecedent}` never held"
+    )
+
+
+def _idle_bodies(
+    nodes: Sequence[Formula], scopes: Sequence[_Samples], evidence: Evidence
+) -> Iterator[Vacuous]:
+    """Find implications in the bodies of quantifiers, whose antecedent held for none of the members."""
+    for identifier, (node, scope) in enumerate(zip(nodes, scopes, strict=True)):
+        if not isinstance(node, Quantified) or not scope.any():
+            continue
+        inner = list(_implications(node))
+        if not inner:
+            continue
+        columns = evidence.columns([evidence.bound(held) for _, held in inner])
+        high = columns[low_and_high(len(columns), wide=True)[1]]
+        for (implication, _), ends in zip(inner, high, strict=True):
+            if not (ends[scope] >= 0.0).any():
+                yield _idle(identifier, implication)
+
+
+def _implications(node: Quantified) -> Iterator[tuple[Boolean, Formula]]:
+    """Yield each implication in a quantifier's body, with the formula that its antecedent ever holds."""
+    stack: list[Formula] = [node.body]
+    while stack:
+        current = stack.pop()
+        if isinstance(current, Quantified):
+            for implication, held in _implications(current):
+                yield implication, replace(node, quantifier="exists", body=held)
+            continue
+        if isinstance(current, Boolean) and current.operator == "->":
+            yield current, replace(node, quantifier="exists", body=current.operands[0])
+        stack.extend(reversed(operands_of(current)))
+
+
+def _empty_groups(
+    nodes: Sequence[Formula], scopes: Sequence[_Samples], evidence: Evidence
+) -> Iterator[Vacuous]:
+    groups: dict[Group | Earlier, bool] = {}
+    open_groups = {
+        identifier: list(_open_groups(evidence.bound(node)))
+        for identifier, (node, scope) in enumerate(zip(nodes, scopes, strict=True))
+        if isinstance(node, Atom | Quantified) and scope.any()
+    }
+    wanted = list(dict.fromkeys(group for each in open_groups.values() for group in each))
+    groups = dict(zip(wanted, evidence.have_members(wanted), strict=True))
+    for identifier, own in open_groups.items():
+        empty = [group for group in own if not groups[group]]
+        if empty:
+            names = " or ".join(f"`{format_term(group)}`" for group in dict.fromkeys(empty))
+            yield Vacuous(
+                identifier, "", "no members", f"`{{}}` decided nothing: no object was ever in {names}"
+            )
+
+
+def _open_groups(formula: Formula) -> Iterator[Group | Earlier]:
+    """Yield the open groups that a leaf is about, as they are for any binding of its variables."""
+    for term in map(without_enlargement, iter_terms([formula])):
+        group = term.term if isinstance(term, Earlier) else term
+        if isinstance(group, Group) and group.members is None:
+            excluded = tuple(each for each in group.excluded if isinstance(each, TrackedName))
+            whole = replace(group, excluded=excluded)
+            yield replace(term, term=whole) if isinstance(term, Earlier) else whole
+
+
+def _infinite(identifier: int, node: Formula, seconds: float) -> Iterator[Vacuous]:
+    """Yield why a result is infinite, from the node that its number is of."""
+    if isinstance(node, Temporal):
+        side = "past the end" if node.operator in FUTURE_OPERATORS else "before the start"
+        message = f"`{{}}` decides at {seconds:.3f} s, where it looks {side} of the log"
+        yield Vacuous(identifier, "", "past the end", message)
+    elif isinstance(node, Atom | Quantified):
+        message = f"`{{}}` decides at {seconds:.3f} s, where no object is in its group"
+        yield Vacuous(identifier, "", "no members", message)
