@@ -197,7 +197,6 @@ class SpecAutomaton:
         name: the name that the spec is reported under.
         automaton: None if it has none.
         reason: why not.
-        details: the same, with the place in the specification and the remedy where those are known.
     """
 
     name: str
@@ -205,13 +204,12 @@ class SpecAutomaton:
     spec: NamedSpec
     automaton: Automaton | None
     reason: str = ""
-    details: str = ""
 
     @property
     def summary(self) -> str:
         """Its size, or the reason why there is none."""
         if self.automaton is None:
-            return f"none: {self.details or self.reason}"
+            return f"none: {self.reason}"
         return size_words(self.automaton)
 
 
@@ -277,4 +275,4 @@ def _spec_automaton(
     try:
         return SpecAutomaton(name, file, spec, automaton(file, spec.name, stored=stored))
     except NoAutomatonError as error:
-        return SpecAutomaton(name, file, spec, None, error.reason, str(error))
+        return SpecAutomaton(name, file, spec, None, error.reason)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import PurePath
 from typing import NamedTuple
 
@@ -30,6 +31,7 @@ from spatial_replay.spec.formula import (
     iter_nodes,
     operator_of,
 )
+from spatial_replay.spec.overrides import text_with_constants
 from spatial_replay.spec.relations import RELATION_NAMES
 
 DIMENSIONLESS = "1"
@@ -161,8 +163,9 @@ def _units(expression: Expression, signal_units: Mapping[str, str]) -> Iterator[
 def logged_specifications(files: Sequence[Specification]) -> list[Specification]:
     """Return the specifications as a log stores them, so that reading it gives equal ones of equal names.
 
-    Each has a file name with a stem of its own. A text that does not parse to the same specification
-    (it was parsed with another profile or constants) is replaced by the canonical one.
+    Each has a file name with a stem of its own. Constants given from outside are written into the text. One
+    that still does not parse to the same specification (it was parsed with another profile) is replaced by
+    the canonical text.
     """
     logged: list[Specification] = []
     stems: set[str] = set()
@@ -184,8 +187,9 @@ def specification_attachments(files: Sequence[Specification], prefix: str) -> li
 
 
 def _self_contained(file: Specification) -> Specification:
-    for text in (file.source, format_specification(file)):
+    for text_of in (attrgetter("source"), text_with_constants, format_specification):
         try:
+            text = text_of(file)
             read_back = parse_specification(text, filename=file.filename)
         except SpecificationError:
             continue

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import click
 
 from spatial_replay.cli.application import warn
-from spatial_replay.cli.options import ReadArguments, profile_option, reading_options, require_choice
+from spatial_replay.cli.options import (
+    ReadArguments,
+    constants_option,
+    load_spec_options,
+    profile_option,
+    reading_options,
+    require_choice,
+)
 from spatial_replay.cli.progress import progress
 from spatial_replay.errors import NoAutomatonError, SpecificationError, UsageError
-from spatial_replay.spec import check_names, format_formula, load_specification
+from spatial_replay.spec import check_names, format_formula
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import iter_branches, label_of
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operator_of
@@ -28,6 +35,7 @@ _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
     type=click.Path(path_type=Path),
     help="Log whose objects and signals to compare names with.",
 )
+@constants_option
 @profile_option
 @reading_options
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
@@ -40,6 +48,7 @@ _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
 def check(
     specification: Path,
     log: Path | None,
+    constants: Mapping[str, float | str],
     profile: str | None,
     as_json: bool,
     dfa: str | None,
@@ -62,7 +71,7 @@ def check(
         raise UsageError("--json and --dfa - both write to standard output; give --dfa a file")
     if log is None and reading["mapping"] is not None:
         raise UsageError("--mapping applies to the log to compare with; add --log LOG")
-    parsed = load_specification(specification, profile=profile)
+    (parsed,) = load_spec_options([specification], profile, constants)
     inputs = [specification] if log is None else [specification, log]
     if dfa is not None:
         _check_automaton_options(parsed, of, dfa, inputs)

@@ -36,8 +36,8 @@ def explain(
     For each result: which sample, objects and relation decided it, by how much and since when, and which
     change of a constant would flip it; for an unknown verdict, what was not known.
 
-    T is 12.5s or 1500ms after the first sample, integer nanoseconds, or 2026-01-31T12:00:00Z. Exits with the
-    code of the explained verdicts, as `replay` does.
+    T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or 2026-01-31T12:00:00Z.
+    Exits with the code of the explained verdicts, as `replay` does.
 
     \b
     Examples:

@@ -29,8 +29,9 @@ if TYPE_CHECKING:
 def export(annotated: Path, output: Path, quantity: Quantity) -> int:
     """Export the robustness in an annotated log as a table: one row per sample, one column per node.
 
-    A column is named after its node, or SPEC#ID if the node has no unique name. Empty cells are numbers that
-    are not determined.
+    A column is named after the named specs on the way to its node, task/deliver, and the text of an unnamed
+    node. Others hold the seconds since the first row and the states of the automata. Empty cells are numbers
+    that are not determined.
 
     \b
     Example:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from spatial_replay.bags.reader import MessageReader
     from spatial_replay.logs.mcap.summary import LogSummary
     from spatial_replay.sources.overview import Overview, Survey
+    from spatial_replay.spec.overrides import SpecificationText
 
 _EPOCH_LIKELY_NS = 10**18
 """Later times are taken to count from 1970 (2001 or later), earlier ones from the start of the run."""
@@ -34,10 +35,23 @@ _EPOCH_LIKELY_NS = 10**18
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 @click.option("--suggest-mapping", is_flag=True, help="Print a first mapping file (YAML) instead.")
 @click.option("--decisions", is_flag=True, help="Print the decisions of a planned run instead.")
+@click.option(
+    "--specification",
+    metavar="[NAME]",
+    is_flag=False,
+    flag_value="",
+    help="Print the recorded specification as it was written instead; NAME: of which file or spec.",
+)
 @click.option("--layout", is_flag=True, help="Print the layout to import in a viewer instead.")
 @reading_options
 def info(
-    log: Path, as_json: bool, suggest_mapping: bool, decisions: bool, layout: bool, reading: ReadArguments
+    log: Path,
+    as_json: bool,
+    suggest_mapping: bool,
+    decisions: bool,
+    specification: str | None,
+    layout: bool,
+    reading: ReadArguments,
 ) -> int:
     """Show what a log contains: samples, objects, signals, topics, attachments.
 
@@ -52,12 +66,14 @@ def info(
       spatial-replay info blocks.jsonl.gz --json
       spatial-replay info drive.bag --suggest-mapping > drive.yaml
       spatial-replay info push.mcap --decisions
+      spatial-replay info annotated.mcap --specification > used.spatial
       spatial-replay info annotated.mcap --layout > layout.json
     """
-    if layout:
-        if as_json or suggest_mapping or decisions:
-            raise UsageError("--layout prints only the layout; remove the other options")
-        return _print_layout(log)
+    if layout or specification is not None:
+        what = "layout" if layout else "specification"
+        if as_json or suggest_mapping or decisions or (layout and specification is not None):
+            raise UsageError(f"--{what} prints only the {what}; remove the other options")
+        return _print_layout(log) if layout else _print_specification(log, specification or "")
     if decisions:
         return _print_decisions(log, as_json)
     # imported here so that --help stays fast
@@ -115,6 +131,43 @@ def _print_layout(log: Path) -> int:
     raise UsageError(
         f"{source.name} has no layout; logs written by spatial-replay record or replay -o have one"
     )
+
+
+def _print_specification(log: Path, name: str) -> int:
+    """Print the texts of the specifications that a log was written with, or the one of a name."""
+    from spatial_replay.replay import recorded_texts
+    from spatial_replay.sources.open_log import open_source
+
+    source = open_source(log)
+    texts = recorded_texts(source)
+    if not texts:
+        raise UsageError(
+            f"{source.name} holds no specification; logs written by spatial-replay record --spec or "
+            "replay -o have them"
+        )
+    chosen = [each for each in texts if name in ("", each.filename, Path(each.filename).stem)]
+    chosen = chosen or [each for each in texts if name in _names_of(each)]
+    if not chosen:
+        files = ", ".join(each.filename for each in texts)
+        specs = ", ".join(dict.fromkeys(own for each in texts for own in _names_of(each)))
+        raise UsageError(f"{source.name} has no specification {name!r}; files: {files}; specs: {specs}")
+    for each in chosen:
+        if len(chosen) > 1:
+            click.echo(f"# {each.filename}")
+        click.echo(each.text, nl=not each.text.endswith("\n"))
+    return ExitCode.SATISFIED
+
+
+def _names_of(text: SpecificationText) -> list[str]:
+    """Return the names of the specs in a recorded text."""
+    from spatial_replay.errors import SpecificationError
+    from spatial_replay.spec import parse_specification
+
+    try:
+        return [spec.name for spec in parse_specification(text.text, filename=text.filename).specs]
+    except SpecificationError:
+        # relations defined in Python: the text can be printed, but not read here
+        return []
 
 
 def _print_mapping(log: Path, reader: MessageReader | None, as_json: bool) -> int:

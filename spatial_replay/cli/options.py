@@ -55,6 +55,27 @@ def specs_option(text: str) -> Callable[[_Command], _Command]:
     )
 
 
+def _read_constants(
+    context: click.Context, parameter: click.Parameter, texts: tuple[str, ...]
+) -> Mapping[str, float | str]:
+    if not texts:
+        return {}
+    # imported here so that --help stays fast
+    from spatial_replay.spec.overrides import constants_from_texts
+
+    with naming_option("--const"):
+        return constants_from_texts(texts)
+
+
+constants_option = click.option(
+    "--const",
+    "constants",
+    metavar="NAME=VALUE",
+    multiple=True,
+    callback=_read_constants,
+    help="Value of a constant in place of the written one, such as near=80 or hold=2s; repeat for several.",
+)
+
 semantics_option = click.option(
     "--semantics",
     type=click.Choice(["ltlf", "paper"]),
@@ -149,6 +170,7 @@ class EvaluationArguments:
     end: str | None
     every: int
     choices: tuple[str, ...]
+    constants: Mapping[str, float | str]
     profile: str | None
     reading: ReadArguments
 
@@ -183,6 +205,7 @@ _EVALUATION = (
         metavar="VAR=class:C",
         help="Objects to evaluate a template for: one class, or VAR=all.",
     ),
+    constants_option,
     profile_option,
 )
 
@@ -214,7 +237,7 @@ def open_inputs(request: EvaluationArguments) -> EvaluationInputs:
     from spatial_replay.sources.open_log import open_source
 
     source = open_source(request.log, **request.reading)
-    files = load_files(request.specs, source, profile=request.profile)
+    files = load_files(request.specs, source, profile=request.profile, constants=request.constants)
     for warning in (warning for file in files for warning in file.warnings):
         click.echo(warning, err=True)
     return EvaluationInputs(source, files, _window(source, request), _each(request.choices))
@@ -252,6 +275,31 @@ def _window(source: Source, request: EvaluationArguments) -> Window:
     return Window(start_ns, end_ns, request.every)
 
 
+def load_spec_options(
+    specs: Sequence[Path],
+    profile: str | None,
+    constants: Mapping[str, float | str],
+    default: Callable[[], Specification] | None = None,
+) -> list[Specification]:
+    """Return the specifications that a command is given, with its values for their constants.
+
+    Args:
+        default: returns what is evaluated without any, for values of its constants; None if that is nothing.
+
+    Raises:
+        UsageError: values of constants that none of them has.
+        SpecificationError: one of them has errors.
+    """
+    # imported here so that --help stays fast
+    from spatial_replay.spec.overrides import SpecificationText, load_specifications
+
+    sources: list[Path | SpecificationText] = [*dict.fromkeys(specs)]
+    if constants and not sources and default is not None:
+        own = default()
+        sources = [SpecificationText(own.source, own.filename)]
+    return load_specifications(sources, profile=profile, constants=constants)
+
+
 def require_choice(specification: Specification, of: str | None) -> None:
     """Require `--of` where a specification has several results.
 
@@ -278,7 +326,9 @@ def warn_of_damage(result: Replayed | Recorded) -> None:
 _DURATION = re.compile(
     r"(?P<number>\d{1,19}(?:\.\d{1,30})?(?:e[+-]?\d{1,2})?)(?P<unit>s|ms)", re.ASCII | re.I
 )
-_ABSOLUTE = re.compile(r"\d{1,19}", re.ASCII)
+_ABSOLUTE = re.compile(r"(?P<number>\d{1,19})(?P<unit>ns)?", re.ASCII | re.I)
+_LEAST_WITHOUT_UNIT_NS = 10**12
+"""Smaller integers without a unit could be seconds or milliseconds as well."""
 _CALENDAR = re.compile(
     r"(?P<date>\d{4}-\d\d-\d\d)[T ](?P<time>\d\d:\d\d:\d\d)(?:\.(?P<fraction>\d{1,9}))?"
     r"(?P<offset>Z|[+-]\d\d:\d\d)",
@@ -305,20 +355,28 @@ class TimePoint:
 
 
 def time_point_from_text(text: str) -> TimePoint:
-    """Read `12.5s` or `1500ms` after the first sample, integer nanoseconds, or an RFC 3339 time.
+    """Read `12.5s` or `1500ms` after the first sample, `5250000000ns` on the log's clock, or RFC 3339.
+
+    The unit of nanoseconds can be left out from 10^12 on.
 
     Raises:
-        UsageError: for anything else, and for a time beyond the range of logs.
+        UsageError: for anything else, for a small integer without a unit, and for a time beyond the range of
+            logs.
     """
     if _DURATION.fullmatch(text):
         return TimePoint(duration_ns_from_text(text), "first sample")
-    if _ABSOLUTE.fullmatch(text):
-        return TimePoint(_checked_ns(int(text), text), "zero")
+    if absolute := _ABSOLUTE.fullmatch(text):
+        if absolute["unit"] is None and int(text) < _LEAST_WITHOUT_UNIT_NS:
+            raise UsageError(
+                f"{text!r} has no unit: {text}s after the log's first sample, or {text} ns on the log's own "
+                f"clock? Write {text}s or {text}ns"
+            )
+        return TimePoint(_checked_ns(int(absolute["number"]), text), "zero")
     if calendar := _CALENDAR.fullmatch(text):
         return TimePoint(_checked_ns(_ns_from_calendar(calendar, text), text), "zero")
     raise UsageError(
         f"{text!r} is not a time; write 12.5s or 1500ms after the log's first sample, "
-        "integer nanoseconds, or 2026-01-31T12:00:00Z"
+        "5250000000ns on its own clock, or 2026-01-31T12:00:00Z"
     )
 
 

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 
 import click
 
 from spatial_replay.cli.application import exit_code_from_verdicts
-from spatial_replay.cli.options import output_option, profile_option, require_choice
+from spatial_replay.cli.options import (
+    constants_option,
+    load_spec_options,
+    output_option,
+    profile_option,
+    require_choice,
+)
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.record import SCENARIOS, SimulationArguments, parse_injections, simulation_options
 from spatial_replay.text import counted
@@ -50,16 +57,24 @@ def planning_command(scenario: str) -> click.Command:
         help="Specification to plan for.  [default: the scenario's own]",
     )
     @click.option("--of", metavar="NAME", help="Result to plan for, if SPEC has several.")
+    @constants_option
     @profile_option
     @simulation_options
     def command(
-        output: Path, spec: Path | None, of: str | None, profile: str | None, simulation: SimulationArguments
+        output: Path,
+        spec: Path | None,
+        of: str | None,
+        constants: Mapping[str, float | str],
+        profile: str | None,
+        simulation: SimulationArguments,
     ) -> int:
         # imported here so that --help stays fast
         from spatial_replay.runs.planned import record_plan
-        from spatial_replay.spec import load_specification
+        from spatial_replay.simulation.worlds import default_specification
 
-        file = None if spec is None else load_specification(spec, profile=profile)
+        named = [] if spec is None else [spec]
+        files = load_spec_options(named, profile, constants, lambda: default_specification(scenario))
+        file = next(iter(files), None)
         if file is not None:
             require_choice(file, of)
         with progress("samples") as advance:

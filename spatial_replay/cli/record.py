@@ -14,9 +14,11 @@ from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import (
     ReadArguments,
     add_options,
+    constants_option,
     duration_ns_from_text,
     gather,
     input_files,
+    load_spec_options,
     output_option,
     profile_option,
     reading_options,
@@ -109,6 +111,7 @@ def recording_command(scenario: str) -> click.Command:
     @specs_option(
         "Specification to evaluate while recording; repeat for several.  [default: the scenario's own]"
     )
+    @constants_option
     @profile_option
     @click.option(
         "--duration",
@@ -119,15 +122,16 @@ def recording_command(scenario: str) -> click.Command:
     def command(
         output: Path,
         specs: tuple[Path, ...],
+        constants: Mapping[str, float | str],
         profile: str | None,
         duration: str | None,
         simulation: SimulationArguments,
     ) -> int:
         # imported here so that --help stays fast
         from spatial_replay.runs.scripted import record_script
-        from spatial_replay.spec import load_specification
+        from spatial_replay.simulation.worlds import default_specification
 
-        files = [load_specification(spec, profile=profile) for spec in specs]
+        files = load_spec_options(specs, profile, constants, lambda: default_specification(scenario))
         with progress("samples") as advance:
             recorded = record_script(
                 scenario,
@@ -170,10 +174,16 @@ for _scenario in SCENARIOS:
 @click.argument("file", type=click.Path(path_type=Path))
 @output_option("Log to write (MCAP).", required=True)
 @specs_option("Specification to evaluate while recording; repeat for several.")
+@constants_option
 @profile_option
 @reading_options
 def tracks(
-    file: Path, output: Path, specs: tuple[Path, ...], profile: str | None, reading: ReadArguments
+    file: Path,
+    output: Path,
+    specs: tuple[Path, ...],
+    constants: Mapping[str, float | str],
+    profile: str | None,
+    reading: ReadArguments,
 ) -> int:
     """Record the objects of any readable log: tracks, annotations, scenarios, bags with a mapping.
 
@@ -188,11 +198,10 @@ def tracks(
     # imported here so that --help stays fast
     from spatial_replay.recording import record_source
     from spatial_replay.sources.open_log import open_source
-    from spatial_replay.spec import load_specification
 
     inputs = input_files(file, *specs, reading=reading)
     source = open_source(file, **reading)
-    files = [load_specification(spec, profile=profile) for spec in specs]
+    files = load_spec_options(specs, profile, constants)
     with progress("samples") as advance:
         recorded = record_source(source, output, files, inputs=inputs, advance=advance)
     warn_of_damage(recorded)

@@ -61,7 +61,7 @@ def replay(
 ) -> int:
     """Evaluate specifications over a recorded log.
 
-    T is 12.5s or 1500ms after the first sample, integer nanoseconds, or 2026-01-31T12:00:00Z.
+    T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or 2026-01-31T12:00:00Z.
 
     Exits with 0 if all results are satisfied, 1 if any is violated, 4 if none is violated and any is unknown,
     3 if the log is damaged and the verdicts cover only what could be read.
@@ -116,11 +116,29 @@ def _width_ns(text: str) -> int:
     return width_ns
 
 
+_OTHER_OUTPUTS = {
+    ".csv": "for a table, export the annotated log: spatial-replay export OUT.mcap -o {output}",
+    ".parquet": "for a table, export the annotated log: spatial-replay export OUT.mcap -o {output}",
+    ".html": "for a page, write a report: spatial-replay report LOG --spec SPEC -o {output}",
+    ".json": "for results as JSON, give --json {output}",
+}
+
+
+def _check_ending(output: Path) -> None:
+    """Refuse the name of a file of another kind."""
+    remedy = _OTHER_OUTPUTS.get(output.suffix.lower())
+    if remedy is not None:
+        raise UsageError(
+            f"-o {output}: replay writes an annotated log (MCAP); {remedy.format(output=output)}"
+        )
+
+
 def _check_outputs(output: Path | None, json_file: str | None, inputs: tuple[Path, ...]) -> None:
     """Refuse outputs that could not be written, before the work is done."""
     from spatial_replay.logs.output_file import refuse_inputs
 
     if output is not None:
+        _check_ending(output)
         refuse_inputs(output, inputs)
     if json_file is not None and json_file != "-":
         refuse_inputs(Path(json_file), inputs)

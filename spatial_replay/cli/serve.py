@@ -52,8 +52,8 @@ def serve(
     the specifications is a parameter: change one, and the curves, colours, events and verdicts of the whole
     log are updated.
 
-    T is 12.5s or 1500ms after the first sample, integer nanoseconds, or 2026-01-31T12:00:00Z. Ctrl-C stops
-    the server, with exit code 130.
+    T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or 2026-01-31T12:00:00Z.
+    Ctrl-C stops the server, with exit code 130.
 
     \b
     Examples:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.replay.annotated import load_files, run_replay
+    from spatial_replay.replay.annotated import load_files, recorded_texts, run_replay
     from spatial_replay.replay.document import Explanation, document_from_replay, explain_results
     from spatial_replay.replay.engine import Replay, Replayed
     from spatial_replay.replay.playback import Playback
@@ -40,6 +40,7 @@ __all__ = [
     "first_sample_ns",
     "has_samples_from",
     "load_files",
+    "recorded_texts",
     "run_replay",
     "verify_certificate",
 ]
@@ -47,7 +48,7 @@ __all__ = [
 __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
-        "annotated": ("load_files", "run_replay"),
+        "annotated": ("load_files", "recorded_texts", "run_replay"),
         "document": ("Explanation", "document_from_replay", "explain_results"),
         "engine": ("Replay", "Replayed"),
         "playback": ("Playback",),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -25,8 +25,8 @@ from spatial_replay.logs.topics import (
 )
 from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Window
-from spatial_replay.spec import load_specification, parse_specification
 from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.overrides import SpecificationText, load_specifications
 
 _REPLACED = (REPLAYED_PREFIX, AUTOMATA_PREFIX + REPLAYED_PREFIX)
 """Prefixes of the attachments that a replay replaces."""
@@ -76,30 +76,45 @@ def run_replay(
     return replayed
 
 
-def load_files(paths: Sequence[Path], source: Source, *, profile: str | None = None) -> list[Specification]:
+def load_files(
+    paths: Sequence[Path],
+    source: Source,
+    *,
+    profile: str | None = None,
+    constants: Mapping[str, float | str] | None = None,
+) -> list[Specification]:
     """Load the named specifications or, without any, those that the log was written with.
 
     A replayed log gives those of the last replay, another log those that it was recorded with.
 
+    Args:
+        constants: values in place of those that the specifications have; see `load_specifications`.
+
     Raises:
-        UsageError: none was named and the log has none.
+        UsageError: none was named and the log has none, or no specification has one of the constants.
         SpecificationError: a specification with errors.
     """
-    if paths:
-        return [load_specification(path, profile=profile) for path in dict.fromkeys(paths)]
+    named: Sequence[Path | SpecificationText] = tuple(dict.fromkeys(paths)) or recorded_texts(source)
+    if not named:
+        raise UsageError(f"{source.name} holds no specification of its own; give one with --spec FILE")
+    return load_specifications(named, profile=profile, constants=constants)
+
+
+def recorded_texts(source: Source) -> list[SpecificationText]:
+    """Return the specifications that a log was written with, as they were written.
+
+    A replayed log gives those of the last replay, another log those that it was recorded with.
+    """
     attachments = source.attachments()
     for prefix in (REPLAYED_PREFIX, RECORDED_PREFIX):
-        texts = [attachment for attachment in attachments if attachment.name.startswith(prefix)]
+        texts = [
+            SpecificationText(each.data.decode("utf-8", "replace"), each.name.removeprefix(prefix))
+            for each in attachments
+            if each.name.startswith(prefix)
+        ]
         if texts:
-            return [
-                parse_specification(
-                    text.data.decode("utf-8", "replace"),
-                    filename=text.name.removeprefix(prefix),
-                    profile=profile,
-                )
-                for text in texts
-            ]
-    raise UsageError(f"{source.name} holds no specification of its own; give one with --spec FILE")
+            return texts
+    return []
 
 
 def _begin(sink: Sink, source: Source, replay: Replay, options: ReplayOptions, *, layer: bool) -> None:

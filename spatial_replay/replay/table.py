@@ -1,4 +1,4 @@
-"""The numbers of an annotated log as a table: a row for each sample, a column for each node."""
+"""The numbers of an annotated log as a table: a row for each sample, a column for each node and automaton."""
 
 from __future__ import annotations
 
@@ -9,25 +9,34 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Final, Literal, TypeAlias, get_args
 
 import numpy as np
+from google.protobuf.message import DecodeError
 
 from spatial_replay.annotate.robustness import RobustnessSeries, decode_robustness
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.output_file import replacing
+from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
+from spatial_replay.logs.schemas.Specification_pb2 import Specification, SpecificationResult
 from spatial_replay.logs.source import Source
-from spatial_replay.logs.topics import ROBUSTNESS
+from spatial_replay.logs.topics import AUTOMATON, ROBUSTNESS, SPECIFICATION
 
 Quantity: TypeAlias = Literal["value", "now", "lower", "upper"]
 TIME = "time_ns"
 """The title of the column of times."""
+SECONDS = "seconds"
+"""The title of the column of seconds since the first row."""
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 
+_LONGEST_TEXT: Final = 60
+"""Characters of a node's text in a title."""
 _Result: TypeAlias = tuple[str, str | None]
 """Name and object of a result."""
+_Node: TypeAlias = tuple[_Result, int]
+"""A node of a result, by its number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +45,15 @@ class TableRows:
 
     Attributes:
         times_ns: (T,) int64.
-        numbers: (T, columns); NaN where a node has no number, or no sample.
+        seconds: (T,), since the first row of the table.
+        numbers: (T, nodes); NaN where a node has no number, or no sample.
+        states: for each automaton, the states that it may be in after each sample: "2", "1|2" or "".
     """
 
     times_ns: Integers
+    seconds: Floats
     numbers: Floats
+    states: Sequence[Sequence[str]]
 
 
 def export_table(
@@ -54,7 +67,7 @@ def export_table(
     """Write the robustness in an annotated log as CSV or Parquet, by the output's ending.
 
     Returns:
-        The numbers of rows and columns, and what was lost while reading, each with its place.
+        The numbers of rows and of nodes, and what was lost while reading, each with its place.
 
     Raises:
         UsageError: another ending, Parquet without its library, or a log without robustness.
@@ -66,12 +79,12 @@ def export_table(
         raise UsageError(
             f"{output.name} ends in neither {' nor '.join(_WRITERS)}; the ending gives the format"
         )
-    titles = _columns(source)
+    titles, automata = _titles(source)
     faults: list[str] = []
     rows = 0
     with replacing(output, inputs) as stream:
-        write = writer(stream, [TIME, *titles.values()])
-        for table in _iter_tables(source, titles, QUANTITIES.index(quantity), faults):
+        write = writer(stream, [TIME, SECONDS, *titles.values()], list(automata.values()))
+        for table in _iter_tables(source, titles, automata, QUANTITIES.index(quantity), faults):
             write(table)
             rows += len(table.times_ns)
             advance(len(table.times_ns))
@@ -97,9 +110,13 @@ def _iter_series(source: Source) -> Iterator[tuple[list[RobustnessSeries], tuple
             raise LogError(f"{source.name}: a message of {ROBUSTNESS} cannot be read: {error}") from error
 
 
-def _columns(source: Source) -> Mapping[tuple[_Result, int], str]:
-    """Return the title of each node's column: its name, or its result's and its number; all differ."""
-    nodes: dict[tuple[_Result, int], str | None] = {}
+def _titles(source: Source) -> tuple[Mapping[_Node, str], Mapping[_Result, str]]:
+    """Return the titles of the columns of nodes and of automata; all differ.
+
+    A node is called after the named specs on the way to it, `task/deliver`; one without a name of its own,
+    after the nearest of them and its text.
+    """
+    nodes: dict[_Node, str | None] = {}
     faults: list[str] = []
     for series, lost in _iter_series(source):
         faults += lost
@@ -113,62 +130,138 @@ def _columns(source: Source) -> Mapping[tuple[_Result, int], str]:
         raise UsageError(
             f"{source.name} holds no {ROBUSTNESS}; write it with spatial-replay replay … -o FILE.mcap"
         )
-    names = list(nodes.values())
-    titles: dict[tuple[_Result, int], str] = {}
-    taken = {TIME}
+    taken = {TIME, SECONDS}
+    paths = {result: _paths(result, tree) for result, tree in _trees(source).items()}
+    titles: dict[_Node, str] = {}
     for (result, identifier), name in nodes.items():
-        owner = result[0] if result[1] is None else f"{result[0]}({result[1]})"
-        numbered = f"{owner}#{identifier}"
-        if name is None:
-            title = numbered
-        elif names.count(name) > 1:
-            title = owner if identifier == 0 else f"{owner}.{name}"
+        numbered = f"{_shown(result)}#{identifier}"
+        own = f"{_shown(result)}/{name}" if name and identifier else _shown(result)
+        fallback = own if name or not identifier else numbered
+        title = paths.get(result, {}).get(identifier, fallback)
+        titles[result, identifier] = _free(title, numbered, taken)
+    automata = {
+        result: _free(f"{_shown(result)}/automaton", f"{_shown(result)}#automaton", taken)
+        for result in _results_with_automaton(source)
+    }
+    return titles, automata
+
+
+def _shown(result: _Result) -> str:
+    return result[0] if result[1] is None else f"{result[0]}({result[1]})"
+
+
+def _free(title: str, other: str, taken: set[str]) -> str:
+    """Return the first of a title and its alternatives that no column has, and take it."""
+    choices = chain(
+        [title, f"{title} #{other.rpartition('#')[2]}", other], (f"{other} ({n})" for n in count(2))
+    )
+    chosen = next(choice for choice in choices if choice not in taken)
+    taken.add(chosen)
+    return chosen
+
+
+def _trees(source: Source) -> Mapping[_Result, SpecificationResult]:
+    """Return the trees of the results, as far as the log's specification can be read."""
+    trees: dict[_Result, SpecificationResult] = {}
+    for payload in _payloads(source, SPECIFICATION):
+        try:
+            message = Specification.FromString(payload)
+        except DecodeError:
+            continue
+        trees |= {(each.name, each.object or None): each for each in message.results}
+    return trees
+
+
+def _paths(result: _Result, tree: SpecificationResult) -> Mapping[int, str]:
+    """Return the title of each node of a tree; nodes come in the order of their numbers, parents first."""
+    owners: dict[int, str] = {}
+    titles: dict[int, str] = {}
+    for node in tree.nodes:
+        owner = owners.get(node.parent) if node.HasField("parent") else None
+        if owner is None:
+            title = owners[node.id] = _shown(result)
+        elif node.name:
+            title = owners[node.id] = f"{owner}/{node.name}"
         else:
-            title = name
-        choices = chain([title, numbered], (f"{numbered} ({number})" for number in count(2)))
-        titles[result, identifier] = next(choice for choice in choices if choice not in taken)
-        taken.add(titles[result, identifier])
+            text = node.text if len(node.text) <= _LONGEST_TEXT else f"{node.text[: _LONGEST_TEXT - 1]}…"
+            title, owners[node.id] = f"{owner}: {text}", owner
+        titles[node.id] = title
     return titles
 
 
+def _payloads(source: Source, topic: str) -> Iterator[bytes]:
+    """Yield the payloads of a topic; what is damaged is reported with the robustness."""
+    if isinstance(source, McapSource):
+        for payloads, _ in source.iter_payloads(topic):
+            yield from payloads
+
+
+def _results_with_automaton(source: Source) -> list[_Result]:
+    """Return the results whose automaton has states in the log, in the order in which they appear."""
+    return list(dict.fromkeys(result for _, result, _ in _iter_states(source)))
+
+
+def _iter_states(source: Source) -> Iterator[tuple[int, _Result, str]]:
+    """Yield time, result and states of each message about an automaton."""
+    for payload in _payloads(source, AUTOMATON):
+        try:
+            state = AutomatonState.FromString(payload)
+        except DecodeError:
+            continue
+        states = "|".join(map(str, state.states))
+        yield state.time_ns, (state.specification, state.object or None), states
+
+
 def _iter_tables(
-    source: Source, titles: Mapping[tuple[_Result, int], str], quantity: int, faults: list[str]
+    source: Source,
+    titles: Mapping[_Node, str],
+    automata: Mapping[_Result, str],
+    quantity: int,
+    faults: list[str],
 ) -> Iterator[TableRows]:
     column = {node: index for index, node in enumerate(titles)}
+    states: dict[_Result, dict[int, str]] = {result: {} for result in automata}
+    for time_ns, result, state in _iter_states(source) if automata else ():
+        states[result][time_ns] = state
+    first_ns: int | None = None
     for series, lost in _iter_series(source):
         faults += lost
         if not series:
             continue
         times_ns = np.unique(np.concatenate([each.times_ns for each in series]))
+        first_ns = int(times_ns[0]) if first_ns is None else first_ns
         numbers = np.full((len(times_ns), len(column)), np.nan)
         for each in series:
             result = (each.specification, each.object or None)
             rows = np.searchsorted(times_ns, each.times_ns)
             columns = [column[result, int(identifier)] for identifier in each.ids]
             numbers[rows[:, None], columns] = each.series[:, quantity].T
-        yield TableRows(times_ns, numbers)
+        cells = [[each.get(time_ns, "") for time_ns in times_ns.tolist()] for each in states.values()]
+        yield TableRows(times_ns, (times_ns - first_ns) / 1e9, numbers, cells)
 
 
 Write: TypeAlias = Callable[[TableRows | None], None]
 """Writes the next rows; None after the last."""
 
 
-def _csv_writer(stream: Any, titles: Sequence[str]) -> Write:
+def _csv_writer(stream: Any, titles: Sequence[str], automata: Sequence[str]) -> Write:
     text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
     rows = csv.writer(text)
-    rows.writerow(titles)
+    rows.writerow([*titles, *automata])
 
     def write(table: TableRows | None) -> None:
         if table is None:
             text.detach()
             return
-        for time_ns, numbers in zip(table.times_ns.tolist(), table.numbers.tolist(), strict=True):
-            rows.writerow([time_ns, *("" if math.isnan(number) else number for number in numbers)])
+        columns = [table.times_ns.tolist(), table.seconds.tolist(), table.numbers.tolist()]
+        for index, (time_ns, seconds, numbers) in enumerate(zip(*columns, strict=True)):
+            cells = ("" if math.isnan(number) else number for number in numbers)
+            rows.writerow([time_ns, seconds, *cells, *(states[index] for states in table.states)])
 
     return write
 
 
-def _parquet_writer(stream: Any, titles: Sequence[str]) -> Write:
+def _parquet_writer(stream: Any, titles: Sequence[str], automata: Sequence[str]) -> Write:
     try:
         import pyarrow as pa
         from pyarrow import parquet
@@ -176,7 +269,14 @@ def _parquet_writer(stream: Any, titles: Sequence[str]) -> Write:
         raise UsageError(
             "Parquet needs pyarrow; pip install 'spatial-replay[parquet]', or write a .csv"
         ) from error
-    schema = pa.schema([(titles[0], pa.int64()), *((title, pa.float64()) for title in titles[1:])])
+    time, *numbers = titles
+    schema = pa.schema(
+        [
+            (time, pa.int64()),
+            *((title, pa.float64()) for title in numbers),
+            *((title, pa.string()) for title in automata),
+        ]
+    )
     writer = parquet.ParquetWriter(stream, schema)
 
     def write(table: TableRows | None) -> None:
@@ -185,14 +285,16 @@ def _parquet_writer(stream: Any, titles: Sequence[str]) -> Write:
             return
         columns = [
             pa.array(table.times_ns),
+            pa.array(table.seconds),
             *(pa.array(column, from_pandas=True) for column in table.numbers.T),
+            *(pa.array([state or None for state in states], pa.string()) for states in table.states),
         ]
         writer.write_table(pa.table(columns, schema=schema))
 
     return write
 
 
-_WRITERS: dict[str, Callable[[Any, Sequence[str]], Write]] = {
+_WRITERS: dict[str, Callable[[Any, Sequence[str], Sequence[str]], Write]] = {
     ".csv": _csv_writer,
     ".parquet": _parquet_writer,
 }

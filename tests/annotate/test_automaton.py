@@ -138,7 +138,7 @@ def test_a_log_says_why_there_is_no_automaton() -> None:
     recording = Recording(sink, [parse_specification(text)])
     recording.add(Trace.from_samples(RUN))
     about = dict(sink.metadata)["spatial_replay_automata"]
-    assert about["a"].startswith("none: text.spatial:1:12: error: `O` looks back")
+    assert about["a"] == "none: `O` looks back: there is no automaton for past operators"
     assert about["b"] == "2 states, 1 proposition"
     assert not any("/a." in each.name for each in sink.attachments)
 

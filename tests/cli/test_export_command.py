@@ -27,7 +27,11 @@ def test_the_command_reports_what_it_wrote(folder: Path) -> None:
     said = "wrote run.csv: 12 rows, 4 nodes\n"
     assert (done.returncode, done.stdout, done.stderr) == (0, said, "")
     lines = (folder / "run.csv").read_text().splitlines()
-    assert lines[0] == "time_ns,reach,reach#1,apart,apart#1"
+    assert lines[0] == (
+        'time_ns,seconds,reach,reach: cube enclosedin goal,apart,"apart: cube dist ""cup 物"" >= 0.5",'
+        "reach/automaton,apart/automaton"
+    )
+    assert lines[2].startswith("250000000,0.25,")
     assert len(lines) == 13
 
 

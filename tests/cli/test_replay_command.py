@@ -78,7 +78,7 @@ def test_each_and_the_window_are_passed_to_the_evaluation(
     assert [each["object"] for each in found["specifications"]] == ["cup 物"]
 
 
-@pytest.mark.parametrize("window", [(), ("--from", "1s"), ("--from", "500000000", "--every", "2")])
+@pytest.mark.parametrize("window", [(), ("--from", "1s"), ("--from", "500000000ns", "--every", "2")])
 def test_a_printed_time_can_be_used_as_an_option(
     folder: Path, window: Sequence[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -184,6 +184,9 @@ TEN_FAULTS = "\n".join(
         ((*REPLAY, "-o", "out", "--json", "./out"), "-o and --json both name ./out"),
         ((*REPLAY, "-o", "none/out.mcap"), "there is no folder none"),
         ((*REPLAY, "-o", "."), "is a folder"),
+        ((*REPLAY, "--from", "3"), "--from: '3' has no unit: 3s after the log's first sample, or 3 ns"),
+        ((*REPLAY, "-o", "out.csv"), "export the annotated log: spatial-replay export OUT.mcap -o out.csv"),
+        ((*REPLAY, "-o", "out.html"), "spatial-replay report LOG --spec SPEC -o out.html"),
         ((*REPLAY, "--from", "soon"), "'soon' is not a time; write 12.5s"),
         ((*REPLAY, "--from", "99s"), "run.jsonl has no sample in the requested window; its samples are from"),
         ((*REPLAY, "--from", "2s", "--to", "1000ms"), "the window --from 2s --to 1000ms is empty"),

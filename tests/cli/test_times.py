@@ -22,8 +22,22 @@ zones = st.integers(-14 * 60, 14 * 60).map(lambda minutes: timezone(timedelta(mi
 
 
 @given(times_ns)
-def test_integers_are_nanoseconds_on_the_clock_of_the_log(time_ns: int) -> None:
-    assert time_point_from_text(str(time_ns)).absolute_ns(first_ns=17) == time_ns
+def test_nanoseconds_are_on_the_clock_of_the_log(time_ns: int) -> None:
+    assert time_point_from_text(f"{time_ns}ns").absolute_ns(first_ns=17) == time_ns
+
+
+@given(st.integers(10**12, LATEST_NS))
+def test_large_integers_are_nanoseconds(time_ns: int) -> None:
+    assert time_point_from_text(str(time_ns)) == time_point_from_text(f"{time_ns}ns")
+
+
+@pytest.mark.parametrize("text", ["3", "0", "1500", "999999999999"])
+def test_a_small_integer_is_refused_with_both_readings(text: str) -> None:
+    with pytest.raises(
+        UsageError, match=f"{text}s after the log's first sample, or {text} ns on the log's own"
+    ) as no:
+        time_point_from_text(text)
+    assert str(no.value).endswith(f"Write {text}s or {text}ns")
 
 
 @given(times_ns, st.integers(0, 10**18))

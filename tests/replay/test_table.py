@@ -11,7 +11,7 @@ import pytest
 
 from replay.runs import SPECIFICATION, PiecewiseSource, record, run
 from spatial_replay.errors import UsageError
-from spatial_replay.replay import QUANTITIES, Replayed, ReplayOptions, export_table, run_replay
+from spatial_replay.replay import QUANTITIES, Replayed, ReplayOptions, Window, export_table, run_replay
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec.load import parse_specification
 
@@ -37,11 +37,12 @@ def test_the_table_has_every_number(annotated: tuple[Path, Replayed], tmp_path: 
     output = tmp_path / "run.csv"
     rows, columns, faults = export_table(open_source(path), output, quantity=quantity)  # type: ignore[arg-type]
     titles, *body = _rows(output)
-    assert (rows, columns, faults) == (12, len(titles) - 1, ())
+    automata = [title for title in titles if title.endswith("/automaton")]
+    assert (rows, columns, faults) == (12, len(titles) - 2 - len(automata), ())
     assert len(set(titles)) == len(titles)
     at = QUANTITIES.index(quantity)  # type: ignore[arg-type]
     expected: dict[tuple[int, int], str] = {}
-    column = 1
+    column = 2
     for result in replayed.results:
         assert result.series is not None
         assert result.times_ns is not None
@@ -53,7 +54,10 @@ def test_the_table_has_every_number(annotated: tuple[Path, Replayed], tmp_path: 
                     expected[time_ns, column] = repr(number)
             column += 1
     assert expected == {
-        (int(row[0]), index): cell for row in body for index, cell in enumerate(row) if index and cell
+        (int(row[0]), index): cell
+        for row in body
+        for index, cell in enumerate(row)
+        if 1 < index < columns + 2 and cell
     }
 
 
@@ -61,15 +65,55 @@ def test_columns_have_the_names_of_nodes(annotated: tuple[Path, Replayed], tmp_p
     export_table(open_source(annotated[0]), tmp_path / "run.csv")
     assert _rows(tmp_path / "run.csv")[0] == [
         "time_ns",
+        "seconds",
         "reach",
-        "reach#1",
+        "reach: cube enclosedin goal",
         "apart",
-        "apart#1",
+        'apart: cube dist "cup 物" >= 0.5',
         "near(cube)",
-        "near(cube)#1",
+        "near(cube): ego dist cube <= 9",
         "near(cup 物)",
-        "near(cup 物)#1",
+        "near(cup 物): ego dist cube <= 9",
+        "reach/automaton",
+        "apart/automaton",
+        "near(cube)/automaton",
+        "near(cup 物)/automaton",
     ]
+
+
+def test_a_named_part_is_called_after_the_specs_that_it_is_part_of(tmp_path: Path) -> None:
+    text = """\
+region goal = box(4, -1, 9, 2)
+spec grasp = F (cube ovlp goal)
+spec deliver = grasp and F (cube enclosedin goal)
+spec task = deliver and G (cube dist cube >= 0)
+"""
+    path = tmp_path / "annotated.mcap"
+    run_replay(PiecewiseSource(run(), 5), [parse_specification(text)], output=path)
+    export_table(open_source(path), tmp_path / "run.csv")
+    titles = _rows(tmp_path / "run.csv")[0]
+    assert titles[2:6] == ["task", "task/deliver", "task/deliver/grasp", "task/deliver/grasp: cube ovlp goal"]
+
+
+def test_seconds_count_from_the_first_row(tmp_path: Path) -> None:
+    path = tmp_path / "late.mcap"
+    spec = parse_specification(SPECIFICATION)
+    run_replay(PiecewiseSource(run(), 5), [spec], ReplayOptions(Window(start_ns=10**9)), output=path)
+    export_table(open_source(path), tmp_path / "run.csv")
+    _, *body = _rows(tmp_path / "run.csv")
+    first_ns = int(body[0][0])
+    assert first_ns == 10**9
+    assert [float(row[1]) for row in body] == [(int(row[0]) - first_ns) / 1e9 for row in body]
+
+
+def test_automata_have_a_column_of_states_each(annotated: tuple[Path, Replayed], tmp_path: Path) -> None:
+    export_table(open_source(annotated[0]), tmp_path / "run.csv")
+    titles, *body = _rows(tmp_path / "run.csv")
+    states = [row[titles.index("reach/automaton")] for row in body]
+    # the cube enters the goal with sample 8, and has been there ever since
+    assert states == ["0"] * 8 + ["1"] * 4
+    apart = [row[titles.index("apart/automaton")] for row in body]
+    assert "0|1" in apart, "the cup is out of sight in some samples, so that several states are possible"
 
 
 def test_no_two_columns_have_the_same_name(tmp_path: Path) -> None:
@@ -96,7 +140,11 @@ def test_parquet_holds_the_same_numbers(annotated: tuple[Path, Replayed], tmp_pa
     table = parquet.read_table(tmp_path / "run.parquet")
     titles, *body = _rows(tmp_path / "run.csv")
     assert table.column_names == titles
-    cells = [[None if cell == "" else float(cell) for cell in row] for row in body]
+    numeric = len(titles) - 4
+    cells = [
+        [None if cell == "" else cell if index >= numeric else float(cell) for index, cell in enumerate(row)]
+        for row in body
+    ]
     assert [list(row) for row in zip(*table.to_pydict().values(), strict=True)] == cells
 
 
