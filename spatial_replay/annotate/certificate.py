@@ -105,33 +105,44 @@ class SampleHash:
 
 
 class MessageHash:
-    """SHA-256 of messages in order: topic, time and bytes of each."""
+    """SHA-256 of messages: of each topic, in order, the times and bytes of its messages.
+
+    The order among topics does not count: a recorder gets messages from several threads, and may have written
+    later ones of one topic when those of another arrive.
+    """
 
     def __init__(self, hashing: Hashing | None = None) -> None:
         self._hashing = hashing or Hashing()
         # one hash per column, so that many messages are hashed at once however they are cut into blocks
-        self._topics, self._times = hashlib.sha256(), hashlib.sha256()
-        self._lengths, self._payloads = hashlib.sha256(), hashlib.sha256()
+        self._topics: dict[str, tuple[hashlib._Hash, hashlib._Hash, hashlib._Hash]] = {}
 
     def add(self, messages: Messages) -> None:
         """Take in the next messages."""
         if not len(messages):
             return
-        topics = np.zeros((max(messages.channels) + 1, 32), np.uint8)
+        topics = sorted({channel.topic for channel in messages.channels.values()})
+        codes = np.zeros(max(messages.channels) + 1, np.int64)
         for number, channel in messages.channels.items():
-            topics[number] = np.frombuffer(hashlib.sha256(_text(channel.topic)).digest(), np.uint8)
-        lengths = np.fromiter(map(len, messages.payloads), np.int64, len(messages))
-        update = self._hashing.update
-        update(self._topics, topics[messages.channel])
-        update(self._times, _integers(messages.log_time_ns))
-        update(self._lengths, _integers(lengths))
-        update(self._payloads, b"".join(messages.payloads))
+            codes[number] = topics.index(channel.topic)
+        codes = codes[messages.channel]
+        for code in np.unique(codes).tolist():
+            rows = np.flatnonzero(codes == code)
+            payloads = [messages.payloads[row] for row in rows.tolist()]
+            lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
+            hashes = self._topics.setdefault(
+                topics[code], (hashlib.sha256(), hashlib.sha256(), hashlib.sha256())
+            )
+            self._hashing.update(hashes[0], _integers(messages.log_time_ns[rows]))
+            self._hashing.update(hashes[1], _integers(lengths))
+            self._hashing.update(hashes[2], b"".join(payloads))
 
     def hexdigest(self) -> str:
         self._hashing.finish()
         total = hashlib.sha256()
-        for column in (self._topics, self._times, self._lengths, self._payloads):
-            total.update(column.digest())
+        for topic in sorted(self._topics):
+            total.update(_text(topic))
+            for hashed in self._topics[topic]:
+                total.update(hashed.digest())
         return total.hexdigest()
 
 

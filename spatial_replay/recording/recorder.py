@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from os import PathLike
 from pathlib import Path
@@ -22,9 +22,11 @@ from spatial_replay.geometry.contact import contacts
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.geometry.measure import Operand
 from spatial_replay.logs.mcap.writer import LogWriter
-from spatial_replay.logs.messages import MemorySink
+from spatial_replay.logs.messages import MemorySink, Messages
 from spatial_replay.logs.output_file import open_output, refuse_inputs
 from spatial_replay.recording.interruption import terminable, uninterrupted
+from spatial_replay.recording.message_channel import MessageChannel, MessageQueue
+from spatial_replay.recording.message_schema import SchemaLike, message_channel
 from spatial_replay.recording.recording import Recording, refuse_templates
 from spatial_replay.spec import object_names, signal_names
 from spatial_replay.spec.formula import Specification
@@ -56,6 +58,8 @@ class Recorder:
     Use as:
 
         with Recorder("run.mcap", specifications=[spec]) as recorder:
+            joints = recorder.channel("/joint_states")
+            joints.write(time_ns, {"position": [0.1, 0.2]})
             recorder.write(sample)
     """
 
@@ -77,8 +81,8 @@ class Recorder:
             path: replaced if it exists.
             specifications: evaluated as the samples arrive, without templates; one or several.
             about: further metadata of the log: a seed, where the samples come from.
-            waiting: how many samples may wait for the writing thread.
-            block: when that many wait, let `write` wait, too; otherwise drop samples, and count them in the
+            waiting: how many samples, and how many messages of channels, may wait for the writing thread.
+            block: when that many wait, let `write` wait, too; otherwise drop what comes, and count it in the
                 log.
 
         Raises:
@@ -97,6 +101,7 @@ class Recorder:
         self._waiting = waiting
         self._enough = max(1, min(waiting, _TOGETHER) // 2)
         self._blocks = block
+        self._messages = MessageQueue(self._path.name, waiting, blocks=block, ring=self._ring)
         self._dropped = 0
         self._last_ns = -1
         self._closed = False
@@ -119,6 +124,35 @@ class Recorder:
     def dropped(self) -> int:
         """How many samples were dropped because the queue was full."""
         return self._dropped
+
+    def channel(
+        self,
+        topic: str,
+        *,
+        schema: SchemaLike = None,
+        encoding: str | None = None,
+        schema_name: str | None = None,
+        schema_encoding: str | None = None,
+    ) -> MessageChannel:
+        """Open a topic for messages of your own, which are recorded beside the samples.
+
+        A replay keeps them, and the certificate covers them. Opening a topic again gives the same channel.
+
+        Args:
+            topic: such as "/joint_states"; those under /spatial and those of a planner are taken.
+            schema: a JSON schema (dict or text), a protobuf class, or the definition that belongs to the
+                encoding (text or bytes); json needs none. Messages are not checked against it.
+            encoding: "json", "protobuf", "ros1", "cdr", "cbor", "msgpack" or "flatbuffer"; without it,
+                "protobuf" for a protobuf class, else "json".
+            schema_name: the type of the messages; a protobuf class has its name, a JSON schema its title.
+            schema_encoding: that of the schema where there are several: "ros2msg", "ros2idl" or "omgidl".
+
+        Raises:
+            UsageError: a topic of ours, an unknown encoding, a schema that does not fit, a topic that is open
+                in another way, a closed recorder.
+            OutputError: something before could not be written.
+        """
+        return self._messages.channel(message_channel(topic, encoding, schema, schema_name, schema_encoding))
 
     def write(self, sample: Sample) -> None:
         """Hand over the next sample; return at once unless the queue is full.
@@ -157,6 +191,7 @@ class Recorder:
             if self._closed:
                 return
             self._closed = True
+            self._messages.close()
             self._queue.put(None)
             self._ring()
             self._thread.join()
@@ -177,7 +212,9 @@ class Recorder:
         """Write the end of the log, unless writing failed before."""
         try:
             if self._failure is None:
-                self._recording.end(interrupted=interrupted, dropped=self._dropped)
+                self._recording.end(
+                    interrupted=interrupted, dropped=self._dropped, messages_dropped=self._messages.dropped
+                )
                 self._writer.close()
         finally:
             self._stream.close()
@@ -193,17 +230,26 @@ class Recorder:
         ended = False
         while not ended:
             samples, ended = self._waiting_samples()
-            if self._failure is not None:
-                continue
-            try:
-                if samples:
-                    self._recording.add(Trace.from_samples(samples))
-                if time.monotonic() - flushed >= FLUSH_S:
-                    self._flush()
-                    flushed = time.monotonic()
-            except Exception as error:
-                # raised by the next `write`, since an error that ends a thread goes unnoticed
-                self._failure = error
+            self._record(samples, self._messages.take())
+            if self._failure is None and time.monotonic() - flushed >= FLUSH_S:
+                self._try(self._flush)
+                flushed = time.monotonic()
+        while len(messages := self._messages.take()):
+            self._record([], messages)
+
+    def _record(self, samples: Sequence[Sample], messages: Messages) -> None:
+        """Encode and write samples and messages; after a failure, drop them."""
+        if self._failure is None and (samples or len(messages)):
+            self._try(lambda: self._recording.add(Trace.from_samples(samples), messages))
+
+    def _try(self, step: Callable[[], None]) -> None:
+        """Do a step of the writing thread."""
+        try:
+            step()
+        except Exception as error:
+            # raised by the next `write`, since an error that ends a thread goes unnoticed
+            self._failure = error
+            self._messages.fail(error)
 
     def _ring(self) -> None:
         """Wake the writing thread before its gathering time is over."""

@@ -63,7 +63,7 @@ class Recording:
         self._evaluation = AnnotatedEvaluation(
             files, [find_instances(file, {}, (), 0, FOREVER) for file in files], known=known
         )
-        self._samples = self._end_ns = 0
+        self._samples = self._messages = self._end_ns = 0
         self._topics: set[str] = set()
         hashing = Hashing()
         self._sample_hash, self._message_hash = SampleHash(hashing), MessageHash(hashing)
@@ -99,8 +99,8 @@ class Recording:
         """Write the next samples.
 
         Args:
-            beside: messages of other topics that are not derived from samples, none before the first of these
-                samples; a replay keeps them.
+            beside: messages of other topics that are not derived from samples, those of each topic in the
+                order of time; a replay keeps them.
 
         Raises:
             TraceError: samples that are not after those before.
@@ -110,23 +110,31 @@ class Recording:
         if beside is not None and len(beside):
             own = merge([own, beside])
             self._topics.update(channel.topic for channel in beside.channels.values())
+            self._messages += len(beside)
         derived = self._evaluation.messages(trace, stretches)
         self._sink.write_messages(merge([own, *derived]))
         if len(own):
-            self._end_ns = int(own.log_time_ns[-1])
+            self._end_ns = max(self._end_ns, int(own.log_time_ns[-1]))
         self._samples += len(trace)
         self._sample_hash.add(trace)
         self._message_hash.add(own)
         for index, stretch in enumerate(stretches):
             self._result_hash.add(index, stretch.series)
 
-    def end(self, *, interrupted: bool = False, dropped: int = 0) -> None:
-        """Write what follows the last sample; the certificate is that of a replay of the log."""
+    def end(self, *, interrupted: bool = False, dropped: int = 0, messages_dropped: int = 0) -> None:
+        """Write what follows the last sample; the certificate is that of a replay of the log.
+
+        Args:
+            interrupted: whether the recording ended early.
+            dropped, messages_dropped: how many samples, and messages beside them, found no place.
+        """
         ending = {
             "samples": str(self._samples),
             "dropped": str(dropped),
             "interrupted": json.dumps(interrupted),
         }
+        if self._messages or messages_dropped:
+            ending |= {"messages": str(self._messages), "messages_dropped": str(messages_dropped)}
         if self._samples:
             self._sink.write_messages(self._evaluation.end(self._end_ns))
         layout = self._evaluation.layout(self._topics)

@@ -1,0 +1,234 @@
+"""Channels of a recorder for a caller's own messages, and the queue where these wait to be written."""
+
+from __future__ import annotations
+
+import operator
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from reprlib import repr as shortened
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from spatial_replay.errors import UsageError
+from spatial_replay.logs.messages import Channel, Messages
+from spatial_replay.recording.message_schema import MessageData, payload_encoder
+from spatial_replay.trace.sample import LATEST_NS
+
+MOST_WAITING_BYTES: Final = 64 * 2**20
+"""The most bytes of messages that wait to be written; one message that is larger waits alone."""
+
+_TOGETHER_BYTES: Final = 8 * 2**20
+"""About the most bytes that are written at once."""
+
+_PAUSE_S = 0.001
+
+
+class _Waiting(NamedTuple):
+    """One message in the queue."""
+
+    channel: int
+    sequence: int
+    time_ns: int
+    payload: bytes
+
+
+class MessageQueue:
+    """Messages from any thread, on their way to the one thread that writes them.
+
+    Only the threads that write messages take its lock, so that an interruption of one of them never stops
+    the writing thread.
+    """
+
+    def __init__(self, name: str, limit: int, *, blocks: bool, ring: Callable[[], None]) -> None:
+        """Begin without channels.
+
+        Args:
+            name: of the log.
+            limit: how many messages may wait.
+            blocks: whether a message waits for its place, or is dropped.
+            ring: wakes the writing thread.
+        """
+        self._name, self._limit, self._blocks, self._ring = name, limit, blocks, ring
+        # reentrant, so that a signal handler may write while its own thread does
+        self.lock = threading.RLock()
+        self.channels: dict[str, MessageChannel] = {}
+        self._declared: Mapping[int, Channel] = MappingProxyType({})
+        self._queue: queue.SimpleQueue[_Waiting] = queue.SimpleQueue()
+        self._bytes_in = self._bytes_out = 0
+        self._is_closed = False
+        self._failure: Exception | None = None
+
+    @property
+    def written(self) -> int:
+        """How many messages were taken, on all channels."""
+        return sum(channel.written for channel in self.channels.values())
+
+    @property
+    def dropped(self) -> int:
+        """How many messages were dropped, on all channels."""
+        return sum(channel.dropped for channel in self.channels.values())
+
+    def channel(self, channel: Channel) -> MessageChannel:
+        """Return the channel of a topic, the same one whenever it is opened in the same way.
+
+        Raises:
+            UsageError: the recorder is closed, or the topic is open with another encoding or schema.
+        """
+        with self.lock:
+            self.require_open()
+            known = self.channels.get(channel.topic)
+            if known is None:
+                number = len(self.channels)
+                known = MessageChannel(self, number, channel)
+                # replaced, never changed: the writing thread may be reading it
+                self._declared = MappingProxyType({**self._declared, number: channel})
+                self.channels[channel.topic] = known
+            elif known.declaration != channel:
+                raise UsageError(
+                    f"{channel.topic} is open already with another encoding or schema; give one topic to each"
+                )
+            return known
+
+    def require_open(self) -> None:
+        """Check that messages can be taken.
+
+        Raises:
+            UsageError: the recorder is closed.
+            Exception: what prevents writing.
+        """
+        if self._is_closed:
+            raise UsageError(f"{self._name} is closed; open another recorder")
+        if self._failure is not None:
+            raise self._failure
+
+    def put(self, message: _Waiting) -> bool:
+        """Queue a message; return False if it was dropped. Call it with the lock held."""
+        size = len(message.payload)
+        while self._is_full(size):
+            if not self._blocks:
+                return False
+            self._ring()
+            time.sleep(_PAUSE_S)
+        self._bytes_in += size
+        self._queue.put(message)
+        if self._bytes_in - self._bytes_out > _TOGETHER_BYTES or self._queue.qsize() * 2 >= self._limit:
+            self._ring()
+        return True
+
+    def take(self) -> Messages:
+        """Return some of the messages that wait, none if there are none; for the writing thread."""
+        taken: list[_Waiting] = []
+        size = 0
+        with suppress(queue.Empty):
+            while size < _TOGETHER_BYTES:
+                message = self._queue.get_nowait()
+                taken.append(message)
+                size += len(message.payload)
+        self._bytes_out += size
+        if not taken:
+            return Messages()
+        channel, sequence, times_ns, payloads = zip(*taken, strict=True)
+        log_time_ns = np.array(times_ns, np.int64)
+        return Messages(
+            self._declared,
+            np.array(channel, np.int64),
+            np.array(sequence, np.int64),
+            log_time_ns,
+            log_time_ns,
+            payloads,
+        )
+
+    def fail(self, error: Exception) -> None:
+        """Raise an error of the writing thread in whichever call comes next."""
+        self._failure = error
+
+    def close(self) -> None:
+        """Take no more messages."""
+        with self.lock:
+            self._is_closed = True
+
+    def _is_full(self, size: int) -> bool:
+        waiting_bytes = self._bytes_in - self._bytes_out
+        return self._queue.qsize() >= self._limit or (
+            waiting_bytes > 0 and waiting_bytes + size > MOST_WAITING_BYTES
+        )
+
+
+class MessageChannel:
+    """A topic of a recorder for messages of the caller's own; `Recorder.channel` opens it.
+
+    Any thread may write, also several on one channel.
+    """
+
+    def __init__(self, queue: MessageQueue, number: int, declaration: Channel) -> None:
+        self._queue, self._number = queue, number
+        self.declaration = declaration
+        self._encode = payload_encoder(declaration)
+        self._last_ns = 0
+        self._written = self._dropped = 0
+
+    @property
+    def topic(self) -> str:
+        return self.declaration.topic
+
+    @property
+    def encoding(self) -> str:
+        """The encoding of its messages."""
+        return self.declaration.encoding
+
+    @property
+    def written(self) -> int:
+        """How many messages were taken."""
+        return self._written
+
+    @property
+    def dropped(self) -> int:
+        """How many messages were dropped because the queue was full."""
+        return self._dropped
+
+    def __repr__(self) -> str:
+        return f"MessageChannel({self.topic!r}, encoding={self.encoding!r}, written={self.written})"
+
+    def write(self, time_ns: int, data: MessageData) -> None:
+        """Hand over the next message; return at once unless the queue is full.
+
+        Args:
+            time_ns: its log time, on the clock of the samples; not before that of the channel's last message.
+            data: a dict for json, a message for protobuf, or bytes, which are written unchanged.
+
+        Raises:
+            UsageError: a time out of range or order, data that does not fit the channel, a closed recorder.
+            OutputError: something before could not be written.
+        """
+        time_ns = self._checked(time_ns)
+        payload = self._encode(data)
+        queue = self._queue
+        with queue.lock:
+            queue.require_open()
+            if time_ns < self._last_ns:
+                raise UsageError(
+                    f"a message on {self.topic} at {time_ns} ns follows one at {self._last_ns} ns; give times"
+                    " that do not decrease, or each thread a topic"
+                )
+            self._last_ns = time_ns
+            if queue.put(_Waiting(self._number, self._written, time_ns, payload)):
+                self._written += 1
+            else:
+                self._dropped += 1
+
+    def _checked(self, time_ns: object) -> int:
+        try:
+            number = operator.index(time_ns)  # type: ignore[arg-type]
+        except TypeError:
+            number = -1
+        if isinstance(time_ns, bool) or not 0 <= number <= LATEST_NS:
+            raise UsageError(
+                f"the time of a message on {self.topic} is {shortened(time_ns)}; give integer nanoseconds"
+                " from 0 to 2**63 - 1"
+            )
+        return number
