@@ -37,9 +37,9 @@ from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.online.operators import looks_ahead
 from spatial_replay.monitor.semantics import Semantics
+from spatial_replay.monitor.sentences import number_text
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, final_verdict
-from spatial_replay.monitor.witness.sentences import number_text
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, Specification, iter_nodes
 from spatial_replay.spec.relations import RELATION_NAMES

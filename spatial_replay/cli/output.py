@@ -78,7 +78,7 @@ def _numbers(result: SpecResult, first_ns: int) -> str:
 
 def _why_unknown(result: SpecResult, first_ns: int) -> str:
     """Return the sentence about what was unknown, or too uncertain."""
-    from spatial_replay.monitor.witness.sentences import sentences_of
+    from spatial_replay.monitor.sentences import sentences_of
 
     _, reason = sentences_of(result.witness(), first_ns=first_ns)
     return reason

@@ -129,6 +129,11 @@ class Evaluation(Displayed):
         worst = worst_verdict(result.verdict for result in results)
         return next(result for result in results if result.verdict is worst).witness(node)
 
+    def explain(self) -> str:
+        """Explain every verdict in sentences, as the command `explain` does (see `SpecResult.explain`)."""
+        texts = [result.explain() for result in self.results]
+        return "\n\n".join([*texts, *(each.message for each in self.vacuous)])
+
     def __repr__(self) -> str:
         return f"<Evaluation: {self.verdict}; {', '.join(map(repr, self.results))}>"
 

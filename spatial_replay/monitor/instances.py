@@ -19,19 +19,26 @@ class Instance:
     """One formula to evaluate.
 
     Attributes:
-        name: the spec's name.
+        spec: the statement that it comes from.
         object: the object that the template's parameter stands for, or None.
         bindings: that object by the parameter's name.
         start_ns, end_ns: it is evaluated over the samples from start to before end.
     """
 
-    name: str
+    spec: NamedSpec
     object: str | None
-    formula: Formula
     program: Program
     bindings: Bindings
     start_ns: int
     end_ns: int
+
+    @property
+    def name(self) -> str:
+        return self.spec.name
+
+    @property
+    def formula(self) -> Formula:
+        return self.spec.formula
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,13 +95,11 @@ def find_instances(
     for spec in specification.results:
         program = compile_formula(spec.formula)
         if spec.parameter is None:
-            instances.append(Instance(spec.name, None, spec.formula, program, {}, start_ns, end_ns))
+            instances.append(Instance(spec, None, program, {}, start_ns, end_ns))
             continue
         for name, (first_ns, last_ns) in sorted(chosen[spec.parameter].items()):
             bindings = {spec.parameter: TrackedName(name)}
-            instances.append(
-                Instance(spec.name, name, spec.formula, program, bindings, first_ns, last_ns + 1)
-            )
+            instances.append(Instance(spec, name, program, bindings, first_ns, last_ns + 1))
     return instances
 
 

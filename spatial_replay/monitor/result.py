@@ -14,6 +14,7 @@ from spatial_replay.lazy import Displayed
 from spatial_replay.monitor.causes import Cause, LeastPart, conjuncts_of, find_causes, find_least
 from spatial_replay.monitor.offline import full_signal, window_signal
 from spatial_replay.monitor.semantics import Semantics, require_ltlf
+from spatial_replay.monitor.sentences import cause_sentences, sentences_of, time_text, verdict_sentence
 from spatial_replay.monitor.stream import NEVER, InstanceStream, SeriesBlock
 from spatial_replay.monitor.vacuity import Vacuous, find_vacuous
 from spatial_replay.monitor.verdict import Verdict, final_verdict
@@ -21,7 +22,7 @@ from spatial_replay.monitor.witness.path import Evidence
 from spatial_replay.monitor.witness.witness import Witness, find_witness
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import Formula, iter_nodes, operator_of
+from spatial_replay.spec.formula import Formula, NamedSpec, iter_nodes, operator_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +127,11 @@ class SpecResult(Displayed):
             block.leaves if block is not None and has_leaves else None,
             evidence,
         )
+
+    @property
+    def spec(self) -> NamedSpec:
+        """The `spec` statement that it is the result of, with its requirement's id and title."""
+        return self.evidence.instance.spec
 
     @property
     def title(self) -> str:
@@ -261,6 +267,42 @@ class SpecResult(Displayed):
         if not 0 <= identifier < len(self.final):
             raise UsageError(f"no node has the id {identifier}; they go from 0 to {len(self.final) - 1}")
         return find_witness(self.evidence, leaves, self.times_ns, identifier)
+
+    def explain(self, *, first_ns: int | None = None) -> str:
+        """Explain the verdict in sentences, one a line, as the command `explain` prints them.
+
+        Of a result that is not satisfied, each cause with what decided it, and which change would flip that;
+        of a satisfied one, what it is satisfied by; then the parts that decided nothing.
+
+        Args:
+            first_ns: the time that others are counted from; by default that of the log's first sample.
+        """
+        first_ns = self.evidence.first_ns() if first_ns is None else first_ns
+        return "\n".join(self.sentences(first_ns))
+
+    def sentences(self, first_ns: int) -> tuple[str, ...]:
+        """Return the sentences of `explain`, which count time from `first_ns`."""
+        found: list[str] = []
+        if self.can_explain and not self.causes:
+            found += sentences_of(self.witness(), first_ns=first_ns)
+        else:
+            found.append(self._headline(first_ns))
+        for cause in self.causes:
+            about = cause_sentences(cause, first_ns=first_ns, object=self.object)
+            # of the whole formula, the headline has said the first of them
+            found += about if cause.node else about[1:]
+        return (*found, *(each.message for each in self.vacuous))
+
+    def _headline(self, first_ns: int) -> str:
+        instance = f" for {self.object}" if self.object is not None else ""
+        settled_ns = self.satisfied_at_ns if self.violated_at_ns is None else self.violated_at_ns
+        return verdict_sentence(
+            f"`{self.name}`{instance}",
+            self.verdict,
+            (self.lower, self.upper),
+            certain_since=None if settled_ns is None else time_text(settled_ns, first_ns),
+            least=self.least,
+        )
 
     def _cause_witness(self, node: int, settled_ns: int | None) -> Witness | None:
         if self.leaves is None or not self.can_explain:

@@ -59,7 +59,7 @@ class Vacuous:
 def no_instances(name: str, parameter: str) -> Vacuous:
     """Return the entry of a template that no object fits."""
     text = f"{name}({parameter})"
-    message = f"`{text}` was never evaluated: no object stands for {parameter}"
+    message = f"`{text}` was never evaluated: no object stands for {parameter}."
     return Vacuous(None, text, "no instances", message)
 
 
@@ -167,7 +167,7 @@ def _empty_windows(
         begin, end = windows_of(node, times_ns)
         if not (begin < end)[scope].any():
             what = f"the log has no {_NEXT[node.operator]}" if node.operator in _NEXT else _NO_SAMPLE
-            yield Vacuous(identifier, "", "empty window", f"`{{}}` was never tested: {what}")
+            yield Vacuous(identifier, "", "empty window", f"`{{}}` was never tested: {what}.")
 
 
 _NO_SAMPLE = "no sample of the log lies in its window"
@@ -190,7 +190,7 @@ def _idle_implications(
 def _idle(identifier: int, implication: Boolean) -> Vacuous:
     antecedent = format_formula(implication.operands[0])
     return Vacuous(
-        identifier, "", "antecedent never held", f"`{{}}` was never tested: `{antecedent}` never held"
+        identifier, "", "antecedent never held", f"`{{}}` was never tested: `{antecedent}` never held."
     )
 
 
@@ -241,7 +241,7 @@ def _empty_groups(
         if empty:
             names = " or ".join(f"`{format_term(group)}`" for group in dict.fromkeys(empty))
             yield Vacuous(
-                identifier, "", "no members", f"`{{}}` decided nothing: no object was ever in {names}"
+                identifier, "", "no members", f"`{{}}` decided nothing: no object was ever in {names}."
             )
 
 
@@ -259,8 +259,8 @@ def _infinite(identifier: int, node: Formula, seconds: float) -> Iterator[Vacuou
     """Yield why a result is infinite, from the node that its number is of."""
     if isinstance(node, Temporal):
         side = "past the end" if node.operator in FUTURE_OPERATORS else "before the start"
-        message = f"`{{}}` decides at {seconds:.3f} s, where it looks {side} of the log"
+        message = f"`{{}}` decides at {seconds:.3f} s, where it looks {side} of the log."
         yield Vacuous(identifier, "", "past the end", message)
     elif isinstance(node, Atom | Quantified):
-        message = f"`{{}}` decides at {seconds:.3f} s, where no object is in its group"
+        message = f"`{{}}` decides at {seconds:.3f} s, where no object is in its group."
         yield Vacuous(identifier, "", "no members", message)

@@ -21,7 +21,7 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanGuard,
     PlanTarget,
 )
-from spatial_replay.monitor.witness.sentences import number_text
+from spatial_replay.monitor.sentences import number_text
 from spatial_replay.planning.decision_log import decision_from_payload, latest_decisions
 from spatial_replay.planning.decisions import Reason
 from spatial_replay.report.compact import Packing, singles

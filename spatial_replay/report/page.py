@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import Final
 
 from spatial_replay import __version__
-from spatial_replay.monitor.witness.sentences import time_text
+from spatial_replay.monitor.sentences import time_text
 from spatial_replay.notebook.figures import Html, element
 from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
 from spatial_replay.report.compact import json_text, sentence_parts

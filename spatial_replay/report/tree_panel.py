@@ -11,8 +11,8 @@ import numpy as np
 from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.specification import unit_of
 from spatial_replay.geometry.arrays import Floats
+from spatial_replay.monitor.sentences import number_text
 from spatial_replay.monitor.verdict import final_verdict
-from spatial_replay.monitor.witness.sentences import number_text
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Boolean, Formula, Temporal, iter_nodes, operands_of, operator_of
 

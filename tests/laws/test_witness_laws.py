@@ -15,8 +15,8 @@ from laws.test_monitor_laws import observed_in
 from spatial_replay import Sample, Trace, Verdict, evaluate, parse_specification
 from spatial_replay.monitor.offline import evaluate_offline
 from spatial_replay.monitor.online.program import compile_formula
+from spatial_replay.monitor.sentences import sentences_of
 from spatial_replay.monitor.witness.path import End, deciding_path
-from spatial_replay.monitor.witness.sentences import sentences_of
 from spatial_replay.spec.formula import Number, iter_nodes
 
 SIGNALS = Vocabulary(objects=(), signals=("p", "q"), max_depth=4, delays=False)

@@ -374,6 +374,10 @@ class Evidence:
         channels = max(map(len, parts))
         return np.concatenate([in_channels(part, channels) for part in parts], axis=2)
 
+    def first_ns(self) -> int:
+        """Return the time of the first sample, those looked back at included."""
+        return next(int(trace.times_ns[0]) for trace in self._traces() if len(trace))
+
     def times_ns(self) -> Integers:
         """Return the times of the samples, (T,)."""
         parts = [scene.trace.times_ns[scene.skip :] for scene in self._scenes()]

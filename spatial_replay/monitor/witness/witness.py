@@ -52,8 +52,8 @@ class Witness:
         obstacle: why there is none, if there is an atom.
         open_end: for a settled verdict whose interval has an open end, the atom that leaves it open, and the
             time of its sample.
-        is_settled: whether it is about the samples up to the one that made the verdict certain, whatever
-            came after; verdict, interval and threshold are then those of that moment.
+        settled_ns: the time of the sample that made the verdict certain, whatever came after; interval and
+            threshold are then those of that moment. None if it is about the whole log.
     """
 
     name: str
@@ -66,12 +66,17 @@ class Witness:
     threshold: Threshold | None
     obstacle: Obstacle | None
     open_end: tuple[DecidingAtom, int] | None
-    is_settled: bool = False
+    settled_ns: int | None = None
 
     @property
     def node(self) -> int:
         """The id of the node that it is about."""
         return self.path[0].node
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether it is about the sample that made the verdict certain, before the log ended."""
+        return self.settled_ns is not None
 
     @property
     def time_ns(self) -> int:
@@ -131,7 +136,7 @@ def find_witness(
         threshold if isinstance(threshold, Threshold) else None,
         None if isinstance(threshold, Threshold) else threshold,
         open_end,
-        goes_on,
+        int(times_ns[-1]) if goes_on else None,
     )
 
 

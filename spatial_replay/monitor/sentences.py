@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 
+from spatial_replay.monitor.causes import Cause, LeastPart
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom, Measured
 from spatial_replay.monitor.witness.threshold import Threshold
@@ -26,7 +27,10 @@ def sentences_of(
         since_ns: since when it has had its verdict, if that is known.
         is_open: whether samples after those evaluated may change it.
     """
-    sentences = [_verdict(witness, first_ns, since_ns, is_open)]
+    if witness.is_settled:
+        sentences = [_settled(witness, first_ns)]
+    else:
+        sentences = [_verdict(witness, first_ns, since_ns, is_open)]
     if witness.deciding is None:
         sentences.append(_dead_end(witness.path[-1], first_ns))
     elif witness.deciding.unknown:
@@ -39,6 +43,38 @@ def sentences_of(
     if witness.open_end is not None:
         sentences.append(_open_end(*witness.open_end, first_ns))
     return tuple(sentences)
+
+
+def cause_sentences(cause: Cause, *, first_ns: int, object: str | None = None) -> tuple[str, ...]:
+    """Return sentences on one cause of a verdict: since when, what decided it, and what would flip it."""
+    if cause.witness is not None:
+        return sentences_of(cause.witness, first_ns=first_ns)
+    instance = f" for {object}" if object is not None else ""
+    if cause.settled_ns is not None:
+        since = time_text(cause.settled_ns, first_ns)
+        return (f"`{cause.spec}`{instance} is {cause.verdict} since {since}, whatever came after.",)
+    return (f"`{cause.spec}`{instance} is {cause.verdict}: robustness {number_text(cause.robustness)}.",)
+
+
+def verdict_sentence(
+    title: str,
+    verdict: Verdict,
+    ends: tuple[float, float],
+    *,
+    certain_since: str | None = None,
+    least: LeastPart | None = None,
+) -> str:
+    """Return a sentence on the verdict of a result as a whole.
+
+    Args:
+        title: what the result is called.
+        ends: of its interval for the finished log.
+        certain_since: since when it is certain, in words.
+        least: the part that its number is of, if that is another than the first cause.
+    """
+    since = f", certain since {certain_since}" if certain_since is not None else ""
+    of = f" (the least robustness is that of `{least.name}`)" if least is not None else ""
+    return f"{title} is {verdict}: {_robustness(*ends)}{since}{of}."
 
 
 def number_text(number: float) -> str:
@@ -54,13 +90,24 @@ def time_text(time_ns: int, first_ns: int) -> str:
 def _verdict(witness: Witness, first_ns: int, since_ns: int | None, is_open: bool) -> str:
     title = witness.path[0].name or witness.path[0].text
     instance = f" for {witness.object}" if witness.object is not None else ""
-    low, high = number_text(witness.lower), number_text(witness.upper)
-    numbers = (
-        f"robustness {low}" if witness.lower == witness.upper else f"robustness between {low} and {high}"
-    )
+    numbers = _robustness(witness.lower, witness.upper)
     since = f", since {time_text(since_ns, first_ns)}" if since_ns is not None else ""
     so_far, later = (" so far", "; later samples may change that") if is_open else ("", "")
     return f"`{title}`{instance} is {witness.verdict}{so_far}: {numbers}{since}{later}."
+
+
+def _robustness(lower: float, upper: float) -> str:
+    if math.isnan(lower):
+        return "robustness not determined"
+    low, high = number_text(lower), number_text(upper)
+    return f"robustness {low}" if lower == upper else f"robustness between {low} and {high}"
+
+
+def _settled(witness: Witness, first_ns: int) -> str:
+    title = witness.path[0].name or witness.path[0].text
+    instance = f" for {witness.object}" if witness.object is not None else ""
+    since = time_text(witness.settled_ns or 0, first_ns)
+    return f"`{title}`{instance} is {witness.verdict} since {since}, whatever came after."
 
 
 def _decision(witness: Witness, deciding: DecidingAtom, first_ns: int) -> str:
@@ -147,12 +194,15 @@ def _flip(witness: Witness, deciding: DecidingAtom, threshold: Threshold | None)
                 return f"No number that can stand in it makes that {opposite}."
         return f"No number of this atom alone makes it {opposite}: other atoms decide it, too."
     change = _change(threshold)
+    would = f"It would be {threshold.verdict}"
+    if witness.is_settled:
+        would = f"It would not have been {witness.verdict} then"
     if threshold.is_written:
         limit = f"{change} in place of {number_text(threshold.value)}"
-        return f"It would be {threshold.verdict} with {limit} in `{deciding.text}`."
+        return f"{would} with {limit} in `{deciding.text}`."
     margin = change.removeprefix("-").removesuffix(" or less").removesuffix(" or more")
     how = "were allowed to fail by" if threshold.flips_at < 0.0 else "had to hold by"
-    return f"It would be {threshold.verdict} if `{deciding.text}` {how} {margin}."
+    return f"{would} if `{deciding.text}` {how} {margin}."
 
 
 def _change(threshold: Threshold) -> str:
