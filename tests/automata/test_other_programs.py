@@ -90,7 +90,7 @@ def test_mona_takes_over_where_this_package_reaches_its_limits(
 def test_without_the_translator_the_error_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "ltlf2dfa", None)
     with pytest.raises(NoAutomatonError, match=r"pip install 'spatial-replay\[mona\]'"):
-        sr.automaton(sr.parse_specification("F a ovlp b"), compiler="mona")
+        automaton(parse_specification("F a ovlp b"), compiler="mona")
 
 
 def _program(folder: Path, name: str, script: str) -> None:
