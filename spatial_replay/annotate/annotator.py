@@ -27,7 +27,7 @@ from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.robustness import encode_robustness
 from spatial_replay.annotate.scene_update import SceneEncoder, SceneFrames, SceneState
 from spatial_replay.annotate.specification import ReportedTree, encode_specification, reported_trees
-from spatial_replay.annotate.violations import EvaluatedResult, leaf_pairs
+from spatial_replay.annotate.violations import EvaluatedResult, leaf_pairs, violated_since
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Attachment, Channel, Messages, merge, messages_of
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
@@ -47,6 +47,7 @@ from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
 from spatial_replay.spec.formula import Outline, Specification, iter_nodes
+from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
 
 
@@ -75,7 +76,10 @@ class Annotator:
         """
         self._files = files
         self._trees = trees
-        self._requirements = [requirements_of(tree.formula, tree.object) for tree in trees]
+        self._requirements = [
+            requirements_of(tree.formula, tree.object, settles=semantics == "ltlf") for tree in trees
+        ]
+        self._since_ns = [np.full(len(own), LATEST_NS) for own in self._requirements]
         self._names = [[node.name for _, _, node in iter_nodes(tree.formula)] for tree in trees]
         self._leaf_pairs = [
             leaf_pairs(instance, requirements, files[tree.file].regions)
@@ -157,6 +161,10 @@ class Annotator:
 
     def _changes(self, blocks: Sequence[SeriesBlock]) -> list[EncodedEvent]:
         """Return the events, by time, then in the order of results and of their nodes."""
+        self._since_ns = [
+            violated_since(own, block, since_ns)
+            for own, block, since_ns in zip(self._requirements, blocks, self._since_ns, strict=True)
+        ]
         events = [
             each
             for reporter, block in zip(self._reporters, blocks, strict=True)
@@ -179,8 +187,10 @@ class Annotator:
 
     def _scene_messages(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> Messages:
         results = [
-            EvaluatedResult(requirements, block, pairs)
-            for requirements, block, pairs in zip(self._requirements, blocks, self._leaf_pairs, strict=True)
+            EvaluatedResult(requirements, block, pairs, since_ns, reporter.settled)
+            for requirements, block, pairs, since_ns, reporter in zip(
+                self._requirements, blocks, self._leaf_pairs, self._since_ns, self._reporters, strict=True
+            )
         ]
         drawn = self._encoder.encode(trace, results, self._scene)
         if drawn.frames is not None:

@@ -52,7 +52,7 @@ def leaves_below(formula: Formula, leaves: Sequence[Formula]) -> list[LeavesBelo
     Args:
         leaves: the program's leaves, of which equal ones are one.
     """
-    numbers = {_key(leaf): index for index, leaf in enumerate(leaves)}
+    numbers = {leaf_key(leaf): index for index, leaf in enumerate(leaves)}
     nodes = list(iter_nodes(formula))
     found: list[dict[tuple[int, int], None]] = [{} for _ in nodes]
     operands: list[list[int]] = [[] for _ in nodes]
@@ -61,7 +61,7 @@ def leaves_below(formula: Formula, leaves: Sequence[Formula]) -> list[LeavesBelo
             operands[parent].append(identifier)
     for identifier, _, node in reversed(nodes):
         if isinstance(node, Atom | Quantified):
-            found[identifier] = {(numbers[_key(node)], 1): None}
+            found[identifier] = {(numbers[leaf_key(node)], 1): None}
         for place, operand in enumerate(operands[identifier]):
             for sign in operand_signs(node, place):
                 found[identifier].update(dict.fromkeys((leaf, own * sign) for leaf, own in found[operand]))
@@ -93,7 +93,7 @@ def _columns(entries: Sequence[tuple[int, int]]) -> LeavesBelow:
     return LeavesBelow(pairs[:, 0], pairs[:, 1].astype(np.float64))
 
 
-def _key(leaf: Formula) -> tuple[object, ...]:
+def leaf_key(leaf: Formula) -> tuple[object, ...]:
     """Return what equal leaves have in common."""
     if isinstance(leaf, Quantified):
         return leaf.quantifier, leaf.variables, leaf.group, leaf.body

@@ -18,6 +18,7 @@ from spatial_replay.annotate.deciding_leaf import (
     find_leaf,
     leaves_below,
 )
+from spatial_replay.annotate.leaf_history import DecidingLeaf, LeafHistory, SettledViolation
 from spatial_replay.annotate.specification import ReportedTree
 from spatial_replay.annotate.verdict_changes import (
     FAILING,
@@ -122,11 +123,16 @@ class ReportedNode(NamedTuple):
 
 
 class PeriodText(NamedTuple):
-    """A period in words: the leaf that gives its number, "" if none does, and a sentence."""
+    """A period in words: the leaf that gives its number, "" if none does, and a sentence.
+
+    Attributes:
+        witness_ns: when the leaf had that number, if that is known.
+    """
 
     period: Period
     witness: str
     sentence: str
+    witness_ns: int | None = None
 
 
 class EncodedEvent(NamedTuple):
@@ -140,8 +146,11 @@ class EncodedEvent(NamedTuple):
 class EventReporter:
     """Reports the changes of one result's root and of the named specs in it, up to the end of the log.
 
-    Its state between blocks is small: a few numbers for each of these nodes, and for each operand of theirs
-    the numbers of the leaves at one sample.
+    Its state between blocks is a few numbers for each of these nodes, for each operand of theirs the numbers
+    of the leaves at one sample, and up to a bound those of all samples (see `LeafHistory`).
+
+    Attributes:
+        settled: what settled the violation of the root before the end of the log, once it has happened.
     """
 
     def __init__(
@@ -155,18 +164,26 @@ class EventReporter:
         self._reported = _reported_nodes(tree, below, file)
         self._nodes = np.array([each.node for each in self._reported], np.int64)
         self._leaf_finder = DecidingLeaves(tree.formula, below, self._nodes.tolist())
+        self._history = LeafHistory(tree.formula, self._leaves) if self._settles else None
+        self._values = np.empty(0)
         self._bindings = instance.bindings
         self._relations = RELATION_NAMES | file.relations
         self._states = NodeStates.begin(len(self._reported))
         self._carried: dict[tuple[int, int], LeafValue | None] = {}
         self._last_ns: int | None = None
+        self.settled: SettledViolation | None = None
 
     def extend(self, block: SeriesBlock) -> list[EncodedEvent]:
         """Take in the next samples; return the changes that they confirm, by node, then by time."""
+        if self._states.are_final:
+            self._history = None
         if not len(block.times_ns) or self._states.are_final:
             return []
         self._last_ns = int(block.times_ns[-1])
+        self._values = block.series[:, 0, -1].copy()
         self._leaf_finder.extend(block)
+        if self._history is not None:
+            self._history.extend(block)
         tracked = track(self._states, block.times_ns, block.series, self._nodes, settles=self._settles)
         self._states = tracked.states
         events = [self._event(change, block) for change in tracked.changes]
@@ -201,23 +218,35 @@ class EventReporter:
 
     def _event(self, change: Change, block: SeriesBlock) -> EncodedEvent:
         reported, after, before = self._reported[change.node], change.after, change.before
-        witness = self._words(self._deciding_leaf(change.node, after, block))
-        now = PeriodText(after, witness, change_sentence(reported.title, after, witness))
+        time_ns, witness_ns = int(block.times_ns[change.sample]), None
+        if self._history is not None and self._history.is_complete and after.code in _VERDICTS:
+            series, verdict = block.series[:, :, change.sample], _VERDICTS[after.code]
+            settled = self._history.settled(reported.node, series, time_ns, verdict)
+            witness, because, witness_ns = self._settled(settled, time_ns)
+            if change.node == 0 and verdict is Verdict.VIOLATED:
+                self.settled = SettledViolation(time_ns, settled)
+        else:
+            witness = because = self._words(self._deciding_leaf(change.node, after, block))
+        now = PeriodText(after, witness, change_sentence(reported.title, after, because), witness_ns)
         past = None
         if before is not None:
             past = self._past(before, after.start_ns, self._deciding_leaf(change.node, before, block))
-        return self._encoded(reported, int(block.times_ns[change.sample]), now, past)
+        return self._encoded(reported, time_ns, now, past)
 
     def _final_event(self, node: int, time_ns: int, last_ns: int, final: Floats) -> EncodedEvent:
         reported, before = self._reported[node], self._states.period(node)
         lower, upper = final[reported.node].tolist()
         verdict = final_verdict(lower, upper)
-        low, found = verdict is not Verdict.VIOLATED, None
-        if verdict is not Verdict.UNKNOWN:
+        low, witness, because, witness_ns = verdict is not Verdict.VIOLATED, "", "", None
+        if self._history is not None and self._history.is_complete:
+            decided = self._history.finished(reported.node, self._values, final)
+            witness, because, witness_ns = self._settled(decided, last_ns)
+        elif verdict is not Verdict.UNKNOWN:
             found = self._leaf_finder.find_leaf(reported.node, final, low=low, wide=self._settles)
+            witness = because = self._words(found)
         after = Period(_ENDED[verdict], last_ns, last_ns, lower if low else upper, OF_CURRENT)
-        witness = self._words(found)
-        now = PeriodText(after, witness, end_sentence(reported.title, verdict, (lower, upper), witness))
+        sentence = end_sentence(reported.title, verdict, (lower, upper), because)
+        now = PeriodText(after, witness, sentence, witness_ns)
         past = None
         if before.code != START and before.start_ns < last_ns:
             past = self._past(before, last_ns, self._carried[node, OF_CURRENT])
@@ -231,8 +260,10 @@ class EventReporter:
     def _encoded(
         self, reported: ReportedNode, time_ns: int, now: PeriodText, past: PeriodText | None
     ) -> EncodedEvent:
-        period, witness, sentence = now
+        period, witness, sentence, witness_ns = now
         facts = self._facts(reported) | self._facts_of(period, witness, "")
+        if witness_ns is not None:
+            facts["witness_ns"] = str(witness_ns)
         if past is not None:
             before, sentence = past.period, f"{sentence} {past.sentence}"
             facts |= self._facts_of(before, past.witness, "_before")
@@ -249,6 +280,15 @@ class EventReporter:
             line=reported.line,
         )
         return EncodedEvent(time_ns, *(each.SerializeToString(deterministic=True) for each in (event, log)))
+
+    def _settled(self, found: DecidingLeaf | None, now_ns: int) -> tuple[str, str, int | None]:
+        """Return what decided in words, the same with how long ago, and its time; nothing for None."""
+        if found is None:
+            return "", "", None
+        before_ns = now_ns - found.time_ns
+        words = self._words(LeafValue(found.leaf, found.number), past=before_ns > 0)
+        ago = f" ({before_ns / 1e9:.3f} s earlier)" if before_ns else ""
+        return words, f"{words}{ago}", found.time_ns
 
     def _words(self, found: LeafValue | None, *, past: bool = False) -> str:
         """Return a leaf and its number in words; "" for none."""
@@ -314,6 +354,8 @@ _ENDED: Final[Mapping[Verdict, int]] = {
     Verdict.UNKNOWN: START,
 }
 """The state of a node when the log has ended."""
+
+_VERDICTS: Final = {SATISFIED: Verdict.SATISFIED, VIOLATED: Verdict.VIOLATED}
 
 _LEVELS: Final[Mapping[int, Log.Level.ValueType]] = {
     START: Log.WARNING,

@@ -4,12 +4,17 @@ A formula without temporal operators is about the present sample alone. The larg
 specification are its *requirements*. Each has the sign in which the specification needs it: under a negation,
 or left of an implication, low robustness is what is wanted. A requirement counts until its *obligation*, the
 largest temporal subformula around it, is fulfilled: no later sample can undo that.
+
+A requirement that fails now is violated only if that is certain: its obligation, and the conjunct of the
+specification that this is in, are violated whatever comes. A goal that is not reached yet is pending.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple, TypeAlias
+from enum import IntEnum
+from types import MappingProxyType
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +23,7 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.spec.formula import (
     ANY_CLASS,
     Atom,
+    Boolean,
     Earlier,
     Formula,
     Group,
@@ -29,6 +35,7 @@ from spatial_replay.spec.formula import (
     Variable,
     iter_nodes,
     operands_of,
+    operator_of,
 )
 from spatial_replay.spec.walks import base_of, operand_signs
 
@@ -67,6 +74,26 @@ class Obligation(NamedTuple):
             return np.asarray(series[self.node, 2, at] >= 0.0)
         return np.asarray(series[self.node, 3, at] < 0.0)
 
+    def is_open(self, series: Floats, at: Integers) -> NDArray[np.bool_]:
+        """Return (S,) whether it is met, or later samples may still meet it; see `is_fulfilled`."""
+        if self.sign > 0.0:
+            return np.asarray(series[self.node, 3, at] >= 0.0)
+        return np.asarray(series[self.node, 2, at] <= 0.0)
+
+
+class Standing(IntEnum):
+    """How a requirement stands in a sample.
+
+    `FULFILLED`: its obligation is, so that it no longer counts. `HOLDING` and `VIOLATED`: now, in the sign
+    that counts. `PENDING`: it fails now, and later samples can make up for that. `UNKNOWN`: not observed.
+    """
+
+    FULFILLED = 0
+    HOLDING = 1
+    VIOLATED = 2
+    PENDING = 3
+    UNKNOWN = 4
+
 
 class Requirement(NamedTuple):
     """A subformula without temporal operators that is in no larger one.
@@ -77,6 +104,8 @@ class Requirement(NamedTuple):
         obligation: the temporal subformula that needs it; None if there is none.
         objects, regions: names.
         groups: open groups, whose members are objects too.
+        conjunct: the conjunct of the formula that it is in.
+        can_violate: whether failing now may be what violates its obligation; not a goal beside invariants.
     """
 
     node: int
@@ -85,54 +114,124 @@ class Requirement(NamedTuple):
     objects: frozenset[str]
     regions: frozenset[str]
     groups: frozenset[ClassMembers]
+    conjunct: Obligation = Obligation(0, 1.0)
+    can_violate: bool = True
 
-    def robustness(self, series: Floats, at: Integers) -> Floats:
-        """Return (S,) its robustness now, in the sign that counts; NaN once its obligation is fulfilled.
+    def standing(self, series: Floats, at: Integers) -> NDArray[np.uint8]:
+        """Return (S,) how it stands, see `Standing`.
 
         Args:
             series: (N, 4, T): value, now, lower, upper of each node.
             at: (S,) indices of samples.
         """
-        now: Floats = self.sign * series[self.node, 1, at]
-        return (
-            now
-            if self.obligation is None
-            else np.where(self.obligation.is_fulfilled(series, at), np.nan, now)
-        )
+        now = self.sign * series[self.node, 1, at]
+        standing = np.full(now.shape, Standing.UNKNOWN, np.uint8)
+        standing[now >= 0.0] = Standing.HOLDING
+        fails = now < 0.0
+        is_pending = np.full(now.shape, not self.can_violate)
+        for each in (self.conjunct, self.obligation):
+            if each is not None:
+                is_pending |= each.is_open(series, at)
+        standing[fails] = np.where(is_pending[fails], Standing.PENDING, Standing.VIOLATED)
+        if self.obligation is not None:
+            standing[self.obligation.is_fulfilled(series, at)] = Standing.FULFILLED
+        return standing
+
+    def robustness(self, series: Floats, at: Integers) -> Floats:
+        """Return (S,) its robustness where it holds or is violated, in the sign that counts; else NaN.
+
+        Args:
+            series: (N, 4, T): value, now, lower, upper of each node.
+            at: (S,) indices of samples.
+        """
+        standing = self.standing(series, at)
+        counts = (standing == Standing.HOLDING) | (standing == Standing.VIOLATED)
+        return np.where(counts, self.sign * series[self.node, 1, at], np.nan)
 
 
 _Bindings: TypeAlias = Mapping[str, Group]
 
 
-def requirements_of(formula: Formula, object: str | None = None) -> tuple[Requirement, ...]:
+def requirements_of(
+    formula: Formula, object: str | None = None, *, settles: bool = True
+) -> tuple[Requirement, ...]:
     """Return the requirements of a formula, by node, but for those needed in both signs (`xor`, `<->`).
 
     Args:
         object: what the parameter of a template stands for.
+        settles: whether the semantics has verdicts that stay; without, a goal is pending up to the end.
     """
-    nodes = list(iter_nodes(formula))
-    temporal = [isinstance(node, Temporal) for _, _, node in nodes]
-    for identifier, parent, _ in reversed(nodes):
+    places = _places(formula)
+    temporal = [isinstance(place.formula, Temporal) for place in places]
+    for identifier, parent, _ in reversed(list(iter_nodes(formula))):
         if parent is not None:
             temporal[parent] |= temporal[identifier]
-    signs: list[float] = []
-    obligations: list[Obligation | None] = []
-    operands_passed = [0] * len(nodes)
+    found = [
+        (identifier, place)
+        for identifier, place in enumerate(places)
+        if place.sign and not temporal[identifier] and (place.parent is None or temporal[place.parent])
+    ]
+    invariant = {
+        None if place.obligation is None else place.obligation.node for _, place in found if place.always
+    }
     requirements = []
-    for identifier, parent, node in nodes:
-        if parent is None:
-            signs.append(1.0)
-        else:
-            signs.append(signs[parent] * _sign(nodes[parent][2], operands_passed[parent]))
-            operands_passed[parent] += 1
-        above = None if parent is None else obligations[parent]
-        starts = above is None and isinstance(node, Temporal)
-        obligations.append(Obligation(identifier, signs[identifier]) if starts else above)
-        if signs[identifier] and not temporal[identifier] and (parent is None or temporal[parent]):
-            requirements.append(
-                _requirement(identifier, signs[identifier], obligations[identifier], node, object)
-            )
+    for identifier, place in found:
+        obligation = place.obligation
+        is_goal = not place.always and obligation is not None
+        beside = is_goal and obligation is not None and obligation.node in invariant
+        own = _requirement(identifier, place, object)
+        requirements.append(own._replace(can_violate=not (is_goal and (beside or not settles))))
     return tuple(requirements)
+
+
+class _Place(NamedTuple):
+    """Where a node is in a formula.
+
+    Attributes:
+        sign: 0 where it counts in both.
+        always: whether no operator above it but conjunctions and those that need it at every sample.
+    """
+
+    formula: Formula
+    parent: int | None
+    sign: float
+    obligation: Obligation | None
+    conjunct: Obligation
+    always: bool
+
+
+def _places(formula: Formula) -> list[_Place]:
+    """Return where each node is, by id."""
+    places: list[_Place] = []
+    passed: list[int] = []
+    for identifier, parent, node in iter_nodes(formula):
+        passed.append(0)
+        if parent is None:
+            sign, above, conjunct, always = 1.0, None, Obligation(0, 1.0), True
+        else:
+            up = places[parent]
+            sign = up.sign * _sign(up.formula, passed[parent])
+            above, conjunct, always = up.obligation, up.conjunct, up.always and _needs_all(up)
+            if conjunct == Obligation(parent, up.sign) and isinstance(up.formula, Boolean) and _needs_all(up):
+                conjunct = Obligation(identifier, sign)
+            passed[parent] += 1
+        starts = above is None and isinstance(node, Temporal)
+        obligation = Obligation(identifier, sign) if starts else above
+        places.append(_Place(node, parent, sign, obligation, conjunct, always))
+    return places
+
+
+_NEEDS_ALL: Final[Mapping[float, frozenset[str]]] = MappingProxyType(
+    {
+        1.0: frozenset({"and", "not", "spec", "G", "H", "X", "WX", "Y"}),
+        -1.0: frozenset({"or", "not", "spec", "->", "F", "O", "X", "WX", "Y"}),
+    }
+)
+"""Operators that need all of their operands, by the sign in which they count themselves."""
+
+
+def _needs_all(place: _Place) -> bool:
+    return operator_of(place.formula) in _NEEDS_ALL.get(place.sign, frozenset())
 
 
 def iter_subformulas(formula: Formula) -> Iterator[Formula]:
@@ -147,13 +246,11 @@ def _sign(parent: Formula, operand: int) -> float:
     return float(signs[0]) if len(signs) == 1 else 0.0
 
 
-def _requirement(
-    identifier: int, sign: float, obligation: Obligation | None, formula: Formula, object: str | None
-) -> Requirement:
+def _requirement(identifier: int, place: _Place, object: str | None) -> Requirement:
     objects: set[str] = set()
     regions: set[str] = set()
     groups: set[ClassMembers] = set()
-    for node, bindings in _with_bindings(formula):
+    for node, bindings in _with_bindings(place.formula):
         terms: tuple[Term, ...] = node.terms if isinstance(node, Atom) else ()
         if isinstance(node, Quantified):
             terms = (node.group,)
@@ -174,7 +271,13 @@ def _requirement(
                 case _:
                     pass
     return Requirement(
-        identifier, sign, obligation, frozenset(objects), frozenset(regions), frozenset(groups)
+        identifier,
+        place.sign,
+        place.obligation,
+        frozenset(objects),
+        frozenset(regions),
+        frozenset(groups),
+        place.conjunct,
     )
 
 

@@ -36,8 +36,8 @@ from spatial_replay.annotate.violations import (
     EvaluatedResult,
     Presence,
     Violations,
+    first_violations,
     worst_robustness,
-    worst_violations,
 )
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.batch import FootprintBatch
@@ -134,7 +134,7 @@ class DrawnEntity(NamedTuple):
 
 
 class DrawnViolation(NamedTuple):
-    """The arrow at the worst violation in one message.
+    """The arrow at the first violation in one message.
 
     Attributes:
         ends: (2, 2), from where to where it points.
@@ -142,6 +142,7 @@ class DrawnViolation(NamedTuple):
         result: which of the results is violated.
         node: id of the requirement that is violated.
         robustness: that of the requirement, in the sign that counts.
+        leaf: what decides it, an index among the leaves of the result's program.
     """
 
     ends: Floats
@@ -149,6 +150,7 @@ class DrawnViolation(NamedTuple):
     result: int
     node: int
     robustness: float
+    leaf: int = -1
 
 
 class SceneFrame(NamedTuple):
@@ -202,8 +204,8 @@ class SceneFrames:
         found, violation = content.violations, None
         if found.is_shown[index]:
             robustness = float(found.robustness[index])
-            which, node = int(found.result[index]), int(found.node[index])
-            violation = DrawnViolation(found.points[index], _label(robustness), which, node, robustness)
+            which, node, leaf = (int(each[index]) for each in (found.result, found.node, found.leaf))
+            violation = DrawnViolation(found.points[index], _label(robustness), which, node, robustness, leaf)
         is_violated = bool((self.objects[index] < 0.0).any() or (self.regions[index] < 0.0).any())
         return SceneFrame(entities, violation, is_violated)
 
@@ -224,7 +226,7 @@ class SceneEncoder:
     Every message holds all regions and all objects that are observed, so that a viewer can jump to any of
     them; objects that are gone are deleted. Blue, vermillion and grey show the worst of the requirements on
     an object or region (see `palette` and `requirements`). Where one is violated, an arrow with its
-    robustness points at the worst (see `violations`).
+    robustness points at the one that was certain first (see `violations`).
 
     Attributes:
         regions: by name.
@@ -254,7 +256,7 @@ class SceneEncoder:
             return SceneMessages(times_ns, [], state, None)
         state, scales = _scaled(state, trace, trace.rows[written])
         scale = state.scale or _UNSCALED
-        violations = worst_violations(results, trace, written)
+        violations = first_violations(results, trace, written)
         content = _content(trace, trace.rows[written], state, scale, violations)
         presence = Presence(times_ns, content.names, _class_codes(trace, content.rows), trace.classes)
         objects, regions = worst_robustness(results, presence, [region.name for region in self._drawn])

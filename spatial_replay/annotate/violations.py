@@ -1,4 +1,4 @@
-"""How well objects and regions meet the requirements in each sample, and where the worst violation is.
+"""How well objects and regions meet the requirements in each sample, and where the first violation is.
 
 The scene is coloured by the one, and an arrow in it points at the other.
 """
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.annotate.deciding_leaf import LeavesBelow, leaves_below
+from spatial_replay.annotate.leaf_history import SettledViolation
 from spatial_replay.annotate.requirements import ClassMembers, Requirement
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.contact import contacts
@@ -30,6 +31,7 @@ from spatial_replay.spec.formula import (
     Term,
 )
 from spatial_replay.spec.walks import iter_expressions, looks_back, substitute
+from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
 
 
@@ -62,11 +64,16 @@ class EvaluatedResult(NamedTuple):
         requirements: the formula's.
         block: the numbers of nodes and leaves.
         leaf_pairs: what its violations can be traced to; None leaves them out.
+        since_ns: (R,), since when each requirement's conjunct is violated for certain (see
+            `violated_since`); None for an equal time.
+        settled: what settled the violation of the formula, if it is.
     """
 
     requirements: tuple[Requirement, ...]
     block: SeriesBlock
     leaf_pairs: LeafPairs | None = None
+    since_ns: Integers | None = None
+    settled: SettledViolation | None = None
 
 
 class Presence(NamedTuple):
@@ -86,19 +93,21 @@ class Presence(NamedTuple):
 
 
 class Violations(NamedTuple):
-    """The worst violation in each of S samples, and where it can be pointed at.
+    """The violation to point at in each of S samples, and where it can be pointed at.
 
     Attributes:
         result: (S,) int64, which of the results it is of; -1 where nothing is violated.
         node: (S,) int64, id of the requirement that is violated.
+        leaf: (S,) int64, index of what decides it among the leaves of the result's program; -1 for none.
         is_shown: (S,), whether there are two points to show it between.
         points: (S, 2, 2), a point of the first of the pair and one of the second.
         top: (S,), the upper end of the higher one, NaN if neither has a height.
-        robustness: (S,), below 0: of the requirement.
+        robustness: (S,), at most 0: of the requirement, or of the atom that settled the violation.
     """
 
     result: Integers
     node: Integers
+    leaf: Integers
     is_shown: NDArray[np.bool_]
     points: Floats
     top: Floats
@@ -112,6 +121,22 @@ def leaf_pairs(
     below = leaves_below(instance.formula, instance.program.leaves)
     pairs = tuple(_pair(substitute(leaf, instance.bindings)) for leaf in instance.program.leaves)
     return LeafPairs(pairs, tuple(below[requirement.node] for requirement in requirements), regions)
+
+
+def violated_since(requirements: Sequence[Requirement], block: SeriesBlock, before_ns: Integers) -> Integers:
+    """Return (R,) since when the conjunct of each requirement is violated for certain, or `LATEST_NS`.
+
+    Args:
+        block: the next samples.
+        before_ns: the same before them.
+    """
+    since_ns = before_ns.copy()
+    at = np.arange(len(block.times_ns))
+    for number in np.flatnonzero(since_ns == LATEST_NS).tolist():
+        certain = np.flatnonzero(~requirements[number].conjunct.is_open(block.series, at))
+        if len(certain):
+            since_ns[number] = block.times_ns[certain[0]]
+    return since_ns
 
 
 def worst_robustness(
@@ -135,24 +160,29 @@ def worst_robustness(
     return objects, places
 
 
-def worst_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: Integers) -> Violations:
-    """Return the worst violation in some samples of a trace.
+def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: Integers) -> Violations:
+    """Return the violation to point at in some samples of a trace: of those now, what was certain first.
 
     It is shown at the atom that gives the requirement its number: between the two points at which the signed
     distance of its two terms is attained or, of an enclosure, along which the one sticks out of the other.
+    In the sample that settled the formula's violation that is the atom that settled it.
 
     Args:
         samples: (S,) int64, indices.
     """
     times_ns = trace.times_ns[samples]
-    which, requirement, worst = _worst(results, times_ns)
+    which, requirement, robustness = _first(results, times_ns)
+    for index, result in enumerate(results):
+        # what settled a violation may be a goal whose time is over
+        which[(which < 0) & _is_settled_at(result, times_ns)] = index
     found = Violations(
         result=which,
         node=np.full(len(samples), -1, np.int64),
+        leaf=np.full(len(samples), -1, np.int64),
         is_shown=np.zeros(len(samples), np.bool_),
         points=np.full((len(samples), 2, 2), np.nan),
         top=np.full(len(samples), np.nan),
-        robustness=worst,
+        robustness=robustness,
     )
     for index, result in enumerate(results):
         here = np.flatnonzero(which == index)
@@ -160,9 +190,33 @@ def worst_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
             nodes = np.array([each.node for each in result.requirements], np.int64)
             found.node[here] = nodes[requirement[here]]
             at = np.searchsorted(result.block.times_ns, times_ns[here])
-            leaves = _deciding(result, result.leaf_pairs, requirement[here], at)
-            _locate(result.leaf_pairs, leaves, trace, samples, here, found)
+            found.leaf[here] = _deciding(result, result.leaf_pairs, requirement[here], at)
+            _point_at_settled(result, times_ns, here, found)
+            _locate(result.leaf_pairs, trace, samples, here, found)
     return found
+
+
+def _is_settled_at(result: EvaluatedResult, times_ns: Integers) -> NDArray[np.bool_]:
+    """Return (S,), whether a sample settled the violation of a result by an atom in it."""
+    settled = result.settled
+    if result.leaf_pairs is None or not result.requirements or settled is None or settled.leaf is None:
+        return np.zeros(len(times_ns), np.bool_)
+    is_now = settled.leaf.time_ns == settled.time_ns
+    return np.asarray((times_ns == settled.time_ns) & is_now)
+
+
+def _point_at_settled(result: EvaluatedResult, times_ns: Integers, here: Integers, found: Violations) -> None:
+    """Name the leaf that settled the violation in the sample that did; none if that was an earlier one's."""
+    if result.settled is None:
+        return
+    found.leaf[here[times_ns[here] == result.settled.time_ns]] = -1
+    leaf = result.settled.leaf
+    for sample in here[_is_settled_at(result, times_ns[here])].tolist():
+        if leaf is not None:
+            found.leaf[sample] = leaf.leaf
+            within = [each for each in result.requirements if each.node <= leaf.node]
+            found.node[sample] = within[-1].node if within else found.node[sample]
+            found.robustness[sample] = -abs(leaf.number)
 
 
 def _robustness(result: EvaluatedResult, times_ns: Integers) -> Iterator[tuple[Requirement, Floats]]:
@@ -176,20 +230,25 @@ def _robustness(result: EvaluatedResult, times_ns: Integers) -> Iterator[tuple[R
         yield requirement, np.where(is_evaluated, requirement.robustness(result.block.series, at), np.nan)
 
 
-def _worst(results: Sequence[EvaluatedResult], times_ns: Integers) -> tuple[Integers, Integers, Floats]:
-    """Return (S,) the worst violation at each time: the result, the place of its requirement, its robustness.
+def _first(results: Sequence[EvaluatedResult], times_ns: Integers) -> tuple[Integers, Integers, Floats]:
+    """Return (S,) the first violation at each time: the result, the place of its requirement, its robustness.
 
     A requirement of -inf is passed over: it has no members to satisfy it, and so no place in the scene.
     """
     which, place = np.full(len(times_ns), -1, np.int64), np.full(len(times_ns), -1, np.int64)
-    worst = np.zeros(len(times_ns))
+    violated = np.full(len(times_ns), np.nan)
+    earliest = np.full(len(times_ns), LATEST_NS)
     for index, result in enumerate(results):
         if result.leaf_pairs is None:
             continue
+        since_ns = (
+            np.zeros(len(result.requirements), np.int64) if result.since_ns is None else result.since_ns
+        )
         for number, (_, now) in enumerate(_robustness(result, times_ns)):
-            is_worse = (now < worst) & (now > -np.inf)
-            which[is_worse], place[is_worse], worst[is_worse] = index, number, now[is_worse]
-    return which, place, np.where(which >= 0, worst, np.nan)
+            is_first = (now < 0.0) & (now > -np.inf) & (since_ns[number] < earliest)
+            which[is_first], place[is_first], violated[is_first] = index, number, now[is_first]
+            earliest[is_first] = since_ns[number]
+    return which, place, violated
 
 
 def _deciding(result: EvaluatedResult, pairs: LeafPairs, requirement: Integers, at: Integers) -> Integers:
@@ -210,11 +269,10 @@ def _deciding(result: EvaluatedResult, pairs: LeafPairs, requirement: Integers, 
     return leaf
 
 
-def _locate(
-    pairs: LeafPairs, leaf: Integers, trace: Trace, samples: Integers, here: Integers, found: Violations
-) -> None:
-    """Fill in the points of the samples `here` (H,), whose leaves (H,) are given."""
+def _locate(pairs: LeafPairs, trace: Trace, samples: Integers, here: Integers, found: Violations) -> None:
+    """Fill in the points of the samples `here` (H,), whose leaves are given."""
     scene = TraceScene(trace, pairs.regions)
+    leaf = found.leaf[here]
     for index in np.unique(leaf[leaf >= 0]).tolist():
         pair = pairs.pairs[index]
         if pair is None:

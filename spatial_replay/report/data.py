@@ -187,7 +187,7 @@ def _result_value(each: ReportedResult, kept: Integers, first_ns: int, packing: 
         "first": int(np.searchsorted(kept, here[0])) if len(here) else 0,
         "samples": len(here),
         "nodes": tree_value(each.result.formula, each.result.values, each.result.final, each.relations),
-        "requirements": requirement_values(each.result.formula, each.result.object),
+        "requirements": requirement_values(each.result, samples, packing),
         "series": packing.add(singles(series), "f4"),
         "automaton": None,
         "no_automaton": sentence_parts(each.no_automaton),

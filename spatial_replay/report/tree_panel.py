@@ -10,9 +10,11 @@ import numpy as np
 
 from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.specification import unit_of
-from spatial_replay.geometry.arrays import Floats
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.sentences import number_text
 from spatial_replay.monitor.verdict import final_verdict
+from spatial_replay.report.compact import Packing
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Boolean, Formula, Temporal, iter_nodes, operands_of, operator_of
 
@@ -74,22 +76,20 @@ def tree_value(
     ]
 
 
-def requirement_values(formula: Formula, object: str | None) -> list[Mapping[str, Any]]:
+def requirement_values(result: SpecResult, samples: Integers, packing: Packing) -> list[Mapping[str, Any]]:
     """Return the requirements of a formula (see `annotate.requirements`) whose nodes are shown.
 
     Args:
-        object: what the parameter of a template stands for.
+        samples: (S,) indices of those that the page has.
     """
-    place = {identifier: index for index, identifier in enumerate(shown_nodes(formula))}
+    place = {identifier: index for index, identifier in enumerate(shown_nodes(result.formula))}
+    settles = result.semantics == "ltlf"
     return [
         {
             "node": place[requirement.node],
-            "sign": requirement.sign,
-            "obligation": None if requirement.obligation is None else place[requirement.obligation.node],
-            "obligation_sign": None if requirement.obligation is None else requirement.obligation.sign,
+            "standing": packing.add(requirement.standing(result.series, samples), "u1"),
         }
-        for requirement in requirements_of(formula, object)
-        # an obligation is above its requirement, and so shown where that is
+        for requirement in requirements_of(result.formula, result.object, settles=settles)
         if requirement.node in place
     ]
 
@@ -113,7 +113,7 @@ def named_nodes(formula: Formula) -> tuple[int, ...]:
     )
 
 
-def series_of(series: Floats, formula: Formula, samples: np.ndarray[Any, np.dtype[np.int64]]) -> Floats:
+def series_of(series: Floats, formula: Formula, samples: Integers) -> Floats:
     """Return the numbers (nodes, 4, samples) of the shown nodes at some samples."""
     return np.asarray(series[list(shown_nodes(formula))][:, :, samples])
 

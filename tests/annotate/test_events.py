@@ -120,14 +120,31 @@ def test_samples_that_say_nothing_are_no_sign(tmp_path):
     assert number == 8
 
 
-def test_without_a_witness_in_the_same_sample_there_is_none(tmp_path):
+def test_what_decided_may_lie_before_the_sample_that_settles_a_verdict(tmp_path):
     # what decides is the second sample; that it does is known when the window closes
     [(number, event, line)] = events_of(
         tmp_path, "spec soon = F[0s, 0.3s] battery >= 5", 1.0, 4.0, 3.0, 2.0, 1.0
     )
     assert number == 3
-    assert "witness" not in facts(event)
-    assert line.message.startswith("`soon` is violated, whatever comes, by 1.")
+    assert (facts(event)["witness"], facts(event)["witness_ns"]) == (
+        "`battery >= 5` failed by 1",
+        "1100000000",
+    )
+    assert line.message.startswith(
+        "`soon` is violated, whatever comes: `battery >= 5` failed by 1 (0.200 s earlier)."
+    )
+
+
+def test_what_settled_a_verdict_is_reported_rather_than_what_is_least(tmp_path):
+    text = "spec kept = G battery >= 0\nspec filled = F battery >= 50\nspec task = filled and kept"
+    charges = [2.0, -1.0, 3.0, 3.0]
+    task = [
+        (number, event) for number, event, line in events_of(tmp_path, text, *charges) if line.name == "task"
+    ]
+    [(number, event)] = task
+    assert number == 1
+    assert facts(event)["witness"] == "`battery >= 0` fails by 1"
+    assert not [line for *_, line in events_at_end(tmp_path, text, *charges) if line.name == "task"]
 
 
 def test_named_parts_that_later_samples_can_change_are_reported_too(tmp_path):
@@ -185,7 +202,8 @@ def test_what_is_pending_is_decided_by_the_end(tmp_path):
         "verdict": "violated",
         "sign": "negative",
         "robustness": "-1.0",
-        "witness": "`battery >= 0` fails by 1",
+        "witness": "`battery >= 0` failed by 1",
+        "witness_ns": "1100000000",
         "verdict_before": "pending",
         "sign_before": "negative",
         "robustness_before": "-3.0",
@@ -195,7 +213,7 @@ def test_what_is_pending_is_decided_by_the_end(tmp_path):
         "message": line.message,
     }
     assert line.message == (
-        "`full` is violated, for the log has ended: `battery >= 0` fails by 1. "
+        "`full` is violated, for the log has ended: `battery >= 0` failed by 1 (0.200 s earlier). "
         "Before, it failed for 0.300 s; its worst was that `battery >= 0` failed by 3."
     )
     assert (line.level, line.name, line.file, line.line) == (Log.ERROR, "full", "battery.spatial", 1)
@@ -204,7 +222,7 @@ def test_what_is_pending_is_decided_by_the_end(tmp_path):
 def test_what_no_sample_could_change_is_not_repeated_at_the_end(tmp_path):
     text = "spec full = F battery >= 5\nspec kept = G battery >= 0\nspec both = full or kept"
     assert [line.message for *_, line in events_at_end(tmp_path, text, 1.0, 6.0, 2.0)] == [
-        "`kept` in `both` is satisfied, for the log has ended: `battery >= 0` holds by 1. "
+        "`kept` in `both` is satisfied, for the log has ended: `battery >= 0` held by 1 (0.200 s earlier). "
         "Before, it held for 0.200 s; its worst was that `battery >= 0` held by 1."
     ]
 
@@ -213,15 +231,16 @@ def test_the_end_finds_the_witness_in_whichever_part_decides(tmp_path):
     text = "spec both = not F battery >= 5 and (G battery >= -4 or F (battery <= -8 and F battery >= 9))"
     [(_, event, _)] = events_at_end(tmp_path, text, 1.0, 3.0, -2.0, 4.0, 0.0)
     assert facts(event)["robustness"] == "1.0"
-    assert facts(event)["witness"] == "`battery >= 5` fails by 1"
+    assert facts(event)["witness"] == "`battery >= 5` failed by 1"
 
 
-def test_without_a_witness_the_end_reports_the_number(tmp_path):
-    # the first sample decides; that it does is known from the second one on
+def test_what_decided_the_end_may_be_the_first_sample(tmp_path):
     text = "spec later = F (battery <= 2 and F battery >= 8)"
     [(_, event, line)] = events_at_end(tmp_path, text, 3.0, 9.0, 9.0)
-    assert "witness" not in facts(event)
-    assert line.message.startswith("`later` is violated by 1, for the log has ended. Before, ")
+    assert facts(event)["witness_ns"] == "1000000000"
+    assert line.message.startswith(
+        "`later` is violated, for the log has ended: `battery <= 2` failed by 1 (0.200 s earlier). Before, "
+    )
 
 
 def test_what_stays_unknown_is_said_at_the_end(tmp_path):

@@ -83,7 +83,7 @@ def test_open_groups_have_the_members_of_each_sample():
     times = np.array([0, 1, 2])
     codes = np.array([[0, 0, 1], [0, -1, 0], [-1, 0, 1]])
     presence = Presence(times, ["a", "b", "c"], codes, ["Cup", None])
-    series = np.array([[[0.0] * 3, [-1.0, 2.0, 3.0], [0.0] * 3, [0.0] * 3]])
+    series = np.array([[[-1.0] * 3, [-1.0, 2.0, 3.0], [-1.0] * 3, [-1.0] * 3]])
     assert len(list(iter_nodes(formula))) == len(series)
     objects, regions = worst_robustness(
         [EvaluatedResult(requirements_of(formula), SeriesBlock(times, series, np.empty((1, 0, 3))))],

@@ -300,7 +300,9 @@ def test_the_scene_changes_with_the_cursor(open_page: Open) -> None:
 
 def test_the_scene_says_what_is_violated_now(open_page: Open) -> None:
     caption = open_page("violated", at="#t=1").locator(".caption")
-    expect(caption).to_have_text("the arrow: spoon dist plate <= 0.08 of table_set fails by 0.6097 now")
+    expect(caption).to_have_text(
+        "nothing is violated now; plate enclosedin mat of table_set is still to come, and 4 more"
+    )
     caption = open_page("violated", at="#t=9.9").locator(".caption")
     expect(caption).to_have_text("nothing is violated now; table_set was before")
 

@@ -48,8 +48,9 @@ function readResult(result, numbers, times) {
     node.depth = nodes[node.parent].depth + 1;
     nodes[node.parent].children.push(node);
   }
+  const requirements = result.requirements.map((each) => ({...each, standing: numbers(each.standing)}));
   const automaton = result.automaton && {...result.automaton, path: numbers(result.automaton.path)};
-  return {...result, nodes, automaton, times: times.subarray(first, first + samples)};
+  return {...result, nodes, requirements, automaton, times: times.subarray(first, first + samples)};
 }
 
 // Where a sample of the page is among those of a result: null before its first, `result.samples` after its last.

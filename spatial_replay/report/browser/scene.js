@@ -21,8 +21,9 @@ function makeScene(clock) {
   place.append(made, element("div", {class: "scene-foot"}, caption, element("span", {class: "choice"},
     layerBox("names", "labels", layers, redraw), layerBox("trails", "trails", layers, redraw),
     hasMaps ? layerBox("map", "map", layers, redraw) : null)),
-  key([{ground: "positive", words: "all requirements on it hold now"},
-    {ground: "negative", words: "one is violated"}, {ground: "neutral", words: "no requirement, or unknown"}]));
+  key([{ground: "positive", words: "its requirements hold now"},
+    {ground: "negative", words: "one is violated, whatever comes"},
+    {ground: "neutral", words: "no requirement, still to come, or unknown"}]));
   let before = null;
   const show = () => {
     const frame = indexAt(scene.times, clock.time);
@@ -268,14 +269,20 @@ function captionOf(clock, scene, frame) {
   const violation = scene.violations.get(frame);
   if (violation) return ["the arrow: ", ...violationWords(run, scene.times[frame], violation)];
   const open = requirementsAt(run, clock.sample);
-  const failing = open.filter(({robustness}) => robustness < 0);
-  if (failing.length) return [...failureWords(failing[0]), others(failing), "; no arrow can show it"];
+  const inState = (state) => open.filter(({standing}) => standing === state);
+  const violated = inState(VIOLATED);
+  if (violated.length) return [...failureWords(violated[0]), others(violated), "; no arrow can show it"];
   if (scene.isViolated[frame]) {
     return ["something is violated now that no arrow can show"];
   }
-  const unknown = open.filter(({robustness}) => Number.isNaN(robustness));
+  const unknown = inState(UNKNOWN);
   if (unknown.length) {
     return ["no violation is known now; ", ...partWords(unknown[0]), " is unknown", others(unknown)];
+  }
+  const pending = inState(PENDING);
+  if (pending.length) {
+    return [`nothing is violated now${lostBefore(clock)}; `, ...partWords(pending[0]), " is still to come",
+      others(pending)];
   }
   if (open.length) return [`nothing is violated now${lostBefore(clock)}`];
   const more = run.results.some((result) => result.requirements.length) ? "more " : "";
@@ -315,22 +322,18 @@ function others({length}) {
   return length > 1 ? `, and ${length - 1} more` : "";
 }
 
-// The requirements of all results at a sample, each with its robustness in the sign that counts.
+// How a requirement stands in a sample; see annotate/requirements.py.
+const FULFILLED = 0, VIOLATED = 2, PENDING = 3, UNKNOWN = 4;
+
+// The requirements of all results at a sample that count there.
 function requirementsAt(run, sample) {
   return run.results.flatMap((result) => {
     const place = placeIn(result, sample);
     if (place === null || place >= result.samples) return [];
-    return result.requirements.filter((requirement) => !isFulfilled(result, requirement, place)).map(({node, sign}) => ({
-      result, node: result.nodes[node], place, robustness: sign * result.nodes[node].series[NOW][place],
-    }));
+    return result.requirements
+      .map(({node, standing}) => ({result, node: result.nodes[node], place, standing: standing[place]}))
+      .filter(({standing}) => standing !== FULFILLED);
   });
-}
-
-// Whether the obligation of a requirement is fulfilled, so that no later sample can undo it.
-function isFulfilled(result, {obligation, obligation_sign: sign}, place) {
-  if (obligation === null) return false;
-  const series = result.nodes[obligation].series;
-  return sign > 0 ? series[LOWER][place] >= 0 : series[UPPER][place] < 0;
 }
 
 // The atom that gives a requirement its number; the requirement itself if the page shows no such atom.
