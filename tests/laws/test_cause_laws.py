@@ -1,0 +1,173 @@
+"""What settled a verdict, and what decided nothing: both are true of every formula and run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+import spatial_replay as sr
+from laws.strategies_monitor import formulas_of_leaves, leaf_runs, recordings, specifications
+from spatial_replay.monitor.online.program import compile_formula
+from spatial_replay.monitor.online.step import OnlineRun
+from spatial_replay.monitor.witness.path import End, deciding_path
+from spatial_replay.monitor.witness.unfinished import evaluate_unfinished
+from spatial_replay.spec.formula import (
+    Boolean,
+    Formula,
+    NamedSpec,
+    Quantified,
+    Specification,
+    Temporal,
+    Truth,
+    iter_nodes,
+    operands_of,
+)
+
+_NUMBERS = st.sampled_from([-9.0, -3.0, -1.5, 0.0, 0.25, 1.0, 2.5, 7.0])
+
+
+@st.composite
+def signal_runs(draw) -> sr.Trace:
+    """Samples of three signals, some of them missing now and then."""
+    known = draw(st.booleans())
+    samples, time_ns = [], 0
+    for _ in range(draw(st.integers(1, 8))):
+        signals = {name: draw(_NUMBERS) for name in "pqr" if known or draw(st.integers(0, 5)) > 0}
+        samples.append(sr.Sample(time_ns, {}, signals))
+        time_ns += draw(st.sampled_from([50, 100, 100, 130, 400]))
+    return sr.Trace.from_samples(samples)
+
+
+def evaluated(formula: Formula, trace: sr.Trace) -> sr.SpecResult:
+    return sr.evaluate(Specification((NamedSpec("s", formula),), "paper"), trace).result()
+
+
+def rebuilt(formula: Formula, node: int, change) -> Formula:
+    """The formula with another one in place of a node."""
+    if node == 0:
+        return change(formula)
+    operands, at = [], 1
+    for operand in operands_of(formula):
+        count = sum(1 for _ in iter_nodes(operand))
+        operands.append(rebuilt(operand, node - at, change) if at <= node < at + count else operand)
+        at += count
+    return replace(formula, operands=tuple(operands))
+
+
+@settings(max_examples=200)
+@given(formula=formulas_of_leaves, run=leaf_runs(max_size=8))
+def test_a_log_that_may_go_on_has_the_intervals_of_a_monitor(formula, run):
+    program = compile_formula(formula)
+    leaves, times = run.values(program.leaves), np.array(run.times_ns)
+    series = OnlineRun(program).extend(leaves, times)
+    for count in range(1, len(times) + 1):
+        done = evaluate_unfinished(formula, program.leaves, leaves[:, :, :count], times[:count])
+        for node, _, _ in iter_nodes(formula):
+            low, high = done.ends(node)
+            assert (low[0], high[0]) == tuple(series[node, 2:, count - 1])
+
+
+@settings(max_examples=200)
+@given(formula=formulas_of_leaves, run=leaf_runs(max_size=8))
+def test_what_settled_a_violation_has_the_number_of_that_moment(formula, run):
+    program = compile_formula(formula)
+    leaves, times = run.values(program.leaves), np.array(run.times_ns)
+    upper = OnlineRun(program).extend(leaves, times)[:, 3]
+    for node, _, _ in iter_nodes(formula):
+        settled = np.flatnonzero(upper[node] < 0.0)
+        if not len(settled):
+            continue
+        count = int(settled[0]) + 1
+        done = evaluate_unfinished(formula, program.leaves, leaves[:, :, :count], times[:count])
+        path = deciding_path(formula, done, times[:count], node, End.HIGH, goes_on=True)
+        low, high = done.ends(path.steps[-1].node)
+        number = (high if path.end is End.HIGH else -low)[path.steps[-1].sample]
+        assert number == upper[node, count - 1]
+
+
+@settings(max_examples=150)
+@given(parts=st.lists(formulas_of_leaves, min_size=2, max_size=4), trace=signal_runs(), data=st.data())
+def test_causes_are_the_conjuncts_that_fail_and_the_settled_ones_come_first(parts, trace, data):
+    named = [replace(part, name=f"part{k}") for k, part in enumerate(parts)]
+    result = evaluated(Boolean("and", tuple(named)), trace)
+    failing = {
+        node.id: node for node in result.nodes if node.name and node.verdict is not sr.Verdict.SATISFIED
+    }
+    causes = result.causes
+    assert bool(causes) == (result.verdict is not sr.Verdict.SATISFIED)
+    assert {cause.spec for cause in causes} == {node.name for node in failing.values()}
+    settled = [cause.settled_ns for cause in causes if cause.settled_ns is not None]
+    assert settled == sorted(settled)
+    assert [cause.settled_ns for cause in causes[: len(settled)]] == settled
+    assert result.violated_at_ns == (settled[0] if settled else None)
+    for cause in causes:
+        assert cause.witness is not None
+        assert cause.witness.verdict is cause.verdict
+        assert cause.witness.node == cause.node
+        if cause.settled_ns is not None:
+            assert cause.witness.time_ns <= cause.settled_ns
+            at = trace.times_ns.tolist().index(cause.settled_ns)
+            assert result.nodes[cause.node].upper[at] == cause.witness.upper
+
+
+@settings(max_examples=200)
+@given(formula=formulas_of_leaves, trace=signal_runs())
+def test_a_vacuous_part_can_be_replaced_by_true(formula, trace):
+    result = evaluated(formula, trace)
+    for each in result.vacuous:
+        nodes = list(iter_nodes(formula))
+        assert each.message.startswith("`")
+        if each.reason == "empty window":
+            assert isinstance(nodes[each.node][2], Temporal)
+            other = rebuilt(formula, each.node, _with_true_operands)
+            replaced = evaluated(other, trace)
+            np.testing.assert_array_equal(
+                [replaced.robustness, replaced.lower, replaced.upper],
+                [result.robustness, result.lower, result.upper],
+            )
+        elif each.reason == "antecedent never held":
+            other = rebuilt(
+                formula, each.node, lambda node: replace(node, operands=(node.operands[0], Truth(True)))
+            )
+            assert evaluated(other, trace).verdict is result.verdict
+
+
+def _with_true_operands(node: Temporal) -> Temporal:
+    return replace(node, operands=tuple(Truth(True) for _ in node.operands))
+
+
+@settings(max_examples=200)
+@given(formula=formulas_of_leaves, trace=signal_runs())
+def test_no_infinite_pass_is_silent(formula, trace):
+    assume(not any(isinstance(node, Truth) for _, _, node in iter_nodes(formula)))
+    result = evaluated(formula, trace)
+    if result.verdict is sr.Verdict.SATISFIED and result.robustness == np.inf:
+        assert result.vacuous
+
+
+@settings(max_examples=60)
+@given(specification=specifications(), recording=recordings())
+def test_the_body_over_an_empty_group_can_be_replaced_by_true(specification, recording):
+    trace = recording.trace()
+    each = {"ego": "all"} if specification.specs[0].parameter else None
+    for result in sr.evaluate(specification, trace, each=each):
+        nodes = list(iter_nodes(result.formula))
+        if result.verdict is sr.Verdict.SATISFIED and result.robustness == np.inf:
+            assert result.vacuous or any(isinstance(node, Truth) for _, _, node in nodes)
+        for vacuous in result.vacuous:
+            node = nodes[vacuous.node][2]
+            if vacuous.reason != "no members" or not isinstance(node, Quantified):
+                continue
+            if "ever" not in vacuous.message:
+                continue
+            other = rebuilt(result.formula, vacuous.node, lambda node: replace(node, body=Truth(True)))
+            spec = replace(result.spec, formula=other)
+            changed = sr.evaluate(replace(specification, specs=(spec,)), trace, each=each)
+            replaced = changed.result(object=result.object)
+            np.testing.assert_array_equal(
+                [replaced.robustness, replaced.lower, replaced.upper],
+                [result.robustness, result.lower, result.upper],
+            )
