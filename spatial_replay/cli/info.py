@@ -197,6 +197,7 @@ def _document(overview: Overview, survey: Survey | None, faults: tuple[str, ...]
         "end_ns": overview.end_ns,
         "damaged": bool(faults),
         "faults": faults,
+        "axes": {"y": "up", "source": asdict(overview.axes)},
         "objects": [asdict(each) for each in overview.objects],
         "signals": overview.signals,
     }
@@ -244,6 +245,8 @@ def _lines(overview: Overview, survey: Survey | None, damaged: bool) -> Iterator
         start_ns, end_ns = survey.start_ns, survey.end_ns
     if start_ns is not None and end_ns is not None:
         yield f"time     {_clock(start_ns)} to {_clock(end_ns)} ({(end_ns - start_ns) / 1e9:.3f} s)"
+    if overview.samples:
+        yield f"axes     {overview.axes}"
     if overview.objects:
         yield "objects"
         yield from _table(

@@ -121,6 +121,7 @@ class ReadArguments(TypedDict):
     on_time_jump: Literal["error", "split"]
     rate: float | None
     lost: Literal["drop", "keep"]
+    y_down: bool | None
     concave: Literal["decompose", "hull"]
 
 
@@ -145,6 +146,12 @@ _READING = (
         type=click.Choice(["drop", "keep"]),
         default="drop",
         help="Drone annotations: drop or keep boxes marked as lost.  [default: drop]",
+    ),
+    click.option(
+        "--y-down/--y-up",
+        default=None,
+        help="Tracks, annotations: y points down in the file, as in images; it is turned over."
+        "  [default: down in drone annotations, else up]",
     ),
     click.option(
         "--concave",

@@ -35,6 +35,7 @@ class ReadOptions:
         on_time_jump: whether a clock that jumps back is an error or ends the log.
         rate: frames a second, for formats that count frames.
         lost: whether rows marked as out of the picture are dropped or kept.
+        y_down: whether y points down in the file, as in images; None for what is usual in its format.
 
     Raises:
         UsageError: an invalid value.
@@ -45,6 +46,7 @@ class ReadOptions:
     on_time_jump: OnTimeJump = "error"
     rate: float | None = None
     lost: Lost = "drop"
+    y_down: bool | None = None
 
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
@@ -53,6 +55,8 @@ class ReadOptions:
                 raise UsageError(f"{name} is {shortened(value)}; give one of {', '.join(choices)}")
         if self.mapping is not None and not isinstance(self.mapping, (str, PathLike)):
             raise UsageError(f"mapping is {shortened(self.mapping)}; give the path of a mapping file")
+        if self.y_down not in (None, True, False):
+            raise UsageError(f"y_down is {shortened(self.y_down)}; give True, False or None")
         if self.rate is not None:
             _check_rate(self.rate)
 
@@ -82,6 +86,10 @@ _REASONS = {
     "on_time_jump": "whose times never go back",
     "rate": "which has times, not numbers of frames",
     "lost": "which has no rows marked as lost",
+    "y_down": (
+        "whose samples have y up: recordings and scenarios always, and messages unless their mapping file"
+        " says `axes: {y: down}`"
+    ),
 }
 
 

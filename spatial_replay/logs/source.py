@@ -14,6 +14,7 @@ from spatial_replay.errors import LogError
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import BLOCK_SAMPLES, Attachment, Block
 from spatial_replay.logs.read_options import FaultList
+from spatial_replay.trace.axes import OUR_AXES, Axes
 from spatial_replay.trace.sample import FOREVER, Sample
 from spatial_replay.trace.trace import Trace, window_of
 
@@ -90,6 +91,7 @@ class TrackSource(_Bare):
 
     Attributes:
         options: those with which it is read, where they are not the defaults.
+        axes: those of the file; samples have ours.
     """
 
     path: Path
@@ -97,6 +99,7 @@ class TrackSource(_Bare):
     concave: Concave
     iter_traces: IterTraces
     options: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+    axes: Axes = OUR_AXES
 
     @property
     def name(self) -> str:
@@ -111,7 +114,8 @@ class TrackSource(_Bare):
             any_sample = any_sample or len(trace) > 0
             lost = faults.take()
             first_fault = first_fault or next(iter(lost), None)
-            yield Block(replace(within(trace, start_ns, end_ns), faults=lost))
+            window = self.axes.convert_trace(within(trace, start_ns, end_ns))
+            yield Block(replace(window, faults=lost))
         rest = faults.take(last=True)
         if not any_sample:
             reason = first_fault or next(iter(rest), f"{self.name} is empty")
@@ -157,6 +161,12 @@ def read_ahead(blocks: Generator[Block, None, None]) -> Iterator[Block]:
             # starts, or the end of the interpreter, may prevent that; then garbage collection closes it
             with suppress(ValueError, RuntimeError):
                 thread.submit(blocks.close).result()
+
+
+def axes_of(source: Source) -> Axes:
+    """Return the axes of a source, or of what a log was recorded from; its samples have ours."""
+    axes = getattr(source, "axes", None)
+    return axes if isinstance(axes, Axes) else OUR_AXES
 
 
 def reading_options(source: Source) -> dict[str, object]:

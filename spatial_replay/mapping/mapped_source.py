@@ -26,6 +26,7 @@ from spatial_replay.logs.topics import DERIVED, OBJECTS
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.model import LogMapping
 from spatial_replay.mapping.reading_plan import ReadingPlan
+from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
 
@@ -55,6 +56,11 @@ class MappedSource:
     @property
     def name(self) -> str:
         return self.path.name or self.path.absolute().name
+
+    @property
+    def axes(self) -> Axes:
+        """Those of the messages; samples have ours."""
+        return self.mapping.axes
 
     @property
     def options(self) -> Mapping[str, object]:
@@ -87,6 +93,10 @@ class MappedSource:
             concave=self.concave,
         )
         blocks = _Blocks(assembler, reader, copied, start_ns, end_ns)
+        blocks.remarks.extend(
+            f"{self.name}: it has no topic {topic!r}, which {self.mapping.name} marks as optional"
+            for topic in plan.absent
+        )
         blocks.remarks.extend(_unread(self.name, topics, plan))
         as_recorded = self.on_time_jump == "split"
         columns = _columns(reader, plan, read, start_ns, end_ns, as_recorded=as_recorded)

@@ -37,6 +37,7 @@ from spatial_replay.mapping.model import (
 )
 from spatial_replay.mapping.yaml_document import LARGEST_TEXT, Document, Place, Value, document_from_text
 from spatial_replay.text import nearest_hint
+from spatial_replay.trace.axes import Axes
 
 if TYPE_CHECKING:
     from jsonschema.protocols import Validator
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 SCHEMA_FILE = "mapping.schema.json"
 
 _MOST_FAULTS = 100
-_SIGNAL_KEYS = frozenset({"signals", "max_age", "clock", "stamp"})
+_SIGNAL_KEYS = frozenset({"signals", "max_age", "clock", "stamp", "optional"})
 """Keys that do not concern objects: a topic with signals and no other keys has no objects."""
 
 
@@ -109,6 +110,7 @@ def _mapping(document: Document, name: str) -> LogMapping:
         clock=value.get("clock", "log"),
         sampling=Sampling(sample.get("topic"), duration_ns(sample["every"]) if "every" in sample else None),
         max_age_ns=age_ns(value["max_age"]) if "max_age" in value else None,
+        axes=Axes(value.get("axes", {}).get("y", "up"), float(value.get("scale", 1.0))),
     )
 
 
@@ -206,6 +208,7 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
         without=tuple(entry.get("except", ())),
         max_age_ns=age_ns(entry["max_age"]) if "max_age" in entry else None,
         clock=entry.get("clock"),
+        optional=entry.get("optional", False),
     )
 
 

@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import Literal, TypeAlias
 
 from spatial_replay.errors import UsageError
+from spatial_replay.trace.axes import OUR_AXES, Axes
 
 Clock: TypeAlias = Literal["log", "publish", "header"]
 """Which time of a message counts: when it was recorded, when it was sent, or the stamp inside it."""
@@ -94,6 +95,7 @@ class TopicMapping:
         max_age_ns: how long an observation stays valid.
         clock: the clock of this topic, if not that of the mapping.
         reads_objects: false for topics that are read for their signals only.
+        optional: whether a log may lack the topic.
     """
 
     topic: str
@@ -119,6 +121,7 @@ class TopicMapping:
     without: tuple[str, ...] = ()
     max_age_ns: int | None = None
     clock: Clock | None = None
+    optional: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +145,7 @@ class LogMapping:
         sha256: of its content, independent of layout and comments.
         fixed_frame: the frame that coordinates are transformed into; None leaves them as they are.
         topics: in the file's order.
+        axes: those of the fixed frame, or of the messages without one.
     """
 
     name: str
@@ -151,6 +155,7 @@ class LogMapping:
     clock: Clock = "log"
     sampling: Sampling = Sampling()
     max_age_ns: int | None = None
+    axes: Axes = OUR_AXES
 
 
 _UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}

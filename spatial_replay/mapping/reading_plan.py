@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 
 from spatial_replay.bags.topic import Topic
@@ -57,6 +57,7 @@ class ReadingPlan:
         margin_ns: how far beyond the end of a window messages still count.
         planned: how each topic is read, in the order of `topics`.
         lost: topics with transforms that cannot be decoded, with the reason.
+        absent: optional topics that the log lacks.
         sampled_topic: the topic whose messages are sampled; None for samples at multiples of a step.
     """
 
@@ -67,6 +68,7 @@ class ReadingPlan:
     planned: tuple[PlannedTopic, ...] = ()
     sampled_topic: str | None = None
     lost: tuple[tuple[str, str], ...] = ()
+    absent: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, mapping: LogMapping, topics: Sequence[Topic]) -> ReadingPlan:
@@ -91,7 +93,9 @@ class ReadingPlan:
         lost = [
             (topic.name, topic.unreadable) for topic in transforms if topic.unreadable and topic.count != 0
         ]
-        sampled = None if mapping.sampling.step_ns is not None else mapping.sampling.topic or _first(mapping)
+        sampled = (
+            None if mapping.sampling.step_ns is not None else mapping.sampling.topic or _first(mapping, known)
+        )
         if sampled is not None and sampled not in names:
             names.append(sampled)
         planned = tuple(_planned(mapping, mapped.get(name), known[name], needs_frames) for name in names)
@@ -104,6 +108,7 @@ class ReadingPlan:
             planned=planned,
             sampled_topic=sampled,
             lost=tuple(lost),
+            absent=tuple(topic for topic in mapped if topic not in known),
         )
 
     def lookback_ns(self, topic: str) -> int | None:
@@ -128,14 +133,24 @@ def _faults(mapping: LogMapping, known: dict[str, Topic]) -> list[str]:
     faults: list[str] = []
     named = [entry.topic for entry in mapping.topics]
     sampled = mapping.sampling.topic
+    optional = {entry.topic for entry in mapping.topics if entry.optional}
     for name in [*named, *([sampled] if sampled is not None and sampled not in named else [])]:
         where = f"topics.{name}" if name in named else "sample.topic"
-        if name not in known:
+        if name in optional and name not in known:
+            if name == sampled:
+                faults.append(
+                    f"sample.topic: the log has no topic {name!r}, so no sample can be taken; name one that"
+                    " every log has, or {every: 100ms}"
+                )
+        elif name not in known:
             listed = ", ".join(sorted(known)[:20]) or "none"
             hint = nearest_hint(name, known) or f"its topics are {listed}"
             faults.append(f"{where}: the log has no topic {name!r}; {hint}")
         elif (reason := known[name].unreadable) is not None:
             faults.append(f"{where}: its messages cannot be decoded: {reason}")
+    if optional.issuperset(named) and known.keys().isdisjoint(named):
+        listed = ", ".join(sorted(known)[:20]) or "none"
+        faults.append(f"topics: the log has none of these optional topics; its topics are {listed}")
     for entry in mapping.topics:
         if entry.type is not None and short_type(entry.type) not in BUILT_IN:
             hint = nearest_hint(short_type(entry.type), BUILT_IN) or f"known are {', '.join(BUILT_IN)}"
@@ -143,9 +158,10 @@ def _faults(mapping: LogMapping, known: dict[str, Topic]) -> list[str]:
     return faults
 
 
-def _first(mapping: LogMapping) -> str:
-    """Return the topic that is sampled by default: the first with objects, else the first."""
-    return next((entry.topic for entry in mapping.topics if entry.reads_objects), mapping.topics[0].topic)
+def _first(mapping: LogMapping, known: Container[str]) -> str:
+    """Return the topic that is sampled by default: the first of the log with objects, else its first."""
+    present = [entry for entry in mapping.topics if entry.topic in known]
+    return next((entry.topic for entry in present if entry.reads_objects), present[0].topic)
 
 
 def _planned(

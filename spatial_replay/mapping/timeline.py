@@ -18,6 +18,7 @@ from spatial_replay.mapping.detections import EVERY_OBJECT, Detections
 from spatial_replay.mapping.footprints import Solids, footprints_from_solids
 from spatial_replay.mapping.model import FOREVER_NS
 from spatial_replay.mapping.transforms import Transforms
+from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.observations import Observations, trace_from_observations
 from spatial_replay.trace.trace import ABSENT
 
@@ -205,12 +206,14 @@ class ObservationRows:
 def rows_from_detections(
     detections: Detections,
     transforms: Transforms | None,
+    axes: Axes,
     concave: Concave,
     report: Callable[[int, str], None],
 ) -> ObservationRows:
     """Bring detections into the fixed frame; blank rows where there is no transform or no valid footprint.
 
     Args:
+        axes: those of the fixed frame; rows have ours.
         transforms: fixed_from_frame of each object, or None if all are in the fixed frame.
         report: receives the index of each object without a valid footprint, and the text after its name.
     """
@@ -228,7 +231,8 @@ def rows_from_detections(
         heights = poses.position[:, 2, None] + detections.height
         shapes = replace(shapes, bottom=heights[:, 0], top=heights[:, 1])
     uncertainty = detections.uncertainty if covariance is None else _radius(covariance)
-    return _checked(detections, shapes, poses.yaw, uncertainty, unknown, concave, report)
+    shapes, yaw = axes.convert_shapes(shapes), axes.convert_yaw(poses.yaw)
+    return _checked(detections, shapes, yaw, uncertainty * axes.scale, unknown, concave, report)
 
 
 def _moved(solids: Solids, transforms: Transforms) -> Solids:

@@ -153,7 +153,7 @@ class Tracker:
             self._report(reader.name, log_time_ns, f"object {name!r}{what}")
 
         transforms = self._transforms(reader, detections, times_ns)
-        rows = rows_from_detections(detections, transforms, self._concave, report)
+        rows = rows_from_detections(detections, transforms, self._plan.mapping.axes, self._concave, report)
         number = self._add(rows)
         layout = reader.planned.layout
         is_complete = layout is not None and layout.complete

@@ -12,7 +12,7 @@ from pathlib import Path
 from spatial_replay.errors import LogError
 from spatial_replay.logs.mcap.writer import LogWriter
 from spatial_replay.logs.output_file import open_output, refuse_inputs
-from spatial_replay.logs.source import Source, read_blocks, reading_options
+from spatial_replay.logs.source import Source, axes_of, read_blocks, reading_options
 from spatial_replay.recording.interruption import leaving, uninterrupted
 from spatial_replay.recording.recording import Recording, refuse_templates
 from spatial_replay.spec import check_names
@@ -75,6 +75,7 @@ def record_source(
     first = next(traces)
     with leaving(output), open_output(output) as stream:
         about = {"source": source.name, "options": json.dumps(reading_options(source))}
+        about |= axes_of(source).metadata()
         _record(LogWriter(stream), about, files, chain([first], traces), advance)
     return tally.recorded(files)
 

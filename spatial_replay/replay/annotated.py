@@ -14,7 +14,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.logs.mcap.writer import LogWriter
 from spatial_replay.logs.messages import Sink
 from spatial_replay.logs.output_file import replacing
-from spatial_replay.logs.source import Source, reading_options
+from spatial_replay.logs.source import Source, axes_of, reading_options
 from spatial_replay.logs.topics import (
     AUTOMATA,
     AUTOMATA_PREFIX,
@@ -130,6 +130,7 @@ def _begin(sink: Sink, source: Source, replay: Replay, options: ReplayOptions, *
         "specifications": specifications_json(replay.files),
         "options": json.dumps(_recorded_options(source, options, layer=layer)),
     }
+    about |= axes_of(source).metadata()
     recorded = {key: value for key, value in before.items() if key not in about and key != "source"}
     if not is_replayed and "options" in before:
         recorded["recorded_options"] = before["options"]

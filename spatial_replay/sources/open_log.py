@@ -22,6 +22,7 @@ from spatial_replay.logs.mcap.chunks import MAGIC
 from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.read_options import Lost, OnTimeJump, ReadOptions, count_of
 from spatial_replay.logs.source import IterTraces, Source, TrackSource
+from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.trace import Trace
 
 _BAG_FILE = re.compile(r"^metadata\.yaml$|\.(db3|mcap)(\.zstd)?$")
@@ -38,6 +39,7 @@ def open_source(
     on_time_jump: OnTimeJump = "error",
     rate: float | None = None,
     lost: Lost = "drop",
+    y_down: bool | None = None,
 ) -> Source:
     """Open the log in a file of any format; the content decides, not the name.
 
@@ -47,6 +49,8 @@ def open_source(
         on_time_jump: whether a clock of an external log that jumps back is an error or ends the log.
         rate: frames a second of annotations that count frames; 30 unless given.
         lost: whether annotations that are marked as lost are dropped or kept.
+        y_down: whether y points down in a file of tracks or annotations, as in images; samples have y up. By
+            default, it points down in drone annotations, and up in all other files.
 
     Raises:
         UsageError: no path was given, or an option that means nothing to this format.
@@ -54,7 +58,7 @@ def open_source(
         LogError: the file is in none of the known formats.
     """
     _require_path(path)
-    options = ReadOptions(concave, mapping, on_time_jump, rate, lost)
+    options = ReadOptions(concave, mapping, on_time_jump, rate, lost, y_down)
     path = Path(path)
     if is_bag_folder(path):
         options.refuse_except(_MESSAGES, "ROS 2 bag", path.name)
@@ -78,13 +82,14 @@ def read_trace(
     on_time_jump: OnTimeJump = "error",
     rate: float | None = None,
     lost: Lost = "drop",
+    y_down: bool | None = None,
     allow_damage: bool = False,
 ) -> Trace:
     """Read a whole log into memory.
 
     Args:
         path: a log in any format that `open_source` knows.
-        mapping, concave, on_time_jump, rate, lost: how to read it, as for `open_source`.
+        mapping, concave, on_time_jump, rate, lost, y_down: how to read it, as for `open_source`.
         allow_damage: return what can be read of a damaged log, with its `faults`.
 
     Raises:
@@ -93,7 +98,13 @@ def read_trace(
         LogError: the file is not a log, or is damaged and `allow_damage` is not set.
     """
     source = open_source(
-        path, concave=concave, mapping=mapping, on_time_jump=on_time_jump, rate=rate, lost=lost
+        path,
+        concave=concave,
+        mapping=mapping,
+        on_time_jump=on_time_jump,
+        rate=rate,
+        lost=lost,
+        y_down=y_down,
     )
     traces = [replace(block.trace, remarks=block.remarks) for block in source.iter_blocks()]
     trace = Trace.concatenate(traces)
@@ -153,13 +164,21 @@ class Format(NamedTuple):
 
 
 def _tracks(iter_traces: IterTraces) -> Callable[[Path, str, ReadOptions], Source]:
-    return lambda path, kind, options: TrackSource(path, kind, options.concave, iter_traces)
+    return lambda path, kind, options: _track_source(path, kind, options, iter_traces, y_down=False)
+
+
+def _track_source(
+    path: Path, kind: str, options: ReadOptions, iter_traces: IterTraces, *, y_down: bool
+) -> Source:
+    """Return the source of a file; `y_down` says what is usual in its format."""
+    axes = Axes("down" if (y_down if options.y_down is None else options.y_down) else "up")
+    return TrackSource(path, kind, options.concave, iter_traces, MappingProxyType(options.given()), axes)
 
 
 def _open_annotations(path: Path, kind: str, options: ReadOptions) -> Source:
     rate = FRAMES_A_SECOND if options.rate is None else options.rate
     reader = partial(iter_annotations, rate=rate, lost=options.lost)
-    return TrackSource(path, kind, options.concave, reader, MappingProxyType(options.given()))
+    return _track_source(path, kind, options, reader, y_down=True)
 
 
 def _open_messages(path: Path, kind: str, options: ReadOptions) -> Source:
@@ -191,8 +210,8 @@ FORMATS: dict[str, Format] = {
     "MCAP": Format(lambda head: head.startswith(MAGIC), _open_mcap, _MESSAGES),
     "ROS 1 bag": Format(lambda head: head.startswith(b"#ROSBAG V2.0\n"), _open_messages, _MESSAGES),
     "ROS 2 bag": Format(lambda head: head.startswith(b"SQLite format 3\x00"), _open_messages, _MESSAGES),
-    "track JSONL": Format(_is_jsonl, _tracks(iter_jsonl)),
-    "track CSV": Format(_is_csv, _tracks(iter_csv)),
-    "drone annotations": Format(is_annotations, _open_annotations, frozenset({"rate", "lost"})),
+    "track JSONL": Format(_is_jsonl, _tracks(iter_jsonl), frozenset({"y_down"})),
+    "track CSV": Format(_is_csv, _tracks(iter_csv), frozenset({"y_down"})),
+    "drone annotations": Format(is_annotations, _open_annotations, frozenset({"rate", "lost", "y_down"})),
     "CommonRoad scenario": Format(is_scenario, _tracks(iter_scenario)),
 }

@@ -18,10 +18,11 @@ from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.mcap.summary import LogSummary, summarise_mcap
 from spatial_replay.logs.read_options import FaultList
-from spatial_replay.logs.source import Source, TrackSource
+from spatial_replay.logs.source import Source, TrackSource, axes_of
 from spatial_replay.logs.topics import OBJECTS
 from spatial_replay.mapping.suggest import EXAMPLES, suggest_mapping, suggest_topics
 from spatial_replay.sources.open_log import is_bag_folder
+from spatial_replay.trace.axes import OUR_AXES, Axes
 from spatial_replay.trace.trace import Trace
 
 _STEP = 10_000
@@ -215,6 +216,7 @@ class Overview:
         faults: what was lost or left out.
         container: channels, metadata and attachments of an MCAP log; None for other formats.
         remarks: what is worth knowing although nothing was lost.
+        axes: those of the source; its samples have ours.
     """
 
     name: str
@@ -227,6 +229,7 @@ class Overview:
     faults: tuple[str, ...]
     container: LogSummary | None = None
     remarks: tuple[str, ...] = ()
+    axes: Axes = OUR_AXES
 
 
 def overview_of(source: Source, advance: Callable[[int], object] = lambda samples: None) -> Overview:
@@ -266,6 +269,7 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
         faults=tuple(dict.fromkeys(faults)),
         container=container,
         remarks=tuple(remarks),
+        axes=axes_of(source),
     )
 
 

@@ -40,7 +40,8 @@ from spatial_replay.logs.mcap.index import (
 from spatial_replay.logs.messages import BLOCK_SAMPLES, Attachment, Block, Channel, Messages, Schema
 from spatial_replay.logs.objects.decode import decode_objects
 from spatial_replay.logs.read_options import FaultList
-from spatial_replay.logs.topics import DERIVED, OBJECTS
+from spatial_replay.logs.topics import DERIVED, METADATA, OBJECTS
+from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
 
@@ -99,6 +100,11 @@ class McapSource:
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
         """See `Source.metadata`; records that are damaged are left out."""
         return self._beside[1]
+
+    @property
+    def axes(self) -> Axes:
+        """Those of what the log was recorded from; its samples have ours."""
+        return Axes.from_metadata(dict(self.metadata()).get(METADATA, {}))
 
     @property
     def has_samples(self) -> bool:
