@@ -139,7 +139,7 @@ def test_what_is_kept_changes_no_sample(tmp_path: Path, mapping: Path) -> None:
 
 
 def test_messages_of_two_definitions_on_one_topic_keep_their_own(tmp_path: Path, mapping: Path) -> None:
-    """They cannot be mapped, as nobody can say which is meant; a copy has both."""
+    """They cannot be mapped, since either may be meant; a copy has both."""
     log = tmp_path / "mixed.mcap"
     with log.open("wb") as stream:
         writer = McapWriter(stream)
