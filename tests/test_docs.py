@@ -4,14 +4,23 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
 from collections.abc import Iterator
+from importlib.util import find_spec
 from inspect import cleandoc
 from pathlib import Path
 
 import click
 import pytest
+import yaml
 
+import spatial_replay as sr
+from spatial_replay.cli import run as run_in_process
 from spatial_replay.cli.application import COMMANDS, application
+from spatial_replay.spec.relations import RELATION_NAMES
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted(
@@ -30,7 +39,7 @@ def command_lines(text: str) -> Iterator[str]:
     for line in text.splitlines():
         line = line.strip().removeprefix("$ ").removeprefix("run 0 ").removeprefix("run 1 ")
         if line.startswith("spatial-replay "):
-            yield re.split(r" [|>] ", line)[0]
+            yield re.split(r" (?:[|>]|\|\|) ", line)[0]
 
 
 def leaves(name: str) -> Iterator[tuple[str, click.Command]]:
@@ -83,6 +92,70 @@ def test_the_links_of_the_readme_are_collected() -> None:
     assert ("README.md", "docs/language.md") in LINKS
 
 
+README = (ROOT / "README.md").read_text("utf-8")
+
+
+def test_the_commands_of_the_readme_run_in_a_clone_with_the_exit_code_they_show(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(ROOT / "recordings", tmp_path / "recordings")
+    monkeypatch.chdir(tmp_path)
+    ran = []
+    for line in command_lines(README):
+        command, _, comment = line.partition("#")
+        # a server does not end, and a simulated run takes long and needs an extra: both only have to parse
+        if "extra" not in comment:
+            code = int(comment.split(":")[0]) if comment else 0
+            assert run_in_process(shlex.split(command)[1:]) == code, line
+            ran.append(command.split()[1])
+    assert {"record", "check", "replay", "explain", "report", "export", "info"} <= set(ran)
+
+
+def test_every_input_that_the_documentation_takes_from_recordings_exists() -> None:
+    named = {file for _, line in LINES for file in re.findall(r"(?<![\w/])recordings/[\w./-]+", line)}
+    assert named
+    assert not {file for file in named if not (ROOT / file).exists()}
+
+
+def test_the_specification_in_the_readme_has_the_numbers_that_the_readme_shows() -> None:
+    text = re.findall(r"^```spatial\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)[0]
+    trace = sr.read_trace(ROOT / "recordings" / "table.jsonl")
+    in_time = sr.evaluate(sr.parse_specification(text), trace).results[0]
+    late = sr.evaluate(sr.parse_specification(text.replace("8s", "4s")), trace).results[0]
+    assert f"satisfied by {in_time.robustness:.3f} metres, violated by {-late.robustness:.3f}" in README
+
+
+def test_every_extra_is_explained_where_one_installs() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    install = (ROOT / "docs/install.md").read_text("utf-8")
+    for extra in project["optional-dependencies"]:
+        assert f"| `{extra}` |" in README
+        assert f"| `{extra}` |" in install
+    for dependency in project["dependencies"]:
+        name = re.split(r"[<>=~ ;]", dependency)[0]
+        assert re.search(rf"^\|[^|]*\b{name}\b", install, re.MULTILINE), name
+
+
+def test_the_citation_names_this_version_and_the_paper_of_the_logic() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    assert citation["version"] == sr.__version__
+    assert citation["references"][0]["doi"] in README
+
+
+def test_every_relation_is_drawn_where_it_holds_and_where_it_fails() -> None:
+    page = (ROOT / "docs/relations.md").read_text("utf-8")
+    drawn = re.findall(
+        r"^!\[.*: \+.* on the left, \N{MINUS SIGN}.* on the right\]\(relations/(\w+).svg\)", page, re.M
+    )
+    assert set(drawn) == RELATION_NAMES | {"dist"}
+
+
+def test_the_tool_draws_the_committed_relations() -> None:
+    command = [sys.executable, str(ROOT / "tools/make_relation_figures"), "--check"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout + result.stderr) == (0, "")
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_reference_shows_every_command(name: str) -> None:
     reference = (ROOT / "docs/command-line.md").read_text()
@@ -106,3 +179,24 @@ def test_a_line_that_the_program_refuses_does_not_parse() -> None:
         parse("spatial-replay check a.spatial --no-such-option")
     with pytest.raises(click.UsageError):
         parse("spatial-replay chekc a.spatial")
+
+
+@pytest.mark.skipif(
+    not (find_spec("mkdocs") and find_spec("mkdocstrings") and find_spec("material")),
+    reason="mkdocs-material and mkdocstrings are not installed (dependency group `docs`)",
+)
+def test_the_site_has_every_page_and_public_name_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
+    # strict: a broken link, anchor or reference is an error
+    command = [sys.executable, str(ROOT / "tools/site"), "-o", str(tmp_path / "site")]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stderr) == (0, ""), result.stdout
+    index = (tmp_path / "site/index.html").read_text("utf-8")
+    reference = (tmp_path / "site/api.html").read_text("utf-8")
+    for page in ROOT.glob("docs/*.md"):
+        assert f'href="{page.stem}.html"' in index
+    for name in sr.__all__:
+        assert name.startswith("_") or f'id="spatial_replay.{name}"' in reference
+    for page in (tmp_path / "site").rglob("*.html"):
+        text = page.read_text("utf-8")
+        assert not re.findall(r'<(?:script|img|iframe|source)[^>]*src="(?:https?:)?//', text)
+        assert not re.findall(r'<link[^>]*href="(?:https?:)?//', text)

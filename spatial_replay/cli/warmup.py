@@ -22,8 +22,9 @@ def warmup(jobs: int | None) -> None:
     SPATIAL_REPLAY_CACHE names another place.
 
     \b
-    Example, in a Dockerfile:
-      RUN pip install spatial-replay && spatial-replay warmup
+    Examples, the second in a Dockerfile:
+      spatial-replay warmup
+      RUN pip install . && spatial-replay warmup
     """
     # imported here so that --help stays fast
     from spatial_replay.runs.warmup import TASKS, warm_up_kernels
