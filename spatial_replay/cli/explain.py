@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import click
 
@@ -16,10 +18,13 @@ from spatial_replay.cli.options import (
     open_inputs,
     text_from_duration_ns,
     time_point_from_text,
-    warn_of_damage,
+    warn_of_input,
 )
 from spatial_replay.cli.progress import progress
 from spatial_replay.errors import UsageError
+
+if TYPE_CHECKING:
+    from spatial_replay.replay import Explanation
 
 
 @click.command()
@@ -45,7 +50,7 @@ def explain(
       spatial-replay explain run.mcap --spec blocks.spatial --node reach --at 12.3s
     """
     # imported here so that --help stays fast
-    from spatial_replay.replay import ReplayOptions, explain_results, has_samples_from, run_replay
+    from spatial_replay.replay import explain_results, has_samples_from, run_replay
 
     if at is not None and request.end is not None:
         raise UsageError("--at and --to both set the last sample; give only one")
@@ -54,12 +59,12 @@ def explain(
         replayed = run_replay(
             inputs.source,
             inputs.files,
-            ReplayOptions(inputs.window, inputs.each),
+            inputs.options(),
             keep_series=True,
             keep_leaves=True,
             advance=advance,
         )
-    warn_of_damage(replayed)
+    warn_of_input(replayed)
     goes_on = at is not None and has_samples_from(inputs.source, inputs.window.end_ns)
     if at is not None and not goes_on and replayed.end_ns < inputs.window.end_ns - 1:
         last = text_from_duration_ns(replayed.end_ns - replayed.first_ns)
@@ -68,8 +73,15 @@ def explain(
     if as_json:
         click.echo(json.dumps([each.document for each in results], indent=2, ensure_ascii=False))
     else:
-        click.echo("\n\n".join("\n".join(each.sentences) for each in results))
+        click.echo("\n\n".join("\n".join([*_requirement(each), *each.sentences]) for each in results))
     return exit_code_from_verdicts((each.verdict for each in results), bool(replayed.faults))
+
+
+def _requirement(explanation: Explanation) -> Iterator[str]:
+    """Yield the id and the title of what is explained, if it has any."""
+    parts = [explanation.document[key] for key in ("requirement", "title") if explanation.document[key]]
+    if parts:
+        yield ": ".join(parts)
 
 
 def _until(inputs: EvaluationInputs, at: str | None) -> EvaluationInputs:

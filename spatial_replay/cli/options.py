@@ -6,7 +6,7 @@ import os
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal
 from functools import wraps
@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from spatial_replay.logs.source import Source
+    from spatial_replay.monitor.semantics import Semantics
     from spatial_replay.recording.record_source import Recorded
-    from spatial_replay.replay import Replayed, Window
+    from spatial_replay.replay import Replayed, ReplayOptions, Window
     from spatial_replay.spec.formula import Specification
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
@@ -178,6 +179,7 @@ class EvaluationArguments:
     every: int
     choices: tuple[str, ...]
     constants: Mapping[str, float | str]
+    strict_names: bool
     profile: str | None
     reading: ReadArguments
 
@@ -213,6 +215,11 @@ _EVALUATION = (
         help="Objects to evaluate a template for: one class, or VAR=all.",
     ),
     constants_option,
+    click.option(
+        "--strict-names",
+        is_flag=True,
+        help="Refuse names that the log never has, instead of warning that they are unknown.",
+    ),
     profile_option,
 )
 
@@ -230,6 +237,13 @@ class EvaluationInputs:
     files: Sequence[Specification]
     window: Window
     each: Mapping[str, str]
+    strict_names: bool
+
+    def options(self, semantics: Semantics = "ltlf") -> ReplayOptions:
+        """Return how the specifications are evaluated over the log."""
+        from spatial_replay.replay import ReplayOptions
+
+        return ReplayOptions(self.window, self.each, semantics, self.strict_names)
 
 
 def open_inputs(request: EvaluationArguments) -> EvaluationInputs:
@@ -247,7 +261,8 @@ def open_inputs(request: EvaluationArguments) -> EvaluationInputs:
     files = load_files(request.specs, source, profile=request.profile, constants=request.constants)
     for warning in (warning for file in files for warning in file.warnings):
         click.echo(warning, err=True)
-    return EvaluationInputs(source, files, _window(source, request), _each(request.choices))
+    window, each = _window(source, request), _each(request.choices)
+    return EvaluationInputs(source, files, window, each, request.strict_names)
 
 
 def _each(choices: tuple[str, ...]) -> dict[str, str]:
@@ -318,9 +333,11 @@ def require_choice(specification: Specification, of: str | None) -> None:
         raise UsageError(f"{specification.filename} has several results; choose one with --of: {names}")
 
 
-def warn_of_damage(result: Replayed | Recorded) -> None:
-    """Warn of what was lost, remarkable or unreadable in the log that a result comes from."""
+def warn_of_input(result: Replayed | Recorded) -> None:
+    """Warn of what was lost, remarkable or unreadable in a log, and of names that it never has."""
     warn(*result.faults, *result.remarks)
+    for name in result.missing:
+        click.echo(replace(name, severity="warning"), err=True)
     if result.unreadable:
         count = counted(result.unreadable, "observation")
         one = result.unreadable == 1

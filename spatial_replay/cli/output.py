@@ -30,17 +30,17 @@ def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | Non
     seconds = (replayed.end_ns - replayed.start_ns) / 1e9
     damaged = ", damaged: verdicts are over what could be read" if replayed.faults else ""
     click.echo(f"{replayed.log}: {counted(replayed.samples, 'sample')} over {seconds:.3f} s{damaged}")
-    titles = [result.title for result in replayed.results]
+    titles = [_titled(result) for result in replayed.results]
     width = max(map(len, titles), default=0)
     for title, result in zip(titles, replayed.results, strict=True):
         verdict = click.style(f"{result.verdict:<9}", fg=_COLOURS[result.verdict], bold=True)
         click.echo(f"  {title:<{width}}  {verdict}  {_numbers(result, replayed.first_ns)}")
-        if result.verdict == "unknown" and result.can_explain:
-            click.echo(f"  {'':<{width}}  {_why_unknown(result, replayed.first_ns)}")
+        for line in _below(result, replayed.first_ns):
+            click.echo(f"  {'':<{width}}  {line}")
         if window_ns is not None:
             click.echo(f"  {'':<{width}}  {_over_window(result, replayed.first_ns, window_ns)}")
-    if not replayed.results:
-        click.echo("  the template matched no objects")
+    for part in replayed.vacuous:
+        click.echo(f"  vacuous: {part.message}")
     if output is not None:
         click.echo(f"wrote {output}")
 
@@ -64,6 +64,11 @@ def write_document(
         stream.write(text.encode() + b"\n")
 
 
+def _titled(result: SpecResult) -> str:
+    """Return the name of a result with the id of its requirement."""
+    return f"{result.title} [{result.spec.id}]" if result.spec.id else result.title
+
+
 def _numbers(result: SpecResult, first_ns: int) -> str:
     robustness, lower, upper = result.robustness, result.lower, result.upper
     parts = [f"robustness {_shown(robustness)}"]
@@ -71,17 +76,33 @@ def _numbers(result: SpecResult, first_ns: int) -> str:
         parts.append(f"between {_shown(lower)} and {_shown(upper)}")
     if robustness == 0.0:
         parts.append("marginal")
-    if result.first_satisfied_ns is not None:
+    if result.verdict == "violated":
+        if result.violated_at_ns is not None:
+            parts.append(f"certain since {text_from_duration_ns(result.violated_at_ns - first_ns)}")
+        if result.least is not None:
+            parts.append(f"the least robustness is that of {result.least.name}")
+    elif result.first_satisfied_ns is not None:
         parts.append(f"first satisfied at {text_from_duration_ns(result.first_satisfied_ns - first_ns)}")
     return ", ".join(parts)
 
 
-def _why_unknown(result: SpecResult, first_ns: int) -> str:
-    """Return the sentence about what was unknown, or too uncertain."""
-    from spatial_replay.monitor.sentences import sentences_of
+def _below(result: SpecResult, first_ns: int) -> Iterator[str]:
+    """Yield the requirement, a line for each cause of the verdict, and for each part that decided nothing."""
+    # imported here so that --help stays fast
+    from spatial_replay.monitor.sentences import reason_sentence
 
-    _, reason = sentences_of(result.witness(), first_ns=first_ns)
-    return reason
+    if result.spec.title:
+        yield result.spec.title
+    for cause in result.causes:
+        settled_ns = cause.settled_ns
+        when = "" if settled_ns is None else f" at {text_from_duration_ns(settled_ns - first_ns)}"
+        label = f"{cause.spec}{when}: " if len(result.causes) > 1 or cause.spec != result.name else ""
+        if cause.witness is not None:
+            yield f"{label}{reason_sentence(cause.witness, first_ns=first_ns)}"
+        elif label:
+            yield f"{label}{cause.verdict}, robustness {_shown(cause.robustness)}"
+    for part in result.vacuous:
+        yield f"vacuous: {part.message}"
 
 
 def _over_window(result: SpecResult, first_ns: int, window_ns: int) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypedDict
@@ -23,7 +22,7 @@ from spatial_replay.cli.options import (
     profile_option,
     reading_options,
     specs_option,
-    warn_of_damage,
+    warn_of_input,
 )
 from spatial_replay.cli.progress import progress
 from spatial_replay.text import counted
@@ -204,9 +203,7 @@ def tracks(
     files = load_spec_options(specs, profile, constants)
     with progress("samples") as advance:
         recorded = record_source(source, output, files, inputs=inputs, advance=advance)
-    warn_of_damage(recorded)
-    for name in recorded.missing:
-        click.echo(replace(name, severity="warning"), err=True)
+    warn_of_input(recorded)
     seconds = (recorded.end_ns - recorded.start_ns) / 1e9
     click.echo(
         f"wrote {output}: {counted(recorded.samples, 'sample')} over {seconds:.3f} s of "

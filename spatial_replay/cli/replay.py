@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,14 +17,27 @@ from spatial_replay.cli.options import (
     open_inputs,
     output_option,
     semantics_option,
-    warn_of_damage,
+    warn_of_input,
 )
 from spatial_replay.cli.output import print_verdicts, write_document
 from spatial_replay.cli.progress import progress
 from spatial_replay.errors import UsageError
+from spatial_replay.text import nearest_hint
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.semantics import Semantics
+    from spatial_replay.replay import Replayed
+
+
+_KINDS = ("vacuous", "unknown")
+
+
+def _read_kinds(context: click.Context, parameter: click.Parameter, text: str) -> frozenset[str]:
+    kinds = frozenset(kind.strip() for kind in text.split(",") if kind.strip())
+    for kind in kinds - {*_KINDS}:
+        hint = nearest_hint(kind, _KINDS) or f"the kinds are {' and '.join(_KINDS)}"
+        raise UsageError(f"--fail-on: {kind!r} is not a kind of failure; {hint}")
+    return kinds
 
 
 @click.command()
@@ -48,6 +62,13 @@ if TYPE_CHECKING:
     metavar="DURATION",
     help="Also evaluate a sliding window, such as 10s, at every sample.",
 )
+@click.option(
+    "--fail-on",
+    metavar="KINDS",
+    callback=_read_kinds,
+    default="",
+    help="Exit with 1 on these as well: vacuous, unknown, or both with a comma between.",
+)
 @semantics_option
 def replay(
     request: EvaluationArguments,
@@ -57,6 +78,7 @@ def replay(
     series: bool,
     signal: bool,
     width: str | None,
+    fail_on: frozenset[str],
     semantics: Semantics,
 ) -> int:
     """Evaluate specifications over a recorded log.
@@ -64,18 +86,21 @@ def replay(
     T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or 2026-01-31T12:00:00Z.
 
     Exits with 0 if all results are satisfied, 1 if any is violated, 4 if none is violated and any is unknown,
-    3 if the log is damaged and the verdicts cover only what could be read.
+    3 if the log is damaged and the verdicts cover only what could be read. With --fail-on vacuous also
+    with 1 if a part of a specification decided nothing: an empty window, an antecedent that never held, a
+    group without members, a template without objects.
 
     \b
     Examples:
       spatial-replay replay run.mcap --spec blocks.spatial -o annotated.mcap
       spatial-replay replay run.mcap --spec edited.spatial --json -
+      spatial-replay replay run.mcap --spec blocks.spatial --const near=80 --fail-on vacuous,unknown
       spatial-replay replay run.mcap --spec blocks.spatial --window 10s
       spatial-replay replay walk.jsonl --spec walk.spatial --each ego=class:person
       spatial-replay replay drive.bag --mapping drive.yaml --spec drive.spatial
     """
     # imported here so that --help stays fast
-    from spatial_replay.replay import ReplayOptions, run_replay
+    from spatial_replay.replay import run_replay
 
     if (series or signal) and json_file is None:
         option = "--series" if series else "--signal"
@@ -92,7 +117,7 @@ def replay(
         replayed = run_replay(
             inputs.source,
             inputs.files,
-            ReplayOptions(inputs.window, inputs.each, semantics),
+            inputs.options(semantics),
             keep_series=json_file is not None and (series or signal or window_ns is not None),
             keep_leaves=True,
             output=output,
@@ -100,12 +125,21 @@ def replay(
             layer=layer,
             advance=advance,
         )
-    warn_of_damage(replayed)
+    warn_of_input(replayed)
     if json_file is not None:
         write_document(replayed, json_file, request.inputs, signal=signal, window_ns=window_ns)
     if json_file != "-":
         print_verdicts(replayed, output, window_ns)
-    return exit_code_from_verdicts((result.verdict for result in replayed.results), bool(replayed.faults))
+    verdicts = [str(result.verdict) for result in replayed.results]
+    return exit_code_from_verdicts([*verdicts, *_failures(replayed, fail_on)], damaged=bool(replayed.faults))
+
+
+def _failures(replayed: Replayed, kinds: frozenset[str]) -> Iterator[str]:
+    """Yield "violated" for each thing that the user counts as a failure."""
+    if "unknown" in kinds and any(result.verdict == "unknown" for result in replayed.results):
+        yield "violated"
+    if "vacuous" in kinds and (replayed.vacuous or any(result.vacuous for result in replayed.results)):
+        yield "violated"
 
 
 def _width_ns(text: str) -> int:

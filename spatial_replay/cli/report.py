@@ -14,7 +14,7 @@ from spatial_replay.cli.options import (
     open_inputs,
     output_option,
     semantics_option,
-    warn_of_damage,
+    warn_of_input,
 )
 from spatial_replay.cli.output import print_verdicts
 from spatial_replay.cli.progress import progress
@@ -42,7 +42,6 @@ def report(request: EvaluationArguments, output: Path, semantics: Semantics) -> 
     """
     # imported here so that --help stays fast
     from spatial_replay.logs.output_file import refuse_inputs
-    from spatial_replay.replay import ReplayOptions
     from spatial_replay.report.write import write_report
 
     refuse_inputs(output, request.inputs)
@@ -52,10 +51,10 @@ def report(request: EvaluationArguments, output: Path, semantics: Semantics) -> 
             inputs.source,
             inputs.files,
             output,
-            ReplayOptions(inputs.window, inputs.each, semantics),
+            inputs.options(semantics),
             inputs=request.inputs,
             advance=advance,
         )
-    warn_of_damage(replayed)
+    warn_of_input(replayed)
     print_verdicts(replayed, output)
     return exit_code_from_verdicts((result.verdict for result in replayed.results), bool(replayed.faults))

@@ -13,7 +13,7 @@ from spatial_replay.cli.options import (
     evaluation_options,
     open_inputs,
     semantics_option,
-    warn_of_damage,
+    warn_of_input,
 )
 from spatial_replay.cli.output import print_verdicts
 from spatial_replay.cli.progress import progress
@@ -64,7 +64,7 @@ def serve(
     if layout:
         click.echo(tuned.layout.data)
         return None
-    warn_of_damage(tuned.replayed)
+    warn_of_input(tuned.replayed)
     try:
         _serve(tuned, host, port, play)
     except KeyboardInterrupt:
@@ -88,14 +88,14 @@ def _serve(tuned: Tuned, host: str, port: int, play: bool) -> None:
 
 
 def _tuned(request: EvaluationArguments, semantics: Semantics) -> Tuned:
-    from spatial_replay.replay import ReplayOptions, Tuning
+    from spatial_replay.replay import Tuning
 
     inputs = open_inputs(request)
     with progress("samples") as advance:
         tuning = Tuning(
             inputs.source,
             inputs.files,
-            ReplayOptions(inputs.window, inputs.each, semantics),
+            inputs.options(semantics),
             advance=advance,
         )
     return tuning.evaluate()

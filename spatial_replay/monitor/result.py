@@ -268,6 +268,20 @@ class SpecResult(Displayed):
             raise UsageError(f"no node has the id {identifier}; they go from 0 to {len(self.final) - 1}")
         return find_witness(self.evidence, leaves, self.times_ns, identifier)
 
+    def since_ns(self, node: int = 0) -> int | None:
+        """Return since when a node has had the sign of its verdict; None if that is not known."""
+        if not self.has_series or final_verdict(*self.final[node].tolist()) is Verdict.UNKNOWN:
+            return None
+        value, _, lower, upper = self.series[node]
+        holds = (value >= 0.0) | (lower >= 0.0)
+        fails = (value < 0.0) | (upper < 0.0)
+        others = np.flatnonzero(~(holds if holds[-1] else fails))
+        if not len(others):
+            return int(self.times_ns[0])
+        last = int(others[-1])
+        is_known = holds[last] or fails[last]
+        return int(self.times_ns[last + 1]) if is_known and last + 1 < len(value) else None
+
     def explain(self, *, first_ns: int | None = None) -> str:
         """Explain the verdict in sentences, one a line, as the command `explain` prints them.
 
@@ -284,7 +298,7 @@ class SpecResult(Displayed):
         """Return the sentences of `explain`, which count time from `first_ns`."""
         found: list[str] = []
         if self.can_explain and not self.causes:
-            found += sentences_of(self.witness(), first_ns=first_ns)
+            found += sentences_of(self.witness(), first_ns=first_ns, since_ns=self.since_ns())
         else:
             found.append(self._headline(first_ns))
         for cause in self.causes:

@@ -110,7 +110,20 @@ def _settled(witness: Witness, first_ns: int) -> str:
     return f"`{title}`{instance} is {witness.verdict} since {since}, whatever came after."
 
 
+def reason_sentence(witness: Witness, *, first_ns: int) -> str:
+    """Return one sentence on what decided a verdict or, for an unknown one, on what was not known."""
+    deciding = witness.deciding
+    if deciding is None or deciding.unknown or witness.verdict is Verdict.UNKNOWN:
+        _, reason, *_ = sentences_of(witness, first_ns=first_ns)
+        return reason
+    return f"`{deciding.text}` {_how_it_decides(witness, deciding, first_ns)}"
+
+
 def _decision(witness: Witness, deciding: DecidingAtom, first_ns: int) -> str:
+    return f"What decides is `{deciding.text}`, which {_how_it_decides(witness, deciding, first_ns)}"
+
+
+def _how_it_decides(witness: Witness, deciding: DecidingAtom, first_ns: int) -> str:
     amount = deciding.value if deciding.lower == deciding.upper else _end(witness, deciding)
     how = f"holds by {number_text(amount)}" if amount >= 0.0 else f"fails by {number_text(-amount)}"
     if amount == 0.0:
@@ -120,7 +133,7 @@ def _decision(witness: Witness, deciding: DecidingAtom, first_ns: int) -> str:
     where = (
         _in_time_of_all(witness) if witness.path[-1].operator == deciding.atom.relation else _in_time(witness)
     )
-    return f"What decides is `{deciding.text}`, which {how} at {when}{where}: {what}."
+    return f"{how} at {when}{where}: {what}."
 
 
 def _end(witness: Witness, deciding: DecidingAtom) -> float:

@@ -59,7 +59,7 @@ def run_replay(
 
     Raises:
         UsageError: an option that cannot work, no sample in the window, the output is an input.
-        SpecificationError: names that the log never has.
+        SpecificationError: names that the log never has, if names are strict.
         LogError: no sample in the log.
         OutputError: the output cannot be written.
     """

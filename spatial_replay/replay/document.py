@@ -6,12 +6,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
+from spatial_replay.monitor.causes import Cause
 from spatial_replay.monitor.result import SpecResult, no_such_node
-from spatial_replay.monitor.sentences import sentences_of
+from spatial_replay.monitor.sentences import cause_sentences, sentences_of
+from spatial_replay.monitor.vacuity import Vacuous
 from spatial_replay.monitor.verdict import Verdict, online_verdict
 from spatial_replay.monitor.witness.atom import Measured
 from spatial_replay.monitor.witness.witness import Witness
@@ -41,6 +41,7 @@ def document_from_replay(
             "damaged": bool(replayed.faults),
             "faults": list(replayed.faults),
             "remarks": list(replayed.remarks),
+            "missing": [each.message for each in replayed.missing],
             "unreadable_observations": replayed.unreadable,
         },
         "semantics": replayed.semantics,
@@ -48,6 +49,7 @@ def document_from_replay(
         "specifications": [
             _result(result, replayed.start_ns, signal, window_ns) for result in replayed.results
         ],
+        "vacuous": [_vacuous(each) for each in replayed.vacuous],
     }
 
 
@@ -55,12 +57,18 @@ def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | No
     value: dict[str, Any] = {
         "name": result.name,
         "object": result.object,
+        "requirement": result.spec.id,
+        "title": result.spec.title,
         "verdict": str(result.verdict),
         "robustness": json_number(result.robustness),
         "lower": json_number(result.lower),
         "upper": json_number(result.upper),
         "first_satisfied_ns": result.first_satisfied_ns,
+        "violated_at_ns": result.violated_at_ns,
+        "satisfied_at_ns": result.satisfied_at_ns,
         "worst": None,
+        "causes": [_cause(each, first_ns) for each in result.causes],
+        "vacuous": [_vacuous(each) for each in result.vacuous],
         "nodes": [
             {
                 "id": node.id,
@@ -76,7 +84,10 @@ def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | No
             for node in result.nodes
         ],
     }
-    if result.can_explain:
+    if result.causes:
+        # the atom of the first cause: what headline, arrow and event name
+        value["worst"] = value["causes"][0]["witness"]
+    elif result.can_explain:
         value["worst"] = witness_document(result.witness(), first_ns)
     if result.has_series:
         value["series"] = {
@@ -90,6 +101,21 @@ def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | No
         if result.leaves is not None and window_ns is not None:
             value["series"]["window"] = _numbers(result.window_signal(window_ns))
     return value
+
+
+def _cause(cause: Cause, first_ns: int) -> dict[str, Any]:
+    return {
+        "spec": cause.spec,
+        "node": cause.node,
+        "verdict": str(cause.verdict),
+        "robustness": json_number(cause.robustness),
+        "settled_ns": cause.settled_ns,
+        "witness": None if cause.witness is None else witness_document(cause.witness, first_ns),
+    }
+
+
+def _vacuous(part: Vacuous) -> dict[str, Any]:
+    return {"node": part.node, "text": part.text, "reason": part.reason, "message": part.message}
 
 
 def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
@@ -208,35 +234,42 @@ def explain_node(result: SpecResult, node: int = 0, *, first_ns: int, goes_on: b
     """Explain the verdict of one node of a result; see `explain_results`."""
     if not result.has_series:
         raise ValueError("the replay did not keep series and leaves")
-    witness = result.witness(node)
-    value, _, lower, upper = result.series[node]
-    since = _since(value, lower, upper) if witness.verdict is not Verdict.UNKNOWN else None
-    since_ns = None if since is None else int(result.times_ns[since])
+    _, _, lower, upper = result.series[node]
+    causes = _causes_below(result, node)
+    settled = next((cause.witness for cause in causes if cause.settled_ns is not None), None)
+    witness = settled or (causes[0].witness if causes and node == 0 else None) or result.witness(node)
+    since_ns = result.since_ns(node)
     is_open = goes_on and online_verdict(float(lower[-1]), float(upper[-1])) is Verdict.PENDING
-    sentences = sentences_of(witness, first_ns=first_ns, since_ns=since_ns, is_open=is_open)
+    if node == 0 and not is_open:
+        sentences = result.sentences(first_ns)
+    elif settled is not None:
+        sentences = tuple(
+            sentence
+            for cause in causes
+            for sentence in cause_sentences(cause, first_ns=first_ns, object=result.object)
+        )
+    else:
+        witness = result.witness(node)
+        sentences = sentences_of(witness, first_ns=first_ns, since_ns=since_ns, is_open=is_open)
     document = {
         **witness_document(witness, first_ns),
         "specification": result.name,
         "object": result.object,
+        "requirement": result.spec.id if node == 0 else None,
+        "title": result.spec.title if node == 0 else None,
         "since_ns": since_ns,
+        "causes": [_cause(each, first_ns) for each in causes],
+        "vacuous": [_vacuous(each) for each in result.vacuous] if node == 0 else [],
         "may_change": is_open,
         "explanation": list(sentences),
     }
     return Explanation(witness.verdict, witness.time_ns, sentences, document)
 
 
-def _since(value: Floats, lower: Floats, upper: Floats) -> int | None:
-    """Return the first sample since which the verdict is that of the last one; None if that is unknown.
-
-    Args:
-        value, lower, upper: (T,), those of the node; the last ones settle its verdict.
-    """
-    holds = (value >= 0.0) | (lower >= 0.0)
-    fails = (value < 0.0) | (upper < 0.0)
-    same = holds if holds[-1] else fails
-    others = np.flatnonzero(~same)
-    if not len(others):
-        return 0
-    last = int(others[-1])
-    is_known = holds[last] or fails[last]
-    return last + 1 if is_known and last + 1 < len(value) else None
+def _causes_below(result: SpecResult, node: int) -> list[Cause]:
+    """Return the causes of a result that lie within one of its nodes."""
+    below = {node}
+    for identifier, parent, _ in iter_nodes(result.formula):
+        if parent in below:
+            below.add(identifier)
+    return [cause for cause in result.causes if cause.node in below]

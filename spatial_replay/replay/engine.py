@@ -11,16 +11,22 @@ from spatial_replay.annotate.annotator import AnnotatedEvaluation
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.certificate import Hashing, MessageHash, ResultHash, SampleHash, certificate
 from spatial_replay.annotate.scene_update import SceneFrames
-from spatial_replay.annotate.specification import logged_specifications, specification_attachments
+from spatial_replay.annotate.specification import (
+    ReportedTree,
+    logged_specifications,
+    specification_attachments,
+)
 from spatial_replay.logs.messages import Attachment, Messages, merge
 from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import REPLAYED_PREFIX
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import SeriesBlock, join_blocks
+from spatial_replay.monitor.vacuity import Vacuous, no_instances
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.monitor.witness.path import Evidence
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Selection, first_sample_ns
+from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.trace import Trace
 
@@ -36,8 +42,10 @@ class Replayed:
         start_ns, end_ns: times of the first and the last of those evaluated.
         faults: what was lost while reading, each with its place.
         remarks: what the source reports about its samples where nothing was lost.
+        missing: a warning for each name in the specifications that the log never has: it is unknown.
         unreadable: how many observations have no usable value: a number is not finite, or too old.
         results: one per spec and object.
+        vacuous: templates without instances; what decided nothing within a result is in its own `vacuous`.
         certificate: hashes of what went in and came out.
         semantics: the semantics of the formulas.
     """
@@ -49,8 +57,10 @@ class Replayed:
     end_ns: int
     faults: tuple[str, ...]
     remarks: tuple[str, ...]
+    missing: tuple[Diagnostic, ...]
     unreadable: int
     results: tuple[SpecResult, ...]
+    vacuous: tuple[Vacuous, ...]
     certificate: Mapping[str, str]
     semantics: Semantics = "ltlf"
 
@@ -130,7 +140,7 @@ class Replay:
         Raises:
             LogError: no sample in the log.
             UsageError: no sample in the window.
-            SpecificationError: names that the log never has.
+            SpecificationError: names that the log never has, if names are strict.
         """
         for block, trace in self._selection.iter_blocks():
             stretches = self._evaluation.extend(trace)
@@ -193,7 +203,7 @@ class Replay:
     def _replayed(self) -> Replayed:
         if not self._samples:
             raise self._selection.nothing_to_evaluate(self._faults)
-        self._selection.check_names(self._names, self._signals)
+        missing = self._selection.missing_names(self._names, self._signals)
         options = self._selection.options
         return Replayed(
             log=self._source.name,
@@ -203,6 +213,7 @@ class Replay:
             end_ns=self._times[-1],
             faults=tuple(self._faults),
             remarks=tuple(self._remarks),
+            missing=missing,
             unreadable=self._unreadable,
             results=replayed_specs(
                 self._evaluation,
@@ -212,11 +223,27 @@ class Replay:
                 has_series=self._keep_series,
                 has_leaves=self._keep_leaves,
             ),
+            vacuous=idle_templates(self.files, self.trees),
             certificate=certificate(
                 self._sample_hash, self._message_hash, self._written_files, self._result_hash
             ),
             semantics=options.semantics,
         )
+
+
+def idle_templates(files: Sequence[Specification], trees: Sequence[ReportedTree]) -> tuple[Vacuous, ...]:
+    """Return the templates without instances.
+
+    Args:
+        trees: what was evaluated.
+    """
+    evaluated = {id(tree.formula) for tree in trees}
+    return tuple(
+        no_instances(spec.name, spec.parameter)
+        for file in files
+        for spec in file.results
+        if spec.parameter is not None and id(spec.formula) not in evaluated
+    )
 
 
 def replayed_specs(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -53,11 +53,13 @@ class ReplayOptions:
         window: the samples to evaluate.
         each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
         semantics: "ltlf", or "paper": Def. 16 of the paper to the letter.
+        strict_names: objects and signals that the log never has are errors; otherwise they are unknown.
     """
 
     window: Window = Window()
     each: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     semantics: Semantics = "ltlf"
+    strict_names: bool = False
 
 
 DEFAULT_OPTIONS = ReplayOptions()
@@ -161,14 +163,14 @@ class Selection:
             self._check_class(choice, classes)
         return instances
 
-    def check_names(self, objects: Collection[str], signals: Collection[str]) -> None:
-        """Check that the log has every object and signal that a specification names.
+    def missing_names(self, objects: Collection[str], signals: Collection[str]) -> tuple[Diagnostic, ...]:
+        """Return a warning for each object and signal that a specification names and the log never has.
 
         Args:
             objects, signals: names in the window.
 
         Raises:
-            SpecificationError: it lacks some.
+            SpecificationError: it lacks some, and names are strict.
         """
         missing = self._missing_names(set(objects), set(signals))
         if missing and not self.window.is_whole:
@@ -178,8 +180,9 @@ class Selection:
                 names.update(block.trace.names)
                 others.update(block.trace.signals)
             missing = self._missing_names(names, others)
-        if missing:
+        if missing and self.options.strict_names:
             raise SpecificationError(missing)
+        return tuple(replace(each, severity="warning") for each in missing)
 
     def nothing_to_evaluate(self, faults: Sequence[str]) -> LogError | UsageError:
         """Return the error for a window without any sample.

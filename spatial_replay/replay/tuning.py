@@ -23,7 +23,7 @@ from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.source import MemorySource, Source
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
-from spatial_replay.replay.engine import Replayed, replayed_specs
+from spatial_replay.replay.engine import Replayed, idle_templates, replayed_specs
 from spatial_replay.replay.own_messages import OwnMessages
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Selection, first_sample_ns
 from spatial_replay.spec import parse_specification
@@ -62,6 +62,7 @@ class Tuning:
         inside: those in the window.
         own: the messages of the log itself.
         faults, remarks: what was lost while reading, and what else the source reports.
+        missing: a warning for each name in the specifications that the log never has.
     """
 
     def __init__(
@@ -80,7 +81,7 @@ class Tuning:
         Raises:
             LogError: no sample in the log, or it cannot be read.
             UsageError: no sample in the window, an option that cannot work.
-            SpecificationError: names that the log never has.
+            SpecificationError: names that the log never has, if names are strict.
         """
         selection = Selection(source, tuple(files), options)
         self.name, self.options = source.name, options
@@ -99,7 +100,7 @@ class Tuning:
         self.inside = selection.inside(self.trace)
         if not len(self.inside):
             raise selection.nothing_to_evaluate(self.faults)
-        selection.check_names(self.trace.names, tuple(self.trace.signals))
+        self.missing = selection.missing_names(self.trace.names, tuple(self.trace.signals))
         self.first_ns = first_sample_ns(source) if options.window.start_ns else int(self.trace.times_ns[0])
         self._places = _places(self._files)
         self.constants: Mapping[str, Constant] = self._constants(self._files)
@@ -209,8 +210,10 @@ class Tuned:
             end_ns=int(times_ns[-1]),
             faults=tuning.faults,
             remarks=tuning.remarks,
+            missing=tuning.missing,
             unreadable=tuning.inside.unreadable_count,
             results=replayed_specs(self.evaluation, self.edited.files, self.stretches, self.selection),
+            vacuous=idle_templates(self.edited.files, self.evaluation.trees),
             certificate=MappingProxyType({}),
             semantics=tuning.options.semantics,
         )

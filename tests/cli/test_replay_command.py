@@ -234,12 +234,23 @@ def test_every_error_of_a_specification_is_reported(folder: Path) -> None:
 
 def test_an_object_that_is_not_in_the_log_is_unknown(folder: Path) -> None:
     (folder / "a.spatial").write_text("spec s = F (cub ovlp cube)\n")
-    done = run_program("replay", "run.jsonl", "--spec", "a.spatial", "-o", "out.mcap", cwd=folder)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "a.spatial:1:13: error: the log never has the object 'cub'" in done.stderr
-    assert "'cube'" in done.stderr
-    assert "its objects are cube, cup 物" in done.stderr
-    assert not (folder / "out.mcap").exists()
+    arguments = ("replay", "run.jsonl", "--spec", "a.spatial", "--json", "out.json")
+    done = run_program(*arguments, cwd=folder)
+    assert done.returncode == 4
+    assert "a.spatial:1:13: warning: the log never has the object 'cub'" in done.stderr
+    assert "did you mean 'cube'? its objects are cube, cup 物" in done.stderr
+    document = json.loads((folder / "out.json").read_text())
+    assert document["log"]["missing"] == ["the log never has the object 'cub'"]
+    strict = run_program(*arguments, "--strict-names", cwd=folder)
+    assert (strict.returncode, strict.stdout) == (2, "")
+    assert "a.spatial:1:13: error: the log never has the object 'cub'" in strict.stderr
+
+
+def test_an_unknown_name_leaves_the_verdicts_of_other_specs(folder: Path) -> None:
+    (folder / "two.spatial").write_text("spec a = G (cub ovlp cube)\nspec b = G (cube ovlp cube)\n")
+    assert run_in_process(["replay", "run.jsonl", "--spec", "two.spatial", "--json", "two.json"]) == 4
+    verdicts = [each["verdict"] for each in json.loads((folder / "two.json").read_text())["specifications"]]
+    assert verdicts == ["unknown", "satisfied"]
 
 
 def test_a_full_disk_gives_code_70_and_leaves_no_file(folder: Path) -> None:
