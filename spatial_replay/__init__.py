@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from spatial_replay.monitor.result import NodeResult, SpecResult
     from spatial_replay.monitor.vacuity import Vacuous
     from spatial_replay.monitor.verdict import Verdict
+    from spatial_replay.monitor.violation import Violation
     from spatial_replay.monitor.witness.atom import DecidingAtom, Measured
     from spatial_replay.monitor.witness.threshold import Threshold
     from spatial_replay.monitor.witness.witness import Witness, WitnessStep
@@ -78,6 +79,7 @@ __all__ = [
     "UsageError",
     "Vacuous",
     "Verdict",
+    "Violation",
     "Witness",
     "WitnessStep",
     "__version__",
@@ -100,6 +102,7 @@ __getattr__, __dir__ = loaded_when_used(
         "monitor.result": ("NodeResult", "SpecResult"),
         "monitor.vacuity": ("Vacuous",),
         "monitor.verdict": ("Verdict",),
+        "monitor.violation": ("Violation",),
         "monitor.witness.atom": ("DecidingAtom", "Measured"),
         "monitor.witness.threshold": ("Threshold",),
         "monitor.witness.witness": ("Witness", "WitnessStep"),

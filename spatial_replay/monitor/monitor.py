@@ -15,6 +15,7 @@ from spatial_replay.monitor.result import no_such_node
 from spatial_replay.monitor.semantics import LIVE_ROOM, checked_semantics
 from spatial_replay.monitor.stream import LiveStream
 from spatial_replay.monitor.verdict import Verdict, online_verdict, worst_verdict
+from spatial_replay.monitor.violation import Settled, Violation, ViolationLog
 from spatial_replay.spec.formula import NamedSpec, Specification, iter_nodes
 from spatial_replay.spec.load import require_specification
 from spatial_replay.trace.sample import Sample, require_time
@@ -79,11 +80,22 @@ class Update:
     Attributes:
         specs: one for each result spec, in the order of the text.
         places: for each name, its index in `specs` and its node.
+        settled: what `violations` are found from.
     """
 
     time_ns: int
     specs: tuple[SpecUpdate, ...]
     places: Mapping[str, tuple[int, int]] = field(repr=False)
+    settled: tuple[Settled, ...] = field(repr=False, default=())
+
+    @cached_property
+    def violations(self) -> tuple[Violation, ...]:
+        """What is violated whatever comes, in the order in which it became certain; found when asked for.
+
+        The parts of a conjunction are reported apart. None under the paper's semantics, where later samples
+        may change every verdict.
+        """
+        return tuple(each.violation for each in self.settled)
 
     @property
     def verdict(self) -> Verdict:
@@ -139,6 +151,7 @@ class Monitor:
         for time_ns in range(2 * LIVE_ROOM):
             trial.extend(Sample(time_ns))
         self._live = LiveStream(specification, checked, start_ns or 0)
+        self._violations = ViolationLog(specification, start_ns or 0) if checked == "ltlf" else None
         self._last_ns: int | None = None
 
     def update(self, sample: Sample) -> Update:
@@ -156,8 +169,12 @@ class Monitor:
                 "give samples in the order of their times"
             )
         self._last_ns = sample.time_ns
-        numbers = map(_read_only, self._live.extend(sample))
-        return Update(sample.time_ns, tuple(map(SpecUpdate, self._specs, numbers, self._names)), self._places)
+        numbers = list(map(_read_only, self._live.extend(sample)))
+        specs = tuple(map(SpecUpdate, self._specs, numbers, self._names))
+        if self._violations is None:
+            return Update(sample.time_ns, specs, self._places)
+        self._violations.extend(sample, numbers)
+        return Update(sample.time_ns, specs, self._places, self._violations.settled)
 
 
 def _places_of_names(names: tuple[tuple[str | None, ...], ...]) -> Mapping[str, tuple[int, int]]:

@@ -1,0 +1,211 @@
+"""Violations that a monitor reports while samples come: what was violated for certain, and by which atom."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.monitor.atoms.delays import look_back
+from spatial_replay.monitor.causes import Conjunct, conjuncts_of
+from spatial_replay.monitor.instances import Instance
+from spatial_replay.monitor.online.program import Program, compile_formula
+from spatial_replay.monitor.sentences import number_text, sentences_of, time_text
+from spatial_replay.monitor.verdict import Verdict
+from spatial_replay.monitor.witness.atom import DecidingAtom
+from spatial_replay.monitor.witness.path import End, Evidence
+from spatial_replay.monitor.witness.threshold import Threshold
+from spatial_replay.monitor.witness.witness import Witness, find_witness
+from spatial_replay.spec.format import format_formula
+from spatial_replay.spec.formula import NamedSpec, Number, Specification
+from spatial_replay.trace.sample import FOREVER, Sample
+from spatial_replay.trace.trace import Trace
+
+REMEMBERED = 1024
+"""Samples that a monitor keeps to look for the atom that settled a violation."""
+_AT_ONCE = 64
+"""As many samples are searched as a whole; of more, the newest first."""
+
+
+@dataclass(frozen=True, eq=False)
+class Violation:
+    """A part of a specification that is violated whatever comes. `str()` is a sentence on it.
+
+    Attributes:
+        spec: the innermost named spec that it belongs to.
+        node: its id in the tree of the result.
+        text: its canonical text.
+        time_ns: of the sample that made it certain.
+        robustness: below 0: the most that the part can still reach.
+        witness: the atom that settled it, and what would flip it; None if that lies further back than the
+            samples that the monitor keeps.
+        first_ns: the time that the sentences count from: that of the monitor's first sample.
+    """
+
+    spec: str
+    node: int
+    text: str
+    time_ns: int
+    robustness: float
+    witness: Witness | None
+    first_ns: int
+
+    @property
+    def atom(self) -> DecidingAtom | None:
+        """The atom that settled it: its objects, its value, what was measured."""
+        return None if self.witness is None else self.witness.deciding
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """The objects, regions and groups that the atom is about."""
+        return () if self.atom is None else self.atom.objects
+
+    @property
+    def value(self) -> float:
+        """The robustness of the atom with every uncertainty at 0; NaN if there is none."""
+        return float("nan") if self.atom is None else self.atom.value
+
+    @property
+    def threshold(self) -> Threshold | None:
+        """The change of the atom's number that would have prevented it, if there is one."""
+        return None if self.witness is None else self.witness.threshold
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What decided it and what would flip it, as `SpecResult.explain` says it."""
+        return () if self.witness is None else sentences_of(self.witness, first_ns=self.first_ns)
+
+    def __str__(self) -> str:
+        when = time_text(self.time_ns, self.first_ns)
+        if self.atom is None:
+            return f"`{self.spec}` is violated since {when}, by {number_text(-self.robustness)}"
+        number = self.atom.upper if self.atom.end is End.HIGH else self.atom.lower
+        how = f"{'holds' if number >= 0.0 else 'fails'} by {number_text(abs(number))}"
+        return f"{_short(self.atom, self.spec, abs(number))}: `{self.atom.text}` {how} at {when}"
+
+
+def _short(atom: DecidingAtom, spec: str, amount: float) -> str:
+    """Return what is wrong in a few words: in which direction a distance or a signal is off."""
+    signed = [(sign, part) for sign, part in atom.branch if not isinstance(part, Number)]
+    if len(signed) == 1 and len(atom.measured) == 1:
+        (sign, _), *_ = signed
+        (measured,) = atom.measured
+        needs_more = (sign > 0) == (atom.end is End.HIGH)
+        if measured.quantity == "signed_distance":
+            first, second = measured.names
+            where = f"too close to {second}" if needs_more else f"too far from {second}"
+            return f"{first} is {number_text(amount)} {where}"
+        if measured.quantity == "signal":
+            return f"{measured.names[0]} is {number_text(amount)} too {'low' if needs_more else 'high'}"
+    return f"`{spec}` is violated"
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """A violation that a monitor has seen, with the samples to find its atom in."""
+
+    spec: NamedSpec
+    program: Program
+    specification: Specification
+    conjunct: Conjunct
+    upper: float
+    samples: tuple[Sample, ...]
+    start: int
+    is_whole: bool
+    first_ns: int
+
+    @cached_property
+    def violation(self) -> Violation:
+        return Violation(
+            self.conjunct.spec,
+            self.conjunct.node,
+            format_formula(self.conjunct.formula),
+            self.samples[-1].time_ns,
+            self.upper,
+            self._witness(),
+            self.first_ns,
+        )
+
+    def _witness(self) -> Witness | None:
+        """Return the witness on the fewest of the newest samples that give the part its number."""
+        for begin in self._begins():
+            found = self._witness_from(begin)
+            if found.verdict is Verdict.VIOLATED and found.upper == self.upper:
+                return found
+        return None
+
+    def _begins(self) -> Iterator[int]:
+        """Iterate over the samples to evaluate from, as if the log began there."""
+        count = len(self.samples)
+        if self.is_whole and count - self.start <= _AT_ONCE:
+            yield self.start
+            return
+        # an obligation that holds at every sample has the same atom wherever the evaluation starts
+        for newest in (1, 8, _AT_ONCE, REMEMBERED // 2):
+            if newest < count - self.start:
+                yield count - newest
+        yield self.start
+
+    def _witness_from(self, begin: int) -> Witness:
+        samples, duration_ns = look_back([self.spec.formula])
+        start_ns = self.samples[begin].time_ns
+        first = max(begin - samples, 0)
+        while duration_ns and first > 0 and self.samples[first].time_ns > start_ns - duration_ns:
+            first -= 1
+        trace = Trace.from_samples(self.samples[first:])
+        instance = Instance(self.spec, None, self.program, {}, start_ns, FOREVER)
+        evidence = Evidence(instance, self.specification.regions, lambda: [trace])
+        leaves = evidence.columns(self.program.leaves)
+        return find_witness(evidence, leaves, evidence.times_ns(), self.conjunct.node, goes_on=True)
+
+
+class ViolationLog:
+    """The newest samples of one monitor, and the violations that they made certain."""
+
+    def __init__(self, specification: Specification, start_ns: int) -> None:
+        """Start before the first sample."""
+        self._specification = specification
+        self._start_ns = start_ns
+        self._samples: deque[Sample] = deque(maxlen=REMEMBERED)
+        self._first_ns: int | None = None
+        self._dropped = False
+        self._open = [
+            (index, spec, list(conjuncts_of(spec.formula, spec.name)))
+            for index, spec in enumerate(specification.results)
+        ]
+        self.settled: tuple[Settled, ...] = ()
+
+    def extend(self, sample: Sample, numbers: Sequence[Floats | None]) -> None:
+        """Take in a sample and the numbers (N, 4) of each result after it."""
+        if self._first_ns is None:
+            self._first_ns = sample.time_ns
+        samples = self._samples
+        self._dropped = self._dropped or len(samples) == REMEMBERED
+        samples.append(sample)
+        for index, spec, conjuncts in self._open:
+            after = numbers[index]
+            if after is not None and after[0, 3] < 0.0 and conjuncts:
+                self._settle(spec, conjuncts, after)
+
+    def _settle(self, spec: NamedSpec, conjuncts: list[Conjunct], numbers: Floats) -> None:
+        for conjunct in tuple(conjuncts):
+            upper = float(numbers[conjunct.node, 3])
+            if upper >= 0.0:
+                continue
+            conjuncts.remove(conjunct)
+            samples = tuple(self._samples)
+            start = next(k for k, each in enumerate(samples) if each.time_ns >= self._start_ns)
+            found = Settled(
+                spec,
+                compile_formula(spec.formula),
+                self._specification,
+                conjunct,
+                upper,
+                samples,
+                start,
+                not self._dropped,
+                self._first_ns or 0,
+            )
+            self.settled = (*self.settled, found)
