@@ -160,11 +160,7 @@ def one_by_one(columns: Columns) -> Iterator[Message]:
 
 
 def unnumbered(
-    topics: Sequence[str],
-    times_ns: Integers,
-    payloads: Sequence[bytes],
-    place: Integers,
-    channel: Integers,
+    topics: Sequence[str], times_ns: Integers, payloads: Sequence[bytes], place: Integers, channel: Integers
 ) -> MessageColumns:
     """Return messages of a container with one time and no sequence."""
     sequence = np.zeros(len(times_ns), np.int64)

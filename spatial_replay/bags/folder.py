@@ -24,7 +24,6 @@ from spatial_replay.errors import LogError, MissingFileError
 from spatial_replay.logs.mcap.chunks import MAGIC
 from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList
-from spatial_replay.trace.sample import LATEST_NS
 
 METADATA_FILE = "metadata.yaml"
 _ENDINGS = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
@@ -91,16 +90,16 @@ class BagFolder(MessageReader):
         named = topics_by_name(present, self._distribution)
         if declared is None:
             return named
+        missing = declared.counts.keys() - {topic.name for topic in present}
         absent = [
             Topic(
                 name,
                 declared.types[name],
                 "cdr",
-                count,
+                declared.counts[name],
                 unreadable=f"topic {name!r} is in none of the bag's files",
             )
-            for name, count in declared.counts.items()
-            if name not in {topic.name for topic in present}
+            for name in missing
         ]
         known = [replace(topic, count=declared.counts.get(topic.name, 0)) for topic in named]
         return tuple(sorted([*known, *absent], key=lambda topic: topic.name))
@@ -138,33 +137,21 @@ class BagFolder(MessageReader):
             + self._remarks.take()
         )
 
-    def iter_columns(
-        self,
-        topics: Collection[str],
-        start_ns: int | None = None,
-        end_ns: int | None = None,
-        *,
-        as_recorded: bool = False,
-    ) -> Columns:
-        """See `MessageReader.iter_columns`."""
-        if end_ns is not None and end_ns > LATEST_NS:
-            end_ns = None
-        reads = [
-            partial(self._read, number, file, topics, start_ns, end_ns, as_recorded)
-            for number, file in enumerate(self._files)
-        ]
+    def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
+        def read(number: int, file: _File) -> Columns:
+            for each in file.iter_columns(topics, first, last, as_recorded=as_recorded):
+                place, first_channel = np.int64(number) << 48, self._first_channels[number]
+                yield replace(each, place=place + each.place, channel=first_channel + each.channel)
+
+        reads = [partial(read, number, file) for number, file in enumerate(self._files)]
         if as_recorded or len(reads) == 1:
-            columns: Columns = (each for read in reads for each in read())
+            columns: Columns = (each for open_file in reads for each in open_file())
         else:
             pairs = zip(self._files, reads, strict=True)
-            columns = merged(TimedColumns(file.start_ns or 0, read) for file, read in pairs)
+            columns = merged(TimedColumns(file.start_ns or 0, open_file) for file, open_file in pairs)
         if self._metadata and self._metadata.compression == "message":
             columns = map(self._unpacked, columns)
-        if start_ns or end_ns is not None or self._metadata is None:
-            yield from columns
-            return
-        self._compare_types(topics)
-        yield from self._counted(columns, topics, f"{self.name}/{METADATA_FILE}")
+        return columns
 
     def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
         """See `MessageReader.channels`; those of its files, one file after the other."""
@@ -187,21 +174,19 @@ class BagFolder(MessageReader):
         """The number of the first channel of each file."""
         return tuple(accumulate((file.channel_count for file in self._files[:-1]), initial=0))
 
-    def _read(
-        self,
-        number: int,
-        file: _File,
-        topics: Collection[str],
-        start_ns: int | None,
-        end_ns: int | None,
-        as_recorded: bool,
-    ) -> Columns:
-        for each in file.iter_columns(topics, start_ns, end_ns, as_recorded=as_recorded):
-            yield replace(
-                each,
-                place=(np.int64(number) << 48) + each.place,
-                channel=self._first_channels[number] + each.channel,
-            )
+    def _counted(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
+        if self._metadata is None:
+            # each file compares its own counts
+            return columns
+        name = name or f"{self.name}/{METADATA_FILE}"
+        for topic in self._topics:
+            type_name = self._metadata.types.get(topic.name, topic.type)
+            if topic.name in topics and type_name != topic.type:
+                self._faults.add(
+                    f"{name}: it declares messages of {type_name!r:.100} on {topic.name!r}; they are of"
+                    f" {topic.type!r}"
+                )
+        return super()._counted(columns, topics, name)
 
     def _opened_files(self) -> Iterable[_File]:
         """Return the files that were opened so far."""
@@ -232,16 +217,6 @@ class BagFolder(MessageReader):
         except LogError as error:
             self._faults.add(f"{self.name}: {error}")
             return ()
-
-    def _compare_types(self, topics: Collection[str]) -> None:
-        declared = self._metadata.types if self._metadata else {}
-        for topic in self._topics:
-            type_name = declared.get(topic.name, topic.type)
-            if topic.name in topics and type_name != topic.type:
-                self._faults.add(
-                    f"{self.name}/{METADATA_FILE}: it declares messages of {type_name!r:.100} on"
-                    f" {topic.name!r}; they are of {topic.type!r}"
-                )
 
     def _unpacked(self, packed: MessageColumns) -> MessageColumns:
         payloads: list[bytes] = []

@@ -38,7 +38,7 @@ class McapLog(MessageReader):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        self._walked = 0
+        self._walked, self._walked_all = 0, False
 
     @cached_property
     def _contents(self) -> tuple[Directory, dict[int, Channel]]:
@@ -74,16 +74,7 @@ class McapLog(MessageReader):
         """Log time of the first message."""
         return min((place.start_ns for place in self._contents[0].chunks), default=None)
 
-    def iter_columns(
-        self,
-        topics: Collection[str],
-        start_ns: int | None = None,
-        end_ns: int | None = None,
-        *,
-        as_recorded: bool = False,
-    ) -> Columns:
-        """See `MessageReader.iter_columns`."""
-        first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else min(end_ns, LATEST_NS + 1)
+    def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
         directory, channels = self._contents
         wanted = {number: channel.topic for number, channel in channels.items() if channel.topic in topics}
         places = [
@@ -95,19 +86,20 @@ class McapLog(MessageReader):
         ]
         if not as_recorded:
             places.sort(key=lambda ranked: ranked[1].start_ns)
+        self._walked, self._walked_all = 0, len(places) == len(directory.chunks)
         with self._path.open("rb") as stream:
-            self._walked = 0
             contents = (self._messages(stream, *ranked, wanted, first, last) for ranked in places)
-            columns = contents if as_recorded else in_order([place.start_ns for _, place in places], contents)
-            if (first, last) != (0, LATEST_NS + 1):
-                yield from columns
-                return
-            yield from self._counted(columns, topics)
-            # without counts of channels, the total is all there is to compare
-            statistics = directory.statistics
-            total = statistics.message_count if statistics else self._walked
-            is_total_only = statistics is not None and not statistics.channel_message_counts
-            if is_total_only and len(places) == len(directory.chunks) and total != self._walked:
+            yield from (
+                contents if as_recorded else in_order([place.start_ns for _, place in places], contents)
+            )
+
+    def _counted(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
+        yield from super()._counted(columns, topics, name)
+        statistics = self._contents[0].statistics
+        # without counts of channels, the total is all there is to compare
+        if statistics and not statistics.channel_message_counts and self._walked_all:
+            total = statistics.message_count
+            if total != self._walked:
                 self._faults.add(
                     f"{self.name}: it declares {total} messages in all; {self._walked} could be read"
                 )

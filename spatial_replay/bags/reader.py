@@ -12,6 +12,7 @@ from spatial_replay.bags.topic import Decoder, Topic
 from spatial_replay.errors import LogError
 from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList
+from spatial_replay.trace.sample import LATEST_NS
 
 
 class MessageReader(ABC):
@@ -43,19 +44,8 @@ class MessageReader(ABC):
         """Log time of the first message."""
 
     @abstractmethod
-    def iter_columns(
-        self,
-        topics: Collection[str],
-        start_ns: int | None = None,
-        end_ns: int | None = None,
-        *,
-        as_recorded: bool = False,
-    ) -> Columns:
-        """Yield what `iter_messages` gives, as columns.
-
-        Args:
-            as_recorded: in the order of recording instead, which may jump back in time.
-        """
+    def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
+        """Yield the messages of some topics logged from `first` up to, not including, `last`."""
 
     @abstractmethod
     def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
@@ -111,6 +101,23 @@ class MessageReader(ABC):
             LogError: nothing can be read.
         """
         return one_by_one(self.iter_columns(topics, start_ns, end_ns))
+
+    def iter_columns(
+        self,
+        topics: Collection[str],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        *,
+        as_recorded: bool = False,
+    ) -> Columns:
+        """Yield what `iter_messages` gives, as columns.
+
+        Args:
+            as_recorded: in the order of recording instead, which may jump back in time.
+        """
+        first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else min(end_ns, LATEST_NS + 1)
+        columns = self._read(topics, first, last, as_recorded=as_recorded)
+        yield from self._counted(columns, topics) if (first, last) == (0, LATEST_NS + 1) else columns
 
     def take_faults(self) -> tuple[str, ...]:
         """Return what was lost since the last call, each with its place, on the topics that were read."""

@@ -32,7 +32,6 @@ from spatial_replay.bags.topic import Topic
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.chunks import DamageError
 from spatial_replay.logs.messages import Channel, Schema
-from spatial_replay.trace.sample import LATEST_NS
 
 
 class Ros1Bag(MessageReader):
@@ -59,16 +58,7 @@ class Ros1Bag(MessageReader):
         """Log time of the first message."""
         return min((chunk.start_ns for chunk in self._directory.chunks), default=None)
 
-    def iter_columns(
-        self,
-        topics: Collection[str],
-        start_ns: int | None = None,
-        end_ns: int | None = None,
-        *,
-        as_recorded: bool = False,
-    ) -> Columns:
-        """See `MessageReader.iter_columns`."""
-        first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else min(end_ns, LATEST_NS + 1)
+    def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
         wanted = {c.number: c for c in self._directory.connections.values() if c.topic in topics}
         chunks = [
             (rank, chunk)
@@ -81,11 +71,9 @@ class Ros1Bag(MessageReader):
             chunks.sort(key=lambda ranked: ranked[1].start_ns)
         with self._path.open("rb") as stream:
             contents = (self._messages(stream, *ranked, wanted, first, last) for ranked in chunks)
-            columns = contents if as_recorded else in_order([chunk.start_ns for _, chunk in chunks], contents)
-            if (first, last) != (0, LATEST_NS + 1) or not self._directory.is_indexed:
-                yield from columns
-            else:
-                yield from self._counted(columns, topics)
+            yield from (
+                contents if as_recorded else in_order([chunk.start_ns for _, chunk in chunks], contents)
+            )
 
     def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
         """See `MessageReader.channels`; each connection is a channel."""
@@ -130,10 +118,9 @@ class Ros1Bag(MessageReader):
             self._fault(chunk, f"the {span} have other times than the index says")
         rows = is_message & np.isin(table.connection, list(wanted))
         rows &= (table.time_ns >= first) & (table.time_ns < last)
-        names = {number: connection.topic for number, connection in wanted.items()}
         bounds = zip(table.begin[rows].tolist(), table.end[rows].tolist(), strict=True)
         return unnumbered(
-            [names[number] for number in table.connection[rows].tolist()],
+            [wanted[number].topic for number in table.connection[rows].tolist()],
             table.time_ns[rows],
             [content[begin:end] for begin, end in bounds],
             places_in(rank, np.flatnonzero(rows)),

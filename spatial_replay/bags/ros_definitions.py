@@ -126,17 +126,10 @@ def _iter_fields(body: str, owner: str, known: set[str]) -> Iterator[Field]:
             )
         if found["rest"].startswith("="):
             continue
-        limit = found["limit"] or ""
-        kind: Kind = "scalar"
-        if found["brackets"]:
-            kind = "array" if limit.isdigit() else "sequence"
-        yield Field(
-            found["name"],
-            _resolved(found["type"], owner, known),
-            kind,
-            int(limit.removeprefix("<=") or 0),
-            int(found["longest"] or 0),
-        )
+        limit, longest = found["limit"] or "", int(found["longest"] or 0)
+        kind: Kind = "scalar" if not found["brackets"] else "array" if limit.isdigit() else "sequence"
+        type_name = _resolved(found["type"], owner, known)
+        yield Field(found["name"], type_name, kind, int(limit.removeprefix("<=") or 0), longest)
 
 
 def _resolved(name: str, owner: str, known: set[str]) -> str:
@@ -237,12 +230,12 @@ def _used_by(above: tuple[str, ...]) -> str:
 
 def msg_from_definitions(definitions: Definitions, type_name: str) -> str:
     """Write a .msg text of a type and those that it uses, as `definitions_from_msg` reads it."""
-    others = [name for name in definitions if name != type_name]
-    texts = ["".join(f"{_written(field)} {field.name}\n" for field in definitions[type_name])]
-    for name in others:
-        head = f"{'=' * 80}\nMSG: {name.replace('/msg/', '/')}\n"
-        texts.append(head + "".join(f"{_written(field)} {field.name}\n" for field in definitions[name]))
-    return "".join(texts)
+    lines: list[str] = []
+    for name in sorted(definitions, key=lambda name: name != type_name):
+        if name != type_name:
+            lines += ["=" * 80, f"MSG: {name.replace('/msg/', '/')}"]
+        lines += [f"{_written(field)} {field.name}" for field in definitions[name]]
+    return "".join(f"{line}\n" for line in lines)
 
 
 def _written(field: Field) -> str:

@@ -123,10 +123,8 @@ def _cdr_decoder(store: Typestore, type_name: str) -> Decoder:
     def decode(payload: bytes) -> object:
         try:
             # alignment counts from behind the four bytes that say how the rest is encoded
-            if payload[1]:
-                message, end = little(payload[4:], 0, message_class, store)
-            else:
-                message, end = big(payload[4:], 0, message_class, store)
+            deserialize = little if payload[1] else big
+            message, end = deserialize(payload[4:], 0, message_class, store)
         except Exception as error:
             raise LogError(f"a message is not a {type_name}: {_reason(error)}") from None
         if not 4 <= len(payload) - end <= _MOST_AROUND or payload[:2] not in _PLAIN:
@@ -162,10 +160,8 @@ def _parsed(type_name: str, schema: Schema) -> Definitions:
         return definitions_from_msg(text, type_name)
     if schema.encoding == "ros2idl":
         return _from_idl(text, type_name)
-    raise LogError(
-        f"the definition of {type_name!r} is in {schema.encoding!r:.100};"
-        " ros1msg, ros2msg and ros2idl are read"
-    )
+    known = "ros1msg, ros2msg and ros2idl are read"
+    raise LogError(f"the definition of {type_name!r} is in {schema.encoding!r:.100}; {known}")
 
 
 def _from_idl(text: str, type_name: str) -> Definitions:

@@ -29,7 +29,6 @@ from spatial_replay.bags.unpacking import copy_beginning, temporary_folder
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.messages import Channel, Schema
-from spatial_replay.trace.sample import LATEST_NS
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
 _MOST_TOPICS = 100_000
@@ -87,19 +86,6 @@ class SqliteBag(MessageReader):
             return 0
         return start_ns if isinstance(start_ns, int) else None
 
-    def iter_columns(
-        self,
-        topics: Collection[str],
-        start_ns: int | None = None,
-        end_ns: int | None = None,
-        *,
-        as_recorded: bool = False,
-    ) -> Columns:
-        """See `MessageReader.iter_columns`."""
-        first, last = start_ns or 0, LATEST_NS if end_ns is None else min(end_ns - 1, LATEST_NS)
-        columns = self._messages(topics, first, last, "id" if as_recorded else "timestamp, id")
-        yield from columns if (first, last) != (0, LATEST_NS) else self._counted(columns, topics)
-
     def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
         """See `MessageReader.channels`."""
         described = self._tables.topics
@@ -119,16 +105,17 @@ class SqliteBag(MessageReader):
         """The numbers of the topics, in order."""
         return np.array(sorted(self._tables.topics), np.int64)
 
-    def _messages(self, topics: Collection[str], first: int, last: int, order: str) -> Columns:
+    def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
         wanted = {number: topic.name for number, topic in self._tables.topics.items() if topic.name in topics}
         query = (
-            f"SELECT id, topic_id, timestamp, data FROM messages WHERE topic_id IN ({_marks(wanted)})"
-            f" AND timestamp BETWEEN ? AND ? ORDER BY {order}"
+            "SELECT id, topic_id, timestamp, data FROM messages"
+            f" WHERE topic_id IN ({', '.join('?' * len(wanted))}) AND timestamp BETWEEN ? AND ?"
+            f" ORDER BY {'id' if as_recorded else 'timestamp, id'}"
         )
         row_id = None
         with _opened(self._whole) as database:
             try:
-                for rows in _batches(database.execute(query, (*sorted(wanted), first, last))):
+                for rows in _batches(database.execute(query, (*sorted(wanted), first, last - 1))):
                     yield self._columns(rows, wanted)
                     row_id = rows[-1][0]
             except sqlite3.Error as error:
@@ -235,10 +222,6 @@ def _read_tables(database: sqlite3.Connection, name: str) -> BagTables:
     return BagTables(topics, metadata, distribution)
 
 
-def _marks(values: Collection[object]) -> str:
-    return ", ".join("?" * len(values))
-
-
 def _batches(cursor: sqlite3.Cursor) -> Iterator[list[Row]]:
     """Yield the rows of a query in lists of at most some megabytes; those before an error come before it."""
     rows: list[Row] = []
@@ -268,14 +251,9 @@ def _records(database: sqlite3.Connection, table: str) -> list[dict[str, object]
 def _schemas(database: sqlite3.Connection) -> dict[str, Schema]:
     schemas = {}
     for row in _records(database, "message_definitions"):
-        type_name, text = row.get("topic_type"), row.get("encoded_message_definition")
-        if (
-            isinstance(type_name, str)
-            and isinstance(text, str)
-            and text.strip()
-            and len(text) <= LONGEST_TEXT
-        ):
-            schemas[type_name] = Schema(type_name, str(row.get("encoding")), text.encode())
+        name, text = row.get("topic_type"), row.get("encoded_message_definition")
+        if isinstance(name, str) and isinstance(text, str) and text.strip() and len(text) <= LONGEST_TEXT:
+            schemas[name] = Schema(name, str(row.get("encoding")), text.encode())
     return schemas
 
 

@@ -273,12 +273,10 @@ class Assembler:
 def _columns(messages: Sequence[Message]) -> MessageColumns:
     if not messages:
         return MessageColumns()
-    topics, log_times_ns, publish_times_ns, sequences, payloads = zip(*messages, strict=True)
-    log, publish, sequence = (
-        np.array(each, np.int64) for each in (log_times_ns, publish_times_ns, sequences)
-    )
-    place = np.arange(len(messages))
-    return MessageColumns(topics, log, publish, sequence, payloads, place, np.zeros(len(messages), np.int64))
+    topics, *numbers, payloads = zip(*messages, strict=True)
+    log_ns, publish_ns, sequence = (np.array(each, np.int64) for each in numbers)
+    place, channel = np.arange(len(messages)), np.zeros(len(messages), np.int64)
+    return MessageColumns(topics, log_ns, publish_ns, sequence, payloads, place, channel)
 
 
 class _Stamped(NamedTuple):

@@ -135,6 +135,9 @@ class _Columns:
         self.paths.append(path)
         return len(self.paths) - 1
 
+    def add_all(self, paths: Sequence[str]) -> tuple[int, ...]:
+        return tuple(self.add(FieldPath.of(path)) for path in paths)
+
     def point(self, path: FieldPath, names: str) -> tuple[int, ...]:
         """Return the columns of a point's coordinates, at least two."""
         value = walk(path, self.example)
@@ -171,7 +174,7 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
             yaw = _first(layout.yaw, lambda path: columns.add(FieldPath.of(path)))
         position = () if layout.polygon and layout.is_generic else _position(layout, columns)
     uncertainty, covariance = _uncertainty(layout, columns, style)
-    sizes = _first(layout.sizes, lambda paths: tuple(columns.add(FieldPath.of(path)) for path in paths)) or ()
+    sizes = _first(layout.sizes, columns.add_all) or ()
     shape_sizes = tuple(map(columns.measure, layout.shape.sizes)) if layout.shape else ()
     height = tuple(map(columns.measure, layout.height)) if layout.height else ()
     polygon = _polygon(layout, example, style)
@@ -179,9 +182,7 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
     if len(class_paths) == 1:
         # alternatives may all be missing, a single path of the mapping must not
         walk(class_paths[0], example)
-    lifetime = None
-    if layout.stays:
-        lifetime = bind_time((Stamp("lifetime"),), example, message)
+    lifetime = bind_time((Stamp("lifetime"),), example, message) if layout.stays else None
     paths = columns.paths
     return Binding(
         style=style,
@@ -204,9 +205,7 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
 
 def _position(layout: MessageLayout, columns: _Columns) -> tuple[int, ...]:
     def columns_of(paths: tuple[str, ...]) -> tuple[int, ...]:
-        if len(paths) == 1:
-            return columns.point(FieldPath.of(paths[0]), "xyz")
-        return tuple(columns.add(FieldPath.of(path)) for path in paths)
+        return columns.point(FieldPath.of(paths[0]), "xyz") if len(paths) == 1 else columns.add_all(paths)
 
     if not layout.position:
         return ()
@@ -305,7 +304,6 @@ def bind_time(stamps: Sequence[Stamp], example: object, message: object) -> Time
                 return TimeGetter(path, pair, parts, 1)
         if is_number(value):
             return TimeGetter(path, getter(path, style), None, stamp.unit_ns)
-        raise FieldError(
-            f"{path.text}: {type_name(value)} is not a time; give the path of a stamp or a number"
-        )
+        remedy = "give the path of a stamp or a number"
+        raise FieldError(f"{path.text}: {type_name(value)} is not a time; {remedy}")
     return None

@@ -154,12 +154,8 @@ def detections_from_chunks(
 
 
 def _no_detections(deleted: list[tuple[int, int]], skipped: int) -> Detections:
-    none, numbers, points, matrices = (
-        np.empty(0, np.int64),
-        np.empty(0),
-        np.empty((0, 3)),
-        np.empty((0, 3, 3)),
-    )
+    none, numbers = np.empty(0, np.int64), np.empty(0)
+    points, matrices = np.empty((0, 3)), np.empty((0, 3, 3))
     return Detections(
         message=none,
         name=none,
@@ -199,10 +195,9 @@ def _poses(layout: MessageLayout, binding: Binding, numbers: Floats) -> Poses:
 def _heights(binding: Binding, numbers: Floats) -> Floats | None:
     if not binding.height:
         return None
-    columns = [
-        numbers[:, each] if isinstance(each, int) else np.full(len(numbers), each) for each in binding.height
-    ]
-    return np.stack(columns, axis=1)
+    count = len(numbers)
+    bounds = [numbers[:, each] if isinstance(each, int) else np.full(count, each) for each in binding.height]
+    return np.stack(bounds, axis=1)
 
 
 def _uncertainty(binding: Binding, numbers: Floats, count: int) -> Floats:
@@ -239,26 +234,16 @@ def _listed_solids(listed: list[list[Solid]]) -> tuple[Solids, Poses]:
     shifted = np.flatnonzero((np.diff(start) == 1) & ((kind == BOX) | (kind == SPHERE)))
     position = position.copy()
     position[shifted] += np.einsum("nij,nj->ni", rotation[shifted], points[start[shifted]])
-    return (
-        Solids(
-            owner=np.repeat(np.arange(len(counts)), counts),
-            kind=kind,
-            position=position,
-            rotation=rotation,
-            size=_array([solid.size for solid in solids], 3),
-            point_start=start,
-            points=points,
-        ),
-        poses,
-    )
+    owner = np.repeat(np.arange(len(counts)), counts)
+    size = _array([solid.size for solid in solids], 3)
+    return Solids(owner, kind, position, rotation, size, start, points), poses
 
 
 def _shapes(layout: MessageLayout, binding: Binding, poses: Poses, numbers: Floats) -> Solids:
     """Return one solid each: the shape of the mapping or of the message; a point without either."""
-    count = len(poses.position)
-    shape = layout.shape
+    shape, position = layout.shape, poses.position
+    count = len(position)
     size = np.full((count, 3), np.nan)
-    position = poses.position
     counts, points = np.zeros(count, np.int64), np.empty((0, 3))
     if shape is None:
         kind = BOX if binding.sizes else DISC
@@ -278,29 +263,17 @@ def _shapes(layout: MessageLayout, binding: Binding, poses: Poses, numbers: Floa
             counts, points = np.full(count, len(corners)), np.tile(corners, (count, 1))
     # NaN makes the object unknown, as a negative size should
     size[:, :2] = np.where(size[:, :2] < 0, np.nan, size[:, :2])
-    return Solids(
-        owner=np.arange(count),
-        kind=np.full(count, kind, np.int8),
-        position=position,
-        rotation=poses.rotation,
-        size=size,
-        point_start=starts_from_counts(counts),
-        points=points,
-    )
+    owner, kinds = np.arange(count), np.full(count, kind, np.int8)
+    return Solids(owner, kinds, position, poses.rotation, size, starts_from_counts(counts), points)
 
 
 def _polygons(counts: Integers, points: Floats) -> Solids:
     """Return polygons with corners in the frame of their message, not in the object's own."""
     count = len(counts)
-    return Solids(
-        owner=np.arange(count),
-        kind=np.full(count, POLYGON, np.int8),
-        position=np.zeros((count, 3)),
-        rotation=np.broadcast_to(np.eye(3), (count, 3, 3)),
-        size=np.full((count, 3), np.nan),
-        point_start=starts_from_counts(counts),
-        points=points,
-    )
+    owner, kind = np.arange(count), np.full(count, POLYGON, np.int8)
+    position, rotation = np.zeros((count, 3)), np.broadcast_to(np.eye(3), (count, 3, 3))
+    size = np.full((count, 3), np.nan)
+    return Solids(owner, kind, position, rotation, size, starts_from_counts(counts), points)
 
 
 def points_from_lists(lists: list[Any]) -> tuple[Integers, Floats]:

@@ -181,11 +181,12 @@ def getter(path: FieldPath, style: Style) -> Get:
 
     The function is fast, but its errors (AttributeError, LookupError, TypeError) say little; `walk` explains.
     """
-    if style == "attributes" and all(isinstance(step, str) for step in path.steps):
-        return attrgetter(".".join(str(step) for step in path.steps)) if path.steps else _itself
-    chain = [_step(step, style) for step in path.steps]
-    if not chain:
-        return _itself
+    if style == "attributes" and path.steps and all(isinstance(step, str) for step in path.steps):
+        return attrgetter(".".join(map(str, path.steps)))
+    chain: list[Get] = [
+        attrgetter(step) if style == "attributes" and isinstance(step, str) else itemgetter(step)
+        for step in path.steps
+    ]
     if len(chain) == 1:
         return chain[0]
 
@@ -203,9 +204,6 @@ def tuple_getter(paths: Sequence[FieldPath], style: Style) -> Callable[[Any], tu
     if style == "attributes" and plain and len(paths) > 1:
         return attrgetter(*(".".join(str(step) for step in path.steps) for path in paths))
     each = [getter(path, style) for path in paths]
-    if len(each) == 1:
-        only = each[0]
-        return lambda value: (only(value),)
     return lambda value: tuple([get(value) for get in each])
 
 
@@ -235,18 +233,6 @@ def list_getter(path: FieldPath, style: Style) -> Get | None:
     if isinstance(last, Each) and not any(isinstance(step, Each) for step in before):
         return getter(FieldPath(path.text, tuple(before)), style)
     return None
-
-
-def _step(step: Step, style: Style) -> Get:
-    if isinstance(step, str):
-        return attrgetter(step) if style == "attributes" else itemgetter(step)
-    if isinstance(step, int):
-        return itemgetter(step)
-    raise ValueError("a path with [*] has many values")
-
-
-def _itself(value: Any) -> Any:
-    return value
 
 
 def below(path: FieldPath, step: str | int) -> FieldPath:
@@ -300,16 +286,13 @@ class NameTemplate:
             UsageError: the text is not a template.
         """
         if not _TEMPLATE.fullmatch(text):
-            raise UsageError(
-                f"{text[:80]!r} is not a name; write text with fields in braces: tag{{id}}, {{ns}}_{{id}}"
-            )
-        parts: list[str | tuple[FieldPath, ...]] = []
-        for match in _PART.finditer(text):
-            fields, literal = match.groups()
-            parts.append(
-                literal if fields is None else tuple(FieldPath.of(each) for each in fields.split("|"))
-            )
-        return cls(text, tuple(parts))
+            example = "tag{id}, {ns}_{id}"
+            raise UsageError(f"{text[:80]!r} is not a name; write text with fields in braces: {example}")
+        parts = tuple(
+            literal if fields is None else tuple(map(FieldPath.of, fields.split("|")))
+            for fields, literal in (match.groups() for match in _PART.finditer(text))
+        )
+        return cls(text, parts)
 
     @property
     def is_constant(self) -> bool:

@@ -116,13 +116,8 @@ def _rectangles(solids: Solids, size: Floats, pieces: Integers) -> Floats:
     along = solids.rotation[pieces, :2, 0] * (size[pieces, 0, None] / 2)
     across = solids.rotation[pieces, :2, 1] * (size[pieces, 1, None] / 2)
     centre = solids.position[pieces, :2]
-    corners = (
-        centre - along - across,
-        centre + along - across,
-        centre + along + across,
-        centre - along + across,
-    )
-    return np.stack(corners, axis=1)
+    front, back = centre + along, centre - along
+    return np.stack((back - across, front - across, front + across, back + across), axis=1)
 
 
 def _hexagons(solids: Solids, size: Floats, pieces: Integers) -> Floats:
@@ -167,9 +162,8 @@ def _ring(solids: Solids, piece: int) -> Floats:
 
 def _heights(solids: Solids, size: Floats, count: int) -> tuple[Floats, Floats]:
     """Return the bottom and the top (R,) of objects; NaN if one of their solids is flat."""
-    has_height = (
-        (solids.kind != DISC) & (solids.kind != POLYGON) & ~((solids.kind == BOX) & np.isnan(size[:, 2]))
-    )
+    is_flat_box = (solids.kind == BOX) & np.isnan(size[:, 2])
+    has_height = (solids.kind != DISC) & (solids.kind != POLYGON) & ~is_flat_box
     if not has_height.any():
         return np.full(count, np.nan), np.full(count, np.nan)
     up = solids.rotation[:, 2, :]
@@ -217,9 +211,8 @@ def lenient_getter(style: Style) -> GetField:
 
 def solids_of_marker(marker: Any, get: GetField) -> list[Solid]:
     """Return the solids of a visualization_msgs/Marker; none for arrows, lines and texts."""
-    kind = get(marker, "type")
-    pose, scale = get(marker, "pose"), _vector(get(marker, "scale"), get)
-    position, quaternion = _pose(pose, get)
+    kind, scale = get(marker, "type"), _vector(get(marker, "scale"), get)
+    position, quaternion = _pose(get(marker, "pose"), get)
     single = {1: BOX, 2: SPHERE, 3: CYLINDER}.get(kind)
     if single is not None:
         return [Solid(single, position, quaternion, scale)]
@@ -230,10 +223,7 @@ def solids_of_marker(marker: Any, get: GetField) -> list[Solid]:
         return [Solid(listed, position, quaternion, scale, (point,)) for point in points]
     if kind == 11 and len(points) >= 3:
         scaled = [tuple(a * b for a, b in zip(point, scale, strict=True)) for point in points]
-        return [
-            Solid(HULL, position, quaternion, (nan,) * 3, scaled[i : i + 3])
-            for i in range(0, len(points) - 2, 3)
-        ]
+        return _triangles((position, quaternion), scaled)
     return []
 
 
@@ -251,9 +241,12 @@ def solids_of_entity(entity: Any, get: GetField) -> list[Solid]:
         points = [_vector(point, get) for point in get(primitive, "points") or ()]
         order = list(get(primitive, "indices") or range(len(points)))
         corners = [points[i] for i in order if i < len(points)]
-        pose = _pose(get(primitive, "pose"), get)
-        solids += [Solid(HULL, *pose, (nan,) * 3, corners[i : i + 3]) for i in range(0, len(corners) - 2, 3)]
+        solids += _triangles(_pose(get(primitive, "pose"), get), corners)
     return solids
+
+
+def _triangles(pose: tuple[Numbers, Numbers], corners: Sequence[Numbers]) -> list[Solid]:
+    return [Solid(HULL, *pose, (nan,) * 3, corners[i : i + 3]) for i in range(0, len(corners) - 2, 3)]
 
 
 def solids_of_perceived_object(thing: Any, get: GetField) -> list[Solid]:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Iterator
 from collections.abc import Mapping as Table
-from decimal import Decimal
 from functools import cache
 from importlib.resources import files
 from math import pi
@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 from spatial_replay.errors import MissingFileError, UsageError
 from spatial_replay.mapping.field_paths import FieldPath, NameTemplate
 from spatial_replay.mapping.model import (
+    UNITS_NS,
     ClassMapping,
     LogMapping,
     Measure,
@@ -33,9 +34,8 @@ from spatial_replay.mapping.model import (
     Uncertainty,
     age_ns,
     duration_ns,
-    unit_ns,
 )
-from spatial_replay.mapping.yaml_document import LARGEST_TEXT, Document, Place, Value, document_from_text
+from spatial_replay.mapping.yaml_document import LARGEST_TEXT, Document, Place, document_from_text
 from spatial_replay.text import nearest_hint
 from spatial_replay.trace.axes import Axes
 
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 SCHEMA_FILE = "mapping.schema.json"
 
 _MOST_FAULTS = 100
+_NO_TIME = re.compile(r"0+(\.0*)?[nums]*", re.ASCII)
 _SIGNAL_KEYS = frozenset({"signals", "max_age", "clock", "stamp", "optional"})
 """Keys that do not concern objects: a topic with signals and no other keys has no objects."""
 
@@ -83,12 +84,17 @@ def parse_mapping(text: str, name: str = "mapping") -> LogMapping:
     faults = list(document.faults)
     if not faults:
         # one error for each place; a contradiction says more than the schema
-        by_place = dict([*_schema_faults(document.value), *_contradictions(document)])
+        violations = [
+            fault for error in _validator().iter_errors(document.value) for fault in _described(error)
+        ]
+        by_place = dict(violations + _contradictions(document))
         faults = [
             (document.line_of(place), f"{_text_from_place(place)}{what}") for place, what in by_place.items()
         ]
     if faults:
-        raise UsageError(_listed(name, faults))
+        lines = [f"{name}:{line}: {what}" for line, what in sorted(faults)]
+        more = [f"… and {len(lines) - _MOST_FAULTS} more"] if len(lines) > _MOST_FAULTS else []
+        raise UsageError("\n".join(lines[:_MOST_FAULTS] + more))
     try:
         return _mapping(document, name)
     except UsageError as error:
@@ -134,25 +140,18 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
             if one in entry and other in entry:
                 faults.append((("topics", topic, other), f"there is {one!r} already; give one of the two"))
     for place, text in _durations(value):
-        if isinstance(text, str) and text[:1].isdigit() and Decimal(0) == _leading_number(text):
+        if isinstance(text, str) and _NO_TIME.fullmatch(text):
             faults.append((place, f"{text!r} is not a time; give a duration above 0"))
     return faults
 
 
 def _durations(value: Any) -> list[tuple[Place, Any]]:
-    sample = value.get("sample")
-    durations: list[tuple[Place, Any]] = [(("max_age",), value.get("max_age"))]
-    if isinstance(sample, dict):
-        durations.append((("sample", "every"), sample.get("every")))
-    for topic, entry in value["topics"].items():
-        if isinstance(entry, dict):
-            durations.append((("topics", topic, "max_age"), entry.get("max_age")))
-    return durations
-
-
-def _leading_number(text: str) -> Decimal | None:
-    digits = text.rstrip("nums")
-    return Decimal(digits) if digits.replace(".", "", 1).isdigit() else None
+    tables: list[tuple[Place, Any, str]] = [
+        ((), value, "max_age"),
+        (("sample",), value.get("sample"), "every"),
+    ]
+    tables += [(("topics", topic), entry, "max_age") for topic, entry in value["topics"].items()]
+    return [((*place, key), table.get(key)) for place, table, key in tables if isinstance(table, dict)]
 
 
 def _text_from_place(place: Place) -> str:
@@ -162,17 +161,8 @@ def _text_from_place(place: Place) -> str:
     return f"{text}: " if text else ""
 
 
-def _listed(name: str, faults: list[tuple[int, str]]) -> str:
-    lines = [f"{name}:{line}: {what}" for line, what in sorted(faults)]
-    more = len(lines) - _MOST_FAULTS
-    return "\n".join(lines[:_MOST_FAULTS] + ([f"… and {more} more"] if more > 0 else []))
-
-
 def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) -> TopicMapping:
     """Return the mapping of a topic from an entry that follows the schema.
-
-    Args:
-        shapes: the shapes by name.
 
     Raises:
         UsageError: a path or a template is invalid, although the schema allows it.
@@ -182,8 +172,7 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
     if "name" in entry:
         NameTemplate.of(entry["name"])
     frame = entry.get("frame")
-    yaw = entry.get("yaw")
-    position = entry.get("position")
+    yaw, position, height = entry.get("yaw"), entry.get("position"), entry.get("height")
     return TopicMapping(
         topic=topic,
         reads_objects="signals" not in entry or not entry.keys() <= _SIGNAL_KEYS,
@@ -198,7 +187,7 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
         yaw_scale=pi / 180 if isinstance(yaw, dict) and yaw.get("unit") == "deg" else 1.0,
         polygon=entry.get("polygon"),
         shape=_shape(entry.get("shape"), shapes),
-        height=_height(entry.get("height")),
+        height=(_measure(height[0]), _measure(height[1])) if height else None,
         uncertainty=_uncertainty(entry.get("uncertainty")),
         frame=frame.removeprefix("/") if isinstance(frame, str) else None,
         frame_field=frame["field"] if isinstance(frame, dict) else None,
@@ -235,10 +224,6 @@ def _shape(value: Any, shapes: Table[str, Any]) -> ShapeMapping | None:
     return ShapeMapping("polygon", points=corners, offset=offset)
 
 
-def _height(value: Any) -> tuple[Measure, Measure] | None:
-    return None if value is None else (_measure(value[0]), _measure(value[1]))
-
-
 def _uncertainty(value: Any) -> Uncertainty | None:
     if value is None:
         return None
@@ -254,25 +239,15 @@ def _measure(value: Any) -> Measure:
 
 
 def _stamp(value: Any) -> Stamp | None:
-    if value is None:
-        return None
-    return (
-        Stamp(value["field"], unit_ns(value.get("unit", "ns"))) if isinstance(value, dict) else Stamp(value)
-    )
+    if isinstance(value, dict):
+        return Stamp(value["field"], UNITS_NS[value.get("unit", "ns")])
+    return None if value is None else Stamp(value)
 
 
 def _signal(name: str, value: Any) -> SignalMapping:
-    return (
-        SignalMapping(name, value["field"], value.get("unit", ""))
-        if isinstance(value, dict)
-        else SignalMapping(name, value)
-    )
-
-
-def _schema_faults(value: Value) -> Iterator[tuple[Place, str]]:
-    """Iterate over the places where a value violates the schema, with what belongs there."""
-    for error in _validator().iter_errors(value):
-        yield from _described(error)
+    if isinstance(value, dict):
+        return SignalMapping(name, value["field"], value.get("unit", ""))
+    return SignalMapping(name, value)
 
 
 @cache
@@ -284,11 +259,16 @@ def _validator() -> Validator:
 
 
 def _described(error: Any) -> Iterator[tuple[Place, str]]:
+    """Iterate over the places of a violation of the schema, with what belongs there."""
     place: Place = tuple(error.absolute_path)
     keyword = error.validator
     if keyword == "anyOf" and isinstance(error.instance, dict | list):
-        for branch in _branches(error):
-            if not any(_is_of_another_kind(each, len(place)) for each in branch):
+        branches: dict[int, list[Any]] = {}
+        for each in error.context:
+            branches.setdefault(each.schema_path[0], []).append(each)
+        for branch in branches.values():
+            # not an alternative that failed because the whole value has another type
+            if not any(each.validator == "type" and len(each.absolute_path) == len(place) for each in branch):
                 for each in branch:
                     yield from _described(each)
                 return
@@ -315,18 +295,6 @@ def _around(error: Any) -> str:
         parent = parent.parent
     fallback = f"something that fits {error.validator} {error.validator_value}"
     return fallback if parent is None else str(parent.schema["description"])
-
-
-def _branches(error: Any) -> Iterable[list[Any]]:
-    branches: dict[int, list[Any]] = {}
-    for each in error.context:
-        branches.setdefault(each.schema_path[0], []).append(each)
-    return branches.values()
-
-
-def _is_of_another_kind(error: Any, depth: int) -> bool:
-    """Return whether an alternative failed because the whole value has another type."""
-    return error.validator == "type" and len(error.absolute_path) == depth
 
 
 def _shown(value: object) -> str:

@@ -62,33 +62,26 @@ class MessageLayout:
     is_generic: bool = False
 
 
-_OBJECT_CLASSES = MappingProxyType(
-    {
-        str(value): name
-        for value, name in enumerate(
-            (
-                "unknown",
-                "unknown_small",
-                "unknown_medium",
-                "unknown_big",
-                "pedestrian",
-                "bike",
-                "car",
-                "truck",
-                "motorcycle",
-                "other_vehicle",
-                "barrier",
-                "sign",
-            )
-        )
-    }
-)
+_UNKNOWN = ("unknown", "unknown_small", "unknown_medium", "unknown_big")
+_KNOWN = ("pedestrian", "bike", "car", "truck", "motorcycle", "other_vehicle", "barrier", "sign")
+_OBJECT_CLASSES = MappingProxyType({str(i): name for i, name in enumerate((*_UNKNOWN, *_KNOWN))})
 
-_IN_OBJECT = {"frame": ("header.frame_id",), "stamp": (Stamp("header.stamp"),)}
-_TIMESTAMPED = {"frame": ("frame_id",), "stamp": (Stamp("timestamp"),)}
 _RESULT_CLASS = ("results[0].hypothesis.class_id", "results[0].id", "results[0].hypothesis.id")
 
 _POSE = MessageLayout(position=(("pose.position",),), orientation=("pose.orientation",))
+_POSE_WITH_COVARIANCE = MessageLayout(
+    position=(("pose.pose.position",),), orientation=("pose.pose.orientation",), covariance="pose.covariance"
+)
+_POSES = MessageLayout(
+    objects="poses[*]",
+    complete=True,
+    name="{topic}_{index}",
+    position=(("position",),),
+    orientation=("orientation",),
+)
+_DETECTIONS = MessageLayout(
+    objects="detections[*]", complete=True, name="{topic}_{id|tracking_id|index}", class_field=_RESULT_CLASS
+)
 _TRANSFORM = MessageLayout(
     name="{child_frame_id}",
     position=(("transform.translation",),),
@@ -114,49 +107,29 @@ _MARKER = MessageLayout(
 BUILT_IN: Table[str, MessageLayout] = MappingProxyType(
     {
         "geometry_msgs/PoseStamped": _POSE,
-        "geometry_msgs/PoseWithCovarianceStamped": MessageLayout(
-            position=(("pose.pose.position",),),
-            orientation=("pose.pose.orientation",),
-            covariance="pose.covariance",
-        ),
-        "nav_msgs/Odometry": MessageLayout(
-            position=(("pose.pose.position",),),
-            orientation=("pose.pose.orientation",),
-            covariance="pose.covariance",
-        ),
-        "geometry_msgs/PoseArray": MessageLayout(
-            objects="poses[*]",
-            complete=True,
-            name="{topic}_{index}",
-            position=(("position",),),
-            orientation=("orientation",),
-        ),
+        "geometry_msgs/PoseWithCovarianceStamped": _POSE_WITH_COVARIANCE,
+        "nav_msgs/Odometry": _POSE_WITH_COVARIANCE,
+        "geometry_msgs/PoseArray": _POSES,
         "geometry_msgs/PolygonStamped": MessageLayout(polygon=("polygon.points",)),
         "geometry_msgs/TransformStamped": _TRANSFORM,
         "tf2_msgs/TFMessage": replace(_TRANSFORM, objects="transforms[*]"),
         "tf/tfMessage": replace(_TRANSFORM, objects="transforms[*]"),
         "visualization_msgs/Marker": _MARKER,
         "visualization_msgs/MarkerArray": replace(_MARKER, objects="markers[*]"),
-        "vision_msgs/Detection2DArray": MessageLayout(
-            objects="detections[*]",
-            complete=True,
-            name="{topic}_{id|tracking_id|index}",
+        "vision_msgs/Detection2DArray": replace(
+            _DETECTIONS,
             position=(
                 ("bbox.center.position.x", "bbox.center.position.y"),
                 ("bbox.center.x", "bbox.center.y"),
             ),
             yaw=("bbox.center.theta",),
             sizes=(("bbox.size_x", "bbox.size_y"),),
-            class_field=_RESULT_CLASS,
         ),
-        "vision_msgs/Detection3DArray": MessageLayout(
-            objects="detections[*]",
-            complete=True,
-            name="{topic}_{id|tracking_id|index}",
+        "vision_msgs/Detection3DArray": replace(
+            _DETECTIONS,
             position=(("bbox.center.position",),),
             orientation=("bbox.center.orientation",),
             sizes=(("bbox.size.x", "bbox.size.y", "bbox.size.z"),),
-            class_field=_RESULT_CLASS,
         ),
         "apriltag_msgs/AprilTagDetectionArray": MessageLayout(
             objects="detections[*]",
@@ -180,45 +153,22 @@ BUILT_IN: Table[str, MessageLayout] = MappingProxyType(
             stays=True,
             name="{id|index}",
             solids="scene",
-            **_TIMESTAMPED,  # type: ignore[arg-type]
+            frame=("frame_id",),
+            stamp=(Stamp("timestamp"),),
         ),
-        "foxglove/PosesInFrame": MessageLayout(
-            objects="poses[*]",
-            complete=True,
-            name="{topic}_{index}",
-            position=(("position",),),
-            orientation=("orientation",),
-            frame=("$.frame_id",),
-            stamp=(Stamp("$.timestamp"),),
-        ),
+        "foxglove/PosesInFrame": replace(_POSES, frame=("$.frame_id",), stamp=(Stamp("$.timestamp"),)),
         "foxglove/PoseInFrame": replace(_POSE, frame=("$.frame_id",), stamp=(Stamp("$.timestamp"),)),
         "foxglove/FrameTransform": _FRAME_TRANSFORM,
         "foxglove/FrameTransforms": replace(_FRAME_TRANSFORM, objects="transforms[*]"),
     }
 )
 
-TRANSFORM_TYPES = frozenset(
-    {
-        "geometry_msgs/TransformStamped",
-        "tf2_msgs/TFMessage",
-        "tf/tfMessage",
-        "foxglove/FrameTransform",
-        "foxglove/FrameTransforms",
-    }
-)
+TRANSFORM_TYPES = frozenset(kind for kind, layout in BUILT_IN.items() if layout.name == "{child_frame_id}")
+
+_POINTS = ("pose.pose.position", "pose.position", "position", "base.position", "pose", "center", "centre")
 
 GENERIC = MessageLayout(
-    position=(
-        ("pose.pose.position",),
-        ("pose.position",),
-        ("position",),
-        ("base.position",),
-        ("pose",),
-        ("center",),
-        ("centre",),
-        ("x", "y", "z"),
-        ("x", "y"),
-    ),
+    position=(*((path,) for path in _POINTS), ("x", "y", "z"), ("x", "y")),
     orientation=("pose.pose.orientation", "pose.orientation", "orientation"),
     yaw=("theta", "yaw", "heading", "pose.theta", "pose.yaw", "base.orientation.yaw"),
     frame=("header.frame_id", "$.header.frame_id", "frame_id", "$.frame_id"),
@@ -257,10 +207,8 @@ def layout_of_topic(topic_type: str, mapping: TopicMapping) -> MessageLayout:
         changes["name"] = "{topic}_{id|index}"
     changes |= _pose_changes(mapping) | _shape_changes(mapping) | _class_changes(mapping.class_name)
     if mapping.frame is not None or mapping.frame_field is not None:
-        changes |= {
-            "frame_name": mapping.frame,
-            "frame": (mapping.frame_field,) if mapping.frame_field else (),
-        }
+        paths = (mapping.frame_field,) if mapping.frame_field else ()
+        changes |= {"frame_name": mapping.frame, "frame": paths}
     if mapping.stamp is not None:
         changes["stamp"] = (mapping.stamp,)
     if mapping.uncertainty is not None:

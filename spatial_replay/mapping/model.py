@@ -158,7 +158,7 @@ class LogMapping:
     axes: Axes = OUR_AXES
 
 
-_UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}
+UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}
 _DURATION = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)(ns|us|ms|s)", re.ASCII)
 
 
@@ -169,7 +169,7 @@ def duration_ns(text: str) -> int:
         UsageError: the text is not a duration above 0.
     """
     match = _DURATION.fullmatch(text)
-    nanoseconds = int(Decimal(match[1]) * _UNITS_NS[match[2]]) if match else 0
+    nanoseconds = int(Decimal(match[1]) * UNITS_NS[match[2]]) if match else 0
     if nanoseconds <= 0:
         raise UsageError(f"{text!r} is not a duration; write 100ms or 0.5s")
     return nanoseconds
@@ -182,8 +182,3 @@ def age_ns(text: str) -> int:
         UsageError: the text is neither.
     """
     return FOREVER_NS if text == "forever" else duration_ns(text)
-
-
-def unit_ns(text: str) -> int:
-    """Return the nanoseconds in a unit of time: ns, us, ms or s."""
-    return _UNITS_NS[text]

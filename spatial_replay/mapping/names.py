@@ -120,10 +120,8 @@ class Namer:
                 self._get = getter(path, style)
 
     def _name(self, thing: object, index: int) -> str:
-        words = [
-            part if isinstance(part, str) else self._word(part, thing, index) for part in self._template.parts
-        ]
-        return _checked("".join(words))
+        parts = self._template.parts
+        return _checked("".join(p if isinstance(p, str) else self._word(p, thing, index) for p in parts))
 
     def _word(self, alternatives: tuple[FieldPath, ...], thing: object, index: int) -> str:
         for path in alternatives:
@@ -137,9 +135,8 @@ class Namer:
                 continue
             if word:
                 return word
-        raise ContentError(
-            f"{{{'|'.join(path.text for path in alternatives)}}} is empty; choose another name"
-        )
+        fields = "|".join(path.text for path in alternatives)
+        raise ContentError(f"{{{fields}}} is empty; choose another name")
 
 
 def class_codes(

@@ -84,18 +84,12 @@ class ReadingPlan:
         mapped = {entry.topic: entry for entry in mapping.topics}
         needs_frames = mapping.fixed_frame is not None
         names = [topic for topic in mapped if topic in known]
-        transforms = [
-            topic
-            for topic in topics
-            if needs_frames and short_type(topic.type) in TRANSFORM_TYPES and topic.name not in mapped
-        ]
+        others = [topic for topic in topics if needs_frames and topic.name not in mapped]
+        transforms = [topic for topic in others if short_type(topic.type) in TRANSFORM_TYPES]
         names += [topic.name for topic in transforms if topic.unreadable is None]
-        lost = [
-            (topic.name, topic.unreadable) for topic in transforms if topic.unreadable and topic.count != 0
-        ]
-        sampled = (
-            None if mapping.sampling.step_ns is not None else mapping.sampling.topic or _first(mapping, known)
-        )
+        lost = [(each.name, each.unreadable) for each in transforms if each.unreadable and each.count != 0]
+        is_stepped = mapping.sampling.step_ns is not None
+        sampled = None if is_stepped else mapping.sampling.topic or _first(mapping, known)
         if sampled is not None and sampled not in names:
             names.append(sampled)
         planned = tuple(_planned(mapping, mapped.get(name), known[name], needs_frames) for name in names)

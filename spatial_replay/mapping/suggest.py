@@ -17,6 +17,7 @@ from spatial_replay.bags.topic import Topic
 from spatial_replay.logs.topics import DERIVED
 from spatial_replay.mapping.field_paths import field_names, get_field, is_list, name_from_topic
 from spatial_replay.mapping.message_types import BUILT_IN, TRANSFORM_TYPES, short_type
+from spatial_replay.text import counted
 from spatial_replay.trace.sample import FOREVER
 
 EXAMPLES = 20
@@ -27,8 +28,6 @@ _TOGETHER_NS = 10**9
 _NOT_KNOWN: Mapping[str, int] = MappingProxyType({})
 _MOST_SIGNALS = 8
 _PLAIN = re.compile(r"/?[A-Za-z_][\w/.-]*", re.ASCII)
-_WORDS = frozenset({"true", "false", "null", "yes", "no", "on", "off", "y", "n"})
-"""Words that YAML 1.1 does not read as text."""
 _MIDDLEWARE = frozenset({"rosout", "rosout_agg", "parameter_events", "clock", "diagnostics"})
 """Topics about programs rather than objects, by the last part of their names."""
 
@@ -41,18 +40,7 @@ _SIZES = ("dimension", "dimensions", "size", "scale", "extent", "shape", "bbox")
 _OUTLINES = ("corners", "polygon", "points", "vertices", "outline", "footprint", "contour")
 _NAMES = ("name", "id", "track_id", "object_id", "tracking_id", "child_frame_id", "uuid", "label")
 _CLASSES = ("class", "class_name", "classification", "category", "label", "object_type", "type")
-_LISTS = (
-    "object",
-    "detection",
-    "track",
-    "tag",
-    "agent",
-    "obstacle",
-    "pose",
-    "vehicle",
-    "pedestrian",
-    "marker",
-)
+_LISTS = re.compile("object|detection|track|tag|agent|obstacle|pose|vehicle|pedestrian|marker")
 _NOT_PLACES = frozenset(
     {"velocity", "acceleration", "twist", "linear", "angular", "header", "stamp", "covariance"}
 )
@@ -193,12 +181,8 @@ def _frame_lines(
 ) -> Iterator[str]:
     """Yield the lines about the fixed frame, which coordinates in more than one frame need."""
     frames = sorted({each.frame for each in active if each.frame is not None})
-    edges = {
-        edge
-        for each in transforms
-        for message in examples.get(each.topic.name, ())
-        for edge in _edges(message)
-    }
+    messages = (message for each in transforms for message in examples.get(each.topic.name, ()))
+    edges = {edge for message in messages for edge in _edges(message)}
     roots = sorted({parent for parent, _ in edges} - {child for _, child in edges})
     if len(frames) > 1:
         yield f"# coordinates are in the frames {_comment(', '.join(frames))}: bring them into one"
@@ -249,23 +233,17 @@ def _unused(each: TopicSuggestion) -> Iterator[str]:
     if each.entry:
         yield f"  # {topic}: {each.entry}    # {_described(each.topic)}"
     elif each.numbers:
-        path = {number: _text(number.replace(".", "_")) for number in each.numbers[:_MOST_SIGNALS]}
-        signals = ", ".join(f"{_signal_name(each.topic, name)}: {number}" for number, name in path.items())
+        prefix, numbers = name_from_topic(each.topic.name), each.numbers[:_MOST_SIGNALS]
+        signals = ", ".join(f"{prefix}_{_text(path.replace('.', '_'))}: {path}" for path in numbers)
         yield f"  # {topic}: {{signals: {{{signals}}}}}    # {_described(each.topic)}"
     else:
         remark = "".join(f"; {remark}" for remark in each.remarks)
         yield f"  # {topic}: {_described(each.topic)}{remark}"
 
 
-def _signal_name(topic: Topic, name: str) -> str:
-    return f"{name_from_topic(topic.name)}_{name}"
-
-
 def _described(topic: Topic) -> str:
     kind = _comment(topic.type) or "type unknown"
-    return (
-        kind if topic.count is None else f"{kind}, {topic.count:,} message{'' if topic.count == 1 else 's'}"
-    )
+    return kind if topic.count is None else f"{kind}, {counted(topic.count, 'message')}"
 
 
 def _comment(text: str) -> str:
@@ -275,9 +253,7 @@ def _comment(text: str) -> str:
 
 def _text(text: str) -> str:
     """Return a text as a YAML scalar."""
-    return (
-        text if _PLAIN.fullmatch(text) and not text.endswith("[*]") else json.dumps(text, ensure_ascii=True)
-    )
+    return text if _PLAIN.fullmatch(text) else json.dumps(text, ensure_ascii=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -323,11 +299,8 @@ def _guess(message: object) -> _Guess | None:
 
 def _numbers_in(message: object) -> tuple[str, ...]:
     """Return the paths of the numbers in a message, except those in lists and in the header."""
-    return tuple(
-        path
-        for path, value in _iter_fields(message, skipped=frozenset({"header", "stamp"}))
-        if _is_number(value)
-    )
+    fields = _iter_fields(message, skipped=frozenset({"header", "stamp"}))
+    return tuple(path for path, value in fields if _is_number(value))
 
 
 def _frame_of(message: object) -> str | None:
@@ -423,7 +396,7 @@ def _iter_fields(
 def _list_rank(path: str) -> int:
     """Return how well the name of a list suits objects that move."""
     last = path.removesuffix("[*]").split(".")[-1].lower()
-    return 2 * ("moving" in last or "dynamic" in last) + any(word in last for word in _LISTS)
+    return 2 * ("moving" in last or "dynamic" in last) + bool(_LISTS.search(last))
 
 
 def _is_number(value: object) -> bool:

@@ -184,13 +184,8 @@ class ObservationRows:
         return cls(nowhere, np.full(count, np.nan), np.zeros(count), class_code, np.zeros(count, np.bool_))
 
     def select(self, rows: Integers) -> ObservationRows:
-        return ObservationRows(
-            self.shapes.select(rows),
-            self.yaw[rows],
-            self.uncertainty[rows],
-            self.class_code[rows],
-            self.is_valid[rows],
-        )
+        columns = self.yaw[rows], self.uncertainty[rows], self.class_code[rows], self.is_valid[rows]
+        return ObservationRows(self.shapes.select(rows), *columns)
 
     @classmethod
     def concatenate(cls, several: Sequence[ObservationRows]) -> ObservationRows:

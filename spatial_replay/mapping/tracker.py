@@ -192,7 +192,7 @@ class Tracker:
         codes = Codes()
         of_frame = np.array([codes[frame] for frame in detections.frames], np.int64)
         count = len(of_frame)
-        result = Transforms(np.zeros((count, 3, 3)), np.zeros((count, 3)), np.zeros(count, np.bool_))
+        result = Transforms.unknown(count)
         clock_ns = times_ns[detections.message]
         stamp_ns = np.zeros(count, np.int64) if detections.stamp_ns is None else detections.stamp_ns
         # a stamp of 0 is one that was never set
@@ -204,8 +204,7 @@ class Tracker:
                     continue
                 at = stamp_ns[chosen] if by_stamp else clock_ns[chosen]
                 between = self._tree.between(fixed, frame, at, by_stamp=by_stamp)
-                for whole, part in zip(result, between, strict=True):
-                    whole[chosen] = part
+                result.put(chosen, between)
                 missing = clock_ns[chosen[~between.known]]
                 missing = missing[self._is_relevant(reader, missing)]
                 if len(missing):
@@ -251,9 +250,8 @@ class Tracker:
             column = np.where(is_old, np.nan, values[at])
             name = planned.mapping.signals[index].name
             # several topics may report one signal: the first that has a value counts
-            columns[name] = (
-                np.where(np.isnan(columns[name]), column, columns[name]) if name in columns else column
-            )
+            first = columns.get(name, column)
+            columns[name] = np.where(np.isnan(first), column, first)
         return columns
 
 

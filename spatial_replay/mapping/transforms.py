@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import Booleans, Floats, Integers
 from spatial_replay.mapping.field_paths import (
     FieldError,
     FieldPath,
@@ -79,7 +79,7 @@ def yaw_of(matrices: Floats) -> Floats:
     return np.asarray(np.where(np.hypot(x, y) > _UPRIGHT, np.arctan2(y, x), np.nan))
 
 
-def is_upright(matrices: Floats) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def is_upright(matrices: Floats) -> Booleans:
     """Return whether (N,) the rotation maps the z axis to itself, up or down."""
     return np.asarray(np.hypot(matrices[:, 0, 2], matrices[:, 1, 2]) <= _UPRIGHT)
 
@@ -129,6 +129,15 @@ class Transforms(NamedTuple):
     def identity(cls, count: int) -> Transforms:
         rotation = np.broadcast_to(np.eye(3), (count, 3, 3))
         return cls(rotation, np.zeros((count, 3)), np.ones(count, np.bool_))
+
+    @classmethod
+    def unknown(cls, count: int) -> Transforms:
+        return cls(np.zeros((count, 3, 3)), np.zeros((count, 3)), np.zeros(count, np.bool_))
+
+    def put(self, places: Integers, others: Transforms) -> None:
+        """Replace the transforms in some places, while these are being collected."""
+        for whole, part in zip(self, others, strict=True):
+            whole[places] = part
 
     def after(self, first: Transforms) -> Transforms:
         """Return a_from_c for a_from_b (this) and b_from_c (`first`)."""
@@ -186,9 +195,7 @@ class FrameTree:
             stamp_ns: the time inside the message.
             clock_ns: the time of the message on the clock of the samples.
         """
-        entry = self._children.get(child)
-        if entry is None:
-            entry = self._children[child] = _Child()
+        entry = self._children.setdefault(child, _Child())
         if is_static:
             entry.static = (parent, pose)
             return
@@ -224,14 +231,9 @@ class FrameTree:
         parts = self._stretches(times_ns, by_stamp)
         if len(parts) == 1:
             return self._in_one_tree(target, source, times_ns, by_stamp)
-        result = Transforms(
-            np.zeros((len(times_ns), 3, 3)), np.zeros((len(times_ns), 3)), np.zeros(len(times_ns), np.bool_)
-        )
+        result = Transforms.unknown(len(times_ns))
         for part in parts:
-            for whole, piece in zip(
-                result, self._in_one_tree(target, source, times_ns[part], by_stamp), strict=True
-            ):
-                whole[part] = piece
+            result.put(part, self._in_one_tree(target, source, times_ns[part], by_stamp))
         return result
 
     def _stretches(self, times_ns: Integers, by_stamp: bool) -> list[Integers]:
@@ -255,8 +257,7 @@ class FrameTree:
         down = self._ancestors(target, int(times_ns[0]), by_stamp)
         common = next((frame for frame in up if frame in down), None)
         if common is None:
-            unknown = Transforms.identity(len(times_ns))
-            return unknown._replace(known=np.zeros(len(times_ns), np.bool_))
+            return Transforms.identity(len(times_ns))._replace(known=np.zeros(len(times_ns), np.bool_))
         common_from_source = self._climb(up[: up.index(common)], times_ns, by_stamp)
         common_from_target = self._climb(down[: down.index(common)], times_ns, by_stamp)
         return common_from_target.inverted().after(common_from_source)
@@ -389,9 +390,8 @@ class TransformReader:
     def _each(self, message: object) -> Iterator[Any]:
         if self._list is None:
             has_list = "transforms" in field_names(message)
-            self._list = (
-                getter(FieldPath.of("transforms"), style_of(message)) if has_list else lambda one: (one,)
-            )
+            path, style = FieldPath.of("transforms"), style_of(message)
+            self._list = getter(path, style) if has_list else lambda one: (one,)
         return iter(self._list(message))
 
     def _values(self, transform: Any) -> Sequence[Any]:
@@ -403,15 +403,13 @@ class TransformReader:
 def _getter(example: object) -> Get:
     """Return a getter for child, parent, seconds, nanoseconds, x, y, z and the quaternion x, y, z, w."""
     names = field_names(example)
-    stamp, parent = (
-        ("header.stamp", "header.frame_id") if "header" in names else ("timestamp", "parent_frame_id")
-    )
+    in_header = "header" in names
+    stamp, parent = ("header.stamp", "header.frame_id") if in_header else ("timestamp", "parent_frame_id")
     place = "transform." if "transform" in names else ""
     paths = ["child_frame_id", parent]
     for parts in (_SECONDS, _REST):
-        existing = [
-            f"{stamp}.{part}" for part in parts if leads_somewhere(FieldPath.of(f"{stamp}.{part}"), example)
-        ]
+        fields = [f"{stamp}.{part}" for part in parts]
+        existing = [each for each in fields if leads_somewhere(FieldPath.of(each), example)]
         if not existing:
             raise FieldError(f"{stamp} is not a time; a transform has a stamp")
         paths.append(existing[0])

@@ -98,8 +98,7 @@ def _unsupported(events: Iterable[yaml.Event]) -> tuple[int, str] | None:
 def _value(node: yaml.Node, place: Place, document: Document) -> Value:
     import yaml
 
-    line = node.start_mark.line + 1
-    document.lines.setdefault(place, line)
+    document.lines.setdefault(place, node.start_mark.line + 1)
     if isinstance(node, yaml.SequenceNode):
         return [_value(each, (*place, index), document) for index, each in enumerate(node.value)]
     if isinstance(node, yaml.MappingNode):
@@ -118,8 +117,7 @@ def _table(node: yaml.MappingNode, place: Place, document: Document) -> dict[str
             continue
         key = key_node.value
         if key in table:
-            first = document.lines[(*place, key)]
-            what = f"the key {key[:60]!r} appears twice; the first is in line {first}"
+            what = f"the key {key[:60]!r} appears twice; the first is in line {document.lines[(*place, key)]}"
             document.faults.append((line, what))
             continue
         document.lines[(*place, key)] = line
