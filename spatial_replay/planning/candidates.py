@@ -49,9 +49,8 @@ def find_target(
         tracked: the object before the motion.
         failed: places (x, y) where earlier attempts failed.
     """
-    good = (
-        (gradient.blocked == FREE) & (gradient.robustness >= settings.margin) & ~_near(failed, gradient.grid)
-    )
+    holds = (gradient.blocked == FREE) & (gradient.robustness >= settings.margin)
+    good = holds & ~_near(failed, gradient.grid)
     if not good.any():
         return _why_nowhere(gradient, settings, bool(failed))
     if settings.skill == "place":
@@ -138,16 +137,12 @@ def _why_nowhere(gradient: GradientMap, settings: Settings, has_failed: bool) ->
     if not enough.any():
         best = float(gradient.robustness.max())
         return f"nowhere would it hold: {best:.4g} at best, {settings.margin:.4g} needed"
-    where = gradient.blocked[enough]
-    counts = np.bincount(where, minlength=len(REASONS))
+    counts = np.bincount(gradient.blocked[enough], minlength=len(REASONS))
     if counts[FREE] and has_failed:
         return "it was tried wherever it would hold"
-    counted = [
-        f"{count} cells: {reason}"
-        for count, reason in zip(counts[1:].tolist(), REASONS[1:], strict=True)
-        if count
-    ]
-    return f"blocked wherever it would hold: {', '.join(counted)}"
+    reasons = zip(counts[1:].tolist(), REASONS[1:], strict=True)
+    listed = ", ".join(f"{count} cells: {reason}" for count, reason in reasons if count)
+    return f"blocked wherever it would hold: {listed}"
 
 
 class Movables:
@@ -209,9 +204,8 @@ class Movables:
             pushes = self._settings.skill == "push"
             # a pushed object crosses all cells from where it lies, which may be outside the workspace
             grid = workspace.grid.reaching(*centre_of(tracked.footprint)) if pushes else workspace.grid
-            self._maps[name] = proposition_maps(
-                self._propositions, self._regions, self._sample, name, workspace, grid
-            )
+            about = self._propositions, self._regions, self._sample, name
+            self._maps[name] = proposition_maps(*about, workspace, grid)
         return self._maps[name]
 
 
@@ -230,12 +224,8 @@ def with_choice(
     }
     if not costs:
         causes = "; ".join(f"{each.name}: {each.rejected}" for each in candidates)
-        reason = (
-            Reason("no object can do it", causes)
-            if causes
-            else Reason("no object that can be moved matters to it")
-        )
-        return replace(consideration, candidates=tuple(candidates), pruned=reason)
-    chosen = min(costs, key=lambda number: costs[number])
+        kind = "no object can do it" if causes else "no object that can be moved matters to it"
+        return replace(consideration, candidates=tuple(candidates), pruned=Reason(kind, causes))
+    chosen = min(costs, key=costs.__getitem__)
     marked = (replace(each, is_chosen=number == chosen) for number, each in enumerate(candidates))
     return replace(consideration, candidates=tuple(marked))

@@ -11,7 +11,6 @@ import numpy as np
 from foxglove_schemas_protobuf.Grid_pb2 import Grid as GridMessage
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
-from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import DecodeError, Message
@@ -19,7 +18,6 @@ from google.protobuf.message import DecodeError, Message
 from spatial_replay.annotate.scene_entities import FRAME, outlines_of
 from spatial_replay.annotate.scene_update import cell_colours
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.logs.messages import Messages, merge, messages_of
 from spatial_replay.logs.schemas.PlanDecision_pb2 import (
@@ -136,10 +134,9 @@ class BlackBox:
         if self._step is None or self._sample is None:
             raise UsageError("no step is being executed; decide on one first")
         step, end_ns = self._step, self._sample.time_ns
-        concluded = self._concluded(outcome, end_ns)
         path = path_message(step.target, self._tracked, end_ns, self._travelled)
         self._step = None
-        return self._messages(end_ns, [concluded], [], [path])
+        return self._messages(end_ns, [self._concluded(outcome, end_ns)], [], [path])
 
     def _ended_wait(self, end_ns: int) -> list[PlanDecision]:
         """Return the last decision with its outcome if it was a wait."""
@@ -255,6 +252,7 @@ def decision_message(step: Step, specification: str, first_map: int) -> PlanDeci
         first_map: the number of the step's first map in the log.
     """
     numbers = {turned: number for number, turned in enumerate(maps_of(step), first_map)}
+    pruned = (PrunedEdge(source=edge[0], target=edge[1], reason=str(reason)) for edge, reason in step.pruned)
     return PlanDecision(
         time_ns=step.time_ns,
         number=step.number,
@@ -263,10 +261,7 @@ def decision_message(step: Step, specification: str, first_map: int) -> PlanDeci
         states=step.states,
         considered=[_edge(each, numbers) for each in step.considered],
         target=None if step.target is None else _target(step.target),
-        pruned=[
-            PrunedEdge(source=source, target=target, reason=str(reason))
-            for (source, target), reason in step.pruned
-        ],
+        pruned=pruned,
         reason=step.reason,
     )
 
@@ -341,42 +336,34 @@ def path_message(
     Without a target, the message deletes what was drawn before.
     """
     message = SceneUpdate()
-    lines: dict[str, list[tuple[list[tuple[float, float]], bool, tuple[float, float, float]]]] = {}
-    height = 0.0
+    lines: dict[str, list[LinePrimitive]] = {}
     if target is not None and tracked is not None:
         height = 0.0 if tracked.height is None else tracked.height[1]
         there = moved_object(tracked, target.x, target.y, target.turn)
-        outlines = [(points, True, POSITIVE) for points in map(_points, outlines_of(there.footprint))]
-        lines[_PATH] = [(list(target.waypoints), False, POSITIVE), *outlines]
+        rings = [ring.tolist() for ring in outlines_of(there.footprint)]
+        lines[_PATH] = [_line(target.waypoints, height, POSITIVE)]
+        lines[_PATH] += [_line(ring, height, POSITIVE, LinePrimitive.LINE_LOOP) for ring in rings]
         if travelled:
-            lines[_TRAVELLED] = [(list(travelled), False, NEUTRAL)]
+            lines[_TRAVELLED] = [_line(travelled, height, NEUTRAL)]
     for identifier in (_PATH, _TRAVELLED):
-        if identifier not in lines:
+        if identifier in lines:
+            entity = message.entities.add(id=identifier, frame_id=FRAME, lines=lines[identifier])
+            entity.timestamp.FromNanoseconds(time_ns)
+        else:
             deletion = message.deletions.add(type=SceneEntityDeletion.MATCHING_ID, id=identifier)
             deletion.timestamp.FromNanoseconds(time_ns)
-            continue
-        entity = message.entities.add(id=identifier, frame_id=FRAME)
-        entity.timestamp.FromNanoseconds(time_ns)
-        for points, is_closed, colour in lines[identifier]:
-            _add_line(entity, points, height, colour, is_closed=is_closed)
     return message
 
 
-def _add_line(
-    entity: SceneEntity,
-    points: list[tuple[float, float]],
+def _line(
+    points: Iterable[Sequence[float]],
     height: float,
     colour: tuple[float, float, float],
-    *,
-    is_closed: bool,
-) -> None:
-    kind = LinePrimitive.LINE_LOOP if is_closed else LinePrimitive.LINE_STRIP
-    line = entity.lines.add(type=kind, thickness=_PIXELS, scale_invariant=True)
+    kind: LinePrimitive.Type.ValueType = LinePrimitive.LINE_STRIP,
+) -> LinePrimitive:
+    line = LinePrimitive(type=kind, thickness=_PIXELS, scale_invariant=True)
     line.pose.position.z, line.pose.orientation.w = height, 1.0
     for x, y in points:
         line.points.add(x=x, y=y)
     line.color.r, line.color.g, line.color.b, line.color.a = *colour, 1.0
-
-
-def _points(ring: Floats) -> list[tuple[float, float]]:
-    return [(x, y) for x, y in ring.tolist()]
+    return line

@@ -40,9 +40,8 @@ class Observer:
         """Return the value of each proposition in a sample."""
         values = self._leaves.values(self._leaves.look_at(sample))
         lower, upper = values[0, :, 0].tolist(), values[min(1, len(values) - 1), :, 0].tolist()
-        return tuple(
-            None if low < 0.0 <= high else low >= 0.0 for low, high in zip(lower, upper, strict=True)
-        )
+        bounds = zip(lower, upper, strict=True)
+        return tuple(None if low < 0.0 <= high else low >= 0.0 for low, high in bounds)
 
 
 def refuse_template(specification: Specification, name: str) -> None:
@@ -101,11 +100,9 @@ def consideration_of(
         symbol: the newest sample's propositions. The constraint set also leaves out the edge that these would
             take, unless acceptance is lost by it.
     """
-    first = path[0]
-    edge = (first.source, first.target)
+    states, edge = (path[0].source, *(each.target for each in path)), (path[0].source, path[0].target)
     others = _other_edges(automaton, edge, pruned, symbol)
-    states = (first.source, *(each.target for each in path))
-    return Consideration(states, edge, _guards(automaton, [first]), _guards(automaton, others), ())
+    return Consideration(states, edge, _guards(automaton, path[:1]), _guards(automaton, others), ())
 
 
 def equivalent_edges(
@@ -134,15 +131,10 @@ def _other_edges(
 ) -> Iterator[Transition]:
     """Iterate over the transitions that must not be taken on the way to an edge."""
     source = edge[0]
-    idle = automaton.step_set({source}, symbol) & automaton.can_accept
+    allowed = {*edge, *(automaton.step_set({source}, symbol) & automaton.can_accept)}
     for target in automaton.successors[source]:
         transition = automaton.transition(source, target)
-        if (
-            transition is not None
-            and target not in edge
-            and target not in idle
-            and (source, target) not in pruned
-        ):
+        if transition is not None and target not in allowed and (source, target) not in pruned:
             yield transition
 
 

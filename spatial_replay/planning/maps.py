@@ -46,15 +46,10 @@ Cubes: TypeAlias = tuple[Cube, ...]
 """A disjunction of cubes. The empty one is false."""
 
 FREE: Final = 0
-
 CONSTRAINED: Final = 1
-
 OCCUPIED: Final = 2
-
 OUT_OF_REACH: Final = 3
-
 UNKNOWN: Final = 4
-
 REASONS: Final = ("free", "a constraint would hold", "an obstacle is there", "out of reach", "unknown")
 """Why a cell is blocked, by its number in `GradientMap.blocked`."""
 
@@ -213,13 +208,8 @@ def _obstacle_distances(
     A distance is at most 0 exactly if the object's centre lies in the Minkowski sum of the other object and
     the mirrored one, the usual configuration-space obstacle.
     """
-    measured = {
-        part
-        for proposition in propositions
-        for each in iter_formulas(proposition)
-        if isinstance(each, Atom)
-        for part in iter_expressions(each.expression)
-    }
+    atoms_read = (each for one in propositions for each in iter_formulas(one) if isinstance(each, Atom))
+    measured = {part for each in atoms_read for part in iter_expressions(each.expression)}
     atoms = []
     for other in sorted(sample.objects):
         if other != name and other not in workspace.supports:
@@ -237,8 +227,7 @@ def _to_static(trace: Trace, name: str, workspace: Workspace) -> Floats:
     obstacles = FootprintBatch.from_footprints(workspace.obstacles)
     batch = FootprintBatch.concatenate([trace.footprints, obstacles])
     operands = (Operand(own), Operand(np.tile(static, (len(trace), 1))))
-    distance: Floats = measure(batch, operands, [MeasureRequest("signed_distance", 0, 1)])[0]
-    return distance
+    return np.asarray(measure(batch, operands, [MeasureRequest("signed_distance", 0, 1)])[0])
 
 
 def _trace_over_cells(here: Trace, tracked: TrackedObject, name: str, grid: Grid, turns: Floats) -> Trace:
@@ -263,12 +252,11 @@ def _trace_over_cells(here: Trace, tracked: TrackedObject, name: str, grid: Grid
 
 def concerns(formula: Formula, name: str) -> bool:
     """Return whether a formula depends on the pose of an object."""
-    for each in iter_formulas(formula):
-        if isinstance(each, Quantified):
-            return True
-        if isinstance(each, Atom) and any(_is_about(term, name) for term in terms_of(each.expression)):
-            return True
-    return False
+    return any(
+        isinstance(each, Quantified)
+        or (isinstance(each, Atom) and any(_is_about(term, name) for term in terms_of(each.expression)))
+        for each in iter_formulas(formula)
+    )
 
 
 def _is_about(term: Term, name: str) -> bool:
@@ -322,8 +310,7 @@ def centre_of(footprint: Footprint) -> tuple[float, float]:
     if sum(weights) <= 0.0:
         weights = (1.0,) * len(centres)
     total = sum(weights)
-    x = sum(weight * centre[0] for weight, centre in zip(weights, centres, strict=True)) / total
-    y = sum(weight * centre[1] for weight, centre in zip(weights, centres, strict=True)) / total
+    x, y = (sum(w * each[axis] for w, each in zip(weights, centres, strict=True)) / total for axis in (0, 1))
     return x, y
 
 
@@ -331,12 +318,10 @@ def moved_object(tracked: TrackedObject, x: float, y: float, turn: float = 0.0) 
     """Return the object with its centre at (x, y), turned by an angle in radians; heights stay."""
     footprint = tracked.footprint
     centre = np.array(centre_of(footprint))
-    parts = tuple(
-        ConvexPart(_placed(part.vertices, centre, np.array([[x, y]]), turn)[0], part.radius)
-        for part in footprint.parts
-    )
+    place = np.array([[x, y]])
+    parts = (ConvexPart(_placed(p.vertices, centre, place, turn)[0], p.radius) for p in footprint.parts)
     yaw = None if tracked.yaw is None else tracked.yaw + turn
-    return replace(tracked, footprint=Footprint(parts), yaw=yaw)
+    return replace(tracked, footprint=Footprint(tuple(parts)), yaw=yaw)
 
 
 def moved_batch(tracked: TrackedObject, positions: Floats, turns: Floats) -> FootprintBatch:
@@ -347,12 +332,11 @@ def moved_batch(tracked: TrackedObject, positions: Floats, turns: Floats) -> Foo
     vertices = np.concatenate([part.vertices for part in footprint.parts])
     sizes = np.array([len(part.vertices) for part in footprint.parts], np.int64)
     bottom, top = tracked.height or (math.nan, math.nan)
+    placed = [_placed(vertices, centre, positions, turn) for turn in turns.tolist()]
     return FootprintBatch(
         part_start=np.arange(count + 1, dtype=np.int64) * len(sizes),
         vertex_start=starts_from_counts(np.tile(sizes, count)),
-        vertices=np.concatenate(
-            [_placed(vertices, centre, positions, turn) for turn in turns.tolist()]
-        ).reshape(-1, 2),
+        vertices=np.concatenate(placed).reshape(-1, 2),
         radius=np.tile([part.radius for part in footprint.parts], count),
         bottom=np.full(count, bottom),
         top=np.full(count, top),
@@ -361,9 +345,7 @@ def moved_batch(tracked: TrackedObject, positions: Floats, turns: Floats) -> Foo
 
 def turns_for(tracked: TrackedObject, yaws: tuple[float, ...]) -> Floats:
     """Return (A,) angles that turn an object to each orientation; [0] without orientations."""
-    if not yaws:
-        return np.zeros(1)
-    return np.array(yaws) - (tracked.yaw or 0.0)
+    return np.array(yaws) - (tracked.yaw or 0.0) if yaws else np.zeros(1)
 
 
 def _placed(vertices: Floats, centre: Floats, positions: Floats, turn: float) -> Floats:

@@ -245,10 +245,8 @@ class Planner:
             raise UsageError("the chosen object has no target")
         self._attempts.begin(aim.edge)
         verb = "push" if self.settings.skill == "push" else "place"
-        reason = (
-            f"{verb} {target.name} at ({target.x:.4g}, {target.y:.4g}) for the edge {aim.edge[0]} -> "
-            f"{aim.edge[1]}: {aim.progress}"
-        )
+        edge = f"{aim.edge[0]} -> {aim.edge[1]}: {aim.progress}"
+        reason = f"{verb} {target.name} at ({target.x:.4g}, {target.y:.4g}) for the edge {edge}"
         return replace(self._decided("execute", considered, reason), target=target)
 
     def _decided(self, kind: Kind, considered: Iterable[Consideration], reason: str) -> Step:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
@@ -194,15 +194,10 @@ def iter_moments(blocks: Iterable[Block]) -> Iterator[Moment]:
 
 def planner_messages(messages: Messages) -> Iterator[PlannerMessage]:
     """Iterate over the messages on the planner's topics, in their order."""
-    topics: Mapping[int, str] = {
-        number: channel.topic
-        for number, channel in messages.channels.items()
-        if channel.topic in PLANNER_TOPICS
-    }
-    for number, time_ns, payload in zip(
-        messages.channel.tolist(), messages.log_time_ns.tolist(), messages.payloads, strict=True
-    ):
-        if number in topics:
+    topics = {number: channel.topic for number, channel in messages.channels.items()}
+    columns = messages.channel.tolist(), messages.log_time_ns.tolist(), messages.payloads
+    for number, time_ns, payload in zip(*columns, strict=True):
+        if topics[number] in PLANNER_TOPICS:
             yield PlannerMessage(time_ns, topics[number], payload)
 
 

@@ -120,13 +120,8 @@ class _Comparison:
                     self.differences.append(f"at {_seconds(time_ns)}: {error}")
                     return
         for topic in PLANNER_TOPICS:
-            old, new = (
-                [each.payload for each in messages if each.topic == topic]
-                for messages in (recorded, recomputed)
-            )
-            self.differences += (
-                f"at {_seconds(time_ns)}: {difference}" for difference in _differences(topic, old, new)
-            )
+            old, new = ([m.payload for m in each if m.topic == topic] for each in (recorded, recomputed))
+            self.differences += (f"at {_seconds(time_ns)}: {what}" for what in _differences(topic, old, new))
 
     def _recomputed(self, recorded: PlanDecision) -> Iterator[PlannerMessage]:
         has_outcome = recorded.HasField("outcome")
@@ -171,11 +166,8 @@ def _differences(topic: str, recorded: list[bytes], recomputed: list[bytes]) -> 
 
 def _differing_fields(recorded: bytes, recomputed: bytes) -> str:
     one, other = map(decision_from_payload, (recorded, recomputed))
-    fields = [
-        field.name
-        for field in PlanDecision.DESCRIPTOR.fields
-        if getattr(one, field.name) != getattr(other, field.name)
-    ]
+    names = (field.name for field in PlanDecision.DESCRIPTOR.fields)
+    fields = [name for name in names if getattr(one, name) != getattr(other, name)]
     return f" in {', '.join(fields)} of decision {one.number}" if fields else ""
 
 

@@ -24,6 +24,8 @@ Skill: TypeAlias = Literal["push", "place"]
 """What the robot does with an object: push it along a path in the plane, or pick and place it."""
 
 _SKILLS = ("push", "place")
+_PLAIN = ("skill", "movable", "margin", "constraint_margin", "room", "attempts")
+"""Settings that stand in the text as they are."""
 
 
 @dataclass(frozen=True)
@@ -74,20 +76,14 @@ def text_from_settings(settings: Settings) -> str:
     workspace, grid = settings.workspace, settings.workspace.grid
     return json.dumps(
         {
-            "skill": settings.skill,
-            "movable": settings.movable,
-            "margin": settings.margin,
-            "constraint_margin": settings.constraint_margin,
-            "room": settings.room,
-            "attempts": settings.attempts,
+            **{name: getattr(settings, name) for name in _PLAIN},
             "grid": [grid.xmin, grid.ymin, grid.cell_size, grid.columns, grid.rows],
             "yaws": workspace.yaws,
             "base": workspace.base,
             "nearest": workspace.nearest,
             "farthest": workspace.farthest if math.isfinite(workspace.farthest) else None,
             "obstacles": [
-                [[part.vertices.tolist(), part.radius] for part in obstacle.parts]
-                for obstacle in workspace.obstacles
+                [[part.vertices.tolist(), part.radius] for part in each.parts] for each in workspace.obstacles
             ],
             "supports": sorted(workspace.supports),
             "clearance": workspace.clearance,

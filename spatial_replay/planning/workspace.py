@@ -91,16 +91,14 @@ class Grid:
     def contains(self, points: Floats) -> Booleans:
         """Return whether each of the points (…, 2) lies in a cell, as (…)."""
         cells = (points - np.array([self.xmin, self.ymin])) / self.cell_size
-        inside: Booleans = ((cells >= 0.0) & (cells < np.array([self.columns, self.rows]))).all(axis=-1)
-        return inside
+        return np.asarray(((cells >= 0.0) & (cells < np.array([self.columns, self.rows]))).all(axis=-1))
 
     def reaching(self, x: float, y: float) -> Grid:
         """Return this grid, extended on up to two sides so that a point lies in it.
 
         A point farther away than the grid is long does not extend it.
         """
-        column = math.floor((x - self.xmin) / self.cell_size)
-        row = math.floor((y - self.ymin) / self.cell_size)
+        row, column = self._cell(x, y)
         left, below = max(-column, 0), max(-row, 0)
         right, above = max(column + 1 - self.columns, 0), max(row + 1 - self.rows, 0)
         columns, rows = self.columns + left + right, self.rows + below + above
@@ -112,9 +110,12 @@ class Grid:
 
     def cell(self, x: float, y: float) -> tuple[int, int]:
         """Return the cell (row, column) of a point, or the nearest one to a point outside the grid."""
-        column = math.floor((x - self.xmin) / self.cell_size)
-        row = math.floor((y - self.ymin) / self.cell_size)
+        row, column = self._cell(x, y)
         return min(max(row, 0), self.rows - 1), min(max(column, 0), self.columns - 1)
+
+    def _cell(self, x: float, y: float) -> tuple[int, int]:
+        """Return the cell (row, column) of a point, as if the grid had no end."""
+        return math.floor((y - self.ymin) / self.cell_size), math.floor((x - self.xmin) / self.cell_size)
 
 
 @dataclass(frozen=True)
@@ -180,16 +181,12 @@ class Workspace:
         Raises:
             UsageError: the sample has no object.
         """
-        parts = [
-            (part.vertices, part.radius)
-            for tracked in sample.objects.values()
-            if isinstance(tracked, TrackedObject)
-            for part in tracked.footprint.parts
-        ]
+        tracked = [each for each in sample.objects.values() if isinstance(each, TrackedObject)]
+        parts = [part for each in tracked for part in each.footprint.parts]
         if not parts:
             raise UsageError("there is nothing in the sample to lay a grid around; give a workspace")
-        low = np.min([vertices.min(axis=0) - radius for vertices, radius in parts], axis=0)
-        high = np.max([vertices.max(axis=0) + radius for vertices, radius in parts], axis=0)
+        low = np.min([part.vertices.min(axis=0) - part.radius for part in parts], axis=0)
+        high = np.max([part.vertices.max(axis=0) + part.radius for part in parts], axis=0)
         longer = float((high - low).max()) or 1.0
         (xmin, ymin), (xmax, ymax) = (low - longer / 2).tolist(), (high + longer / 2).tolist()
         return cls(Grid.over(xmin, ymin, xmax, ymax, 2.0 * longer / CELLS_AROUND))
@@ -202,8 +199,7 @@ class Workspace:
         centres = grid.centres()
         distance = np.hypot(*(centres - np.array(self.base)).T)
         reached = (distance >= self.nearest) & (distance <= self.farthest) & self.grid.contains(centres)
-        result: Booleans = reached.reshape(grid.shape)
-        return result
+        return np.asarray(reached.reshape(grid.shape))
 
 
 def refuse_faults(faults: Iterable[str]) -> None:
