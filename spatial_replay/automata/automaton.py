@@ -241,9 +241,8 @@ class Automaton(Displayed):
     def _check(self, state: int, symbol: Sequence[object]) -> None:
         self._check_state(state)
         if len(symbol) != len(self.propositions):
-            raise UsageError(
-                f"a symbol of {len(symbol)} values; there are {len(self.propositions)} propositions"
-            )
+            count = len(self.propositions)
+            raise UsageError(f"a symbol of {len(symbol)} values; there are {count} propositions")
 
     def _check_state(self, state: int) -> None:
         if state not in self.states:
@@ -261,9 +260,8 @@ def automaton_of(machine: Machine, name: str, propositions: Sequence[Proposition
             if variable == LEAF:
                 places[node] = ~low
             else:
-                row = (variable, place(low), place(high))
-                places[node] = len(decisions)
-                decisions.append(row)
+                decisions.append((variable, place(low), place(high)))
+                places[node] = len(decisions) - 1
         return places[node]
 
     entries = tuple(place(node) for node in machine.moves)

@@ -84,22 +84,17 @@ def _decisions(value: object) -> tuple[tuple[int, int, int], ...] | None:
 
 def _is_sound(automaton: Automaton) -> bool:
     """Return whether every decision leads on to later ones and, in the end, to states that there are."""
-    states, propositions = len(automaton.entries), len(automaton.propositions)
+    rows, states, propositions = automaton.decisions, len(automaton.entries), len(automaton.propositions)
 
-    def leads(place: int, rows: Sequence[tuple[int, int, int]], row: int, after: int) -> bool:
-        if place < 0:
-            return ~place < states
-        return place < row and rows[place][0] > after
+    def leads(place: int, row: int, after: int) -> bool:
+        return ~place < states if place < 0 else place < row and rows[place][0] > after
 
-    rows = automaton.decisions
     return (
         states > 0
         and all(0 <= state < states for state in automaton.accepting)
-        and all(leads(place, rows, len(rows), -1) for place in automaton.entries)
+        and all(leads(place, len(rows), -1) for place in automaton.entries)
         and all(
-            0 <= proposition < propositions
-            and leads(low, rows, row, proposition)
-            and leads(high, rows, row, proposition)
+            0 <= proposition < propositions and leads(low, row, proposition) and leads(high, row, proposition)
             for row, (proposition, low, high) in enumerate(rows)
         )
     )
@@ -218,8 +213,6 @@ def chosen_spec(specification: Specification, name: str | None) -> NamedSpec:
         return specification.results[0]
     if name not in known:
         hint = nearest_hint(name, known)
-        names = ", ".join(known)
-        raise UsageError(
-            f"no spec {name!r} in {specification.filename}; {f'{hint} ' if hint else ''}there are {names}"
-        )
+        others = f"{f'{hint} ' if hint else ''}there are {', '.join(known)}"
+        raise UsageError(f"no spec {name!r} in {specification.filename}; {others}")
     return known[name]

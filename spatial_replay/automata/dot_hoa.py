@@ -68,13 +68,11 @@ def abbreviated(automaton: Automaton) -> Automaton:
     """Return the automaton with short names for long propositions, as fit on arrows."""
     taken = {each.label for each in automaton.propositions}
     names = (name for number in range(2 * len(taken) + 1) if (name := f"p{number}") not in taken)
-    return replace(
-        automaton,
-        propositions=tuple(
-            each if len(each.label) <= _LONGEST_LABEL else replace(each, name=next(names))
-            for each in automaton.propositions
-        ),
+    short = (
+        each if len(each.label) <= _LONGEST_LABEL else replace(each, name=next(names))
+        for each in automaton.propositions
     )
+    return replace(automaton, propositions=tuple(short))
 
 
 def meanings(automaton: Automaton) -> list[str]:
@@ -105,8 +103,7 @@ def _digraph(automaton: Automaton, legend: Sequence[str] = ()) -> str:
         lines.append(f'  graph [fontname="Helvetica", fontsize=11, labelloc=b, labeljust=l, label="{text}"];')
     for state in automaton.states:
         shape = "doublecircle" if state in automaton.accepting else "circle"
-        colour = state_colour(automaton, state)
-        about = _quoted(state_words(automaton, state))
+        colour, about = state_colour(automaton, state), _quoted(state_words(automaton, state))
         lines.append(f'  {state} [shape={shape}, fillcolor="{colour}", tooltip={about}];')
     for each in automaton.transitions:
         label = "\\n".join(map(_escaped, _broken(automaton.guard_words(each))))
@@ -168,12 +165,9 @@ def _graphviz(automaton: Automaton, text: str, form: str) -> str:
             "or write it as text to a file that ends in .dot"
         )
     try:
+        command = [executable, f"-T{form}"]
         done = subprocess.run(
-            [executable, f"-T{form}"],
-            input=text.encode(),
-            capture_output=True,
-            check=False,
-            timeout=_DRAWING_S,
+            command, input=text.encode(), capture_output=True, timeout=_DRAWING_S, check=False
         )
     except subprocess.TimeoutExpired:
         raise OutputError(
@@ -195,11 +189,10 @@ def _by_source(automaton: Automaton) -> list[list[Transition]]:
 
 
 def _hoa_guard(transition: Transition) -> str:
-    cubes = [
-        "&".join(str(number) if value else f"!{number}" for number, value in cube) or "t"
-        for cube in transition.guard
-    ]
-    return " | ".join(cubes)
+    literals = (
+        [str(number) if value else f"!{number}" for number, value in cube] for cube in transition.guard
+    )
+    return " | ".join("&".join(cube) or "t" for cube in literals)
 
 
 def _broken(text: str) -> list[str]:

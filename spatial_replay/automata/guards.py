@@ -35,7 +35,6 @@ class Covers:
     """
 
     def __init__(self, diagrams: Diagrams) -> None:
-        """Take functions from some diagrams."""
         self._diagrams = diagrams
         self._known: dict[tuple[int, int], tuple[tuple[Cube, ...], int]] = {}
         self._cubes = 0
@@ -74,16 +73,12 @@ class Covers:
         cubes_0, covered_0 = self._between(diagrams.both(low_0, diagrams.complement(high_1)), high_0)
         cubes_1, covered_1 = self._between(diagrams.both(low_1, diagrams.complement(high_0)), high_1)
         # what the cubes with this variable leave open is left to cubes without it
-        left = diagrams.either(
-            diagrams.both(low_0, diagrams.complement(covered_0)),
-            diagrams.both(low_1, diagrams.complement(covered_1)),
-        )
-        cubes, covered = self._between(left, diagrams.both(high_0, high_1))
-        all_cubes = (
-            *(((variable, False), *cube) for cube in cubes_0),
-            *(((variable, True), *cube) for cube in cubes_1),
-            *cubes,
-        )
+        open_0 = diagrams.both(low_0, diagrams.complement(covered_0))
+        open_1 = diagrams.both(low_1, diagrams.complement(covered_1))
+        cubes, covered = self._between(diagrams.either(open_0, open_1), diagrams.both(high_0, high_1))
+        with_0 = (((variable, False), *cube) for cube in cubes_0)
+        with_1 = (((variable, True), *cube) for cube in cubes_1)
+        all_cubes = (*with_0, *with_1, *cubes)
         if len(all_cubes) > MAX_CUBES:
             self._count(len(all_cubes))
         decided = diagrams.decide(variable, covered_0, covered_1)
@@ -94,12 +89,9 @@ def guard_words(guard: Guard, propositions: Sequence[Proposition]) -> str:
     """Return a guard as a sentence of the specification language."""
     if guard == ((),):
         return "true"
-    return " or ".join(_cube_words(cube, propositions, alone=len(guard) == 1) for cube in guard)
-
-
-def _cube_words(cube: Cube, propositions: Sequence[Proposition], *, alone: bool) -> str:
-    text = " and ".join(propositions[number].literal(value) for number, value in cube)
-    return text if alone or len(cube) == 1 else f"({text})"
+    texts = [" and ".join(propositions[number].literal(value) for number, value in cube) for cube in guard]
+    is_bare = [len(guard) == 1 or len(cube) == 1 for cube in guard]
+    return " or ".join(text if bare else f"({text})" for text, bare in zip(texts, is_bare, strict=True))
 
 
 MAX_VISITS = 25_000_000

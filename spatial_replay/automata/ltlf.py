@@ -179,9 +179,8 @@ class Skeleton:
                 join = self._both if (formula.operator == "and") == positive else self._either
                 return reduce(join, [self._of(each, positive) for each in formula.operands])
             case Temporal():
-                return self._temporal(
-                    formula, [self._of(each, positive) for each in formula.operands], positive
-                )
+                operands = [self._of(each, positive) for each in formula.operands]
+                return self._temporal(formula, operands, positive)
         raise ValueError(f"{formula!r} is not a proposition")
 
     def _temporal(self, formula: Temporal, operands: list[int], positive: bool) -> int:

@@ -65,20 +65,15 @@ def _classes(machine: Machine) -> list[int]:
         for state in pending:
             own = parts[classes[state]]
             if state in leading:
-                _remove(own, leading[state], state)
+                own[leading[state]].remove(state)
+                if not own[leading[state]]:
+                    del own[leading[state]]
             leading[state] = copy(machine.moves[state])
             own.setdefault(leading[state], set()).add(state)
         moved = _split(parts, classes, dict.fromkeys(classes[state] for state in pending))
         pending = dict.fromkeys(source for state in moved for source in before[state])
     numbers: dict[int, int] = {}
     return [numbers.setdefault(each, len(numbers)) for each in classes]
-
-
-def _remove(parts: dict[int, set[int]], node: int, state: int) -> None:
-    """Remove a state from its part of a class."""
-    parts[node].remove(state)
-    if not parts[node]:
-        del parts[node]
 
 
 def _split(parts: list[dict[int, set[int]]], classes: list[int], touched: Iterable[int]) -> list[int]:

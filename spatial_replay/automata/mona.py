@@ -38,14 +38,11 @@ def require_translatable(skeleton: Skeleton) -> None:
         NoAutomatonError: it is not.
     """
     depth, size = _depth_and_size(skeleton)
+    formula = "with its bounds unrolled the formula"
     if depth > _MAX_DEPTH:
-        raise NoAutomatonError(
-            f"with its bounds unrolled the formula nests {depth} deep, at most {_MAX_DEPTH} can be translated"
-        )
+        raise NoAutomatonError(f"{formula} nests {depth} deep, at most {_MAX_DEPTH} can be translated")
     if size > _MAX_SIZE:
-        raise NoAutomatonError(
-            f"with its bounds unrolled the formula has more than {_MAX_SIZE} subformulas to translate"
-        )
+        raise NoAutomatonError(f"{formula} has more than {_MAX_SIZE} subformulas to translate")
 
 
 def mona_program(skeleton: Skeleton) -> str:
@@ -144,10 +141,8 @@ def compiled_by_mona(skeleton: Skeleton, propositions: int) -> Machine:
             "what writes its programs is not installed: pip install 'spatial-replay[mona]'"
         )
     program = mona_program(skeleton)
-    if len(program) > _MAX_PROGRAM:
-        raise NoAutomatonError(
-            f"its program has {len(program)} characters, at most {_MAX_PROGRAM} are given to it"
-        )
+    if (length := len(program)) > _MAX_PROGRAM:
+        raise NoAutomatonError(f"its program has {length} characters, at most {_MAX_PROGRAM} are given to it")
     return _machine(_output(executable, program), propositions)
 
 

@@ -60,7 +60,6 @@ class Propositions:
     """
 
     def __init__(self, formula: Formula) -> None:
-        """Number those of a formula."""
         self._shapes = _Shapes()
         self._numbers: dict[int, int] = {}
         self._literals: dict[int, tuple[int, bool]] = {}
@@ -136,9 +135,8 @@ class _Shapes:
 
     def _join(self, is_both: bool, *operands: int) -> int:
         """Return the number of a conjunction or disjunction; order, repetition and brackets do not count."""
-        chosen = frozenset[int]().union(
-            *(self._joined.get((is_both, each), frozenset({each})) for each in operands)
-        )
+        parts = (self._joined.get((is_both, each), frozenset({each})) for each in operands)
+        chosen = frozenset[int]().union(*parts)
         if len(chosen) == 1:
             return next(iter(chosen))
         number = self._intern(is_both, chosen)

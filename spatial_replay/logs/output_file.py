@@ -34,9 +34,7 @@ def replacing(output: Path, inputs: Iterable[Path] = ()) -> Iterator[BinaryIO]:
     # a link stays a link, to the new content
     output = output.resolve()
     with _writing(output):
-        descriptor, partial = tempfile.mkstemp(
-            prefix=f".{output.name}.", suffix=".partial", dir=output.parent
-        )
+        descriptor, partial = tempfile.mkstemp(".partial", f".{output.name}.", output.parent)
     try:
         with _stream(descriptor, output) as stream:
             yield stream

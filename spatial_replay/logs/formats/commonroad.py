@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
-from functools import partial
 from math import cos, fsum, hypot, isfinite, nan, pi, sin
 from pathlib import Path
 
@@ -71,21 +70,12 @@ class ObstacleState:
             return ObjectReport(name, class_name, [nan, nan], [1], [0.0], invalid=True)
         parts = self.region if self.region is not None else outline
         along_x, along_y = cos(self.angle), sin(self.angle)
-        vertices = [
-            coordinate
-            for part in parts
-            for x, y in part.vertices
-            for coordinate in (self.x + along_x * x - along_y * y, self.y + along_y * x + along_x * y)
-        ]
-        return ObjectReport(
-            name,
-            class_name,
-            vertices,
-            [len(part.vertices) for part in parts],
-            [part.radius for part in parts],
-            yaw=self.angle if self.oriented else nan,
-            uncertainty=self.uncertainty,
-        )
+        vertices: list[float] = []
+        for x, y in (vertex for part in parts for vertex in part.vertices):
+            vertices += (self.x + along_x * x - along_y * y, self.y + along_y * x + along_x * y)
+        counts, radii = [len(part.vertices) for part in parts], [part.radius for part in parts]
+        yaw = self.angle if self.oriented else nan
+        return ObjectReport(name, class_name, vertices, counts, radii, yaw, self.uncertainty)
 
 
 UNKNOWN = ObstacleState(known=False)
@@ -124,11 +114,8 @@ class _Obstacle:
 
 def is_scenario(head: bytes) -> bool:
     """Return whether a file begins as an XML file does."""
-    return (
-        head.removeprefix(b"\xef\xbb\xbf")
-        .lstrip()
-        .startswith((b"<?xml", b"<!--", b"<!DOCTYPE", b"<commonRoad"))
-    )
+    text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    return text.startswith((b"<?xml", b"<!--", b"<!DOCTYPE", b"<commonRoad"))
 
 
 def iter_scenario(path: Path, faults: FaultList, *, concave: Concave = "decompose") -> Iterator[Trace]:
@@ -171,10 +158,9 @@ def _step_size(path: Path, root: Element) -> Fraction:
         size = float(text)
     except ValueError:
         size = 0.0
-    if not (isfinite(size) and 1e-9 <= size <= 1e9):
-        raise LogError(
-            f"{path.name}:{root.line}: timeStepSize is {text[:60]!r}; give seconds from 1e-9 to 1e9"
-        )
+    if not 1e-9 <= size <= 1e9:
+        place = f"{path.name}:{root.line}"
+        raise LogError(f"{place}: timeStepSize is {text[:60]!r}; give seconds from 1e-9 to 1e9")
     # exactly as written: 0.1 s is 100 ms to the nanosecond
     return Fraction(repr(size))
 
@@ -184,20 +170,20 @@ def _iter_obstacles(path: Path, faults: FaultList, elements: Iterator[Element]) 
     for element in elements:
         name = element.attributes.get("id", "")
         place = f"{path.name}:{element.line}: <{element.name}>"
+
+        def report(line: int, what: str, obstacle: str = name) -> None:
+            faults.add(f"{path.name}:{line}: obstacle {obstacle}: {what}")
+
         try:
             if not name or name in names:
                 raise ScenarioError(f"id is {name[:60]!r}; give each obstacle one of its own")
             place = f"{path.name}:{element.line}: obstacle {name}"
-            obstacle = _obstacle(name, element, partial(_report, faults, path.name, name))
+            obstacle = _obstacle(name, element, report)
         except ScenarioError as error:
             faults.add(f"{place}: {error}; it is left out")
             continue
         names.add(name)
         yield obstacle
-
-
-def _report(faults: FaultList, file: str, obstacle: str, line: int, what: str) -> None:
-    faults.add(f"{file}:{line}: obstacle {obstacle}: {what}")
 
 
 def _obstacle(name: str, element: Element, report: ReportFault) -> _Obstacle:
@@ -370,9 +356,8 @@ def _steps(time: Element) -> range:
         return range(step, step + 1)
     first, last = (_whole(_required(time, name)) for name in ("intervalStart", "intervalEnd"))
     if not 0 <= last - first <= _LONGEST_INTERVAL:
-        raise ScenarioError(
-            f"time is from step {first} to {last}; give an interval of 0 to {_LONGEST_INTERVAL}"
-        )
+        wanted = f"an interval of 0 to {_LONGEST_INTERVAL}"
+        raise ScenarioError(f"time is from step {first} to {last}; give {wanted}")
     return range(first, last + 1)
 
 

@@ -98,17 +98,11 @@ def _report(row: dict[str, str]) -> ObjectReport:
     yaw = _number(row, "yaw") if row["yaw"].strip() else nan
     if length < 0 or width < 0:
         raise _NoObjectError(f"length and width are {length:g} and {width:g}; give sizes of at least 0")
-    if isfinite(yaw) or not row["yaw"].strip():
-        angle = yaw if isfinite(yaw) else 0.0
-        along, across = (cos(angle), sin(angle)), (-sin(angle), cos(angle))
-    else:
-        along = across = (nan, nan)
-    corners = ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))
-    vertices = [
-        origin + a * length * along[axis] + b * width * across[axis]
-        for a, b in corners
-        for axis, origin in enumerate((x, y))
-    ]
+    # the cosine and sine of an orientation that is not finite make the box unknown
+    c, s = (1.0, 0.0) if not row["yaw"].strip() else (cos(yaw), sin(yaw)) if isfinite(yaw) else (nan, nan)
+    vertices: list[float] = []
+    for a, b in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)):
+        vertices += (x + a * length * c + b * width * -s, y + a * length * s + b * width * c)
     return ObjectReport(row["name"], row["class"] or None, vertices, [4], [0.0], yaw=yaw)
 
 
@@ -118,6 +112,5 @@ def _number(row: dict[str, str], column: str) -> float:
     try:
         return float(text) if text else nan
     except ValueError:
-        raise _NoObjectError(
-            f"{column} is {text[:60]!r}; give a number, or nothing where it is not known"
-        ) from None
+        wanted = "a number, or nothing where it is not known"
+        raise _NoObjectError(f"{column} is {text[:60]!r}; give {wanted}") from None

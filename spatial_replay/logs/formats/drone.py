@@ -103,9 +103,8 @@ class _Boxes:
         """Sort by frame, keeping the file's order within each."""
         frame = np.frombuffer(self._numbers["frame"], np.int64)
         order = np.argsort(frame, kind="stable")
-        self.frame = frame[order]
-        self.id = np.frombuffer(self._numbers["id"], np.int64)[order]
-        self.label = np.frombuffer(self._numbers["label"], np.int64)[order]
+        columns = (np.frombuffer(self._numbers[name], np.int64)[order] for name in ("id", "frame", "label"))
+        self.id, self.frame, self.label = columns
         self.corners = np.frombuffer(self._corners, np.float64).reshape(-1, 4)[order]
         self.lost = np.frombuffer(self._lost, np.int8)[order].astype(np.bool_)
         self._numbers, self._corners, self._lost = {}, array("d"), array("b")
@@ -204,9 +203,6 @@ def _shapes(corners: Floats) -> FootprintBatch:
 
 def _is_row(line: bytes) -> bool:
     cells = line.split(None, len(COLUMNS) - 1)
-    return (
-        len(cells) == len(COLUMNS)
-        and cells[0].isdigit()
-        and cells[5].isdigit()
-        and all(flag in (b"0", b"1") for flag in cells[6:9])
-    )
+    if len(cells) != len(COLUMNS) or not (cells[0].isdigit() and cells[5].isdigit()):
+        return False
+    return all(flag in (b"0", b"1") for flag in cells[6:9])

@@ -224,10 +224,9 @@ def _sample(line: str) -> tuple[int, list[ObjectReport], dict[str, float]]:
     time_ns = sample.get("time_ns")
     if type(time_ns) is not int or not 0 <= time_ns <= LATEST_NS:
         raise _NoSampleError(f"time_ns is {_short(time_ns)}; give integer nanoseconds from 0 to 2**63 - 1")
-    objects = _list(sample.get("objects", []), "objects")
-    reports = [_report(entry) for entry in objects]
-    if len({report.name for report in reports}) < len(reports):
-        names = [report.name for report in reports]
+    reports = [_report(entry) for entry in _list(sample.get("objects", []), "objects")]
+    names = [report.name for report in reports]
+    if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise _NoSampleError(f"object {twice!r} is there twice; name each object once")
     return time_ns, reports, _signals(sample.get("signals", {}))
@@ -252,9 +251,8 @@ def _report(entry: Any) -> ObjectReport:
     else:
         for part in _list(entry["parts"], f"{what}: parts"):
             if not isinstance(part, dict):
-                raise _NoSampleError(
-                    f'{what}: a part is {_kind(part)}; give {{"vertices": […], "radius": r}}'
-                )
+                wanted = '{"vertices": […], "radius": r}'
+                raise _NoSampleError(f"{what}: a part is {_kind(part)}; give {wanted}")
             _check_keys(part, _PART_KEYS, f"a part of {what}")
             radius = _number(part.get("radius", 0.0), f"{what}: radius")
             _add_part(report, part.get("vertices"), radius, f"{what}: vertices")
@@ -302,9 +300,8 @@ def _number(value: Any, what: str) -> float:
     try:
         return float(value)
     except OverflowError:
-        raise _NoSampleError(
-            f"{what} holds an integer beyond 1.8e308; give a number that fits a double"
-        ) from None
+        wanted = "a number that fits a double"
+        raise _NoSampleError(f"{what} holds an integer beyond 1.8e308; give {wanted}") from None
 
 
 def _list(value: Any, what: str) -> list[Any]:
@@ -315,10 +312,8 @@ def _list(value: Any, what: str) -> list[Any]:
 
 def _check_keys(entry: dict[str, Any], known: set[str], what: str) -> None:
     if not entry.keys() <= known:
-        unknown = ", ".join(map(repr, sorted(entry.keys() - known)))
-        raise _NoSampleError(
-            f"{what} has the unknown key {_shorten(unknown)}; known are {', '.join(sorted(known))}"
-        )
+        unknown, listed = ", ".join(map(repr, sorted(entry.keys() - known))), ", ".join(sorted(known))
+        raise _NoSampleError(f"{what} has the unknown key {_shorten(unknown)}; known are {listed}")
 
 
 def _is_text(text: str, *, empty: bool = False) -> bool:

@@ -128,9 +128,8 @@ class _Collector:
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         self._depth += 1
         if self._depth > DEEPEST:
-            raise LogError(
-                f"{self.name}:{self.line}: elements are nested deeper than {DEEPEST}; flatten them"
-            )
+            place = f"{self.name}:{self.line}"
+            raise LogError(f"{place}: elements are nested deeper than {DEEPEST}; flatten them")
         if self._depth == 1:
             self._done.append(Element(name, attributes, self.line))
         elif self._open or (self._depth == 2 and name in self._wanted):

@@ -144,9 +144,8 @@ def _take_in(directory: Directory, opcode: int, body: bytes) -> None:
         if len(body) < _CHUNK_INDEX.size:
             raise DamageError("the index breaks off")
         start_ns, end_ns, offset, length, indexed = _CHUNK_INDEX.unpack_from(body)
-        directory.chunks.append(
-            ChunkPlace(offset, length, start_ns, end_ns, channels=_indexed_channels(body, indexed))
-        )
+        channels = _indexed_channels(body, indexed)
+        directory.chunks.append(ChunkPlace(offset, length, start_ns, end_ns, channels=channels))
     elif opcode == Opcode.ATTACHMENT_INDEX:
         attachment = decoded(records.AttachmentIndex.read, body)
         directory.attachments.append((attachment.offset, attachment.length))
@@ -166,14 +165,12 @@ def _indexed_channels(body: bytes, length: int) -> frozenset[int] | None:
 def _check_complete(directory: Directory, end: int) -> None:
     """Check that a summary is complete; other writers may leave out parts of theirs."""
     statistics = directory.statistics
-    if statistics is None or (
-        statistics.chunk_count != len(directory.chunks)
-        or statistics.channel_count != len(directory.channels)
-        or statistics.schema_count != len(directory.schemas)
-        or statistics.attachment_count != len(directory.attachments)
-        or statistics.metadata_count != len(directory.metadata)
-        or (statistics.message_count > 0 and not directory.chunks)
-    ):
+    kinds = ("schema", "channel", "chunk", "attachment", "metadata")
+    counts = [getattr(statistics, f"{kind}_count", None) for kind in kinds]
+    outside = len(directory.schemas), len(directory.channels), len(directory.chunks)
+    if statistics is None or counts != [*outside, len(directory.attachments), len(directory.metadata)]:
+        raise _NoSummaryError
+    if statistics.message_count > 0 and not directory.chunks:
         raise _NoSummaryError
     places = [(place.offset, place.length) for place in directory.chunks]
     if any(offset + length > end for offset, length in places + directory.attachments + directory.metadata):
@@ -256,13 +253,9 @@ class _Scan:
         time_ns = int.from_bytes(beginning[RECORD_HEAD.size + 6 : RECORD_HEAD.size + 14], "little")
         loose = self._loose
         if loose and loose.offset + loose.length == position and loose.length < _LOOSE_BYTES:
-            self._loose = ChunkPlace(
-                loose.offset,
-                following - loose.offset,
-                min(loose.start_ns, time_ns),
-                max(loose.end_ns, time_ns),
-                compressed=False,
-            )
+            start_ns, end_ns = min(loose.start_ns, time_ns), max(loose.end_ns, time_ns)
+            length = following - loose.offset
+            self._loose = ChunkPlace(loose.offset, length, start_ns, end_ns, compressed=False)
         else:
             self._end_loose()
             self._loose = ChunkPlace(position, following - position, time_ns, time_ns, compressed=False)

@@ -123,9 +123,8 @@ def pack(ranges: list[MessageRange], compressor: zstandard.ZstdCompressor) -> Pa
         uncompressed_crc=zlib.crc32(content),
         uncompressed_size=len(content),
     )
-    return PackedChunk(
-        encoded(chunk), bytes(index), offsets, len(compressed), len(content), counts, start_ns, end_ns
-    )
+    sizes_of = len(compressed), len(content)
+    return PackedChunk(encoded(chunk), bytes(index), offsets, *sizes_of, counts, start_ns, end_ns)
 
 
 @dataclass(slots=True)
@@ -158,9 +157,8 @@ class McapSummary:
         section, offsets = b"", []
         for opcode, group in groups:
             if group:
-                content = (
-                    b"".join(map(_chunk_index, self.chunks)) if group is self.chunks else encoded(*group)
-                )
+                is_index = opcode == Opcode.CHUNK_INDEX
+                content = b"".join(map(_chunk_index, self.chunks)) if is_index else encoded(*group)
                 offsets.append(records.SummaryOffset(opcode, offset + len(section), len(content)))
                 section += content
         footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, offset, offset + len(section))

@@ -70,19 +70,17 @@ class McapSource:
         Only chunks that reach into the window are read, if the log has an index.
         """
         with self.open_walk() as walk:
-            faults = walk.faults
             window = (0 if start_ns is None else start_ns, AFTER_ALL_NS if end_ns is None else end_ns)
             decoder = _BlockDecoder(self, walk)
-            for messages in _blocks(walk, window, _is_copied):
+            for messages in _blocks(walk, window, lambda topic: topic not in DERIVED):
                 yield decoder.block(messages)
-            check_attachments(walk.stream, walk.directory, faults, self.name)
-            rest = faults.take(last=True)
+            check_attachments(walk.stream, walk.directory, walk.faults, self.name)
+            rest = walk.faults.take(last=True)
+            fault = decoder.first_fault or next(iter(rest), None)
             if not decoder.any_sample and not walk.sees_objects:
-                raise self._without_objects(walk, decoder.first_fault or next(iter(rest), None))
-            if not decoder.any_sample and window == (0, AFTER_ALL_NS):
-                fault = decoder.first_fault or next(iter(rest), None)
-                if fault is not None:
-                    raise LogError(f"{self.name} holds no sample: {fault}")
+                raise self._without_objects(walk, fault)
+            if not decoder.any_sample and window == (0, AFTER_ALL_NS) and fault is not None:
+                raise LogError(f"{self.name} holds no sample: {fault}")
             if rest:
                 yield Block(replace(Trace.from_samples(()), faults=rest))
 
@@ -226,10 +224,6 @@ class ChunkWalk:
         self.faults.add(f"{self._name}: at byte {place.offset}: {what}")
 
 
-def _is_copied(topic: str) -> bool:
-    return topic not in DERIVED
-
-
 def _blocks(
     walk: ChunkWalk, window: tuple[int, int], is_wanted: Callable[[str], bool]
 ) -> Iterator[list[RawMessage]]:
@@ -308,14 +302,13 @@ class _BlockDecoder:
         return True
 
     def _columns(self, messages: list[RawMessage]) -> Messages:
-        copied = {
-            number: channel for number, channel in self._walk.channels.items() if channel.topic not in DERIVED
-        }
+        declared = self._walk.channels.items()
+        copied = MappingProxyType({n: each for n, each in declared if each.topic not in DERIVED})
         if not messages:
-            return Messages(MappingProxyType(copied))
+            return Messages(copied)
         log_time_ns, channel, sequence, publish_time_ns, payloads = zip(*messages, strict=True)
         return Messages(
-            channels=MappingProxyType(copied),
+            channels=copied,
             channel=np.array(channel, np.int64),
             sequence=np.array(sequence, np.int64),
             log_time_ns=np.array(log_time_ns, np.int64),

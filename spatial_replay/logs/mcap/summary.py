@@ -85,8 +85,7 @@ def summarise_mcap(source: McapSource) -> LogSummary:
             channels=tuple(sorted(channels, key=lambda each: each.channel.topic)),
             metadata=tuple(iter_metadata(*opened)),
             attachments=tuple(
-                AttachmentSummary(each.name, each.media_type, len(each.data))
-                for each in iter_attachments(*opened)
+                AttachmentSummary(a.name, a.media_type, len(a.data)) for a in iter_attachments(*opened)
             ),
             faults=walk.faults.take(last=True),
         )

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Self
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 import zstandard
@@ -21,7 +21,7 @@ from spatial_replay.errors import OutputError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.chunks import MAGIC, encoded
 from spatial_replay.logs.mcap.packing import Batch, McapSummary, MessageRange, PackedChunk, pack
-from spatial_replay.logs.messages import Channel, Messages, Schema
+from spatial_replay.logs.messages import Channel, Messages, Schema, messages_of
 from spatial_replay.logs.output_file import output_error
 
 CHUNK_BYTES = 128 * 2**10
@@ -89,19 +89,13 @@ class LogWriter:
 
     def write(self, channel: Channel, log_time_ns: int, payload: bytes, *, sequence: int = 0) -> None:
         """Add one message, published at its log time."""
-        time = np.array([log_time_ns], np.int64)
-        number = np.zeros(1, np.int64)
-        self.write_messages(
-            Messages({0: channel}, number, np.array([sequence], np.int64), time, time, (payload,))
-        )
+        self.write_messages(messages_of(channel, np.array([log_time_ns], np.int64), (payload,), sequence))
 
     def write_messages(self, messages: Messages) -> None:
         """Add messages in the order given; a channel is declared before its first one."""
         if not len(messages):
             return
-        numbers, declared = self._numbers(messages)
-        batch = Batch.of(messages, numbers, declared)
-        self._divide(batch, messages.log_time_ns)
+        self._divide(Batch.of(messages, *self._numbers(messages)), messages.log_time_ns)
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
         """Add a metadata record, its keys in the order given, after closing the chunk."""
@@ -112,21 +106,15 @@ class LogWriter:
     def add_attachment(self, name: str, media_type: str, data: bytes, *, log_time_ns: int = 0) -> None:
         """Add an attachment, after closing the chunk; its time of creation is left open."""
         self.flush()
-        record = records.Attachment(
-            create_time=0, log_time=log_time_ns, name=name, media_type=media_type, data=data
-        )
-        offset, length = self._write_record(record)
-        self._summary.attachments.append(
-            records.AttachmentIndex(
-                offset=offset,
-                length=length,
-                log_time=log_time_ns,
-                create_time=0,
-                data_size=len(data),
-                name=name,
-                media_type=media_type,
-            )
-        )
+        about: dict[str, Any] = {
+            "create_time": 0,
+            "log_time": log_time_ns,
+            "name": name,
+            "media_type": media_type,
+        }
+        offset, length = self._write_record(records.Attachment(data=data, **about))
+        index = records.AttachmentIndex(offset=offset, length=length, data_size=len(data), **about)
+        self._summary.attachments.append(index)
 
     def flush(self) -> None:
         """Close the chunk and hand everything written so far to the operating system."""
@@ -163,13 +151,12 @@ class LogWriter:
         declaration = b""
         schema = channel.schema
         if schema is not None and schema not in self._schemas:
-            number = len(self._schemas) + 1
-            self._schemas[schema] = number
-            schema_record = records.Schema(
+            number = self._schemas[schema] = len(self._schemas) + 1
+            described = records.Schema(
                 id=number, data=schema.data, encoding=schema.encoding, name=schema.name
             )
-            self._summary.schemas.append(schema_record)
-            declaration += encoded(schema_record)
+            self._summary.schemas.append(described)
+            declaration += encoded(described)
         self._channels[channel] = len(self._channels) + 1
         record = records.Channel(
             id=self._channels[channel],
@@ -217,23 +204,19 @@ class LogWriter:
         """Write chunks in their order until no more than `waiting` are left, and those that are ready."""
         while self._packing and (len(self._packing) > waiting or self._packing[0].done()):
             chunk = self._packing.popleft().result()
-            self._summary.add_chunk(
-                records.ChunkIndex(
-                    chunk_length=len(chunk.record),
-                    chunk_start_offset=self._offset,
-                    compression="zstd",
-                    compressed_size=chunk.compressed_size,
-                    message_end_time=chunk.end_ns,
-                    message_index_length=len(chunk.index),
-                    message_index_offsets={
-                        channel: self._offset + len(chunk.record) + offset
-                        for channel, offset in chunk.index_offsets.items()
-                    },
-                    message_start_time=chunk.start_ns,
-                    uncompressed_size=chunk.uncompressed_size,
-                ),
-                chunk.counts,
+            following = self._offset + len(chunk.record)
+            index = records.ChunkIndex(
+                chunk_length=len(chunk.record),
+                chunk_start_offset=self._offset,
+                compression="zstd",
+                compressed_size=chunk.compressed_size,
+                message_end_time=chunk.end_ns,
+                message_index_length=len(chunk.index),
+                message_index_offsets={n: following + place for n, place in chunk.index_offsets.items()},
+                message_start_time=chunk.start_ns,
+                uncompressed_size=chunk.uncompressed_size,
             )
+            self._summary.add_chunk(index, chunk.counts)
             self._write(chunk.record)
             self._write(chunk.index)
             self._flush_stream()

@@ -93,12 +93,8 @@ def layout_of(message: ObjectStates) -> SlotLayout:
     signals = {signal.name: slots.next_if(signal.HasField("value"), ZERO) for signal in message.signals}
     if "" in signals or len(signals) < len(message.signals):
         raise WrongMessageError("a signal has no name, or one that another signal has")
-    stated = [
-        (slot, index)
-        for index, state in enumerate(objects)
-        for slot in (state.yaw, state.bottom, state.top)
-        if slot != UNKNOWN
-    ]
+    slots_by = [(slot, index) for index, s in enumerate(objects) for slot in (s.yaw, s.bottom, s.top)]
+    stated = [(slot, index) for slot, index in slots_by if slot != UNKNOWN]
     return SlotLayout(
         time=time,
         names=tuple(state.name for state in message.objects),
@@ -345,11 +341,10 @@ def _observations(groups: Sequence[_Group], times_ns: Integers) -> Observations:
         return np.concatenate([np.empty(0, np.int64), *tiled])
 
     signals = sorted({name for g in groups for name in g.layout.signals})
+    samples = (np.repeat(g.samples, len(g.layout.names)) for g in groups)
     return Observations(
         times_ns=times_ns,
-        sample=np.concatenate(
-            [np.empty(0, np.int64), *(np.repeat(g.samples, len(g.layout.names)) for g in groups)]
-        ),
+        sample=np.concatenate([np.empty(0, np.int64), *samples]),
         name=repeated((g, [names[n] for n in g.layout.names]) for g in groups),
         names=list(names),
         class_code=repeated((g, [classes[c] for c in g.layout.classes]) for g in groups),

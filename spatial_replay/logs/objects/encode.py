@@ -23,9 +23,8 @@ def encode_objects(trace: Trace) -> list[bytes]:
     times = _pieces(ObjectStates(time_ns=0), trace.times_ns.view(np.float64)[:, None])
     objects = _object_pieces(trace)
     begins = starts_from_counts(np.count_nonzero(trace.rows != ABSENT, axis=1)).tolist()
-    signals = list(
-        zip(*(_signal_pieces(name, values) for name, values in trace.signals.items()), strict=True)
-    )
+    columns = [_signal_pieces(name, values) for name, values in trace.signals.items()]
+    signals = list(zip(*columns, strict=True))
     return [
         b"".join((time, *objects[begins[index] : begins[index + 1]], *(signals[index] if signals else ())))
         for index, time in enumerate(times)
@@ -42,9 +41,8 @@ def _object_pieces(trace: Trace) -> list[bytes]:
     for places in _equal(_combined([name, marked < 0, _row_layout(trace)[rows]], len(rows))):
         first = int(places[0])
         message = _message(trace, int(name[first]), int(rows[first]), unreadable=bool(marked[first] < 0))
-        for place, piece in zip(
-            places.tolist(), _pieces(message, _numbers(trace, message, rows[places])), strict=True
-        ):
+        encoded = _pieces(message, _numbers(trace, message, rows[places]))
+        for place, piece in zip(places.tolist(), encoded, strict=True):
             pieces[place] = piece
     return pieces
 
