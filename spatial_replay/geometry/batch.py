@@ -125,6 +125,4 @@ class FootprintBatch:
 
     def height(self, row: int) -> tuple[float, float] | None:
         """Return the height interval (bottom, top) of one row, or None."""
-        if np.isnan(self.bottom[row]):
-            return None
-        return float(self.bottom[row]), float(self.top[row])
+        return None if np.isnan(self.bottom[row]) else (float(self.bottom[row]), float(self.top[row]))

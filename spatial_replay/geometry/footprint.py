@@ -96,10 +96,8 @@ class Footprint:
             GeometryError: coordinates that are not finite, a minimum above its maximum.
         """
         if xmin > xmax or ymin > ymax:
-            raise GeometryError(
-                f"box({xmin}, {ymin}, {xmax}, {ymax}) has its least corner above its greatest; "
-                "give xmin, ymin, xmax, ymax"
-            )
+            what = f"box({xmin}, {ymin}, {xmax}, {ymax}) has its least corner above its greatest"
+            raise GeometryError(f"{what}; give xmin, ymin, xmax, ymax")
         return cls.polygon([(xmin, ymin), (xmax, ymin), (xmax, ymax), (xmin, ymax)])
 
     @classmethod

@@ -17,19 +17,9 @@ from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.kernels import measure_rows
 
 Quantity: TypeAlias = Literal[
-    "signed_distance",
-    "protrusion",
-    "min_x",
-    "max_x",
-    "min_y",
-    "max_y",
-    "min_z",
-    "max_z",
-    "centroid_min_x",
-    "centroid_max_x",
-    "centroid_min_y",
-    "centroid_max_y",
-]
+    "signed_distance", "protrusion", "min_x", "max_x", "min_y", "max_y", "min_z", "max_z",
+    "centroid_min_x", "centroid_max_x", "centroid_min_y", "centroid_max_y",
+]  # fmt: skip
 
 # kernels address a quantity by its position in the list above
 QUANTITY_CODES: Mapping[str, int] = MappingProxyType(
@@ -117,13 +107,13 @@ def _check_request(request: MeasureRequest, operand_count: int) -> None:
     needed = [request.first, request.second] if request.quantity in _BETWEEN_TWO else [request.first]
     for index in needed:
         if not 0 <= index < operand_count:
-            raise GeometryError(
-                f"{request.quantity} asks for operand {index}; there are {operand_count}, from 0"
-            )
+            asked = f"{request.quantity} asks for operand {index}"
+            raise GeometryError(f"{asked}; there are {operand_count}, from 0")
 
 
 def misalignment(first: Floats, second: Floats) -> Floats:
     """Return half the squared distance of unit vectors at two angles (Def. 10, 11): 1 - cos(difference).
+
     Args:
         first, second: (T,) radians; NaN for no orientation, which makes the result NaN.
     """

@@ -75,9 +75,9 @@ def automaton_svg(automaton: Automaton) -> str | None:
 
 
 def _is_large(automaton: Automaton) -> bool:
-    if len(automaton.states) > _MOST_STATES:
-        return True
-    return sum(len(each.guard) for each in automaton.transitions) > _MOST_CUBES
+    # the transitions of an automaton with very many states take long to find
+    too_many = len(automaton.states) > _MOST_STATES
+    return too_many or sum(len(each.guard) for each in automaton.transitions) > _MOST_CUBES
 
 
 @plot.register(Automaton)

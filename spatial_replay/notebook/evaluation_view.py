@@ -77,15 +77,11 @@ def _robustness_text(value: float, lower: float, upper: float) -> str:
 
 
 def _results_table(results: Sequence[SpecResult]) -> Html:
-    rows = [
-        (
-            element("b", _title_of(each)),
-            verdict_mark(each.verdict),
-            _robustness_text(each.robustness, each.lower, each.upper),
-            _first_satisfied(each),
-        )
-        for each in results
-    ]
+    rows = []
+    for each in results:
+        robustness = _robustness_text(each.robustness, each.lower, each.upper)
+        name, verdict = element("b", _title_of(each)), verdict_mark(each.verdict)
+        rows.append((name, verdict, robustness, _first_satisfied(each)))
     return table(["result", "verdict", "robustness", "first satisfied"], rows)
 
 
@@ -153,10 +149,8 @@ def draw_evaluation(evaluation: Evaluation, ax: Axes | Iterable[Axes] | None = N
     for panel in panels:
         panel.label_outer()
     if len(shown) < len(evaluation.results):
-        left_out = len(evaluation.results) - len(shown)
-        panels[-1].set_xlabel(
-            f"{panels[-1].get_xlabel()}\nand {counted(left_out, 'result')} more, none worse"
-        )
+        left_out = counted(len(evaluation.results) - len(shown), "result")
+        panels[-1].set_xlabel(f"{panels[-1].get_xlabel()}\nand {left_out} more, none worse")
     return panels
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from spatial_replay.errors import UsageError
 from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
@@ -36,9 +36,12 @@ def new_panels(
     Raises:
         UsageError: matplotlib is not installed.
     """
-    _, grid = _pyplot().subplots(
-        rows, columns, figsize=size, squeeze=False, sharex=same_x, layout="constrained"
-    )
+    try:
+        from matplotlib import pyplot
+    except ImportError:
+        remedy = "pip install 'spatial-replay[notebook]'"
+        raise UsageError(f"figures need matplotlib, which is not installed: {remedy}") from None
+    _, grid = pyplot.subplots(rows, columns, figsize=size, squeeze=False, sharex=same_x, layout="constrained")
     return tuple(grid.flat)
 
 
@@ -77,16 +80,6 @@ def draw_disc(ax: Axes, centre: tuple[float, float], radius: float, colour: str)
 def plain(text: str, longest: int = 72) -> str:
     """Return text without special meaning for matplotlib, cut after `longest` characters."""
     return printable(text, longest).replace("$", r"\$")
-
-
-def _pyplot() -> Any:
-    try:
-        from matplotlib import pyplot
-    except ImportError:
-        raise UsageError(
-            "figures need matplotlib, which is not installed: pip install 'spatial-replay[notebook]'"
-        ) from None
-    return pyplot
 
 
 _VERDICT_COLOURS: Final[Mapping[str, tuple[float, float, float]]] = MappingProxyType(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from textwrap import wrap
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -82,9 +82,8 @@ def draw_map(
         UsageError: matplotlib is not installed.
     """
     ax = new_panel((6.4, 5.2)) if ax is None else ax
-    image = _draw_cells(
-        gradient, ax, _best_turn(gradient, target) if turn is None else turn, _reach_of([gradient])
-    )
+    turn = _best_turn(gradient, target) if turn is None else turn
+    image = _draw_cells(gradient, ax, turn, _reach_of([gradient]))
     _draw_objects(ax, sample, gradient.name)
     if target is not None:
         _draw_target(ax, target, sample)
@@ -93,9 +92,8 @@ def draw_map(
     ax.set_xlabel("x in the unit of the log")
     ax.set_ylabel("y in the unit of the log")
     if keys := _hatch_keys(ax, [gradient]):
-        ax.legend(
-            handles=keys, loc="upper left", bbox_to_anchor=(0.0, -0.14), ncols=2, frameon=False, fontsize=8.5
-        )
+        place = (0.0, -0.14)
+        ax.legend(handles=keys, loc="upper left", bbox_to_anchor=place, ncols=2, frameon=False, fontsize=8.5)
     return ax
 
 
@@ -161,13 +159,9 @@ def _draw_target(ax: Axes, target: Target, sample: Sample | None) -> None:
 def _hatch_keys(ax: Axes, maps: Sequence[GradientMap]) -> list[Artist]:
     """Return the legend's entries for the hatches in some maps."""
     reasons = np.unique(np.concatenate([gradient.blocked.ravel() for gradient in maps])).tolist()
-    return [
-        ax.fill([], [], facecolor=_BLOCKED, edgecolor=_HATCH, hatch=_HATCHES[reason], label=REASONS[reason])[
-            0
-        ]
-        for reason in reasons
-        if reason != FREE
-    ]
+    style: dict[str, Any] = {"facecolor": _BLOCKED, "edgecolor": _HATCH}
+    filled = (ax.fill([], [], hatch=_HATCHES[r], label=REASONS[r], **style) for r in reasons if r != FREE)
+    return [entry for (entry,) in filled]
 
 
 def _draw_footprint(ax: Axes, footprint: Footprint, width: float, style: str = "-") -> None:
@@ -184,9 +178,8 @@ def step_html(step: Step) -> Html:
     shown = step.considered[-_MOST_EDGES:]
     left_out = len(step.considered) - len(shown)
     more = [element("div", quiet(f"{left_out} edges before were given up, too"))] if left_out else []
-    return element(
-        "div", element("div", title, place), element("div", step.reason), *more, *map(_edge, shown)
-    )
+    lines = element("div", title, place), element("div", step.reason)
+    return element("div", *lines, *more, *map(_edge, shown))
 
 
 @plot.register(Step)
@@ -241,11 +234,8 @@ def _draw_candidate(
     _draw_objects(ax, sample, candidate.name)
     if candidate.target is not None:
         _draw_target(ax, candidate.target, sample)
-    ax.set_title(
-        plain(f"{_arrow(edge)}: move {candidate.name}?") + "\n" + _choice_text(candidate),
-        fontsize=9,
-        loc="left",
-    )
+    question = plain(f"{_arrow(edge)}: move {candidate.name}?")
+    ax.set_title(f"{question}\n{_choice_text(candidate)}", fontsize=9, loc="left")
     ax.tick_params(labelsize=7.5)
     return image
 

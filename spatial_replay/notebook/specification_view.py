@@ -33,15 +33,9 @@ def specification_html(specification: Specification) -> Html:
     title = element("b", specification.filename)
     results = specification.results
     about = quiet(f" {counted(len(results), 'result')}, profile {specification.profile}")
-    declared = [
-        element("div", f"{kind}: {', '.join(names)}")
-        for kind, names in (
-            ("constants", specification.constants),
-            ("regions", specification.regions),
-            ("groups", specification.groups),
-        )
-        if names
-    ]
+    kinds = ("constants", "regions", "groups")
+    names = {kind: ", ".join(getattr(specification, kind)) for kind in kinds}
+    declared = [element("div", f"{kind}: {listed}") for kind, listed in names.items() if listed]
     warnings = [element("div", f"warning: {each.message}") for each in specification.warnings[:5]]
     return element("div", element("div", title, about), *declared, _trees(results), *warnings)
 

@@ -30,11 +30,10 @@ def setting_by_tree(scene: Scene, goals: Mapping[str, Goal]) -> Generator[None, 
     blackboard = _Blackboard()
     tasks = [_task(scene, name, goal, blackboard) for name, goal in goals.items()]
     tree = Sequence("set", memory=True, children=tasks)
-    while True:
-        tree.tick_once()
-        if tree.status is not Status.RUNNING:
-            break
+    tree.tick_once()
+    while tree.status is Status.RUNNING:
         yield
+        tree.tick_once()
     succeeded = tree.status is Status.SUCCESS
     done = f"placed {', '.join(goals)}"
     if blackboard.failures:
@@ -69,20 +68,11 @@ def _task(scene: Scene, name: str, goal: Goal, blackboard: _Blackboard) -> Behav
         "place": lambda: set_down(scene, name, point),
         "leave": leave,
     }
-    leaves: list[Behaviour] = [
-        _Moving(f"{verb} {name}", motion, blackboard) for verb, motion in steps.items()
-    ]
-    attempt = Selector(
-        f"bring {name}",
-        memory=True,
-        children=[
-            _Placed(scene, name, goal),
-            Sequence(
-                f"move {name}", memory=True, children=[_Detecting(scene, name, goal, blackboard), *leaves]
-            ),
-            _Moving(f"recover {name}", recover, None),
-        ],
-    )
+    leaves = (_Moving(f"{verb} {name}", motion, blackboard) for verb, motion in steps.items())
+    stages = [_Detecting(scene, name, goal, blackboard), *leaves]
+    move = Sequence(f"move {name}", memory=True, children=stages)
+    options = [_Placed(scene, name, goal), move, _Moving(f"recover {name}", recover, None)]
+    attempt = Selector(f"bring {name}", memory=True, children=options)
     return Retry(f"try {name}", attempt, num_failures=_ATTEMPTS)
 
 

@@ -75,7 +75,6 @@ class Engine:
         self,
         name: str,
         shape: Shape,
-        *,
         mass: float,
         position: tuple[float, float, float],
         yaw: float,

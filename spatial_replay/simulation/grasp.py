@@ -124,7 +124,5 @@ def _room(scene: Scene, name: str, place: Point, turn: float, grasp: Grasp, bott
     tool = bottom + grasp.above_bottom
     fingers = rectangle(*place, FINGER_DEPTH, grasp.opening + 2 * FINGER_WIDTH, turn)
     hand = rectangle(*place, _HAND_DEPTH, _HAND_WIDTH, turn)
-    return min(
-        scene.clearance(fingers, name, above=tool - FINGERTIP),
-        scene.clearance(hand, name, above=tool + _HAND_ABOVE),
-    )
+    around_fingers = scene.clearance(fingers, name, above=tool - FINGERTIP)
+    return min(around_fingers, scene.clearance(hand, name, above=tool + _HAND_ABOVE))

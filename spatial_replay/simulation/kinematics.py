@@ -51,9 +51,8 @@ def downwards(yaw: float) -> Floats:
 def joints_for(position: Floats, rotation: Floats, start: Floats, steps: int = _STEPS) -> Floats:
     """Return joints (7,) that bring the tool near a pose, by damped least squares from `start`.
 
-    The arm is redundant; its free motion tends to the rest position. A pose out of reach is approached as far
-    as
-    possible: compare with `tool_frame` of the result if that matters.
+    The arm is redundant; its free motion tends to the rest position. A pose out of reach is approached as
+    far as possible: compare with `tool_frame` of the result if that matters.
     """
     joints = start
     for _ in range(steps):

@@ -43,11 +43,9 @@ def pushing(scene: Scene, name: str, path: Sequence[Point]) -> Generator[None, N
         if trouble:
             return Execution(False, trouble)
     trouble = yield from _push_to(scene, name, corners[-1], strokes=_STROKES, allowed=_FAR)
-    return Execution(not trouble, trouble or f"pushed {name} {_along(len(corners))}")
-
-
-def _along(stretches: int) -> str:
-    return "straight to its place" if stretches == 1 else f"along {stretches} straight stretches"
+    is_straight = len(corners) == 1
+    way = "straight to its place" if is_straight else f"along {len(corners)} straight stretches"
+    return Execution(not trouble, trouble or f"pushed {name} {way}")
 
 
 def _push_to(

@@ -62,13 +62,12 @@ class Tabletop:
             raise UsageError(f"the noise is {noise_m} m; give 0 or more")
         for injection in injections:
             if injection.kind == "drop" and scenario.skill == "push":
-                raise UsageError(
-                    f"{injection}: nothing is held in {scenario.name}; slip can be injected there"
-                )
+                what = f"nothing is held in {scenario.name}"
+                raise UsageError(f"{injection}: {what}; slip can be injected there")
         self._scenario = scenario
         self._noise_m = noise_m
         self._injections = tuple(injections)
-        self._listen: Callable[[Sample], None] = _ignore
+        self._listen: Callable[[Sample], None] = lambda sample: None
         self._gui = gui
         self._engine: Engine | None = None
         self.reset(seed)
@@ -125,14 +124,8 @@ class Tabletop:
             dx, dy, turn = (drawn.random(3) * 2 - 1).tolist()
             tall = each.body.shape.height
             x, y = each.x + dx * scenario.scatter_m, each.y + dy * scenario.scatter_m
-            engine.add(
-                each.body.name,
-                each.body.shape,
-                mass=each.mass_kg,
-                position=(x, y, each.bottom + tall / 2 + 5e-4),
-                yaw=each.yaw + turn * scenario.scatter_rad,
-                colour=each.colour,
-            )
+            place, yaw = (x, y, each.bottom + tall / 2 + 5e-4), each.yaw + turn * scenario.scatter_rad
+            engine.add(each.body.name, each.body.shape, each.mass_kg, place, yaw, each.colour)
         bodies = {each.body.name: each.body for each in scenario.placements}
         self._scene = Scene(engine, Arm(engine), MappingProxyType(bodies))
         self._scene.arm.drive()
@@ -270,10 +263,6 @@ class Tabletop:
             raise UsageError(f"{name!r} cannot be moved in {self.name}; {', '.join(movable)} can")
         if not numbers or not all(map(math.isfinite, numbers)):
             raise UsageError(f"{name} cannot be moved to {list(numbers)}; give finite numbers")
-
-
-def _ignore(sample: Sample) -> None:
-    """Ignore samples, while no listener is attached."""
 
 
 def _displacements(radius_m: float, seed: int, sample: int, count: int) -> list[tuple[float, float]]:

@@ -70,8 +70,7 @@ def open_source(
             return format_.open(path, kind, options)
     if not head:
         raise LogError(f"{path.name} is empty; give a log with at least one sample")
-    known = ", ".join(FORMATS)
-    raise LogError(f"{path.name} is not a log in a known format; known formats are {known}")
+    raise LogError(f"{path.name} is not a log in a known format; known formats are {', '.join(FORMATS)}")
 
 
 def read_trace(

@@ -118,10 +118,9 @@ def _ordered(observed: Observations) -> Observations:
 
 def _duplicates(observed: Observations) -> dict[int, str]:
     again = (observed.sample[1:] == observed.sample[:-1]) & (observed.name[1:] == observed.name[:-1])
+    what = "is there twice; name each object once"
     return {
-        int(
-            observed.sample[row]
-        ): f"object {observed.names[observed.name[row]]!r} is there twice; name each object once"
+        int(observed.sample[row]): f"object {observed.names[observed.name[row]]!r} {what}"
         for row in np.flatnonzero(again).tolist()
     }
 
@@ -144,25 +143,20 @@ def _finite(observed: Observations) -> Booleans:
 def _wrong_numbers(observed: Observations, readable: Booleans) -> dict[int, str]:
     shapes = observed.shapes
     with np.errstate(invalid="ignore"):
+        empty_parts = count_in_rows(np.diff(shapes.vertex_start) == 0, shapes.part_start)
+        negative_parts = count_in_rows(shapes.radius < 0, shapes.part_start)
         checks = (
             (np.diff(shapes.part_start) == 0, "has no footprint; give it a polygon or parts"),
-            (
-                count_in_rows(np.diff(shapes.vertex_start) == 0, shapes.part_start) > 0,
-                "has a part without vertices; give each part at least one",
-            ),
-            (
-                count_in_rows(shapes.radius < 0, shapes.part_start) > 0,
-                "has a part with a negative radius; give a radius of at least 0",
-            ),
+            (empty_parts > 0, "has a part without vertices; give each part at least one"),
+            (negative_parts > 0, "has a part with a negative radius; give a radius of at least 0"),
             (observed.uncertainty < 0, "has a negative uncertainty; give a radius of at least 0"),
             (shapes.bottom > shapes.top, "has a height whose bottom is above its top; give [bottom, top]"),
         )
     faults: dict[int, str] = {}
     for wrong, what in checks:
         for row in np.flatnonzero(wrong & readable).tolist():
-            faults.setdefault(
-                int(observed.sample[row]), f"object {observed.names[observed.name[row]]!r} {what}"
-            )
+            name = observed.names[observed.name[row]]
+            faults.setdefault(int(observed.sample[row]), f"object {name!r} {what}")
     return faults
 
 
@@ -184,10 +178,8 @@ def _normalised(
         try:
             pieces[part] = Footprint.polygon(polygon, concave=concave)
         except GeometryError as error:
-            row = int(owner[part])
-            faults.setdefault(
-                int(observed.sample[row]), f"object {observed.names[observed.name[row]]!r}: {error}"
-            )
+            name = observed.names[observed.name[owner[part]]]
+            faults.setdefault(int(observed.sample[owner[part]]), f"object {name!r}: {error}")
     return _with_pieces(shapes, pieces) if pieces else shapes, faults
 
 
