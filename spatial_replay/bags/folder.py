@@ -114,24 +114,20 @@ class BagFolder(MessageReader):
         return self._metadata.distribution if self._metadata else None
 
     def topics(self) -> tuple[Topic, ...]:
-        """See `MessageReader.topics`; a folder may declare none."""
         return self._topics
 
     def take_faults(self) -> tuple[str, ...]:
-        """See `MessageReader.take_faults`."""
         return (
             tuple(fault for each in self._opened_files() for fault in each.take_faults())
             + self._faults.take()
         )
 
     def move_faults(self, other: FaultList) -> None:
-        """See `MessageReader.move_faults`."""
         for each in self._opened_files():
             each.move_faults(other)
         self._faults.move_to(other)
 
     def take_remarks(self) -> tuple[str, ...]:
-        """See `MessageReader.take_remarks`."""
         return (
             tuple(remark for each in self._opened_files() for remark in each.take_remarks())
             + self._remarks.take()
@@ -154,7 +150,6 @@ class BagFolder(MessageReader):
         return columns
 
     def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
-        """See `MessageReader.channels`; those of its files, one file after the other."""
         return {
             first + number: channel
             for first, file in zip(self._first_channels, self._files, strict=True)
@@ -162,11 +157,9 @@ class BagFolder(MessageReader):
         }
 
     def attachments(self) -> tuple[Attachment, ...]:
-        """See `MessageReader.attachments`."""
         return tuple(each for file in self._files for each in file.attachments())
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
-        """See `MessageReader.metadata`."""
         return tuple(each for file in self._files for each in file.metadata())
 
     @cached_property

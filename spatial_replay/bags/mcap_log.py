@@ -105,7 +105,6 @@ class McapLog(MessageReader):
                 )
 
     def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
-        """See `MessageReader.channels`; they are as the log declares them, whatever they lack."""
         declared = self._contents[1]
         return {
             rank: declared[number]
@@ -114,12 +113,10 @@ class McapLog(MessageReader):
         }
 
     def attachments(self) -> tuple[Attachment, ...]:
-        """See `MessageReader.attachments`."""
         with self._path.open("rb") as stream:
             return tuple(iter_attachments(stream, self._contents[0], FaultList(), self.name))
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
-        """See `MessageReader.metadata`."""
         with self._path.open("rb") as stream:
             return tuple(iter_metadata(stream, self._contents[0], FaultList(), self.name))
 

@@ -76,7 +76,6 @@ class Ros1Bag(MessageReader):
             )
 
     def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
-        """See `MessageReader.channels`; each connection is a channel."""
         return {
             rank: channel_of(self._topic(self._directory.connections[number], 0))
             for rank, number in enumerate(self._numbers.tolist())

@@ -87,7 +87,6 @@ class SqliteBag(MessageReader):
         return start_ns if isinstance(start_ns, int) else None
 
     def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
-        """See `MessageReader.channels`."""
         described = self._tables.topics
         return {
             rank: channel_of(described[number], self._distribution)

@@ -35,7 +35,7 @@ _Result = TypeVar("_Result")
 
 
 class Tabletop:
-    """The world of a scenario; see `World`.
+    """The world of a scenario; `World` documents the methods that all worlds have.
 
     Raises:
         UsageError: the simulator is not installed, the noise is below 0, or an injection is impossible.
@@ -74,32 +74,26 @@ class Tabletop:
 
     @property
     def name(self) -> str:
-        """See `World`."""
         return self._scenario.name
 
     @property
     def skill(self) -> Skill:
-        """See `World`."""
         return self._scenario.skill
 
     @property
     def bodies(self) -> tuple[Body, ...]:
-        """See `World`."""
         return tuple(each.body for each in self._scenario.placements)
 
     @property
     def workspace(self) -> ReachableArea:
-        """See `World`."""
         return self._scenario.workspace
 
     @property
     def obstacles(self) -> tuple[Footprint, ...]:
-        """See `World`."""
         return ()
 
     @property
     def time_ns(self) -> int:
-        """See `World`."""
         return self._ticks * 10**9 // TICKS_PER_S
 
     @property
@@ -108,11 +102,9 @@ class Tabletop:
         return self._scene
 
     def attach(self, listen: Callable[[Sample], None]) -> None:
-        """See `World`."""
         self._listen = listen
 
     def reset(self, seed: int) -> None:
-        """See `World`."""
         if seed < 0:
             raise UsageError(f"the seed is {seed}; give 0 or more")
         self.close()
@@ -133,7 +125,6 @@ class Tabletop:
             engine.step()
 
     def sample(self) -> Sample:
-        """See `World`."""
         self._open_engine()
         number = self._ticks // _TICKS_PER_SAMPLE
         errors = _displacements(self._noise_m, self._seed, number, len(self._scene.bodies))
@@ -146,16 +137,13 @@ class Tabletop:
         return Sample(self.time_ns, objects, signals)
 
     def step(self) -> None:
-        """See `World`."""
         self.run(self._scene.arm.wait(1 / SAMPLES_PER_S))
 
     def push(self, name: str, path: Sequence[tuple[float, float]]) -> Execution:
-        """See `World`."""
         self._refuse_unless("push", name, [number for point in path for number in point])
         return self.run(pushing(self._scene, name, path))
 
     def place(self, name: str, x: float, y: float, yaw: float | None = None) -> Execution:
-        """See `World`."""
         self._refuse_unless("place", name, [x, y, 0.0 if yaw is None else yaw])
         return self.run(self._scenario.placing(self._scene, name, (x, y), yaw))
 
@@ -214,7 +202,6 @@ class Tabletop:
         self._emit()
 
     def close(self) -> None:
-        """See `World`."""
         if self._engine is not None:
             self._engine.close()
             self._engine = None

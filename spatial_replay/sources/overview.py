@@ -276,17 +276,8 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
 def overview_of_survey(path: Path, survey: Survey) -> Overview:
     """Return what an external log holds, of which nothing says yet what its samples are."""
     container = summarise_mcap(McapSource(path)) if survey.kind == McapSource.kind else None
-    return Overview(
-        name=survey.name,
-        kind=survey.kind,
-        samples=0,
-        start_ns=None,
-        end_ns=None,
-        objects=(),
-        signals=(),
-        faults=container.faults if container is not None else (),
-        container=container,
-    )
+    faults = container.faults if container is not None else ()
+    return Overview(survey.name, survey.kind, 0, None, None, (), (), faults, container)
 
 
 @dataclass(slots=True)
@@ -315,10 +306,8 @@ class _Tally:
             readable, unreadable = rows[rows >= 0], -2 - rows[rows <= -2]
             self.samples_with[name] += len(readable) + len(unreadable)
             self.unreadable[name] += len(unreadable)
-            codes = np.unique(trace.class_code[np.concatenate([readable, unreadable])])
-            self.classes[name].update(
-                class_name for code in codes.tolist() if (class_name := trace.classes[code]) is not None
-            )
+            codes = np.unique(trace.class_code[np.concatenate([readable, unreadable])]).tolist()
+            self.classes[name].update(each for code in codes if (each := trace.classes[code]) is not None)
 
     def objects(self) -> tuple[ObjectOverview, ...]:
         return tuple(

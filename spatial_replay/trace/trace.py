@@ -100,52 +100,38 @@ class Trace:
             TraceError: times that do not increase.
         """
         listed = list(samples)
-        times = [sample.time_ns for sample in listed]
         names = tuple(sorted({name for sample in listed for name in sample.objects}))
         number = {name: index for index, name in enumerate(names)}
         rows = np.full((len(listed), len(names)), ABSENT, np.int64)
         observed: list[TrackedObject] = []
         for index, sample in enumerate(listed):
             for name in sorted(sample.objects):
+                tracked = sample.objects[name]
                 rows[index, number[name]] = len(observed)
-                observed.append(_tracked(sample.objects[name]))
+                observed.append(TrackedObject(tracked) if isinstance(tracked, Footprint) else tracked)
         classes = _class_order(tracked.class_name for tracked in observed)
         signals = sorted({name for sample in listed for name in sample.signals})
+        footprints, heights = [each.footprint for each in observed], [each.height for each in observed]
+        columns = {name: [sample.signals.get(name, np.nan) for sample in listed] for name in signals}
         return cls(
-            times_ns=np.array(times, np.int64),
+            times_ns=np.array([sample.time_ns for sample in listed], np.int64),
             names=names,
             rows=rows,
-            footprints=FootprintBatch.from_footprints(
-                [tracked.footprint for tracked in observed], [tracked.height for tracked in observed]
-            ),
-            yaw=np.array(
-                [np.nan if tracked.yaw is None else tracked.yaw for tracked in observed], np.float64
-            ),
-            uncertainty=np.array([tracked.uncertainty for tracked in observed], np.float64),
-            class_code=np.array([classes.index(tracked.class_name) for tracked in observed], np.int64),
+            footprints=FootprintBatch.from_footprints(footprints, heights),
+            yaw=np.array([np.nan if each.yaw is None else each.yaw for each in observed], np.float64),
+            uncertainty=np.array([each.uncertainty for each in observed], np.float64),
+            class_code=np.array([classes.index(each.class_name) for each in observed], np.int64),
             classes=classes,
-            signals={
-                name: np.array([sample.signals.get(name, np.nan) for sample in listed], np.float64)
-                for name in signals
-            },
+            signals={name: np.array(values, np.float64) for name, values in columns.items()},
         )
 
     def samples(self) -> Iterator[Sample]:
         """Iterate over the samples as objects, without unreadable observations and unknown signals."""
         for index, time_ns in enumerate(self.times_ns.tolist()):
-            yield Sample(
-                time_ns,
-                {
-                    name: self.observation(row)
-                    for name, row in zip(self.names, self.rows[index].tolist(), strict=True)
-                    if row >= 0
-                },
-                {
-                    name: float(values[index])
-                    for name, values in self.signals.items()
-                    if not np.isnan(values[index])
-                },
-            )
+            rows = zip(self.names, self.rows[index].tolist(), strict=True)
+            objects = {name: self.observation(row) for name, row in rows if row >= 0}
+            values = ((name, float(column[index])) for name, column in self.signals.items())
+            yield Sample(time_ns, objects, {name: value for name, value in values if value == value})
 
     def observation(self, row: int) -> TrackedObject:
         """Return the object that row `row` (at least 0) reports."""
@@ -257,11 +243,9 @@ def _check_shapes(trace: Trace) -> None:
     if list(trace.names) != sorted(set(trace.names)):
         raise TraceError(f"names are {trace.names}; give each once, in order of code points")
     for column in ("yaw", "uncertainty", "class_code"):
-        if getattr(trace, column).shape != (observations,):
-            raise TraceError(
-                f"{column} has the shape {getattr(trace, column).shape}; {observations} footprints need"
-                f" ({observations},)"
-            )
+        if (shape := getattr(trace, column).shape) != (observations,):
+            wanted = f"{observations} footprints need ({observations},)"
+            raise TraceError(f"{column} has the shape {shape}; {wanted}")
     if trace.rows.size and (trace.rows.max() >= observations or trace.rows.min() < -1 - observations):
         raise TraceError(f"a row number lies outside the {observations} observations")
     for name, values in trace.signals.items():
@@ -275,27 +259,20 @@ def _check_times(times_ns: Integers) -> None:
     late = np.flatnonzero(times_ns[1:] <= times_ns[:-1])
     if len(late):
         at = int(late[0])
-        raise TraceError(
-            f"sample {at + 1} is at {times_ns[at + 1]} ns and the one before it at {times_ns[at]} ns;"
-            " give times that increase"
-        )
+        what = f"sample {at + 1} is at {times_ns[at + 1]} ns and the one before it at {times_ns[at]} ns"
+        raise TraceError(f"{what}; give times that increase")
 
 
 def _same_samples(a: Trace, b: Trace) -> bool:
     if (a.names, a.classes, tuple(a.signals)) != (b.names, b.classes, tuple(b.signals)):
         return False
-    columns = ("times_ns", "rows", "class_code")
-    measures = ("yaw", "uncertainty")
+    columns = ("times_ns", "rows", "class_code", "yaw", "uncertainty")
     shapes = ("part_start", "vertex_start", "vertices", "radius", "bottom", "top")
-    return (
-        all(np.array_equal(getattr(a, name), getattr(b, name)) for name in columns)
-        and all(np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True) for name in measures)
-        and all(
-            np.array_equal(getattr(a.footprints, name), getattr(b.footprints, name), equal_nan=True)
-            for name in shapes
-        )
-        and all(np.array_equal(a.signals[name], b.signals[name], equal_nan=True) for name in a.signals)
-    )
+    pairs = [(getattr(a, name), getattr(b, name)) for name in columns]
+    pairs += [(getattr(a.footprints, name), getattr(b.footprints, name)) for name in shapes]
+    pairs += [(a.signals[name], b.signals[name]) for name in a.signals]
+    # only numbers with a point can be NaN
+    return all(np.array_equal(one, other, equal_nan=one.dtype.kind == "f") for one, other in pairs)
 
 
 def _renumber(rows: Integers) -> tuple[Integers, Integers]:
@@ -308,10 +285,6 @@ def _renumber(rows: Integers) -> tuple[Integers, Integers]:
     renumbered = np.full(rows.shape, ABSENT, np.int64)
     renumbered[present] = np.where(unreadable, -2 - number, number)
     return used, renumbered
-
-
-def _tracked(tracked: TrackedObject | Footprint) -> TrackedObject:
-    return TrackedObject(tracked) if isinstance(tracked, Footprint) else tracked
 
 
 def _class_order(classes: Iterable[str | None]) -> tuple[str | None, ...]:
