@@ -46,6 +46,8 @@ from spatial_replay.logs.topics import (
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
+from spatial_replay.monitor.vacuity import Vacuous
+from spatial_replay.monitor.verdict import final_verdict
 from spatial_replay.spec.formula import Outline, Specification, iter_nodes
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
@@ -131,20 +133,24 @@ class Annotator:
                 run.pass_over(block)
         return self._events(self._changes(blocks))
 
-    def end(self, time_ns: int, finals: Sequence[Floats]) -> list[Messages]:
-        """Return what to write after the last sample: the verdicts that were still pending.
+    def end(
+        self, time_ns: int, finals: Sequence[Floats], vacuous: Sequence[Sequence[Vacuous]] = ()
+    ) -> list[Messages]:
+        """Return what to write after the last sample: the verdicts that were still pending, and warnings.
 
         Args:
             time_ns: when the log ends, the last sample's time or later.
             finals: for each tree, (N, 2), lower and upper end of each node's value over the finished log.
+            vacuous: for each tree, the parts that decided nothing, if that is known.
         """
-        return self._events(
-            [
-                each
-                for reporter, final in zip(self._reporters, finals, strict=True)
-                for each in reporter.end(time_ns, final)
-            ]
-        )
+        events = [
+            each
+            for reporter, final in zip(self._reporters, finals, strict=True)
+            for each in reporter.end(time_ns, final)
+        ]
+        for reporter, final, parts in zip(self._reporters, finals, vacuous, strict=False):
+            events += reporter.vacuous(time_ns, parts, final_verdict(*final[0].tolist()))
+        return self._events(events)
 
     def specification(self) -> bytes:
         """Return the message of the specifications and the trees of their results."""
@@ -287,13 +293,14 @@ class AnnotatedEvaluation:
         """For each of `trees` (N, 2), lower and upper end of each node's value if the log ends here."""
         return [stream.final for stream in self.streams]
 
-    def end(self, time_ns: int) -> Messages:
+    def end(self, time_ns: int, vacuous: Sequence[Sequence[Vacuous]] = ()) -> Messages:
         """Return what to write after everything else of a log.
 
         Args:
             time_ns: that of its last sample or message, whichever is later.
+            vacuous: for each of `trees`, the parts that decided nothing, if that is known.
         """
-        return merge(self._annotator.end(time_ns, self.finals))
+        return merge(self._annotator.end(time_ns, self.finals, vacuous))
 
     @property
     def channels(self) -> tuple[Channel, ...]:

@@ -40,6 +40,7 @@ from spatial_replay.monitor.online.operators import looks_ahead
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.sentences import number_text
 from spatial_replay.monitor.stream import SeriesBlock
+from spatial_replay.monitor.vacuity import Vacuous
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, Specification, iter_nodes
@@ -113,6 +114,7 @@ class ReportedNode(NamedTuple):
         name: the spec's name.
         line: where the spec stands in its file, from 1; 0 if nowhere.
         below: its leaves.
+        requirement, sentence: the id of the requirement that the spec stands for, and its words, or None.
     """
 
     node: int
@@ -120,6 +122,8 @@ class ReportedNode(NamedTuple):
     name: str
     line: int
     below: LeavesBelow
+    requirement: str | None = None
+    sentence: str | None = None
 
 
 class PeriodText(NamedTuple):
@@ -207,6 +211,27 @@ class EventReporter:
             return []
         return [self._final_event(node, time_ns, self._last_ns, final) for node in self._states.pending]
 
+    def vacuous(self, time_ns: int, parts: Sequence[Vacuous], verdict: Verdict) -> list[EncodedEvent]:
+        """Return one warning for each part of the result that decided nothing.
+
+        Args:
+            time_ns: when the log ends.
+            verdict: of the result.
+        """
+        root = self._reported[0]
+        facts = self._facts(root) | {"verdict": str(verdict)}
+        return [
+            self._message(
+                root,
+                time_ns,
+                (time_ns, time_ns),
+                Log.WARNING,
+                facts | {"node": str(each.node or 0), "vacuous": each.reason, "part": each.text},
+                each.message,
+            )
+            for each in parts
+        ]
+
     def _deciding_leaf(self, node: int, period: Period, block: SeriesBlock) -> LeafValue | None:
         """Return the leaf that gives a period its worst number, if comparing numbers finds one."""
         if period.place < 0:
@@ -268,12 +293,24 @@ class EventReporter:
             before, sentence = past.period, f"{sentence} {past.sentence}"
             facts |= self._facts_of(before, past.witness, "_before")
             facts |= {"start_ns_before": str(before.start_ns), "end_ns_before": str(before.end_ns)}
-        event = Event(start_time=_stamp(period.start_ns), end_time=_stamp(period.end_ns))
-        for key, text in (facts | {"message": sentence}).items():
+        span = period.start_ns, period.end_ns
+        return self._message(reported, time_ns, span, _LEVELS[period.code], facts, sentence)
+
+    def _message(
+        self,
+        reported: ReportedNode,
+        time_ns: int,
+        span: tuple[int, int],
+        level: Log.Level.ValueType,
+        facts: Mapping[str, str],
+        sentence: str,
+    ) -> EncodedEvent:
+        event = Event(start_time=_stamp(span[0]), end_time=_stamp(span[1]))
+        for key, text in {**facts, "message": sentence}.items():
             event.metadata.add(key=key, value=text)
         log = Log(
             timestamp=_stamp(time_ns),
-            level=_LEVELS[period.code],
+            level=level,
             message=sentence,
             name=reported.name,
             file=self._filename,
@@ -299,7 +336,14 @@ class EventReporter:
 
     def _facts(self, reported: ReportedNode) -> dict[str, str]:
         of = {} if self._tree.object is None else {"object": self._tree.object}
-        return {"specification": self._tree.name, **of, "node": str(reported.node), "name": reported.name}
+        about = {"requirement": reported.requirement, "title": reported.sentence}
+        return {
+            "specification": self._tree.name,
+            **of,
+            "node": str(reported.node),
+            "name": reported.name,
+            **{key: text for key, text in about.items() if text is not None},
+        }
 
     def _facts_of(self, period: Period, witness: str, suffix: str) -> dict[str, str]:
         if period.code == START:
@@ -322,21 +366,25 @@ def _reported_nodes(
     Args:
         below: of each node of the tree, its leaves.
     """
-    lines = {spec.name: _line(file.source, spec.span.start, spec.span.end) for spec in file.specs}
+    specs = {spec.name: spec for spec in file.specs}
     found: list[ReportedNode] = []
+    root = f"`{tree.name}`" + (f" for {tree.object}" if tree.object is not None else "")
     names: set[str] = set()
     for identifier, parent, node in iter_nodes(tree.formula):
         if parent is None:
-            title = f"`{tree.name}`" + (f" for {tree.object}" if tree.object is not None else "")
+            title = root
         elif node.name and node.name not in names and looks_ahead(node):
-            title = f"`{node.name}` in {found[0].title}"
+            title = f"`{node.name}` in {root}"
         else:
             continue
         name = tree.name if parent is None else node.name or ""
         names.add(node.name or name)
-        found.append(
-            ReportedNode(identifier, title, name, lines.get(node.name or name, 0), below[identifier])
-        )
+        spec = specs.get(node.name or name)
+        line = 0 if spec is None else _line(file.source, spec.span.start, spec.span.end)
+        about = (None, None) if spec is None else (spec.id, spec.title)
+        if any(about):
+            title = f"{title} ({': '.join(filter(None, about))})"
+        found.append(ReportedNode(identifier, title, name, line, below[identifier], *about))
     return found
 
 

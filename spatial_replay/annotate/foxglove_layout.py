@@ -73,7 +73,7 @@ def result_curves(trees: Sequence[ReportedTree]) -> Panel:
 def part_curves(trees: Sequence[ReportedTree]) -> Panel | None:
     """Return the curves of named specs: `now` of those that do not look ahead; None without any."""
     paths = [
-        (f"{name} in {_title(tree)}", node_path(tree, name=name, field="value" if ahead else "now"))
+        (f"{name} in {tree.title}", node_path(tree, name=name, field="value" if ahead else "now"))
         for tree in trees
         for name, ahead in named_parts(tree).items()
     ]
@@ -84,7 +84,7 @@ def whole_curves(trees: Sequence[ReportedTree]) -> Panel:
     """Return the curves over the whole log of each result, then of its named specs."""
     labelled = [(_label(tree), f"{_curves_path(tree, 0)}.value[:]") for tree in trees]
     labelled += [
-        (f"{node.name} in {_title(tree)}", f"{_curves_path(tree, identifier)}.{_shown_number(node)}[:]")
+        (f"{node.name} in {tree.title}", f"{_curves_path(tree, identifier)}.{_shown_number(node)}[:]")
         for tree in trees
         for identifier, node in curved_nodes(tree.formula).items()
         if identifier
@@ -98,12 +98,12 @@ def state_strips(trees: Sequence[ReportedTree], has_states: Sequence[bool]) -> P
     """Return strips of each result's verdict and automaton state, then of its named specs' verdicts."""
     strips = []
     for tree, has_state in zip(trees, has_states, strict=True):
-        strips.append((f"{_title(tree)}: verdict", node_path(tree, id=0, field="verdict")))
+        strips.append((f"{tree.title}: verdict", node_path(tree, id=0, field="verdict")))
         if has_state:
-            strips.append((f"{_title(tree)}: state", f"{AUTOMATON}{_of(tree)}.states[0]"))
+            strips.append((f"{tree.title}: state", f"{AUTOMATON}{_of(tree)}.states[0]"))
     for tree in trees:
         strips += [
-            (f"{name} in {_title(tree)}: verdict", node_path(tree, name=name, field="verdict"))
+            (f"{name} in {tree.title}: verdict", node_path(tree, name=name, field="verdict"))
             for name, ahead in named_parts(tree).items()
             if ahead
         ]
@@ -195,14 +195,10 @@ def _of(tree: ReportedTree) -> str:
     return f"{{specification=={_quoted(tree.name)}}}{{object=={_quoted(tree.object or '')}}}"
 
 
-def _title(tree: ReportedTree) -> str:
-    return tree.name if tree.object is None else f"{tree.name}({tree.object})"
-
-
 def _label(tree: ReportedTree) -> str:
     """Return the title, with the unit where it is not that of footprints."""
     unit = unit_of(tree.formula, {})
-    return f"{_title(tree)} [{unit}]" if unit else _title(tree)
+    return f"{tree.title} [{unit}]" if unit else tree.title
 
 
 def _quoted(text: str) -> str:

@@ -46,12 +46,22 @@ class ReportedTree(NamedTuple):
         name: the name it is reported under.
         object: the object that a template's parameter stands for, or None.
         file: index of its specification among the files.
+        requirement: the id of the requirement that it stands for, or None.
+        sentence: that requirement in words, or None.
     """
 
     name: str
     object: str | None
     file: int
     formula: Formula
+    requirement: str | None = None
+    sentence: str | None = None
+
+    @property
+    def title(self) -> str:
+        """What a reader knows it by: "REQ-12 calm(bike)"."""
+        title = self.name if self.object is None else f"{self.name}({self.object})"
+        return title if self.requirement is None else f"{self.requirement} {title}"
 
 
 def reported_trees(
@@ -68,7 +78,8 @@ def reported_trees(
         for instance in own:
             clashes = names.count(instance.name) > 1
             name = f"{PurePath(file.filename).stem}.{instance.name}" if clashes else instance.name
-            trees.append(ReportedTree(name, instance.object, index, instance.formula))
+            spec = instance.spec
+            trees.append(ReportedTree(name, instance.object, index, spec.formula, spec.id, spec.title))
     return trees
 
 

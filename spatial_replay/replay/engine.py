@@ -155,9 +155,10 @@ class Replay:
                 derived = self._evaluation.messages(inside, stretches)
                 write(merge([*derived, *([] if layer else [own])]))
             advance(len(inside))
-        if write is not None and self._samples:
-            write(self._evaluation.end(self._end_ns))
-        return self._replayed()
+        replayed = self._replayed()
+        if write is not None:
+            write(self._evaluation.end(self._end_ns, [each.vacuous for each in replayed.results]))
+        return replayed
 
     @property
     def automata(self) -> Sequence[SpecAutomaton]:

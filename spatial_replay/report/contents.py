@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.monitor.result import SpecResult
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.monitor.result import NodeResult, SpecResult
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.report.automaton_panel import StatePath
@@ -15,10 +16,24 @@ from spatial_replay.report.decision_panel import ReportedDecisions
 from spatial_replay.report.event_panel import ReportedEvent
 from spatial_replay.report.scene_panel import ReportedScene
 from spatial_replay.report.tree_panel import final_text
-from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.formula import NamedSpec, Specification
 
 MOST_DRAWN: Final = 24
 """Results with an explanation, a tree and curves, at most: the worst. All have their verdicts."""
+
+
+class Pointer(NamedTuple):
+    """The atom that decided a verdict, as an arrow in the scene.
+
+    Attributes:
+        ends: (2, 2), from where to where it points.
+        text: the atom's.
+        number: its robustness.
+    """
+
+    ends: Floats
+    text: str
+    number: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +45,9 @@ class ReportedResult:
 
         sentences: the explanation of its verdict; none if the page does not explain it.
         decided_ns: the sample that decided it; None without an explanation.
+        pointer: the two points between which the atom that decided it stands; None if it has none.
+        named: the specs of its file, by name.
+        units: those of the numbers that its robustness is the least of, in words.
         automaton: None if it has none.
         no_automaton: why not.
         path: the states of the run.
@@ -39,9 +57,21 @@ class ReportedResult:
     relations: frozenset[str]
     sentences: tuple[str, ...]
     decided_ns: int | None
+    pointer: Pointer | None
+    named: Mapping[str, NamedSpec]
+    units: tuple[str, ...]
     automaton: Automaton | None
     no_automaton: str
     path: StatePath
+
+    @property
+    def specs(self) -> Iterator[NodeResult]:
+        """Yield the root of each named spec within the formula, once, in the order of the text."""
+        names = {self.result.nodes[0].name}
+        for node in self.result.nodes[1:]:
+            if node.name is not None and node.name not in names:
+                names.add(node.name)
+                yield node
 
     @property
     def fault_ns(self) -> int | None:

@@ -28,6 +28,7 @@ from spatial_replay.report.tree_panel import (
     shown_nodes,
     tree_value,
 )
+from spatial_replay.text import json_number
 
 
 class NodeSeries(NamedTuple):
@@ -183,6 +184,7 @@ def _result_value(each: ReportedResult, kept: Integers, first_ns: int, packing: 
         "name": each.result.name,
         "object": each.result.object,
         "verdict": str(each.result.verdict),
+        "pointer": _pointer_value(each, first_ns),
         "fault": None if each.fault_ns is None else (each.fault_ns - first_ns) / 1e9,
         "first": int(np.searchsorted(kept, here[0])) if len(here) else 0,
         "samples": len(here),
@@ -200,6 +202,19 @@ def _result_value(each: ReportedResult, kept: Integers, first_ns: int, packing: 
             "path": packing.add(each.path.codes[inside], "i4"),
         }
     return value
+
+
+def _pointer_value(each: ReportedResult, first_ns: int) -> Mapping[str, Any] | None:
+    """Return the arrow at what decided a result that is not satisfied, and when it is shown."""
+    if each.pointer is None or each.fault_ns is None:
+        return None
+    return {
+        "time": (each.fault_ns - first_ns) / 1e9,
+        "ends": each.pointer.ends.reshape(-1).tolist(),
+        "text": each.pointer.text,
+        "label": f"{each.pointer.number:.3g}",
+        "number": json_number(each.pointer.number),
+    }
 
 
 def _omissions(report: RunReport, samples: int, kept: int, maps: int) -> Iterator[str]:

@@ -48,6 +48,8 @@ def event_values(events: Sequence[ReportedEvent], first_ns: int) -> list[Mapping
 
 
 def _status(facts: Mapping[str, str]) -> str:
+    if "vacuous" in facts:
+        return "vacuous"
     if facts.get("verdict") != "pending":
         return facts.get("verdict", "")
     return "holding" if facts.get("sign") == "positive" else "failing"

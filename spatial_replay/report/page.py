@@ -15,12 +15,15 @@ from types import MappingProxyType
 from typing import Final
 
 from spatial_replay import __version__
+from spatial_replay.monitor.causes import settled_time
 from spatial_replay.monitor.sentences import time_text
+from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.notebook.figures import Html, element
 from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
 from spatial_replay.report.compact import json_text, sentence_parts
 from spatial_replay.report.contents import ReportedResult, RunReport, worst_first
 from spatial_replay.report.data import page_data
+from spatial_replay.report.tree_panel import final_text
 from spatial_replay.text import counted, printable
 
 _CALENDAR_NS: Final = 500_000_000 * 10**9
@@ -130,26 +133,66 @@ def _verdicts(report: RunReport) -> Iterator[Html]:
     for number, each in enumerate(report.results[place] for place in worst):
         # which result the page shows when something in the verdict is chosen
         drawn = {"data-result": str(places[id(each)])} if id(each) in places else {}
-        is_unfolded = each.result.verdict == report.verdict and not (are_many and number)
+        is_told = each.result.verdict == report.verdict or bool(each.result.vacuous)
+        is_unfolded = is_told and not (are_many and number)
         unfolded = {"open": ""} if each.sentences and is_unfolded else {}
         attributes = {"class": "verdict", **drawn, **unfolded}
-        sentences = [element("p", *_with_code(sentence)) for sentence in each.sentences]
-        yield element(
-            "details" if sentences else "div", _summary(each, report.first_ns), *sentences, **attributes
-        )
+        told = [element("p", *_with_code(sentence)) for sentence in each.sentences]
+        told += [_specs(each, report.first_ns)] if each.sentences else []
+        yield element("details" if told else "div", _summary(each, report.first_ns), *told, **attributes)
 
 
 def _summary(each: ReportedResult, first_ns: int) -> Html:
-    numbers = f"robustness {each.robustness_text or 'not determined'}"
-    if each.result.first_satisfied_ns is not None:
-        numbers += f", first satisfied at {time_text(each.result.first_satisfied_ns, first_ns)}"
+    """Return the line of a result: its verdict, requirement and number, and since when it is certain."""
+    result = each.result
+    numbers = [f"robustness {each.robustness_text or 'not determined'}"]
+    if result.violated_at_ns is not None:
+        numbers.append(f"violated since {time_text(result.violated_at_ns, first_ns)}")
+    elif result.satisfied_at_ns is not None:
+        numbers.append(f"satisfied since {time_text(result.satisfied_at_ns, first_ns)}")
+    elif result.verdict is Verdict.SATISFIED and result.first_satisfied_ns is not None:
+        numbers.append(f"first satisfied at {time_text(result.first_satisfied_ns, first_ns)}")
+    decided_nothing = "a part decided nothing" if len(result.vacuous) == 1 else "parts decided nothing"
+    marks = [element("span", decided_nothing, **{"class": "chip is-vacuous"})] if result.vacuous else []
     return element(
         "summary" if each.sentences else "div",
-        _chip(each.result.verdict),
-        element("span", text(each.result.title), **{"class": "name"}),
-        element("span", text(numbers), **{"class": "numbers"}),
+        _chip(result.verdict),
+        *marks,
+        *_requirement(result.spec.id, result.title, result.spec.title),
+        element("span", text(", ".join(numbers)), **{"class": "numbers"}),
         **{"class": "summary"},
     )
+
+
+def _requirement(identifier: str | None, name: str, title: str | None) -> Iterator[Html]:
+    """Yield the id of a requirement, the name of its spec, and its words."""
+    if identifier is not None:
+        yield element("span", text(identifier), **{"class": "requirement"})
+    yield element("span", text(name), **{"class": "name"})
+    if title is not None:
+        yield element("span", text(title), **{"class": "title-words"})
+
+
+def _specs(each: ReportedResult, first_ns: int) -> Html:
+    """Return one row for each named spec within a result, and the units that its number is the least of."""
+    rows = []
+    for node in each.specs:
+        settled_ns = settled_time(each.result.settled_ns, node.id)
+        spec = each.named.get(node.name or "")
+        about = (None, None) if spec is None else (spec.id, spec.title)
+        numbers = f"robustness {final_text(node.robustness, node.final_lower, node.final_upper)}"
+        if settled_ns is not None:
+            numbers += f", violated since {time_text(settled_ns, first_ns)}"
+        line = element("span", text(numbers), **{"class": "numbers"})
+        rows.append(
+            element("li", _chip(node.verdict), *_requirement(about[0], node.name or "", about[1]), line)
+        )
+    parts = [element("ul", *rows, **{"class": "specs"})] if rows else []
+    if len(each.units) > 1:
+        listed = f"{', '.join(each.units[:-1])} and {each.units[-1]}"
+        words = f"Its robustness is the least of numbers in different units: {listed}."
+        parts.append(element("p", text(words), **{"class": "units"}))
+    return element("div", *parts)
 
 
 def _with_code(sentence: str) -> Iterator[Html]:

@@ -10,20 +10,24 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from spatial_replay.logs import topics as log_topics
 from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.source import Source
-from spatial_replay.replay.document import explain_node
+from spatial_replay.monitor.result import SpecResult
+from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions
 from spatial_replay.report.automaton_panel import StatePath, StatePathCollector
-from spatial_replay.report.contents import ReportedResult, RunReport, worst_results
+from spatial_replay.report.contents import Pointer, ReportedResult, RunReport, worst_results
 from spatial_replay.report.decision_panel import DecisionCollector
 from spatial_replay.report.event_panel import ReportedEvent, event_of
 from spatial_replay.report.page import page
 from spatial_replay.report.scene_panel import SceneCollector
+from spatial_replay.report.tree_panel import unit_words
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.relations import RELATION_NAMES
 
@@ -114,16 +118,35 @@ def _results(replay: Replay, replayed: Replayed, collector: Collector) -> Iterat
     for index, result in enumerate(replayed.results):
         tree, compiled = replay.trees[index], replay.automata[index]
 
-        why = explain_node(result, first_ns=replayed.first_ns) if index in explained else None
+        is_explained = index in explained
+        witness = _deciding(result) if is_explained else None
         yield ReportedResult(
             result=result,
             relations=RELATION_NAMES | replay.files[tree.file].relations,
-            sentences=() if why is None else why.sentences,
-            decided_ns=None if why is None else why.time_ns,
+            sentences=result.sentences(replayed.first_ns) if is_explained else (),
+            decided_ns=None if witness is None else witness.time_ns,
+            pointer=None if witness is None else _pointer(witness),
+            named={spec.name: spec for spec in replay.files[tree.file].specs},
+            units=unit_words(result.formula),
             automaton=compiled.automaton,
             no_automaton=compiled.reason,
             path=collector.path(tree.name, tree.object),
         )
+
+
+def _deciding(result: SpecResult) -> Witness | None:
+    """Return the witness of the first cause or, of a satisfied result, that of its verdict."""
+    return result.causes[0].witness if result.causes else result.witness()
+
+
+def _pointer(witness: Witness) -> Pointer | None:
+    if witness.deciding is None or witness.deciding.unknown:
+        return None
+    for measured in witness.deciding.measured:
+        if measured.contact is not None:
+            ends = np.array([measured.contact.first, measured.contact.second])
+            return Pointer(ends, witness.deciding.text, witness.deciding.value)
+    return None
 
 
 def _explained(replayed: Replayed) -> frozenset[int]:

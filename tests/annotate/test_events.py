@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from foxglove_schemas_protobuf.Event_pb2 import Event
 from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 from mcap.records import Message
 
@@ -282,3 +283,40 @@ def test_the_verdict_of_an_object_that_left_is_reported_at_the_end_and_is_of_its
     assert number == 5
     assert event.end_time.ToNanoseconds() == 10**9 + 2 * STEP_NS
     assert line.message.startswith("`away` for b is violated, for the log has ended: ")
+
+
+def test_an_event_names_the_requirement_that_its_spec_stands_for(tmp_path):
+    text = 'spec kept "REQ-7: the battery never runs empty" = G battery >= 0'
+    [(_, event, line)] = events_of(tmp_path, text, 2.0, -1.0)
+    assert facts(event)["requirement"] == "REQ-7"
+    assert facts(event)["title"] == "the battery never runs empty"
+    assert line.message.startswith(
+        "`kept` (REQ-7: the battery never runs empty) is violated, whatever comes: "
+    )
+
+
+def test_a_part_that_decided_nothing_is_a_warning_at_the_end(tmp_path):
+    [*_, (number, event, line)] = written(tmp_path, "G[60s, 90s] battery >= 0", batteries(1.0, 1.0, 1.0))
+    assert number == 2
+    assert (facts(event)["vacuous"], facts(event)["verdict"]) == ("empty window", "satisfied")
+    assert line.level == Log.WARNING
+    assert line.message == facts(event)["message"]
+    assert line.message.startswith("`G[60s, 90s] (battery >= 0)` was never tested: ")
+
+
+def test_a_goal_that_is_still_to_come_is_neither_pointed_at_nor_red(tmp_path):
+    samples = [
+        sr.Sample(
+            t * STEP_NS,
+            {"robot": sr.Footprint.box(t, 0, t + 1, 1), "bin": sr.Footprint.box(90, 0, 95, 5)},
+        )
+        for t in range(4)
+    ]
+    output = tmp_path / "annotated.mcap"
+    spec = sr.parse_specification("spec delivered = F robot enclosedin bin")
+    run_replay(MemorySource.from_samples(samples), [spec], output=output)
+    for message in _messages(output, "/spatial/scene"):
+        entities = {each.id: each for each in SceneUpdate.FromString(message.data).entities}
+        assert "witness" not in entities
+        colour = entities["object/robot"].lines[0].color
+        assert colour.r == colour.b

@@ -41,7 +41,8 @@ class Run:
 
     @property
     def last_event(self) -> dict[str, str]:
-        return [each for each in self.events if each["node"] == "0"][-1]
+        own = [each for each in self.events if each["node"] == "0" and "vacuous" not in each]
+        return own[-1]
 
     def leaf(self, index: int) -> Formula:
         return self.result.evidence.instance.program.leaves[index]

@@ -223,6 +223,79 @@ def test_under_the_papers_semantics_nothing_is_explained(tmp_path: Path) -> None
     assert "Explanations are given under the semantics ltlf alone." in page.within("header#")
 
 
+TASK = """\
+spec safe "REQ-3: nothing is bumped into" = G (robot dist vase >= 0.05)
+spec powered "REQ-4: the battery never runs low" = G (battery >= 0.2)
+spec delivered "REQ-1: the robot ends in the bin" = F (robot enclosedin bin)
+spec task "the whole job" = safe and delivered and powered
+"""
+
+
+def driving(count: int = 40) -> list[sr.Sample]:
+    """A robot that passes a vase too closely on its way to a bin, which it never reaches."""
+    things = {"vase": sr.Footprint.disc(3, 0.7, 0.25), "bin": sr.Footprint.box(6, 0, 7, 1)}
+    return [
+        sr.Sample(
+            t * 10**8,
+            {"robot": sr.Footprint.box(t / 10, 0, t / 10 + 0.5, 0.5), **things},
+            {"battery": 0.9 - t / 100},
+        )
+        for t in range(count)
+    ]
+
+
+@pytest.fixture(scope="module")
+def task(tmp_path_factory: pytest.TempPathFactory) -> Page:
+    return report_of_samples(tmp_path_factory.mktemp("pages") / "task.html", driving(), TASK)
+
+
+def test_the_headline_is_what_settled_the_verdict_and_says_which_part_is_least(task: Page) -> None:
+    said = task.within("section#verdicts")
+    assert "robustness -2.1, violated since 2.300 s" in said
+    assert "first satisfied" not in said
+    assert "task is violated: robustness -2.1, certain since 2.300 s" in said
+    assert "(the least robustness is that of delivered)" in said
+    assert said.index("robot dist vase >= 0.05") < said.index("robot enclosedin bin")
+
+
+def test_the_page_opens_with_an_arrow_at_what_settled_the_verdict(task: Page) -> None:
+    [result] = task.facts["results"]
+    assert result["fault"] == 2.3
+    assert result["pointer"]["time"] == 2.3
+    assert result["pointer"]["text"] == "robot dist vase >= 0.05"
+    assert result["pointer"]["label"] == "-0.0172"
+
+
+def test_a_goal_that_is_still_to_come_has_no_arrow(task: Page) -> None:
+    scene = task.facts["scene"]
+    frames = task.numbers(scene["violations"]["frames"])
+    times = task.numbers(scene["times"])
+    assert times[frames].min() == 2.3
+    assert not task.numbers(scene["is_violated"])[times < 2.3].any()
+
+
+def test_named_specs_have_a_row_each_with_their_requirement_and_number(task: Page) -> None:
+    said = task.within("ul#")
+    assert "violatedREQ-3safenothing is bumped intorobustness -0.1, violated since 2.300 s" in said
+    assert "violatedREQ-1deliveredthe robot ends in the binrobustness -2.1" in said
+    assert "satisfiedREQ-4poweredthe battery never runs lowrobustness 0.31" in said
+
+
+def test_the_units_that_a_minimum_is_over_are_named(task: Page) -> None:
+    said = task.within("section#verdicts")
+    assert "Its robustness is the least of numbers in different units: " in said
+    assert "battery" in said.split("different units: ")[1]
+    assert "lengths" in said.split("different units: ")[1]
+
+
+def test_a_result_that_decided_nothing_is_marked(tmp_path: Path) -> None:
+    page = report_of_samples(tmp_path / "run.html", driving(3), "spec late = G[60s, 90s] robot ovlp vase")
+    said = page.within("section#verdicts")
+    assert "a part decided nothing" in said
+    assert "no sample of the log lies in its window" in said
+    assert [event["status"] for event in page.facts["events"]][-1] == "vacuous"
+
+
 # ------------------------------------------------------------------------------- what the page is made of
 
 

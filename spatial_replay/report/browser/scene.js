@@ -27,13 +27,14 @@ function makeScene(clock) {
   let before = null;
   const show = () => {
     const frame = indexAt(scene.times, clock.time);
-    const now = [frame, clock.sample, decisionAt(clock.run, clock.time)];
+    const now = [frame, clock.sample, decisionAt(clock.run, clock.time), pointerAt(clock)];
     if (now.every((each, index) => each === before?.[index])) return;
     before = now;
     redraw();
     caption.replaceChildren(...captionOf(clock, scene, frame));
   };
   clock.on("time", show);
+  clock.on("result", show);
   window.addEventListener("themechange", redraw);
 }
 
@@ -105,7 +106,7 @@ function drawScene(context, clock, scene, layers, width, height) {
   for (const entity of scene.entities) drawEntity(context, entity, frame, at, labels);
   if (decision) drawPlan(context, clock, decision, at);
   if (layers.labels) drawLabels(context, labels, width);
-  const violation = scene.violations.get(frame);
+  const violation = pointerAt(clock) ?? scene.violations.get(frame);
   if (violation) drawViolation(context, violation, at, width);
 }
 
@@ -264,8 +265,20 @@ function middlesOf(entity) {
   return middles;
 }
 
+// The arrow at what decided the chosen result, in the sample that did.
+function pointerAt({run, result, sample}) {
+  const pointer = run.results[result]?.pointer;
+  return pointer && indexAt(run.times, pointer.time) === sample ? pointer : null;
+}
+
 function captionOf(clock, scene, frame) {
   const {run} = clock;
+  const pointer = pointerAt(clock);
+  if (pointer) {
+    const how = pointer.number < 0 ? "fails" : "must not hold, and does";
+    return ["the arrow, what decided the verdict: ", element("code", {}, pointer.text),
+      ` of ${run.results[clock.result].title} ${how} by ${numberText(Math.abs(pointer.number))}`];
+  }
   const violation = scene.violations.get(frame);
   if (violation) return ["the arrow: ", ...violationWords(run, scene.times[frame], violation)];
   const open = requirementsAt(run, clock.sample);

@@ -6,6 +6,7 @@ const STATUSES = {
   violated: {sign: "✕", words: "violated", colour: "negative"},
   failing: {sign: "−", words: "fails so far", colour: "negative"},
   unknown: {sign: "?", words: "unknown", colour: "neutral"},
+  vacuous: {sign: "∅", words: "decided nothing", colour: "neutral"},
   absent: {sign: "·", words: "not evaluated here", colour: "neutral"},
 };
 
