@@ -17,6 +17,7 @@ from spatial_replay.report.event_panel import ReportedEvent
 from spatial_replay.report.scene_panel import ReportedScene
 from spatial_replay.report.tree_panel import final_text
 from spatial_replay.spec.formula import NamedSpec, Specification
+from spatial_replay.trace.axes import Axes
 
 MOST_DRAWN: Final = 24
 """Results with an explanation, a tree and curves, at most: the worst. All have their verdicts."""
@@ -91,6 +92,7 @@ class RunReport:
     Attributes:
         log: base name of the log.
         first_ns, start_ns, end_ns: times of the log's first sample, and of the first and last evaluated.
+        axes: those of the source, as opposed to those of the samples.
         faults, remarks: what was lost while reading, and other notes of the reader.
         unreadable: how many observations have no finite numbers.
     """
@@ -100,6 +102,7 @@ class RunReport:
     first_ns: int
     start_ns: int
     end_ns: int
+    axes: Axes
     faults: tuple[str, ...]
     remarks: tuple[str, ...]
     unreadable: int

@@ -56,7 +56,7 @@ def panels(report: RunReport) -> Html:
     has_automaton = any(result.automaton is not None for result in report.drawn)
     sections = [
         _panel("verdicts", "Verdicts", *_verdicts(report)),
-        _panel("scene", "Scene"),
+        _panel("scene", "Scene", element("p", f"Seen from above, {report.axes}.", **{"class": "axes"})),
         _panel("tree", "Specification"),
         _panel("timeline", "Over time"),
         _panel("automaton", "Automaton", kind="panel" if has_automaton else "panel wide"),
@@ -133,13 +133,15 @@ def _verdicts(report: RunReport) -> Iterator[Html]:
     for number, each in enumerate(report.results[place] for place in worst):
         # which result the page shows when something in the verdict is chosen
         drawn = {"data-result": str(places[id(each)])} if id(each) in places else {}
-        is_told = each.result.verdict == report.verdict or bool(each.result.vacuous)
-        is_unfolded = is_told and not (are_many and number)
+        is_reported = each.result.verdict == report.verdict or bool(each.result.vacuous)
+        is_unfolded = is_reported and not (are_many and number)
         unfolded = {"open": ""} if each.sentences and is_unfolded else {}
         attributes = {"class": "verdict", **drawn, **unfolded}
-        told = [element("p", *_with_code(sentence)) for sentence in each.sentences]
-        told += [_specs(each, report.first_ns)] if each.sentences else []
-        yield element("details" if told else "div", _summary(each, report.first_ns), *told, **attributes)
+        content = [element("p", *_with_code(sentence)) for sentence in each.sentences]
+        content += [_specs(each, report.first_ns)] if each.sentences else []
+        yield element(
+            "details" if content else "div", _summary(each, report.first_ns), *content, **attributes
+        )
 
 
 def _summary(each: ReportedResult, first_ns: int) -> Html:

@@ -16,7 +16,7 @@ from spatial_replay.logs import topics as log_topics
 from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
-from spatial_replay.logs.source import Source
+from spatial_replay.logs.source import Source, axes_of
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.replay.engine import Replay, Replayed
@@ -89,17 +89,18 @@ def write_report(
     replay = Replay(source, files, options, keep_series=True, keep_leaves=True, show=collector.scene.add)
     with replacing(output, inputs) as stream:
         replayed = replay.run(collector.add, advance=advance)
-        stream.write(page(_report(replay, replayed, collector)))
+        stream.write(page(_report(source, replay, replayed, collector)))
     return replayed
 
 
-def _report(replay: Replay, replayed: Replayed, collector: Collector) -> RunReport:
+def _report(source: Source, replay: Replay, replayed: Replayed, collector: Collector) -> RunReport:
     return RunReport(
         log=replayed.log,
         samples=replayed.samples,
         first_ns=replayed.first_ns,
         start_ns=replayed.start_ns,
         end_ns=replayed.end_ns,
+        axes=axes_of(source),
         faults=replayed.faults,
         remarks=replayed.remarks,
         unreadable=replayed.unreadable,

@@ -67,7 +67,7 @@ def test_verdicts_and_explanations_can_be_read_without_scripts(violated: Page) -
     said = violated.within("section#verdicts")
     assert "violatedtable_setrobustness -0.155214" in said
     assert "which fails by 0.155214 at 4.000 s" in said
-    assert "It would be satisfied with 0.235215 or more in place of 0.08" in said
+    assert "with 0.235215 or more in place of 0.08" in said
 
 
 def test_the_page_says_which_run_it_is_of(violated: Page) -> None:
@@ -286,6 +286,10 @@ def test_the_units_that_a_minimum_is_over_are_named(task: Page) -> None:
     assert "Its robustness is the least of numbers in different units: " in said
     assert "battery" in said.split("different units: ")[1]
     assert "lengths" in said.split("different units: ")[1]
+
+
+def test_the_scene_says_where_y_points(task: Page) -> None:
+    assert "Seen from above, y up." in task.within("section#scene")
 
 
 def test_a_result_that_decided_nothing_is_marked(tmp_path: Path) -> None:
