@@ -37,14 +37,19 @@ def verify(log: Path, source: Path | None, decisions: bool, reading: ReadArgumen
       spatial-replay verify push.mcap --decisions
     """
     # imported here so that --help stays fast
+    from spatial_replay.logs.read_options import ReadOptions
     from spatial_replay.planning.recompute import recompute_decisions
-    from spatial_replay.replay.verification import verify_certificate
+    from spatial_replay.replay.verification import recorded_reading, verify_certificate
     from spatial_replay.sources.open_log import open_source
 
     if source is None and reading["mapping"] is not None:
         raise UsageError("--mapping applies to the source of the log; add --source SOURCE")
     own = open_source(log)
-    original = None if source is None else open_source(source, **reading)
+    original = None
+    if source is not None:
+        # what is given here has precedence over what the log was made with
+        given = ReadOptions(**reading).given()
+        original = open_source(source, **{**reading, **recorded_reading(own, source.name), **given})
     with progress("samples") as advance:
         verified = verify_certificate(own, original, advance)
     faults = list(verified.faults)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
@@ -134,11 +135,17 @@ class MappedSource:
 
     def attachments(self) -> tuple[Attachment, ...]:
         """See `Source.attachments`."""
-        return open_messages(self.path).attachments()
+        return self._beside[0]
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
         """See `Source.metadata`."""
-        return open_messages(self.path).metadata()
+        return self._beside[1]
+
+    @cached_property
+    def _beside(self) -> tuple[tuple[Attachment, ...], tuple[tuple[str, Mapping[str, str]], ...]]:
+        """Attachments and metadata, read once: a log without an index is scanned for them."""
+        reader = open_messages(self.path)
+        return reader.attachments(), reader.metadata()
 
 
 class _Blocks:

@@ -96,7 +96,12 @@ def suggest_mapping(
     transforms = [each for each in suggestions if each.is_transforms]
     active = mapped or [each for each in transforms if each.entry]
     lines = [f"# How messages of {_comment(log)} become objects: a start, made from the first of them."]
-    lines += [*_frame_lines(active, transforms, examples), *_time_lines(active, first_ns), "topics:"]
+    lines += [
+        *_frame_lines(active, transforms, examples),
+        *_axes_lines(active),
+        *_time_lines(active, first_ns),
+        "topics:",
+    ]
     if not active:
         lines.append("  # nothing looks like an object; name the fields of a topic that is one, such as")
         lines.append("  # /robot/state: {name: robot, position: [x, y], yaw: theta, shape: {disc: 0.5}}")
@@ -107,6 +112,13 @@ def suggest_mapping(
     if rest:
         lines += ["", "  # not used:", *(line for each in rest for line in _unused(each))]
     return "\n".join(lines) + "\n"
+
+
+def _axes_lines(active: Sequence[TopicSuggestion]) -> Iterator[str]:
+    """Yield the lines about axes, if all coordinates are those of an image."""
+    if active and all(short_type(each.topic.type) in _IN_IMAGES for each in active):
+        yield "# rows of pixels are counted downwards; samples have y up, so that above means above"
+        yield "axes: {y: down}"
 
 
 def _suggestion(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
@@ -129,6 +141,9 @@ def _suggestion(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
     best = max(guesses, key=lambda guess: guess.score)
     return TopicSuggestion(topic, _entry(topic, best), _remarks(best), frame=frame)
 
+
+_IN_IMAGES = frozenset({"vision_msgs/Detection2DArray", "apriltag_msgs/AprilTagDetectionArray"})
+"""Types whose coordinates are pixels."""
 
 _SIZELESS = (f"messages have no size: {_RADIUS} is a guess, {{box: [length, width]}} is another shape",)
 

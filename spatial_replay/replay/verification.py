@@ -26,6 +26,7 @@ _HASHES: Mapping[str, str] = MappingProxyType(
 )
 """The meaning of a difference, for each hash of a certificate."""
 
+_READING = ("on_time_jump", "rate", "lost", "y_down", "concave")
 _WINDOW = ("start_ns", "end_ns", "every")
 
 
@@ -87,6 +88,22 @@ def verify_certificate(
         advance=advance,
     )
     return Verified(dict(recorded), dict(replayed.certificate), replayed.faults)
+
+
+def recorded_reading(log: Source, source: str) -> dict[str, Any]:
+    """Return the options with which a log's source was read, such as the rate of its frames.
+
+    Args:
+        source: the name of the file that is given as the source; no option applies to another one.
+    """
+    about = dict(log.metadata()).get(METADATA, {})
+    if about.get("source") != source:
+        return {}
+    try:
+        options = json.loads(about.get("options", "{}"))
+    except ValueError:
+        return {}
+    return {name: options[name] for name in _READING if name in options} if isinstance(options, dict) else {}
 
 
 def _files(log: Source) -> list[Specification]:

@@ -174,3 +174,14 @@ def test_a_log_without_decisions_is_wrong_usage(recorded: Path) -> None:
 def test_a_mapping_requires_a_source(recorded: Path) -> None:
     with pytest.raises(sr.UsageError, match="add --source"):
         call("verify", recorded, "--mapping", "m.yaml")
+
+
+def test_a_source_is_read_as_it_was_when_the_log_was_made(tmp_path: Path) -> None:
+    boxes, spec = tmp_path / "annotations.txt", tmp_path / "near.spatial"
+    boxes.write_text('1 0 10 4 20 0 0 0 0 "Biker"\n2 0 40 4 50 9 1 0 0 "Biker"\n')
+    spec.write_text('F ("1" above "2")\n')
+    call(
+        "replay", boxes, "--spec", spec, "--y-up", "--rate", "10", "--lost", "keep", "-o", tmp_path / "a.mcap"
+    )
+    assert call("verify", tmp_path / "a.mcap", "--source", boxes)[0] == 0
+    assert call("verify", tmp_path / "a.mcap", "--source", boxes, "--y-down")[0] == 1

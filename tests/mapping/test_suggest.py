@@ -156,3 +156,10 @@ def test_the_last_topic_to_start_is_sampled() -> None:
     begins = {"/a": 10, "/b": 20, "/late": 10**10}
     assert parse_mapping(suggest_mapping("run", topics, {}, begins)).sampling.topic == "/b"
     assert parse_mapping(suggest_mapping("run", topics, {})).sampling.topic == "/a"
+
+
+def test_detections_in_images_are_turned_over() -> None:
+    image = Topic("/detections", "vision_msgs/msg/Detection2DArray", "cdr")
+    ground = Topic("/robot", "geometry_msgs/msg/PoseStamped", "cdr")
+    assert "axes: {y: down}\n" in suggest_mapping("a.bag", [image], {})
+    assert "axes:" not in suggest_mapping("a.bag", [image, ground], {})
