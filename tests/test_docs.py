@@ -125,6 +125,18 @@ def test_the_specification_in_the_readme_has_the_numbers_that_the_readme_shows()
     assert f"satisfied by {in_time.robustness:.3f} metres, violated by {-late.robustness:.3f}" in README
 
 
+@pytest.mark.parametrize("page", ["README.md", "docs/command-line.md"])
+def test_the_explanation_on_a_page_is_what_the_command_prints(
+    page: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (ROOT / page).read_text("utf-8")
+    shown = re.findall(r"^(`laid` is violated.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    recordings = ROOT / "recordings"
+    files = [str(recordings / "table.jsonl"), "--spec", str(recordings / "table_edited.spatial")]
+    assert run_in_process(["explain", *files, "--node", "laid"]) == 1
+    assert [each.split() for each in shown] == [capsys.readouterr().out.split()]
+
+
 def test_every_extra_is_explained_where_one_installs() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     install = (ROOT / "docs/install.md").read_text("utf-8")

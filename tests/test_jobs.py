@@ -130,6 +130,15 @@ def test_a_missing_log_does_not_pass_the_gate(gate: list[Block]) -> None:
     assert shell("python gate.py").returncode == 1
 
 
+def test_a_specification_that_checks_nothing_does_not_pass_the_gate(gate: list[Block]) -> None:
+    assert gate
+    Path("gate.spatial").write_text("spec late = G[60s, 90s] (cart dist person >= 0.3)")
+    assert shell("sh gate.sh logs/run-00.jsonl").returncode == 1
+    ended = shell("python gate.py")
+    assert ended.returncode == 1
+    assert "{'vacuous': 50}" in ended.stdout
+
+
 def test_the_workflow_runs_the_gate_of_the_page(gate: list[Block]) -> None:
     workflow = yaml.safe_load(next(block.text for block in gate if block.language == "yaml"))
     steps = [step["run"] for step in workflow["jobs"]["gate"]["steps"] if "run" in step]
