@@ -25,6 +25,7 @@ from spatial_replay.spec.formula import (
     Misalignment,
     Negative,
     Number,
+    Scaled,
     Signal,
     Specification,
     Sum,
@@ -157,6 +158,8 @@ def _units(expression: Expression, signal_units: Mapping[str, str]) -> Iterator[
         match stack.pop():
             case Sum(first, second):
                 stack += [first, second]
+            case Scaled():
+                yield DIMENSIONLESS
             case Negative(operand):
                 stack.append(operand)
             case Minimum(operands) | Maximum(operands):

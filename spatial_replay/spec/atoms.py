@@ -35,6 +35,7 @@ from spatial_replay.spec.syntax import (
     Quantity,
     RelationSyntax,
 )
+from spatial_replay.spec.units import scaled
 from spatial_replay.spec.walks import base_of, iter_expressions, terms_of
 
 _MIRRORED = MappingProxyType({">=": "<=", ">": "<"})
@@ -115,6 +116,7 @@ class AtomBuilder:
         scope: Scope,
     ) -> Atom:
         text = format_relation(relation, terms, parameters, self.names)
+        expression = scaled(expression, self.resolver.names.scales)
         span = scope.call or written.span
         return Atom(text, relation, expression, span=span, terms=terms, parameters=parameters)
 

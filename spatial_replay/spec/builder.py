@@ -12,6 +12,7 @@ from lark import Token
 
 from spatial_replay.spec.formula import Span
 from spatial_replay.spec.syntax import (
+    Arithmetic,
     BooleanSyntax,
     BoundSyntax,
     Call,
@@ -30,8 +31,10 @@ from spatial_replay.spec.syntax import (
     OpenGroup,
     Point,
     QuantifierSyntax,
+    Quantity,
     RegionStatement,
     RelationSyntax,
+    ScaleStatement,
     Shape,
     SpecStatement,
     TemporalSyntax,
@@ -117,6 +120,33 @@ def _title(token: Token) -> str:
     return text
 
 
+def _arithmetic(operator: Any, operands: tuple[Quantity, ...], children: list[Any]) -> Arithmetic:
+    span = _cover(children)
+    depth = 1 + max([each.depth for each in operands if isinstance(each, Arithmetic)], default=0)
+    if depth > MAX_DEPTH:
+        hint = "give parts of it names of their own, with const"
+        raise StatementError(span, f"more than {MAX_DEPTH} operations within one another", hint)
+    return Arithmetic(operator, operands, span, depth)
+
+
+def _looking_back(written: Quantity) -> Quantity:
+    """Return how far a delay looks back: n of `[-n]`.
+
+    Raises:
+        StatementError: no minus sign leads what is written.
+    """
+    if isinstance(written, Arithmetic):
+        leftmost: Quantity = written
+        while isinstance(leftmost, Arithmetic) and len(leftmost.operands) == 2:
+            leftmost = leftmost.operands[0]
+        if isinstance(leftmost, Arithmetic):
+            if leftmost is written:
+                return written.operands[0]
+            return Arithmetic("-", (written,), written.span, written.depth + 1)
+    hint = "write [-3] for three samples earlier, [-2.5s] for 2.5 seconds"
+    raise StatementError(written.span, "the brackets behind an object look back, so expected '-'", hint)
+
+
 class TreeBuilder:
     """Builds a node from the pieces of each rule, tokens included; lark calls a method by the rule's name."""
 
@@ -126,7 +156,10 @@ class TreeBuilder:
         return UseStatement(children[1])
 
     def const(self, children: list[Any]) -> ConstStatement:
-        return ConstStatement(children[1], children[3])
+        return ConstStatement(children[1], children[3], children[5])
+
+    def scale(self, children: list[Any]) -> ScaleStatement:
+        return ScaleStatement(children[1], children[3])
 
     def region(self, children: list[Any]) -> RegionStatement:
         _, name, _, shape, *height = children
@@ -173,10 +206,18 @@ class TreeBuilder:
 
     def number(self, children: list[Token]) -> NumberSyntax:
         span = _cover(children)
-        value = read_number(children[-1].value, span)
-        if len(children) == 2:
-            value = Duration(-value.ns) if isinstance(value, Duration) else 0.0 - value
-        return NumberSyntax(value, span)
+        return NumberSyntax(read_number(children[0].value, span), span)
+
+    def negative(self, children: list[Any]) -> Arithmetic:
+        return _arithmetic("-", (children[1],), children)
+
+    def arithmetic(self, children: list[Any]) -> Arithmetic:
+        first, token, second = children
+        return _arithmetic(token.value, (first, second), children)
+
+    def grouped(self, children: list[Any]) -> Quantity:
+        inner: Quantity = children[1]
+        return inner if isinstance(inner, Name) else replace(inner, span=_cover(children))
 
     # -------------------------------------------------------------------------------------- formulas
 
@@ -279,10 +320,8 @@ class TreeBuilder:
         return Enlargement(children[2], children[4], _cover(children))
 
     def delayed(self, children: list[Any]) -> Delayed:
-        term, _, _, amount, _ = children
+        term, _, amount, _ = children
         span = _cover(children)
         if isinstance(term, Delayed):
             raise StatementError(span, "a delay of a delayed object", "add the two up in one [-n]")
-        if isinstance(amount, Token):
-            amount = NumberSyntax(read_number(amount.value, span_of(amount)), span_of(amount))
-        return Delayed(term, amount, span)
+        return Delayed(term, _looking_back(amount), span)

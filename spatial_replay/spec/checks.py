@@ -27,8 +27,9 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.resolve import Namespace, kind_of
-from spatial_replay.spec.syntax import BrokenStatement, SpecStatement
+from spatial_replay.spec.syntax import BrokenStatement, ScaleStatement, SpecStatement, Statement
 from spatial_replay.spec.tokens import BINARY_TYPES, STATEMENT_TYPES, span_of, tokenize
+from spatial_replay.spec.units import LENGTHS, units_of
 from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, substitute, terms_of
 
 _TIGHTNESS = MappingProxyType({"IFF": 0, "IMPLIES": 1, "OR": 2, "XOR": 3, "AND": 4})
@@ -125,6 +126,21 @@ def unused_warnings(names: Namespace, source: SourceText) -> Iterator[Diagnostic
             continue
         message = f"{name!r} is {kind_of(statement)} that nothing uses"
         yield source.diagnostic("warning", statement.name.span, message, "use it or leave it out")
+
+
+def scale_warnings(
+    statements: Sequence[Statement], specs: Sequence[NamedSpec], source: SourceText
+) -> Iterator[Diagnostic]:
+    """Yield a warning for each `scale` line that divides no atom's number."""
+    scales = [statement for statement in statements if isinstance(statement, ScaleStatement)]
+    units = {str(unit.signal or LENGTHS): unit for spec in specs if scales for unit in units_of(spec.formula)}
+    for statement in scales:
+        name = statement.name.text
+        if name not in units or units[name].divisor is None:
+            known = [unit.signal for unit in units.values() if unit.signal is not None]
+            hint = nearest_hint(name, known) or f"it takes a signal that a spec compares, or {LENGTHS}"
+            message = f"no spec compares {name!r}, so this scale divides nothing"
+            yield source.diagnostic("warning", statement.name.span, message, hint)
 
 
 def object_names(specification: Specification) -> tuple[str, ...]:

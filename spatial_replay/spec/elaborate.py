@@ -29,6 +29,7 @@ from spatial_replay.spec.formula import (
 from spatial_replay.spec.relations import Relation
 from spatial_replay.spec.resolve import MAX_SIZE, Anything, Namespace, Resolver, Scope, Value, kind_of
 from spatial_replay.spec.syntax import (
+    Arithmetic,
     BooleanSyntax,
     BrokenStatement,
     Call,
@@ -422,9 +423,9 @@ class Elaborator:
         hint = self.faults.nearest(name, macros) or "define it with def"
         self.resolver.fault(written.name.span, scope, f"no macro is named {name!r}", hint)
 
-    def _argument(self, written: TermSyntax | NumberSyntax, scope: Scope) -> Value:
-        if isinstance(written, NumberSyntax):
-            return written.value
+    def _argument(self, written: TermSyntax | NumberSyntax | Arithmetic, scope: Scope) -> Value:
+        if isinstance(written, (NumberSyntax, Arithmetic)):
+            return self.resolver.quantity(written, scope)
         if isinstance(written, Name):
             local = scope.values.get(written.text)
             if local is not None:

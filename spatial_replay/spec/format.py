@@ -160,6 +160,9 @@ def format_specification(specification: Specification) -> str:
     lines = [f"use {specification.profile}"]
     for name, outline in specification.regions.items():
         lines.append(f"region {written_name(name, relations)} = {_format_outline(outline)}")
+    for scale in specification.scales:
+        signal = "lengths" if scale.signal is None else written_name(scale.signal, relations | {"lengths"})
+        lines.append(f"scale {signal} = {format_number(scale.divisor)}")
     for name, group in specification.groups.items():
         members = _format_open(group)
         if group.members is not None:

@@ -12,14 +12,15 @@ from lark import Token
 
 from spatial_replay.errors import MissingFileError, SpecificationError, UsageError
 from spatial_replay.spec.atoms import parameters_of
-from spatial_replay.spec.checks import past_warnings, reach_warnings, unused_warnings
+from spatial_replay.spec.checks import past_warnings, reach_warnings, scale_warnings, unused_warnings
+from spatial_replay.spec.constants import replaced
 from spatial_replay.spec.diagnostics import Diagnostic, Faults, SourceText, nearest_hint
 from spatial_replay.spec.elaborate import Elaborator, TooLargeError
-from spatial_replay.spec.formula import Constant, Expression, Span, Specification
+from spatial_replay.spec.formula import Expression, Span, Specification
 from spatial_replay.spec.parser import parse_statements
 from spatial_replay.spec.relations import DEFAULT_PROFILE, PROFILES, RELATION_NAMES, Relation
 from spatial_replay.spec.resolve import Namespace
-from spatial_replay.spec.syntax import BrokenStatement, Duration, SpecStatement, Statement, UseStatement
+from spatial_replay.spec.syntax import BrokenStatement, ConstStatement, SpecStatement, Statement, UseStatement
 from spatial_replay.spec.tokens import MAX_TOKENS, is_reserved, tokenize
 
 MAX_LENGTH = 256 * 1024
@@ -44,13 +45,13 @@ def parse_specification(
         filename: named in messages.
         profile: relation profile of a text without a `use` line: "paper" (the default) or "spatial_spec".
         relations: further relations by name, as functions; see `relations`.
-        constants: values to take instead of those of the text's `const` lines: numbers and, as texts,
-            durations such as "2s".
+        constants: values to put into the text's `const` lines: numbers and, as texts, durations such as
+            "2s"; `Specification.source` has them, with the comments and all else as it was.
 
     Raises:
         SpecificationError: with every fault of the text.
         UsageError: no text, an unknown profile, a relation that does not take terms and numbers, a
-            constant the text does not have.
+            constant that the text does not have, a number for a duration or the reverse.
     """
     _require_text(text)
     given = dict(relations or {})
@@ -58,13 +59,16 @@ def parse_specification(
     if profile is not None and profile not in PROFILES:
         raise UsageError(f"unknown profile {profile!r}; the profiles are {', '.join(PROFILES)}")
     text = text.removeprefix("\ufeff")
-    faults = Faults(SourceText.of(text, filename))
     names = RELATION_NAMES | given.keys()
+    if constants:
+        text = _with_constants(text, filename, names, constants)
+    faults = Faults(SourceText.of(text, filename))
     tokens = _tokens(text, names, faults)
     statements = parse_statements(tokens, names, faults)
     used_profile = _profile(statements, faults) or profile or DEFAULT_PROFILE
-    namespace = Namespace(faults, dict(constants or {}))
+    namespace = Namespace(faults)
     namespace.declare(statements)
+    listed = namespace.constant_ranges()
     elaborator = Elaborator(
         namespace, {**PROFILES[used_profile], **given}, frozenset(token.value for token in tokens), faults
     )
@@ -82,6 +86,7 @@ def parse_specification(
         *reach_warnings(tokens, faults.source, used_profile == "spatial_spec"),
         *past_warnings(done, faults.source),
         *unused_warnings(namespace, faults.source),
+        *scale_warnings(statements, done, faults.source),
     ]
     warnings.sort(key=lambda warning: (warning.line, warning.column))
     return Specification(
@@ -90,7 +95,8 @@ def parse_specification(
         namespace.regions,
         namespace.groups,
         frozenset(given),
-        {name: _constant(value) for name, value in namespace.constants.items() if value is not None},
+        listed,
+        scales=tuple(namespace.scales),
         source=text,
         filename=filename,
         warnings=tuple(warnings[:_MAX_WARNINGS]),
@@ -166,10 +172,16 @@ def _check_relations(relations: Mapping[str, Relation]) -> None:
         parameters_of(name, relation)
 
 
-def _constant(value: float | Duration) -> Constant:
-    if isinstance(value, Duration):
-        return Constant(value.ns / 1e9, value.ns)
-    return Constant(value)
+def _with_constants(
+    text: str, filename: str, names: frozenset[str], constants: Mapping[str, float | str]
+) -> str:
+    """Return the text with other values in its `const` lines, so that it says what is evaluated."""
+    faults = Faults(SourceText.of(text, filename))
+    namespace = Namespace(faults)
+    namespace.declare(parse_statements(_tokens(text, names, faults), names, faults))
+    faults.raise_if_any()
+    lines = {name: each for name, each in namespace.definitions.items() if isinstance(each, ConstStatement)}
+    return replaced(text, lines, namespace.constants, constants)
 
 
 def _tokens(text: str, names: frozenset[str], faults: Faults) -> list[Token]:

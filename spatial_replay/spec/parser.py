@@ -28,7 +28,7 @@ FORMULA_NAME = "spec"
 TABLES_FILE = "grammar_tables.json"
 """Written by `tools/make_grammar`."""
 _OPENING = frozenset({"LPAR", "LSQB"})
-_STATEMENT_WORDS = tuple(word for word, kind in KEYWORDS.items() if kind in STATEMENT_TYPES)
+_STATEMENT_WORDS = (*(word for word, kind in KEYWORDS.items() if kind in STATEMENT_TYPES), "scale")
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +236,7 @@ def _too_deep(tokens: Sequence[Token]) -> Token | None:
 
 
 def _broken(tokens: Sequence[Token]) -> BrokenStatement | None:
-    if len(tokens) > 1 and tokens[1].type == "NAME" and tokens[0].type != "USE":
+    if len(tokens) > 1 and tokens[1].type == "NAME" and tokens[0].type not in ("USE", "SCALE"):
         return BrokenStatement(Name(tokens[1].value, span_of(tokens[1])))
     return None
 
@@ -247,6 +247,7 @@ _EXPECTATIONS: tuple[tuple[frozenset[str], str], ...] = (
     (frozenset({"TRUTH", "NOT", "PREFIX"}), "a formula"),
     (frozenset({"ENLARGE", "ALL"}), "an object, region or group"),
     (frozenset({"NUMBER", "MINUS"}), "a number"),
+    (frozenset({"PLUS", "STAR"}), "an arithmetic sign"),
     (frozenset({"NAME"}), "a name"),
     (frozenset({"RELATION"}), "a relation"),
     (frozenset({"COMPARE"}), "a comparison (<=, <, >=, >, ==)"),
@@ -262,7 +263,8 @@ _COVERED: Mapping[str, frozenset[str]] = MappingProxyType(
     {
         "a formula": frozenset({"NAME", "LPAR", "MINUS", "NUMBER", "ENLARGE", "ALL", "CLASS"}),
         "an object, region or group": frozenset({"NAME", "LPAR", "CLASS", "NUMBER", "MINUS"}),
-        "a number": frozenset({"NAME"}),
+        "a number": frozenset({"NAME", "LPAR"}),
+        "an arithmetic sign": frozenset({"MINUS", "SLASH"}),
         "a relation": frozenset({"DIST", "CLOSER", "BETWEEN"}),
     }
 )

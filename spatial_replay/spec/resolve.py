@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Literal, TypeAlias
 
-from spatial_replay.errors import UsageError
 from spatial_replay.spec import regions as outline
-from spatial_replay.spec.builder import StatementError, read_number
-from spatial_replay.spec.diagnostics import Faults, nearest_hint
+from spatial_replay.spec.constants import constant_of, names_in, range_fault, value_of
+from spatial_replay.spec.diagnostics import Faults
 from spatial_replay.spec.format import format_number
 from spatial_replay.spec.formula import (
     ANY_CLASS,
     Bound,
+    Constant,
     Earlier,
     Enlarged,
     Group,
     Outline,
     RegionName,
+    Scale,
     Span,
     Term,
     TrackedName,
@@ -38,15 +37,17 @@ from spatial_replay.spec.syntax import (
     Exclusion,
     GroupStatement,
     Name,
-    NumberSyntax,
     OpenGroup,
     Quantity,
     RegionStatement,
+    ScaleStatement,
     SpecStatement,
     Statement,
     TermSyntax,
     UseStatement,
 )
+from spatial_replay.spec.tokens import quoted
+from spatial_replay.spec.units import LENGTHS
 
 KIND_OF: Mapping[type, str] = MappingProxyType(
     {
@@ -58,8 +59,6 @@ KIND_OF: Mapping[type, str] = MappingProxyType(
         BrokenStatement: "a definition",
     }
 )
-
-_DURATION = re.compile(r"-?\d+(\.\d*)?([eE][+-]?\d{1,3})?m?s")
 
 
 def kind_of(statement: Statement) -> str:
@@ -75,23 +74,25 @@ class Namespace:
         definitions: statements by name; of a name given twice, the first.
         regions, groups: the values of those definitions.
         used: names that something refers to.
-        overrides: constants given from outside instead of the text's: numbers and, as texts, durations.
+        scales: what `scale` lines divide numbers by.
     """
 
     faults: Faults
-    overrides: Mapping[str, float | str]
     definitions: dict[str, Statement] = field(default_factory=dict)
     regions: dict[str, Outline] = field(default_factory=dict)
     groups: dict[str, Group] = field(default_factory=dict)
     used: set[str] = field(default_factory=set)
     constants: dict[str, float | Duration | None] = field(default_factory=dict)
+    scales: list[Scale] = field(default_factory=list)
 
     def declare(self, statements: Sequence[Statement]) -> None:
         """Add the definitions of a text, and compute constants, regions and groups."""
         for statement in statements:
-            if not isinstance(statement, UseStatement):
+            if not isinstance(statement, (UseStatement, ScaleStatement)):
                 self._declare(statement)
-        self._check_overrides()
+        for statement in statements:
+            if isinstance(statement, ScaleStatement):
+                self._add_scale(statement)
         effort = outline.Effort()
         for name, statement in self.definitions.items():
             match statement:
@@ -110,61 +111,76 @@ class Namespace:
             message = f"{name.text!r} is already the name of {kind_of(first)}, in line {line}"
             self.faults.add(name.span, message, "give each definition a name of its own")
 
-    def _check_overrides(self) -> None:
-        consts = [name for name, each in self.definitions.items() if isinstance(each, ConstStatement)]
-        for name, value in self.overrides.items():
-            if name not in consts:
-                hint = nearest_hint(name, consts) or f"its constants are: {', '.join(consts) or 'none'}"
-                raise UsageError(f"constants: the specification has no const {name!r}; {hint}")
-            _overriding(name, value)
+    def _add_scale(self, statement: ScaleStatement) -> None:
+        name, before = statement.name, self.faults.count
+        signal = None if name.text == LENGTHS and not name.is_quoted else name.text
+        divisor = self.plain_number(statement.value)
+        defined = self.definitions.get(name.text)
+        if signal is not None and defined is not None:
+            hint = f"scale takes a signal of the log, or {LENGTHS}"
+            self.faults.add(name.span, f"{name.text!r} is {kind_of(defined)}", hint)
+        elif any(each.signal == signal for each in self.scales):
+            self.faults.add(name.span, f"{name.text!r} is scaled twice", "leave one out")
+        elif self.faults.count == before and divisor <= 0.0:
+            message = f"a scale of {format_number(divisor)}"
+            hint = "write what counts as much as 1 of the others, above 0"
+            self.faults.add(statement.value.span, message, hint)
+        else:
+            self.scales.append(Scale(signal, divisor))
 
     def constant(self, name: str) -> float | Duration | None:
         """Return the value of a constant; None, and a fault, for one that is defined in terms of itself."""
-        if name in self.constants:
-            return self.constants[name]
-        chain: dict[str, ConstStatement] = {}
-        value: float | Duration | None = None
-        current: str | None = name
-        while current is not None:
+        pending = [name]
+        while pending:
+            current = pending[-1]
             statement = self.definitions.get(current)
-            if current in self.constants:
-                value, current = self.constants[current], None
-            elif not isinstance(statement, ConstStatement) or current in chain:
-                self._report_constant(chain, current, statement)
-                current = None
+            if current in self.constants or not isinstance(statement, ConstStatement):
+                pending.pop()
+                continue
+            needed = next((each for each in names_in(statement.value) if self._is_pending(each)), None)
+            if needed is None:
+                self.constants[current] = value_of(statement.value, self.named, self.faults.add)
+            elif needed.text in pending:
+                message = f"const {needed.text!r} is defined in terms of itself"
+                self.faults.add(needed.span, message, "give it a number")
+                self.constants[current] = None
             else:
-                chain[current] = statement
-                value, current = self._one_constant(current, statement)
-        for each in chain:
-            self.constants[each] = value
-        return value
+                pending.append(needed.text)
+        return self.constants.get(name)
 
-    def _one_constant(
-        self, name: str, statement: ConstStatement
-    ) -> tuple[float | Duration | None, str | None]:
-        """Return the value of a constant, or the name of the constant that it repeats."""
-        if name in self.overrides:
-            return _overriding(name, self.overrides[name]), None
-        if isinstance(statement.value, Name):
-            self.used.add(statement.value.text)
-            return None, statement.value.text
-        return statement.value.value, None
+    def _is_pending(self, name: Name) -> bool:
+        return name.text not in self.constants and isinstance(self.definitions.get(name.text), ConstStatement)
 
-    def _report_constant(
-        self, chain: Mapping[str, ConstStatement], name: str, statement: Statement | None
-    ) -> None:
-        if not chain or isinstance(statement, BrokenStatement):
-            return
-        user = list(chain.values())[-1]
-        if name in chain:
-            message = f"const {name!r} is defined in terms of itself"
-            self.faults.add(user.value.span, message, "give it a number")
-        else:
-            self._report_not_a_number(Name(name, user.value.span), statement)
+    def constant_ranges(self) -> dict[str, Constant]:
+        """Return the constants that have a value, each checked against its range."""
+        found: dict[str, Constant] = {}
+        for name, statement in self.definitions.items():
+            value = self.constants.get(name)
+            if value is None or not isinstance(statement, ConstStatement):
+                continue
+            ends = None
+            if statement.range is not None:
+                low, high = (
+                    value_of(each, self.named, self.faults.add)
+                    for each in (statement.range.lower, statement.range.upper)
+                )
+                ends = None if low is None or high is None else (low, high)
+            fault = None if ends is None else range_fault(value, ends)
+            if fault is not None:
+                self.faults.add(statement.value.span, f"const {name!r}: {fault[0]}", fault[1])
+            found[name] = constant_of(value, ends)
+        return found
 
     def _report_not_a_number(self, name: Name, statement: Statement | None) -> None:
         """Report that a name, and the statement that defines it if one does, is not a number."""
-        if statement is None:
+        if name.text == "inf":
+            self.faults.add(
+                name.span, "'inf' is not a number here", "it is the upper end of a window: [0, inf]"
+            )
+        elif name.is_quoted and statement is None:
+            hint = f"an object gets another name by a group: group NAME = {quoted(name.text)}"
+            self.faults.add(name.span, "a text, where a number or a duration is expected", hint)
+        elif statement is None:
             consts = (each for each, what in self.definitions.items() if isinstance(what, ConstStatement))
             hint = self.faults.nearest(name.text, consts) or f"define it: const {name.text} = 1.0"
             self.faults.add(name.span, f"unknown constant {name.text!r}", hint)
@@ -173,14 +189,16 @@ class Namespace:
 
     def quantity(self, written: Quantity) -> float | Duration:
         """Return the number or duration written, or that of a constant; 0 after a fault."""
-        if isinstance(written, NumberSyntax):
-            return written.value
-        self.used.add(written.text)
-        statement = self.definitions.get(written.text)
+        return value_of(written, self.named, self.faults.add) or 0.0
+
+    def named(self, name: Name) -> float | Duration | None:
+        """Return the value of the constant of a name; None, and a fault, if it is none."""
+        self.used.add(name.text)
+        statement = self.definitions.get(name.text)
         if not isinstance(statement, ConstStatement):
-            self._report_not_a_number(written, statement)
-            return 0.0
-        return self.constant(written.text) or 0.0
+            self._report_not_a_number(name, statement)
+            return None
+        return self.constant(name.text)
 
     def plain_number(self, written: Quantity) -> float:
         """Return a number written outside of formulas; 0 after a fault."""
@@ -235,24 +253,6 @@ class Namespace:
                 self.faults.add(member.span, f"{member.text!r} is listed twice", "leave one out")
             members.setdefault(member.text, member.span)
         return Group(name, members=tuple(members))
-
-
-def _overriding(name: str, value: object) -> float | Duration:
-    """Return the value given for a constant from outside.
-
-    Raises:
-        UsageError: it is neither a finite number nor the text of a duration.
-    """
-    if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
-        return float(value)
-    if isinstance(value, str) and _DURATION.fullmatch(value):
-        try:
-            return read_number(value, Span(0, 0))
-        except StatementError as fault:
-            raise UsageError(f"constants: {name!r}: {fault.message}; {fault.hint}") from fault
-    raise UsageError(
-        f"constants: {name!r} is {value!r}; give a finite number or, as a text, a duration: '2s', '500ms'"
-    )
 
 
 def class_of(group: OpenGroup) -> str:
@@ -404,14 +404,22 @@ class Resolver:
 
     def quantity(self, written: Quantity, scope: Scope) -> float | Duration:
         """Return the number or duration at a place; 0 after a fault."""
-        value = scope.values.get(written.text) if isinstance(written, Name) else None
-        if value is None:
-            return self.names.quantity(written)
-        if isinstance(value, (float, Duration)):
-            return value
-        if isinstance(written, Name) and not isinstance(value, Anything):
-            self.fault(written.span, scope, f"{written.text!r} is an object; a number is expected here")
-        return 0.0
+
+        def named(name: Name) -> float | Duration | None:
+            value = scope.values.get(name.text)
+            if value is None:
+                return self.names.named(name)
+            if isinstance(value, (float, Duration)):
+                return value
+            if not isinstance(value, Anything):
+                message = f"{name.text!r} is an object; a number is expected here"
+                self.fault(name.span, scope, message)
+            return None
+
+        def report(span: Span, message: str, hint: str) -> None:
+            self.fault(span, scope, message, hint)
+
+        return value_of(written, named, report) or 0.0
 
     def number(self, written: Quantity, scope: Scope) -> float:
         """Return a plain number; a duration in its place is a fault."""

@@ -22,6 +22,11 @@ class Name:
     text: str
     span: Span
 
+    @property
+    def is_quoted(self) -> bool:
+        """Whether it was written in quotes."""
+        return self.span.end - self.span.start > len(self.text)
+
 
 @dataclass(frozen=True, slots=True)
 class NumberSyntax:
@@ -31,7 +36,17 @@ class NumberSyntax:
     span: Span
 
 
-Quantity: TypeAlias = Name | NumberSyntax
+@dataclass(frozen=True, slots=True)
+class Arithmetic:
+    """`first * second` or another operation; `-` with one operand is its negative."""
+
+    operator: Literal["+", "-", "*", "/"]
+    operands: tuple[Quantity, ...]
+    span: Span
+    depth: int
+
+
+Quantity: TypeAlias = Name | NumberSyntax | Arithmetic
 
 # ---------------------------------------------------------------------------------------------- terms
 
@@ -89,7 +104,7 @@ class Call:
     """`name(argument, ...)`: a use of a `def`."""
 
     name: Name
-    arguments: tuple[TermSyntax | NumberSyntax, ...]
+    arguments: tuple[TermSyntax | NumberSyntax | Arithmetic, ...]
     span: Span
 
 
@@ -219,7 +234,16 @@ class UseStatement:
 
 @dataclass(frozen=True, slots=True)
 class ConstStatement:
-    """`const name = value`."""
+    """`const name = value in [low, high]`; without a range, that is None."""
+
+    name: Name
+    value: Quantity
+    range: BoundSyntax | None
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleStatement:
+    """`scale signal = value`, or `scale lengths = value`."""
 
     name: Name
     value: Quantity
@@ -273,6 +297,7 @@ class BrokenStatement:
 Statement: TypeAlias = (
     UseStatement
     | ConstStatement
+    | ScaleStatement
     | RegionStatement
     | GroupStatement
     | DefStatement

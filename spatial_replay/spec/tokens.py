@@ -15,7 +15,7 @@ from lark import Token
 from spatial_replay.spec.diagnostics import Faults
 from spatial_replay.spec.formula import Span
 
-STATEMENT_TYPES: frozenset[str] = frozenset({"USE", "CONST", "REGION", "GROUP", "DEF", "SPEC"})
+STATEMENT_TYPES: frozenset[str] = frozenset({"USE", "CONST", "SCALE", "REGION", "GROUP", "DEF", "SPEC"})
 BINARY_TYPES: frozenset[str] = frozenset({"AND", "OR", "XOR", "IMPLIES", "IFF", "INFIX"})
 
 KEYWORDS: Mapping[str, str] = MappingProxyType(
@@ -52,6 +52,9 @@ _SIGNS: Mapping[str, str] = MappingProxyType(
         ":": "COLON",
         "=": "EQUAL",
         "-": "MINUS",
+        "+": "PLUS",
+        "*": "STAR",
+        "/": "SLASH",
     }
 )
 
@@ -62,8 +65,8 @@ _TOKEN = re.compile(
     | (?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?(?P<unit>[A-Za-z_][A-Za-z0-9_]*)?)
     | (?P<word>[A-Za-z_][A-Za-z0-9_]*)
     | (?P<quoted>"(?:[^"\\\r\n]|\\[^\r\n])*")
-    | (?P<sign><->|->|<=|>=|==|[<>!&|()\[\],:=-])
-    | (?P<unknown>"[^\r\n]*|[^\sA-Za-z0-9_"\#()\[\],:=<>!&|.-]+|.)
+    | (?P<sign><->|->|<=|>=|==|[<>!&|()\[\],:=+*/-])
+    | (?P<unknown>"[^\r\n]*|[^\sA-Za-z0-9_"\#()\[\],:=<>!&|.+*/-]+|.)
     """,
     re.VERBOSE | re.DOTALL,
 )
@@ -139,7 +142,18 @@ def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token
                 faults.add(span, f"{value!r} is neither a number, nor a duration, nor a name", hint)
                 value = value[: -len(unit)]
         tokens.append(Token(token_type, value, span.start, line, None, line, None, span.end))
-    return _join_published_spellings(tokens)
+    return _with_scales(_join_published_spellings(tokens))
+
+
+def _with_scales(tokens: list[Token]) -> list[Token]:
+    """Read `scale NAME =` as a statement; anywhere else `scale` is a name like others."""
+    for index, token in enumerate(tokens[:-2]):
+        following = [each.type for each in tokens[index + 1 : index + 3]]
+        if token.value == "scale" and token.type == "NAME" and following == ["NAME", "EQUAL"]:
+            before = tokens[index - 1] if index else None
+            if before is None or before.line != token.line:
+                token.type = "SCALE"
+    return tokens
 
 
 def _is_title_expected(before: list[Token]) -> bool:

@@ -27,6 +27,7 @@ from spatial_replay.spec.formula import (
     Protrusion,
     Quantified,
     RegionName,
+    Scaled,
     Signal,
     SignedDistance,
     Sum,
@@ -69,7 +70,7 @@ def iter_expressions(expression: Expression) -> Iterator[Expression]:
         match current:
             case Sum():
                 stack += (current.second, current.first)
-            case Negative():
+            case Negative() | Scaled():
                 stack.append(current.operand)
             case Minimum() | Maximum():
                 stack += reversed(current.operands)
@@ -230,6 +231,8 @@ def map_leaves(
             return Minimum(tuple([map_leaves(each, change) for each in expression.operands]))
         case Maximum():
             return Maximum(tuple([map_leaves(each, change) for each in expression.operands]))
+        case Scaled():
+            return Scaled(map_leaves(expression.operand, change), expression.divisor)
         case _:
             return change(expression)
 

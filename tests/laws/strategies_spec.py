@@ -222,6 +222,7 @@ def specification_texts(draw: st.DrawFn) -> str:
         profile,
         "const near = 1.5   # in metres",
         "const settle = 2s",
+        draw(st.sampled_from(["", "scale battery = near * 2", "scale lengths = 0.1"])),
         f"region goal = box(-1, {draw(numbers)}, near, 10000){height}",
         f"region table = circle((0, -2.5), {draw(numbers)})",
         "region tri = polygon((0, 0), (4, 1), (1, 4))",

@@ -202,6 +202,53 @@ def test_a_specification_lists_its_constants() -> None:
     assert constants == {"e": Constant(7.0), "far": Constant(7.0), "wait": Constant(2.0, 2_000_000_000)}
 
 
+@pytest.mark.parametrize(
+    ("written", "value"),
+    [
+        ("near * 2", "6"),
+        ("near + 1 - 2", "2"),
+        ("near - 1 * 2", "1"),
+        ("(near - 1) * 2", "4"),
+        ("-near + 10", "7"),
+        ("0.1 * 30", "3"),
+        ("wait / 500ms", "4"),
+        ("(wait + 1s) / wait", "1.5"),
+    ],
+)
+def test_arithmetic_stands_wherever_a_constant_may(written: str, value: str) -> None:
+    head = "const near = 3\nconst wait = 2s\n"
+    text = f"{head}const e = {written}\nspec s = (a closeto[{written}] b) and (a closeto[e] b)"
+    formula = parse_specification(text).specs[0].formula
+    assert format_formula(formula) == f"(a closeto[{value}] b) and (a closeto[{value}] b)"
+    text = (
+        f"{head}def near_it(x, e) = enlarge(x, e + 1 - 1) dist b <= {written}\nspec s = near_it(a, {written})"
+    )
+    formula = parse_specification(text).specs[0].formula
+    assert format_formula(formula) == f"enlarge(a, {value}) dist b <= {value}"
+
+
+def test_durations_are_computed_in_windows_and_delays() -> None:
+    text = "const wait = 2s\nspec s = F[wait / 4, wait * 1.5] (a[-(wait + 1s)] closeto[1 + 1] b[-wait-1s])"
+    formula = parse_specification(text).specs[0].formula
+    assert format_formula(formula) == "F[0.5s, 3s] (a[-3s] closeto[2] b[-3s])"
+    chained = parse_specification("const n = 2\nspec s = n * 2 <= a dist b < (n + 1) * 2").specs[0].formula
+    assert format_formula(chained) == "4 <= a dist b < 6"
+
+
+def test_a_value_given_for_a_constant_has_its_unit_and_keeps_its_range() -> None:
+    text = "const near = 70 in [40, 100]  # pixels\nconst wait = 2s\nspec s = F[0s, wait] a closeto[near] b"
+    changed = parse_specification(text, constants={"near": "80", "wait": "500ms"})
+    assert changed.source == text.replace("70", "80").replace("2s", "0.5s")
+    assert format_formula(changed.specs[0].formula) == "F[0s, 0.5s] (a closeto[80] b)"
+    assert changed.constants["near"] == Constant(80.0, None, (40.0, 100.0))
+    with pytest.raises(UsageError, match="'near' cannot be '2s': it is a number, 70 in the text"):
+        parse_specification(text, constants={"near": "2s"})
+    with pytest.raises(UsageError, match="'wait' cannot be 2: it is a duration, 2s in the text"):
+        parse_specification(text, constants={"wait": 2})
+    with pytest.raises(SpecificationError, match=r"170 is outside of the range \[40, 100\]"):
+        parse_specification(text, constants={"near": 170})
+
+
 def test_relations_can_be_added_in_python() -> None:
     def near_but_apart(a: Term, b: Term, most: float, least: float = 0.5) -> Expression:
         return minimum(SignedDistance(a, b) - least, most - SignedDistance(a, b))

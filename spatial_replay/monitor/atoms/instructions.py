@@ -30,6 +30,7 @@ from spatial_replay.spec.formula import (
     Negative,
     Number,
     Quantified,
+    Scaled,
     Signal,
     Sum,
     Temporal,
@@ -46,6 +47,7 @@ ADD, NEGATE, LEAST, GREATEST = 3, 4, 5, 6  # numbers; not a number where an oper
 HOLDS = 7  # a number as an interval: all of the reals where it is not a number
 AND, OR = 8, 9  # intervals
 AND_MEMBER, OR_MEMBER = 10, 11  # a, and b where members c is 1, anything where it is -1
+DIVIDE = 12  # a by constant b, which is positive
 
 TILE = 128
 """Samples processed together: few, so that their columns stay in the processor's cache."""
@@ -101,6 +103,8 @@ def run_instructions(
                             target[k] = np.inf if channel % 2 else -np.inf
                     elif op == AND:
                         target[k] = min(first[k], second[k])
+                    elif op == DIVIDE:
+                        target[k] = first[k] / constants[b]
                     elif op == OR:
                         target[k] = max(first[k], second[k])
                     else:
@@ -204,6 +208,9 @@ class LeafCode:
                 return self._row(ADD, first, self._expression(expression.second, bindings))
             case Negative():
                 return self._row(NEGATE, self._expression(expression.operand, bindings))
+            case Scaled(operand, divisor):
+                constant = self.constants.setdefault(divisor, len(self.constants))
+                return self._row(DIVIDE, self._expression(operand, bindings), constant)
             case Minimum() | Maximum():
                 op = LEAST if isinstance(expression, Minimum) else GREATEST
                 row, *others = [self._expression(each, bindings) for each in expression.operands]

@@ -34,6 +34,7 @@ from spatial_replay.spec.formula import (
     Projection,
     Protrusion,
     Quantified,
+    Scaled,
     Signal,
     SignedDistance,
     Sum,
@@ -63,7 +64,7 @@ def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
             values = scene.trace.signals.get(part.name)
             if values is None or not np.isfinite(values[scene.skip]):
                 yield f"signal {part.name!r} has no finite value"
-        case Number() | Sum() | Negative() | Minimum() | Maximum():
+        case Number() | Sum() | Negative() | Minimum() | Maximum() | Scaled():
             return
         case _:
             for term in terms_of(part):
@@ -233,6 +234,8 @@ def _branch(
             yield from _branch(scene, expression.second, end, sign)
         case Negative():
             yield from _branch(scene, expression.operand, end.turned, -sign)
+        case Scaled():
+            yield from _branch(scene, expression.operand, end, sign)
         case Minimum() | Maximum():
             operands = expression.operands
             intervals = _intervals(scene, [_as_atom(each) for each in operands])

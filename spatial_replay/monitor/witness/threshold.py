@@ -32,6 +32,7 @@ from spatial_replay.spec.formula import (
     Projection,
     Protrusion,
     Quantified,
+    Scaled,
     Signal,
     SignedDistance,
     Sum,
@@ -57,7 +58,7 @@ class Dial:
 
     kind: Literal["number", "radius", "margin"]
     value: float
-    slope: int
+    slope: float
     is_uniform: bool
     is_exact: bool
 
@@ -66,14 +67,16 @@ class Dial:
         """Choose the first number of the deciding branch written in the atom, else a radius, else 0."""
         atom = deciding.atom
         is_exact = "==" in atom.parameters
+        divisor = atom.expression.divisor if isinstance(atom.expression, Scaled) else 1.0
         for sign, part in deciding.branch:
             if isinstance(part, Number) and part.value in atom.parameters:
                 slopes = _slopes(atom.expression, part.value)
-                return cls("number", part.value, sign, slopes == {sign}, is_exact)
+                slope = sign / divisor
+                return cls("number", part.value, slope, slopes == {slope}, is_exact)
         for sign, part in deciding.branch:
             for radius in _radii(part):
                 # of prisms, how high they are may decide instead
-                slope = sign * _slope_of_radius(part, radius)
+                slope = sign * _slope_of_radius(part, radius) / divisor
                 return cls("radius", radius, slope, False, is_exact)
         return cls("margin", 0.0, -1, True, is_exact)
 
@@ -98,7 +101,7 @@ def rewritten(formula: Formula, is_meant: Callable[[Atom], bool], change: Callab
             return replace(formula, operands=operands)
 
 
-def _slopes(expression: Expression, number: float) -> set[int]:
+def _slopes(expression: Expression, number: float) -> set[float]:
     """Return what adding 1 to every such number adds to the expression, for each branch that may decide."""
     match expression:
         case Number():
@@ -108,6 +111,8 @@ def _slopes(expression: Expression, number: float) -> set[int]:
             return {a + b for a in first for b in second}
         case Negative():
             return {-slope for slope in _slopes(expression.operand, number)}
+        case Scaled(operand, divisor):
+            return {slope / divisor for slope in _slopes(operand, number)}
         case Minimum() | Maximum():
             return {slope for each in expression.operands for slope in _slopes(each, number)}
     return {0}

@@ -1,0 +1,186 @@
+"""Values of constants: arithmetic, ranges, and values given from outside in place of those of the text."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping
+from fractions import Fraction
+from typing import TypeAlias
+
+from spatial_replay.errors import UsageError
+from spatial_replay.spec.builder import MAX_DURATION_NS, StatementError, read_number
+from spatial_replay.spec.diagnostics import nearest_hint
+from spatial_replay.spec.format import format_duration, format_number
+from spatial_replay.spec.formula import Constant, Span
+from spatial_replay.spec.syntax import Arithmetic, ConstStatement, Duration, Name, NumberSyntax, Quantity
+
+Value: TypeAlias = float | Duration
+
+_DURATION = re.compile(r"-?\d+(\.\d*)?([eE][+-]?\d{1,3})?m?s")
+_NUMBER = re.compile(r"-?\d+(\.\d*)?([eE][+-]?\d{1,3})?")
+_WORDS = {"+": "added", "-": "subtracted", "*": "multiplied", "/": "divided"}
+
+
+class _ImpossibleError(Exception):
+    """Operands that an operator cannot combine; the message says why."""
+
+
+def value_of(
+    written: Quantity, named: Callable[[Name], Value | None], report: Callable[[Span, str, str], None]
+) -> Value | None:
+    """Return the value of a quantity; None, and a fault, where it has none.
+
+    Args:
+        named: returns the value of a name; where that has none, reports it and returns None.
+        report: takes the place of a fault, its message and a hint.
+    """
+    if isinstance(written, NumberSyntax):
+        return written.value
+    if isinstance(written, Name):
+        return named(written)
+    values = [value_of(operand, named, report) for operand in written.operands]
+    if any(value is None for value in values):
+        return None
+    try:
+        return _computed(written, [value for value in values if value is not None])
+    except _ImpossibleError as fault:
+        report(written.span, str(fault), "durations are added to durations, and multiplied by numbers")
+    except (OverflowError, ZeroDivisionError) as fault:
+        what = "division by zero" if isinstance(fault, ZeroDivisionError) else "a result that is too large"
+        report(written.span, what, "numbers reach up to about 1.7e308, durations up to 9e9s")
+    return None
+
+
+def names_in(written: Quantity) -> Iterator[Name]:
+    """Yield the names that a quantity is computed from."""
+    if isinstance(written, Name):
+        yield written
+    elif isinstance(written, Arithmetic):
+        for operand in written.operands:
+            yield from names_in(operand)
+
+
+def _computed(written: Arithmetic, values: list[Value]) -> Value:
+    """Return a result, exact in decimal digits and then rounded: 0.1 * 30 is 3, as written."""
+    first, *rest = values
+    if not rest:
+        return Duration(-first.ns) if isinstance(first, Duration) else 0.0 - first
+    durations = [isinstance(value, Duration) for value in values]
+    one, other = _exact(first), _exact(rest[0])
+    match written.operator:
+        case "+" | "-" if durations[0] == durations[1]:
+            return _rounded(one + other if written.operator == "+" else one - other, durations[0])
+        case "*" if not all(durations):
+            return _rounded(one * other, any(durations))
+        case "/" if durations[0] or not durations[1]:
+            return _rounded(one / other, durations[0] and not durations[1])
+    kinds = " and ".join("a duration" if is_duration else "a number" for is_duration in durations)
+    raise _ImpossibleError(f"{kinds} cannot be {_WORDS[written.operator]}")
+
+
+def _exact(value: Value) -> Fraction:
+    return Fraction(value.ns) if isinstance(value, Duration) else Fraction(repr(value))
+
+
+def _rounded(result: Fraction, is_duration: bool) -> Value:
+    if not is_duration:
+        return float(result)
+    ns = round(result)
+    if abs(ns) > MAX_DURATION_NS:
+        raise OverflowError
+    return Duration(ns)
+
+
+# ------------------------------------------------------------------------------------------------ ranges
+
+
+def constant_of(value: Value, ends: tuple[Value, Value] | None) -> Constant:
+    """Return a constant as specifications list it."""
+    span = None if ends is None else (_plain(ends[0]), _plain(ends[1]))
+    return Constant(_plain(value), value.ns if isinstance(value, Duration) else None, span)
+
+
+def _plain(value: Value) -> float:
+    return value.ns / 1e9 if isinstance(value, Duration) else value
+
+
+def range_fault(value: Value, ends: tuple[Value, Value]) -> tuple[str, str] | None:
+    """Return what is wrong with the range of a constant, and a hint; None if it holds the value."""
+    kinds = {isinstance(each, Duration) for each in (value, *ends)}
+    if len(kinds) > 1:
+        return "a range from numbers to durations", "write both ends like the constant itself"
+    low, high = ends
+    text = f"[{text_of(low)}, {text_of(high)}]"
+    if _exact(low) > _exact(high):
+        return f"the range {text} is empty: its ends are reversed", "the smaller end comes first"
+    if not _exact(low) <= _exact(value) <= _exact(high):
+        return f"{text_of(value)} is outside of the range {text}", "give a value in it, or widen the range"
+    return None
+
+
+def text_of(value: Value) -> str:
+    """Return a value as written in a text."""
+    return format_duration(value.ns) if isinstance(value, Duration) else format_number(value)
+
+
+# ------------------------------------------------------------------------------------ from the outside
+
+
+def replaced(
+    text: str,
+    statements: Mapping[str, ConstStatement],
+    values: Mapping[str, Value | None],
+    given: Mapping[str, float | str],
+) -> str:
+    """Return a text with other values for some of its constants; comments and all else stay.
+
+    Args:
+        statements: the text's `const` lines by name.
+        values: what the constants are in the text as it is.
+        given: the new values: numbers and, as texts, durations.
+
+    Raises:
+        UsageError: no such constant, a value that is none, a number for a duration or the reverse.
+    """
+    pieces: list[tuple[Span, str]] = []
+    for name, value in given.items():
+        if name not in statements:
+            hint = nearest_hint(name, statements) or f"its constants are: {', '.join(statements) or 'none'}"
+            raise UsageError(f"constants: the specification has no const {name!r}; {hint}")
+        pieces.append((statements[name].value.span, _given(name, value, values[name])))
+    for span, piece in sorted(pieces, key=lambda each: each[0].start, reverse=True):
+        text = text[: span.start] + piece + text[span.end :]
+    return text
+
+
+def _given(name: str, value: object, written: Value | None) -> str:
+    new = _read(name, value)
+    if written is not None and isinstance(new, Duration) != isinstance(written, Duration):
+        was, example = (
+            ("a duration", "'2s' or '500ms'") if isinstance(written, Duration) else ("a number", "80")
+        )
+        message = f"constants: {name!r} cannot be {value!r}: it is {was}, {text_of(written)} in the text"
+        raise UsageError(f"{message}; give one, such as {example}")
+    return text_of(new)
+
+
+def _read(name: str, value: object) -> Value:
+    """Return the value given for a constant from outside.
+
+    Raises:
+        UsageError: it is neither a finite number nor the text of a number or a duration.
+    """
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
+        return float(value)
+    if isinstance(value, str) and (_DURATION.fullmatch(value) or _NUMBER.fullmatch(value)):
+        try:
+            number = read_number(value.removeprefix("-"), Span(0, 0))
+        except StatementError as fault:
+            raise UsageError(f"constants: {name!r}: {fault.message}; {fault.hint}") from fault
+        if not value.startswith("-"):
+            return number
+        return Duration(-number.ns) if isinstance(number, Duration) else 0.0 - number
+    raise UsageError(
+        f"constants: {name!r} is {value!r}; give a finite number or, as a text, a duration: '2s', '500ms'"
+    )

@@ -1,0 +1,83 @@
+"""The units of a formula's numbers, and `scale`, which makes those of different units comparable."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from spatial_replay.spec.format import format_number
+from spatial_replay.spec.formula import (
+    Atom,
+    Expression,
+    Formula,
+    Measurement,
+    Misalignment,
+    Scale,
+    Scaled,
+    Signal,
+)
+from spatial_replay.spec.walks import iter_expressions, iter_formulas
+
+LENGTHS = "lengths"
+"""What `scale` calls the units of the footprints."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """The unit of an atom's number.
+
+    Attributes:
+        kind: a length, in the units of the footprints; a signal's; or none, of orientations.
+        signal: the name of the signal, or None.
+        divisor: what `scale` divides the number by, or None.
+    """
+
+    kind: Literal["length", "signal", "orientation"]
+    signal: str | None = None
+    divisor: float | None = None
+
+    def __str__(self) -> str:
+        name = {"length": LENGTHS, "orientation": "orientations"}.get(self.kind) or str(self.signal)
+        return name if self.divisor is None else f"{name} / {format_number(self.divisor)}"
+
+
+def units_of(formula: Formula) -> tuple[Unit, ...]:
+    """Return the units of the atoms of a formula, each once, in the order of the text.
+
+    A minimum over atoms of one unit is a number of that unit. Over several it compares what may not be
+    comparable, unless each of them is scaled: see `is_mixed`.
+    """
+    found: dict[Unit, None] = {}
+    for each in iter_formulas(formula):
+        if isinstance(each, Atom):
+            found.update(dict.fromkeys(_units(each.expression)))
+    return tuple(found)
+
+
+def is_mixed(units: Sequence[Unit]) -> bool:
+    """Return whether numbers of these units should not be compared: several, and not all of them scaled."""
+    return len(units) > 1 and any(unit.divisor is None and unit.kind != "orientation" for unit in units)
+
+
+def scaled(expression: Expression, scales: Sequence[Scale]) -> Expression:
+    """Return what an atom computes, divided if there is a scale for the one unit of what it measures."""
+    units = _units(expression)
+    for scale in scales:
+        kind: Literal["length", "signal"] = "length" if scale.signal is None else "signal"
+        if units == [Unit(kind, scale.signal)]:
+            return Scaled(expression, scale.divisor)
+    return expression
+
+
+def _units(expression: Expression) -> list[Unit]:
+    divisor = expression.divisor if isinstance(expression, Scaled) else None
+    found: dict[Unit, None] = {}
+    for part in iter_expressions(expression):
+        if isinstance(part, Signal):
+            found[Unit("signal", part.name, divisor)] = None
+        elif isinstance(part, Misalignment):
+            found[Unit("orientation")] = None
+        elif isinstance(part, Measurement):
+            found[Unit("length", None, divisor)] = None
+    return list(found)
