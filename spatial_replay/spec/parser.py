@@ -288,6 +288,29 @@ def _place(token: Token, tokens: Sequence[Token]) -> Span:
     return span_of(token)
 
 
+def _is_call(tokens: Sequence[Token], position: int) -> bool:
+    return position + 1 < len(tokens) and tokens[position + 1].type == "LPAR"
+
+
+def _between_objects(tokens: Sequence[Token], position: int) -> str:
+    """Return a relation that was written like a function, `closeto(a, b, 0.1)`, between its objects."""
+    arguments: list[list[str]] = [[]]
+    for token in tokens[position + 2 :]:
+        if token.type == "RPAR":
+            break
+        if token.type == "COMMA":
+            arguments.append([])
+        else:
+            arguments[-1].append(token.value)
+    first, second, *rest = (
+        [*(" ".join(words) for words in arguments), "b"]
+        if len(arguments) < 2
+        else [" ".join(words) for words in arguments]
+    )
+    bracket = f"[{', '.join(rest)}]" if rest else ""
+    return f"{first or 'a'} {tokens[position].value}{bracket} {second or 'b'}"
+
+
 def _report(
     token: Token, tokens: Sequence[Token], accepted: set[str], relations: Collection[str], faults: Faults
 ) -> None:
@@ -308,6 +331,14 @@ def _report(
     ):  # fmt: skip
         hint = f"put it before the relation; an object of that name is written {quoted(token.value)}"
         faults.add(span, f"{token.value!r} cannot stand inside a relation", hint)
+    elif token.type in ("RELATION", "DIST") and _is_call(tokens, position):
+        hint = f"write it between its objects: {_between_objects(tokens, position)}"
+        faults.add(span, f"{token.value!r} is not a function", hint)
+    elif token.type == "EQUAL" and tokens[0].type != "CONST":
+        faults.add(span, found, "equality is written ==; a statement begins a line with what it defines")
+    elif token.type == "SLASH" and "NAME" in accepted:
+        hint = 'a name with other characters than letters, digits and _ is written in quotes: "/a/b"'
+        faults.add(span, found, hint)
     elif token.type in ("RELATION", "DIST", "CLOSER", "BETWEEN") and before is not None:
         hint = "a relation stands between two objects, without operators inside"
         if before.type in ("PREFIX", "INFIX", "TRUTH", "NOT"):
@@ -318,6 +349,9 @@ def _report(
         faults.add(span, found, hint)
     elif "TITLE" in accepted and token.type == "NAME":
         hint = 'a title is written in quotes: spec NAME "REQ-12: what must hold" = ...'
+        faults.add(span, found, hint)
+    elif before is not None and before.type == "COMPARE" and token.type == "NUMBER":
+        hint = "a signal is compared as it is, battery >= 1.5; a distance as 1 <= a dist b <= 2"
         faults.add(span, found, hint)
     elif "NAME" in accepted and token.type == "NUMBER":
         hint = f"a name that begins with a digit is written in quotes: {quoted(token.value)}"

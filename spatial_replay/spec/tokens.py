@@ -7,13 +7,14 @@ itself), `start_pos`, `end_pos` and `line`.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 
 from lark import Token
 
 from spatial_replay.spec.diagnostics import Faults
 from spatial_replay.spec.formula import Span
+from spatial_replay.spec.spellings import STARTS_FORMULA, read_spellings
 
 STATEMENT_TYPES: frozenset[str] = frozenset({"USE", "CONST", "SCALE", "REGION", "GROUP", "DEF", "SPEC"})
 BINARY_TYPES: frozenset[str] = frozenset({"AND", "OR", "XOR", "IMPLIES", "IFF", "INFIX"})
@@ -41,8 +42,10 @@ _SIGNS: Mapping[str, str] = MappingProxyType(
         "<->": "IFF",
         "->": "IMPLIES",
         "!": "NOT",
-        "&": "AND",
-        "|": "OR",
+        **dict.fromkeys(("&", "&&"), "AND"),
+        **dict.fromkeys(("|", "||"), "OR"),
+        "=>": "IMPLIES",
+        "!=": "ERROR",
         **dict.fromkeys(("<=", ">=", "==", "<", ">"), "COMPARE"),
         "(": "LPAR",
         ")": "RPAR",
@@ -65,17 +68,15 @@ _TOKEN = re.compile(
     | (?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?(?P<unit>[A-Za-z_][A-Za-z0-9_]*)?)
     | (?P<word>[A-Za-z_][A-Za-z0-9_]*)
     | (?P<quoted>"(?:[^"\\\r\n]|\\[^\r\n])*")
-    | (?P<sign><->|->|<=|>=|==|[<>!&|()\[\],:=+*/-])
+    | (?P<sign><->|->|<=|>=|==|=>|!=|&&|\|\||[<>!&|()\[\],:=+*/-])
     | (?P<unknown>"[^\r\n]*|[^\sA-Za-z0-9_"\#()\[\],:=<>!&|.+*/-]+|.)
     """,
     re.VERBOSE | re.DOTALL,
 )
+_LENGTHS = frozenset({"m", "cm", "mm", "km", "um", "in", "ft", "px"})
+_TIMES: Mapping[str, float] = MappingProxyType({"us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "sec": 1.0})
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _ESCAPED = re.compile(r"\\(.)", re.DOTALL)
-
-_STARTS_FORMULA = frozenset(
-    {"LPAR", "NAME", "NOT", "PREFIX", "TRUTH", "QUANTIFIER", "NUMBER", "MINUS", "ENLARGE", "ALL", "CLASS"}
-)
 
 
 def is_reserved(word: str, relations: Iterable[str]) -> bool:
@@ -128,21 +129,24 @@ def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token
             token_type = KEYWORDS.get(value) or ("RELATION" if value in relations else "NAME")
         elif kind == "sign":
             token_type = _SIGNS[value]
+            if token_type == "ERROR":
+                hint = "write not (... == ...), or two comparisons joined by or"
+                faults.add(span, f"the comparison {value} is not part of the language", hint)
         elif kind == "quoted":
             token_type = "TITLE" if _is_title_expected(tokens) else "NAME"
             value = _unquoted(value, span, faults)
         elif kind == "unknown":
-            _report_unknown(value, span, faults)
+            _report_unknown(value, span, faults, tokens)
             token_type = "ERROR"
         else:
             token_type = "NUMBER"
             unit = found.group("unit")
             if unit is not None and unit not in ("s", "ms"):
-                hint = f"units of time are s and ms; a name is written in quotes: {quoted(value)}"
+                hint = _unit_hint(value, unit)
                 faults.add(span, f"{value!r} is neither a number, nor a duration, nor a name", hint)
                 value = value[: -len(unit)]
         tokens.append(Token(token_type, value, span.start, line, None, line, None, span.end))
-    return _with_scales(_join_published_spellings(tokens))
+    return read_spellings(_with_scales(_join_published_spellings(tokens)), faults)
 
 
 def _with_scales(tokens: list[Token]) -> list[Token]:
@@ -179,7 +183,24 @@ def _unquoted(literal: str, span: Span, faults: Faults) -> str:
     return _ESCAPED.sub(r"\1", name)
 
 
-def _report_unknown(text: str, span: Span, faults: Faults) -> None:
+def _unit_hint(text: str, unit: str) -> str:
+    number = text.removesuffix(unit)
+    if unit in _LENGTHS:
+        return f"lengths have no unit, but that of the log's footprints: write {number}, converted to it"
+    if unit in _TIMES:
+        return f"units of time are s and ms: write {format(float(number) * _TIMES[unit], 'g')}s"
+    return f"units of time are s and ms; a name is written in quotes: {quoted(text)}"
+
+
+def _report_unknown(text: str, span: Span, faults: Faults, before: Sequence[Token]) -> None:
+    if text == "." and before and before[-1].type == "NAME" and before[-1].end_pos == span.start:
+        owner = before[-1].value
+        message = f"an object has no fields, so nothing is behind {owner!r}"
+        hint = (
+            f"compare places by relations, such as {owner} leftof b; a name with a dot is written in quotes"
+        )
+        faults.add(span, message, hint)
+        return
     if text.startswith('"'):
         faults.add(span, "a quoted name does not end on its line", 'close it with "')
         return
@@ -198,7 +219,7 @@ def _join_published_spellings(tokens: list[Token]) -> list[Token]:
             and joined[-1].end_pos == token.start_pos
             and (token.end_pos or 0) - (token.start_pos or 0) == 1
             and index + 1 < len(tokens)
-            and tokens[index + 1].type in _STARTS_FORMULA
+            and tokens[index + 1].type in STARTS_FORMULA
         ):
             sign = joined.pop()
             value = sign.value + "t"

@@ -15,7 +15,7 @@ from spatial_replay import (
     load_specification,
     parse_specification,
 )
-from spatial_replay.spec import check_names, format_formula, format_specification, instantiate
+from spatial_replay.spec import check_names, format_formula, format_specification, instantiate, object_names
 from spatial_replay.spec.formula import (
     ANY_CLASS,
     Atom,
@@ -247,6 +247,45 @@ def test_a_value_given_for_a_constant_has_its_unit_and_keeps_its_range() -> None
         parse_specification(text, constants={"wait": 2})
     with pytest.raises(SpecificationError, match=r"170 is outside of the range \[40, 100\]"):
         parse_specification(text, constants={"near": 170})
+
+
+@pytest.mark.parametrize(
+    ("written", "meaning"),
+    [
+        ("always (a ovlp b)", "G (a ovlp b)"),
+        ("always[0:5] a ovlp b", "G[0, 5] (a ovlp b)"),
+        ("eventually[0s, 2s] next a ovlp b", "F[0s, 2s] (X (a ovlp b))"),
+        ("(a ovlp b) until (c ovlp d)", "(a ovlp b) U (c ovlp d)"),
+        ("a closeto[3] b until[0, 3] c ovlp d", "(a closeto[3] b) U[0, 3] (c ovlp d)"),
+        ("once (a ovlp b) since historically a ovlp b", "O ((a ovlp b) S (H (a ovlp b)))"),
+        ("a ovlp b && c ovlp d || NOT e ovlp f", "(a ovlp b and c ovlp d) or (not e ovlp f)"),
+        ("a ovlp b AND c ovlp d => e ovlp f", "(a ovlp b and c ovlp d) -> e ovlp f"),
+    ],
+)
+def test_spellings_of_other_tools_are_read_where_they_are_clear(written: str, meaning: str) -> None:
+    assert parse_specification(written) == parse_specification(meaning)
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("always ovlp until and next ovlp always", ["always", "until", "next"]),
+        ("always always ovlp until until until ovlp next", ["always", "until", "next"]),
+        ("always[-1] ovlp until[-2] and AND ovlp f", ["always", "until", "AND", "f"]),
+        ("use paper\nnext ovlp once", ["next", "once"]),
+        ("group g = always, until\nspec s = G (g ovlp scale)", ["always", "until", "scale"]),
+        ("def next(a) = a ovlp x\nspec s = next(f) and next(g)", ["f", "x", "g"]),
+        ('eventually ("until" ovlp "always")', ["until", "always"]),
+    ],
+)
+def test_objects_may_be_called_like_words_of_other_tools(text: str, names: list[str]) -> None:
+    assert list(object_names(parse_specification(text))) == names
+
+
+def test_specs_may_be_called_like_words_of_other_tools() -> None:
+    text = "spec always = a ovlp b\nspec s = always and (always until always)"
+    formula = parse_specification(text).specs[1].formula
+    assert format_formula(formula) == "(a ovlp b) and ((a ovlp b) U (a ovlp b))"
 
 
 def test_relations_can_be_added_in_python() -> None:
