@@ -21,6 +21,7 @@ from spatial_replay.errors import (
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
+    from spatial_replay.api import info, replay_log, verify, write_report
     from spatial_replay.automata.automaton import Automaton
     from spatial_replay.automata.compile import automaton
     from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
@@ -36,7 +37,10 @@ if TYPE_CHECKING:
     from spatial_replay.monitor.witness.witness import Witness, WitnessStep
     from spatial_replay.planning.planner import Planner
     from spatial_replay.recording.recorder import Recorder
+    from spatial_replay.replay.engine import Replayed
+    from spatial_replay.replay.verification import Verified
     from spatial_replay.sources.open_log import read_trace
+    from spatial_replay.sources.overview import ObjectOverview, Overview
     from spatial_replay.spec.diagnostics import Diagnostic
     from spatial_replay.spec.formula import Specification
     from spatial_replay.spec.load import load_specification, parse_specification
@@ -62,9 +66,12 @@ __all__ = [
     "NoAutomatonError",
     "NodeResult",
     "NodeUpdate",
+    "ObjectOverview",
     "OutputError",
+    "Overview",
     "Planner",
     "Recorder",
+    "Replayed",
     "Sample",
     "SpatialReplayError",
     "SpecResult",
@@ -79,20 +86,26 @@ __all__ = [
     "UsageError",
     "Vacuous",
     "Verdict",
+    "Verified",
     "Violation",
     "Witness",
     "WitnessStep",
     "__version__",
     "automaton",
     "evaluate",
+    "info",
     "load_specification",
     "parse_specification",
     "read_trace",
+    "replay_log",
+    "verify",
+    "write_report",
 ]
 
 __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
+        "api": ("info", "replay_log", "verify", "write_report"),
         "automata.automaton": ("Automaton",),
         "automata.compile": ("automaton",),
         "geometry.footprint": ("ConvexPart", "Footprint", "TrackedObject"),
@@ -108,7 +121,10 @@ __getattr__, __dir__ = loaded_when_used(
         "monitor.witness.witness": ("Witness", "WitnessStep"),
         "planning.planner": ("Planner",),
         "recording.recorder": ("Recorder",),
+        "replay.engine": ("Replayed",),
+        "replay.verification": ("Verified",),
         "sources.open_log": ("read_trace",),
+        "sources.overview": ("ObjectOverview", "Overview"),
         "spec.diagnostics": ("Diagnostic",),
         "spec.formula": ("Specification",),
         "spec.load": ("load_specification", "parse_specification"),

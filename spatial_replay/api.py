@@ -1,0 +1,203 @@
+"""What the commands do with whole logs, as functions: replay, report, verify, info."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from reprlib import repr as shortened
+from typing import Literal, TypeAlias, TypedDict, Unpack
+
+from spatial_replay.errors import UsageError
+from spatial_replay.logs.output_file import refuse_inputs
+from spatial_replay.logs.source import MemorySource, Source
+from spatial_replay.monitor.semantics import Semantics
+from spatial_replay.replay.annotated import load_files, run_replay
+from spatial_replay.replay.engine import Replayed
+from spatial_replay.replay.selection import ReplayOptions, Window
+from spatial_replay.replay.verification import Verified, verify_certificate
+from spatial_replay.report.write import write_report as write_page
+from spatial_replay.sources.open_log import open_source
+from spatial_replay.sources.overview import Overview, overview_of
+from spatial_replay.spec.formula import Specification
+from spatial_replay.trace.sample import FOREVER
+from spatial_replay.trace.trace import Trace
+
+PathName: TypeAlias = str | PathLike[str]
+Log: TypeAlias = PathName | Trace
+Specifications: TypeAlias = Specification | PathName | Sequence[Specification | PathName]
+
+
+class Reading(TypedDict, total=False):
+    """How to read a log: the options of `read_trace`."""
+
+    mapping: PathName | None
+    concave: Literal["decompose", "hull"]
+    on_time_jump: Literal["error", "split"]
+    rate: float | None
+    lost: Literal["drop", "keep"]
+    y_down: bool | None
+
+
+def replay_log(
+    log: Log,
+    specifications: Specifications | None = None,
+    *,
+    output: PathName | None = None,
+    layer: bool = False,
+    constants: Mapping[str, float | str] | None = None,
+    each: Mapping[str, str] | None = None,
+    semantics: Semantics = "ltlf",
+    start_ns: int = 0,
+    end_ns: int = FOREVER,
+    every: int = 1,
+    strict_names: bool = False,
+    **reading: Unpack[Reading],
+) -> Replayed:
+    """Evaluate specifications over a log, and write the annotated log if a file is named.
+
+    Args:
+        log: a file in any format, or a trace.
+        specifications: one or several, parsed or as files; None takes those that the log was written with.
+        output: the annotated log to write (MCAP).
+        layer: write the derived messages only, without the log's own.
+        constants: values in place of those that files and the log's own specifications give their constants.
+        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
+        semantics: "ltlf", or "paper": Def. 16 of the paper to the letter.
+        start_ns, end_ns, every: evaluate every `every`th sample from `start_ns` to before `end_ns`.
+        strict_names: objects and signals that the log never has are errors; otherwise they are unknown.
+        reading: how to read the log, as for `read_trace`.
+
+    Raises:
+        UsageError: options that do not work, a missing file, an output that is an input.
+        SpecificationError: a specification with errors.
+        LogError: the log cannot be read.
+        OutputError: the output cannot be written.
+    """
+    source = _source(log, reading)
+    window = Window(start_ns, end_ns, every)
+    return run_replay(
+        source,
+        _files(specifications, source, constants),
+        ReplayOptions(window, dict(each or {}), semantics, strict_names),
+        keep_series=True,
+        keep_leaves=True,
+        output=None if output is None else Path(output),
+        inputs=_inputs(log, specifications, reading),
+        layer=layer,
+    )
+
+
+def write_report(
+    log: Log,
+    specifications: Specifications | None = None,
+    *,
+    output: PathName,
+    constants: Mapping[str, float | str] | None = None,
+    each: Mapping[str, str] | None = None,
+    semantics: Semantics = "ltlf",
+    start_ns: int = 0,
+    end_ns: int = FOREVER,
+    every: int = 1,
+    strict_names: bool = False,
+    **reading: Unpack[Reading],
+) -> Replayed:
+    """Evaluate specifications over a log and write a report as one HTML page.
+
+    Args:
+        output: the page to write.
+
+    The other arguments and errors are those of `replay_log`.
+    """
+    source = _source(log, reading)
+    inputs = _inputs(log, specifications, reading)
+    refuse_inputs(Path(output), inputs)
+    return write_page(
+        source,
+        _files(specifications, source, constants),
+        Path(output),
+        ReplayOptions(Window(start_ns, end_ns, every), dict(each or {}), semantics, strict_names),
+        inputs=inputs,
+    )
+
+
+def verify(log: PathName, source: PathName | None = None, **reading: Unpack[Reading]) -> Verified:
+    """Recompute a log's certificate, with the log's own specifications and options, and compare.
+
+    Args:
+        source: the log that it was made from, evaluated in its place.
+        reading: how to read `source`, as for `read_trace`.
+
+    Returns:
+        Both certificates; `differences` is empty if they are equal.
+
+    Raises:
+        UsageError, LogError, SpecificationError: it cannot be evaluated.
+    """
+    if source is None and reading:
+        raise UsageError(f"{', '.join(reading)} applies to the source of the log; give source=…")
+    return verify_certificate(open_source(log), None if source is None else open_source(source, **reading))
+
+
+def info(log: PathName, **reading: Unpack[Reading]) -> Overview:
+    """Read a log once and return what it holds: samples, objects, signals, topics, attachments.
+
+    Args:
+        reading: how to read it, as for `read_trace`.
+
+    Raises:
+        UsageError: a missing file, or an external log without a mapping.
+        LogError: nothing in it can be read.
+    """
+    return overview_of(open_source(log, **reading))
+
+
+def _source(log: Log, reading: Reading) -> Source:
+    if not isinstance(log, Trace):
+        return open_source(log, **reading)
+    if reading:
+        raise UsageError(f"{', '.join(reading)} says how to read a file, and the log is a trace already")
+    return MemorySource(log)
+
+
+def _listed(specifications: Specifications | None) -> list[Specification | PathName]:
+    if specifications is None:
+        return []
+    if isinstance(specifications, Specification | str | PathLike):
+        return [specifications]
+    for each in specifications:
+        if not isinstance(each, Specification | str | PathLike):
+            raise UsageError(f"specifications has {shortened(each)}; give specifications or their files")
+    return list(specifications)
+
+
+def _files(
+    specifications: Specifications | None, source: Source, constants: Mapping[str, float | str] | None
+) -> list[Specification]:
+    """Return the specifications to evaluate, in the order in which they are given."""
+    named = _listed(specifications)
+    paths = [Path(each) for each in named if not isinstance(each, Specification)]
+    if constants and named and not paths:
+        raise UsageError("constants are for files; give parse_specification(text, constants=…) its own")
+    loaded = iter(load_files(paths, source, constants=constants) if paths or not named else [])
+    if not named:
+        return list(loaded)
+    return [each if isinstance(each, Specification) else next(loaded) for each in _distinct(named)]
+
+
+def _distinct(named: Sequence[Specification | PathName]) -> list[Specification | Path]:
+    """Return specifications and paths, each path once."""
+    chosen: list[Specification | Path] = []
+    for each in named:
+        one = each if isinstance(each, Specification) else Path(each)
+        if isinstance(one, Specification) or one not in chosen:
+            chosen.append(one)
+    return chosen
+
+
+def _inputs(log: Log, specifications: Specifications | None, reading: Reading) -> list[Path]:
+    """Return the files that are read."""
+    files = [each for each in _listed(specifications) if not isinstance(each, Specification)]
+    mapping = reading.get("mapping")
+    logs = [] if isinstance(log, Trace) else [log]
+    return [Path(each) for each in (*logs, *files, *([] if mapping is None else [mapping]))]

@@ -1,0 +1,76 @@
+"""What the commands do, from Python: the functions and the program agree."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import spatial_replay as sr
+from spatial_replay.cli import run
+
+RECORDINGS = Path(__file__).parent.parent / "recordings"
+LOG, SPEC = RECORDINGS / "table.jsonl", RECORDINGS / "table.spatial"
+
+
+def test_a_replay_writes_the_file_that_the_command_writes(tmp_path: Path) -> None:
+    replayed = sr.replay_log(LOG, SPEC, output=tmp_path / "python.mcap", constants={"near": 0.3})
+    command = ["replay", str(LOG), "--spec", str(SPEC), "--const", "near=0.3"]
+    assert run([*command, "-o", str(tmp_path / "command.mcap"), "--json", str(tmp_path / "all.json")]) == 0
+    assert (tmp_path / "python.mcap").read_bytes() == (tmp_path / "command.mcap").read_bytes()
+    document = json.loads((tmp_path / "all.json").read_text())
+    assert [each.robustness for each in replayed.results] == [
+        each["robustness"] for each in document["specifications"]
+    ]
+    assert replayed.verdict == "satisfied"
+
+
+def test_a_trace_and_a_parsed_specification_do_as_well_as_files() -> None:
+    of_values = sr.replay_log(sr.read_trace(LOG), sr.load_specification(SPEC))
+    of_files = sr.replay_log(str(LOG), [SPEC])
+    assert [each.robustness for each in of_values.results] == [each.robustness for each in of_files.results]
+    assert of_values.results[0].explain() == of_files.results[0].explain()
+
+
+def test_a_report_is_the_page_that_the_command_writes(tmp_path: Path) -> None:
+    sr.write_report(LOG, SPEC, output=tmp_path / "python.html")
+    assert run(["report", str(LOG), "--spec", str(SPEC), "-o", str(tmp_path / "command.html")]) == 0
+    assert (tmp_path / "python.html").read_bytes() == (tmp_path / "command.html").read_bytes()
+
+
+def test_a_log_is_verified_and_described(tmp_path: Path) -> None:
+    sr.replay_log(LOG, SPEC, output=tmp_path / "annotated.mcap")
+    assert sr.verify(tmp_path / "annotated.mcap").differences == ()
+    assert sr.verify(tmp_path / "annotated.mcap", LOG).differences == ()
+    described = sr.info(tmp_path / "annotated.mcap")
+    assert (described.samples, [each.name for each in described.objects]) == (
+        300,
+        ["cup", "fork", "milk", "plate", "spoon"],
+    )
+
+
+def test_the_log_s_own_specification_is_evaluated_without_another(tmp_path: Path) -> None:
+    first = sr.replay_log(LOG, SPEC, output=tmp_path / "annotated.mcap", constants={"near": 0.01})
+    again = sr.replay_log(tmp_path / "annotated.mcap")
+    assert first.verdict == again.verdict == "violated"
+    assert [each.robustness for each in again.results] == [each.robustness for each in first.results]
+
+
+def test_mistakes_are_named(tmp_path: Path) -> None:
+    with pytest.raises(sr.UsageError, match=r"no such file"):
+        sr.replay_log(tmp_path / "none.jsonl", SPEC)
+    with pytest.raises(sr.UsageError, match=r"holds no specification of its own"):
+        sr.replay_log(LOG)
+    with pytest.raises(sr.UsageError, match=r"constants are for files"):
+        sr.replay_log(LOG, sr.load_specification(SPEC), constants={"near": 1})
+    with pytest.raises(sr.UsageError, match=r"specifications has 3"):
+        sr.replay_log(LOG, [3])  # type: ignore[list-item]
+    with pytest.raises(sr.UsageError, match=r"is a trace already"):
+        sr.replay_log(sr.read_trace(LOG), SPEC, rate=5.0)
+    with pytest.raises(sr.UsageError, match=r"give source="):
+        sr.verify(LOG, rate=5.0)
+    copy = tmp_path / "copy.jsonl"
+    copy.write_bytes(LOG.read_bytes())
+    with pytest.raises(sr.UsageError, match=r"copy\.jsonl"):
+        sr.write_report(copy, SPEC, output=copy)
