@@ -10,6 +10,7 @@ from spatial_replay.automata.automaton import Automaton
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.result import NodeResult, SpecResult
 from spatial_replay.monitor.semantics import Semantics
+from spatial_replay.monitor.vacuity import Vacuous
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.report.automaton_panel import StatePath
 from spatial_replay.report.decision_panel import ReportedDecisions
@@ -94,6 +95,7 @@ class RunReport:
         first_ns, start_ns, end_ns: times of the log's first sample, and of the first and last evaluated.
         axes: those of the source, as opposed to those of the samples.
         faults, remarks: what was lost while reading, and other notes of the reader.
+        vacuous: templates that no object fits.
         unreadable: how many observations have no finite numbers.
     """
 
@@ -110,6 +112,7 @@ class RunReport:
     certificate: Mapping[str, str]
     files: tuple[Specification, ...]
     results: tuple[ReportedResult, ...]
+    vacuous: tuple[Vacuous, ...]
     scene: ReportedScene
     events: tuple[ReportedEvent, ...]
     decisions: ReportedDecisions

@@ -127,6 +127,8 @@ def _panel(name: str, title: str, *content: Html, kind: str = "panel") -> Html:
 def _verdicts(report: RunReport) -> Iterator[Html]:
     if not report.results:
         yield element("p", "The templates matched no objects.")
+    for part in report.vacuous:
+        yield element("p", *_with_code(part.message))
     places = {id(result): place for place, result in enumerate(report.drawn)}
     are_many = len(report.results) > _MANY
     worst = worst_first([each.result.verdict for each in report.results])

@@ -108,6 +108,7 @@ def _report(source: Source, replay: Replay, replayed: Replayed, collector: Colle
         certificate=replayed.certificate,
         files=tuple(replay.files),
         results=tuple(_results(replay, replayed, collector)),
+        vacuous=replayed.vacuous,
         scene=collector.scene.scene,
         events=tuple(collector.events),
         decisions=collector.decisions.decisions,

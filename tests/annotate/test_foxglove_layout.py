@@ -149,6 +149,12 @@ def test_an_instance_of_a_template_has_a_curve_of_its_own(tmp_path):
     assert '{object=="b"}' in paths["calm(b)"]
 
 
+def test_a_curve_is_labelled_with_the_id_of_its_requirement(tmp_path):
+    layout = check_layout(run(tmp_path, 'spec near "REQ-2: they meet" = F a closeto[2] b'))
+    [path] = layout["configById"]["Plot!robustness"]["paths"]
+    assert path["label"] == "REQ-2 near"
+
+
 def test_the_camera_looks_at_everything_from_above(tmp_path):
     camera = layout_of(run(tmp_path, TEXT))["configById"]["3D!scene"]["cameraState"]
     assert camera["target"] == [0, 0, 0]

@@ -446,6 +446,7 @@ def test_a_template_without_instances_is_listed(tmp_path: Path) -> None:
     )
     assert page.facts["results"] == []
     assert "The templates matched no objects." in page.within("section#verdicts")
+    assert "calm(ego) was never evaluated" in page.within("section#verdicts")
 
 
 def test_objects_far_away_are_drawn(tmp_path: Path) -> None:
