@@ -18,6 +18,7 @@ from spatial_replay.report.event_panel import ReportedEvent
 from spatial_replay.report.scene_panel import ReportedScene
 from spatial_replay.report.tree_panel import final_text
 from spatial_replay.spec.formula import NamedSpec, Specification
+from spatial_replay.spec.units import Unit
 from spatial_replay.trace.axes import Axes
 
 MOST_DRAWN: Final = 24
@@ -49,7 +50,7 @@ class ReportedResult:
         decided_ns: the sample that decided it; None without an explanation.
         pointer: the two points between which the atom that decided it stands; None if it has none.
         named: the specs of its file, by name.
-        units: those of the numbers that its robustness is the least of, in words.
+        units: those of the numbers that its robustness is the least of.
         automaton: None if it has none.
         no_automaton: why not.
         path: the states of the run.
@@ -61,7 +62,7 @@ class ReportedResult:
     decided_ns: int | None
     pointer: Pointer | None
     named: Mapping[str, NamedSpec]
-    units: tuple[str, ...]
+    units: tuple[Unit, ...]
     automaton: Automaton | None
     no_automaton: str
     path: StatePath

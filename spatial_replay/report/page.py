@@ -24,6 +24,7 @@ from spatial_replay.report.compact import json_text, sentence_parts
 from spatial_replay.report.contents import ReportedResult, RunReport, worst_first
 from spatial_replay.report.data import page_data
 from spatial_replay.report.tree_panel import final_text
+from spatial_replay.spec.units import is_mixed
 from spatial_replay.text import counted, printable
 
 _CALENDAR_NS: Final = 500_000_000 * 10**9
@@ -193,8 +194,9 @@ def _specs(each: ReportedResult, first_ns: int) -> Html:
         )
     parts = [element("ul", *rows, **{"class": "specs"})] if rows else []
     if len(each.units) > 1:
-        listed = f"{', '.join(each.units[:-1])} and {each.units[-1]}"
-        words = f"Its robustness is the least of numbers in different units: {listed}."
+        *others, last = map(str, each.units)
+        what = "different units" if is_mixed(each.units) else "units made comparable"
+        words = f"Its robustness is the least of numbers in {what}: {', '.join(others)} and {last}."
         parts.append(element("p", text(words), **{"class": "units"}))
     return element("div", *parts)
 

@@ -8,15 +8,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from spatial_replay.annotate.requirements import iter_subformulas, requirements_of
-from spatial_replay.annotate.specification import DIMENSIONLESS, FOOTPRINT_UNITS, unit_of
+from spatial_replay.annotate.requirements import requirements_of
+from spatial_replay.annotate.specification import unit_of
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.sentences import number_text
 from spatial_replay.monitor.verdict import final_verdict
 from spatial_replay.report.compact import Packing
 from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import Atom, Boolean, Formula, Temporal, iter_nodes, operands_of, operator_of
+from spatial_replay.spec.formula import Boolean, Formula, Temporal, iter_nodes, operands_of, operator_of
 
 MOST_NODES: Final = 400
 """Nodes of a tree that a page shows, at most."""
@@ -101,13 +101,6 @@ def final_text(robustness: float, lower: float, upper: float) -> str:
             return "" if math.isnan(robustness) else number_text(robustness)
         return f"{number_text(lower)} … {number_text(upper)}"
     return number_text(robustness)
-
-
-def unit_words(formula: Formula) -> tuple[str, ...]:
-    """Return the units of a formula's atoms, each once, in the order of the text."""
-    units = (unit_of(node, {}) for node in iter_subformulas(formula) if isinstance(node, Atom))
-    words = {FOOTPRINT_UNITS: "lengths", DIMENSIONLESS: "orientations"}
-    return tuple(dict.fromkeys(words.get(unit, unit) for unit in units))
 
 
 def named_nodes(formula: Formula) -> tuple[int, ...]:

@@ -27,9 +27,9 @@ from spatial_replay.report.decision_panel import DecisionCollector
 from spatial_replay.report.event_panel import ReportedEvent, event_of
 from spatial_replay.report.page import page
 from spatial_replay.report.scene_panel import SceneCollector
-from spatial_replay.report.tree_panel import unit_words
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.relations import RELATION_NAMES
+from spatial_replay.spec.units import units_of
 
 
 class Collector:
@@ -129,7 +129,7 @@ def _results(replay: Replay, replayed: Replayed, collector: Collector) -> Iterat
             decided_ns=None if witness is None else witness.time_ns,
             pointer=None if witness is None else _pointer(witness),
             named={spec.name: spec for spec in replay.files[tree.file].specs},
-            units=unit_words(result.formula),
+            units=units_of(result.formula),
             automaton=compiled.automaton,
             no_automaton=compiled.reason,
             path=collector.path(tree.name, tree.object),
