@@ -21,8 +21,9 @@ from spatial_replay.cli.progress import progress
 from spatial_replay.errors import NoAutomatonError, SpecificationError, UsageError
 from spatial_replay.spec import check_names, format_formula
 from spatial_replay.spec.diagnostics import Diagnostic
-from spatial_replay.spec.format import iter_branches, label_of
+from spatial_replay.spec.format import iter_branches, label_of, title_text
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operator_of
+from spatial_replay.spec.tokens import quoted
 
 _STANDARD_OUTPUT = "-"
 _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
@@ -75,45 +76,53 @@ def check(
     inputs = [specification] if log is None else [specification, log]
     if dfa is not None:
         _check_automaton_options(parsed, of, dfa, inputs)
-    diagnostics = [*parsed.warnings, *(_compare_with_log(parsed, log, reading) if log is not None else ())]
+    compared, windows = _compare_with_log(parsed, log, reading) if log is not None else ((), ())
+    diagnostics = [*parsed.warnings, *compared]
     errors = [each for each in diagnostics if each.severity == "error"]
     for each in diagnostics:
         if each.severity == "warning":
             click.echo(each, err=True)
     if errors:
         raise SpecificationError(errors)
-    click.echo(_json_of(parsed, diagnostics) if as_json else _text_of(parsed))
+    click.echo(_json_of(parsed, diagnostics, windows) if as_json else _text_of(parsed, windows))
     if dfa is not None:
         _write_automata(parsed, of, dfa, inputs, quiet=as_json)
 
 
 def _compare_with_log(
     specification: Specification, log: Path, reading: ReadArguments
-) -> tuple[Diagnostic, ...]:
+) -> tuple[tuple[Diagnostic, ...], Sequence[str]]:
+    """Return what does not fit the log, and its windows in samples as seconds."""
     # only needed with --log: log readers load the numerical libraries
     from spatial_replay.sources.open_log import open_source
+    from spatial_replay.trace.plausibility import Survey, plausibility_warnings, window_lines
 
+    survey = Survey()
     names: set[str] = set()
     signals: set[str] = set()
     with progress("samples") as advance:
         for block in open_source(log, **reading).iter_blocks():
             names.update(block.trace.names)
             signals.update(block.trace.signals)
+            survey = survey.extended(block.trace)
             warn(*block.trace.faults)
             advance(len(block.trace))
-    return check_names(specification, sorted(names), sorted(signals))
+    unknown = check_names(specification, sorted(names), sorted(signals))
+    doubtful = plausibility_warnings(specification, survey)
+    return (*unknown, *doubtful), window_lines(specification, survey)
 
 
 def _heading(spec: NamedSpec) -> str:
-    return f"spec {spec.name}" if spec.parameter is None else f"spec {spec.name}({spec.parameter})"
+    head = f"spec {spec.name}" if spec.parameter is None else f"spec {spec.name}({spec.parameter})"
+    return head if spec.title is None else f"{head} {quoted(title_text(spec))}"
 
 
-def _text_of(specification: Specification) -> str:
+def _text_of(specification: Specification, windows: Sequence[str]) -> str:
     blocks = [
         "\n".join([_heading(spec), *(f"  {line}" for line in _tree_lines(spec.formula))])
         for spec in specification.results
     ]
-    return "\n\n".join(blocks)
+    return "\n\n".join([*blocks, "\n".join(windows)] if windows else blocks)
 
 
 def _tree_lines(formula: Formula) -> Iterator[str]:
@@ -124,15 +133,26 @@ def _tree_lines(formula: Formula) -> Iterator[str]:
         yield f"{identifier:>{width}}  {stem}{label_of(node)}"
 
 
-def _json_of(specification: Specification, diagnostics: list[Diagnostic]) -> str:
+def _json_of(specification: Specification, diagnostics: list[Diagnostic], windows: Sequence[str]) -> str:
     return json.dumps(
         {
             "file": specification.filename,
             "profile": specification.profile,
             "specifications": [
-                {"name": spec.name, "parameter": spec.parameter, "nodes": _node_rows(spec.formula)}
+                {
+                    "name": spec.name,
+                    "parameter": spec.parameter,
+                    "requirement": spec.id,
+                    "title": spec.title,
+                    "nodes": _node_rows(spec.formula),
+                }
                 for spec in specification.results
             ],
+            "constants": {
+                name: {"value": each.value, "duration_ns": each.duration_ns, "range": each.range}
+                for name, each in specification.constants.items()
+            },
+            "windows": list(windows),
             "warnings": [
                 {"line": each.line, "column": each.column, "message": each.message, "hint": each.hint}
                 for each in diagnostics

@@ -97,3 +97,43 @@ def test_the_profile_of_a_file_without_a_use_line_can_be_chosen(tmp_path: Path) 
     published.write_text("F (a closeto b)")
     assert run(["check", str(published)]) == 2
     assert run(["check", str(published), "--profile", "spatial_spec"]) == 0
+
+
+SLOW = "".join(
+    f'{{"time_ns": {500_000_000 * n}, "objects": [{{"name": "cube", "polygon": [[0, 0], [1, 0], [1, 1]]}}], '
+    f'"signals": {{"battery": 0.{9 - n}}}}}\n'
+    for n in range(4)
+)
+
+
+def test_with_a_log_windows_in_samples_are_shown_in_seconds(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, spec = tmp_path / "slow.jsonl", tmp_path / "s.spatial"
+    log.write_text(SLOW)
+    spec.write_text('spec s "REQ-1: soon" = F[0, 3] (G[1, inf] (battery >= 0.2))')
+    assert run(["check", str(spec), "--log", str(log)]) == 0
+    output = capsys.readouterr()
+    assert output.out.startswith('spec s "REQ-1: soon"\n')
+    assert "at 2 samples a second, F[0, 3] is 0 s to 1.5 s" in output.out
+    assert "G[1, inf] is 0.5 s to the end" in output.out
+    assert output.err == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("region goal = box(100, 100, 101, 101)\nspec s = F (cube enclosedin goal)", "'goal' is 140 away"),
+        ("spec s = F (cube closeto[-1] cube[-1])", "'closeto' with the negative length -1"),
+        ("spec s = F (cube closeto[1000] cube[-1])", "1000 is far more than anything in the log is apart"),
+        ("spec s = G (battery >= 20)", "'battery' never comes near 20"),
+    ],
+)
+def test_with_a_log_numbers_that_hardly_fit_it_are_warned_of(
+    text: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, spec = tmp_path / "slow.jsonl", tmp_path / "s.spatial"
+    log.write_text(SLOW)
+    spec.write_text(text)
+    assert run(["check", str(spec), "--log", str(log)]) == 0
+    assert message in capsys.readouterr().err
