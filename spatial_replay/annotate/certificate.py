@@ -24,7 +24,8 @@ from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.trace import ABSENT, Trace
 
 _MOST_WAITING = 64
-"""Buffers that may wait to be hashed, so that memory stays bounded."""
+_MOST_WAITING_BYTES = 256 * 2**20
+"""Buffers, and bytes of them, that may wait to be hashed, so that memory stays bounded."""
 
 
 class Hashing:
@@ -36,19 +37,29 @@ class Hashing:
 
     def __init__(self) -> None:
         self._thread = ThreadPoolExecutor(1, "hashing")
-        self._waiting: deque[Future[None]] = deque()
+        self._waiting: deque[tuple[int, Future[None]]] = deque()
+        self._waiting_bytes = 0
 
     def update(self, hashed: hashlib._Hash, buffer: bytes | NDArray[np.generic]) -> None:
         """Take a buffer, which must not change afterwards, into a hash."""
-        if len(self._waiting) >= _MOST_WAITING:
-            self._waiting.popleft().result()
+        size = len(buffer) if isinstance(buffer, bytes) else buffer.nbytes
+        while self._waiting and (
+            len(self._waiting) >= _MOST_WAITING or self._waiting_bytes + size > _MOST_WAITING_BYTES
+        ):
+            self._await_first()
+        self._waiting_bytes += size
         # an array is a buffer, though its type does not say so
-        self._waiting.append(self._thread.submit(hashed.update, cast(bytes, buffer)))
+        self._waiting.append((size, self._thread.submit(hashed.update, cast(bytes, buffer))))
 
     def finish(self) -> None:
         """Wait until everything was taken in."""
         while self._waiting:
-            self._waiting.popleft().result()
+            self._await_first()
+
+    def _await_first(self) -> None:
+        size, hashed = self._waiting.popleft()
+        hashed.result()
+        self._waiting_bytes -= size
 
 
 class SampleHash:

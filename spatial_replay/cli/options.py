@@ -77,6 +77,18 @@ constants_option = click.option(
     help="Value of a constant in place of the written one, such as near=80 or hold=2s; repeat for several.",
 )
 
+
+def keep_option(text: str) -> Callable[[_Command], _Command]:
+    """Return the repeatable option `--keep`, with the beginning of its help."""
+    return click.option(
+        "--keep",
+        metavar="all|mapped|PATTERN",
+        multiple=True,
+        help=f"{text}: all, those of mapped topics, or of topics such as '/camera/*'; repeat for several."
+        "  [default: all]",
+    )
+
+
 semantics_option = click.option(
     "--semantics",
     type=click.Choice(["ltlf", "paper"]),
@@ -239,11 +251,11 @@ class EvaluationInputs:
     each: Mapping[str, str]
     strict_names: bool
 
-    def options(self, semantics: Semantics = "ltlf") -> ReplayOptions:
-        """Return how the specifications are evaluated over the log."""
+    def options(self, semantics: Semantics = "ltlf", keep: tuple[str, ...] = ()) -> ReplayOptions:
+        """Return how the specifications are evaluated over the log, and what a copy of it keeps."""
         from spatial_replay.replay import ReplayOptions
 
-        return ReplayOptions(self.window, self.each, semantics, self.strict_names)
+        return ReplayOptions(self.window, self.each, semantics, self.strict_names, keep or None)
 
 
 def open_inputs(request: EvaluationArguments) -> EvaluationInputs:

@@ -13,6 +13,7 @@ from spatial_replay.cli.options import (
     EvaluationArguments,
     duration_ns_from_text,
     evaluation_options,
+    keep_option,
     naming_option,
     open_inputs,
     output_option,
@@ -44,6 +45,7 @@ def _read_kinds(context: click.Context, parameter: click.Parameter, text: str) -
 @evaluation_options
 @output_option("Annotated log to write (MCAP).")
 @click.option("--layer", is_flag=True, help="Write the derived messages only, without the log's own.")
+@keep_option("With -o: messages of the log to copy")
 @click.option(
     "--json",
     "json_file",
@@ -74,6 +76,7 @@ def replay(
     request: EvaluationArguments,
     output: Path | None,
     layer: bool,
+    keep: tuple[str, ...],
     json_file: str | None,
     series: bool,
     signal: bool,
@@ -98,6 +101,7 @@ def replay(
       spatial-replay replay run.mcap --spec blocks.spatial --window 10s
       spatial-replay replay walk.jsonl --spec walk.spatial --each ego=class:person
       spatial-replay replay drive.bag --mapping drive.yaml --spec drive.spatial
+      spatial-replay replay drive.bag --mapping drive.yaml -o annotated.mcap --keep mapped --keep '/camera/*'
     """
     # imported here so that --help stays fast
     from spatial_replay.replay import run_replay
@@ -107,6 +111,10 @@ def replay(
         raise UsageError(f"{option} adds to the JSON object; add --json FILE or --json -")
     if layer and output is None:
         raise UsageError("--layer applies to the annotated log; add -o FILE")
+    if keep and output is None:
+        raise UsageError("--keep applies to the annotated log; add -o FILE")
+    if keep and layer:
+        raise UsageError("--layer copies no messages; remove --keep or --layer")
     window_ns = None if width is None else _width_ns(width)
     if semantics != "ltlf" and (signal or window_ns is not None):
         option = "--signal" if signal else "--window"
@@ -117,7 +125,7 @@ def replay(
         replayed = run_replay(
             inputs.source,
             inputs.files,
-            inputs.options(semantics),
+            inputs.options(semantics, keep),
             keep_series=json_file is not None and (series or signal or window_ns is not None),
             keep_leaves=True,
             output=output,

@@ -11,6 +11,7 @@ from spatial_replay.cli.application import ExitCode, warn
 from spatial_replay.cli.options import (
     EvaluationArguments,
     evaluation_options,
+    keep_option,
     open_inputs,
     semantics_option,
     warn_of_input,
@@ -42,9 +43,16 @@ if TYPE_CHECKING:
 )
 @click.option("--play", is_flag=True, help="Start playing at once instead of waiting for a viewer.")
 @click.option("--layout", is_flag=True, help="Print the layout to import in the viewer, and exit.")
+@keep_option("Messages of the log to send")
 @semantics_option
 def serve(
-    request: EvaluationArguments, port: int, host: str, play: bool, layout: bool, semantics: Semantics
+    request: EvaluationArguments,
+    port: int,
+    host: str,
+    play: bool,
+    layout: bool,
+    keep: tuple[str, ...],
+    semantics: Semantics,
 ) -> ExitCode | None:
     """Replay a log live to Foxglove or Lichtblick over WebSocket.
 
@@ -60,7 +68,7 @@ def serve(
       spatial-replay serve run.mcap --spec blocks.spatial
       spatial-replay serve run.mcap --spec blocks.spatial --layout > live.json
     """
-    tuned = _tuned(request, semantics)
+    tuned = _tuned(request, keep, semantics)
     if layout:
         click.echo(tuned.layout.data)
         return None
@@ -87,7 +95,7 @@ def _serve(tuned: Tuned, host: str, port: int, play: bool) -> None:
         server.wait()
 
 
-def _tuned(request: EvaluationArguments, semantics: Semantics) -> Tuned:
+def _tuned(request: EvaluationArguments, keep: tuple[str, ...], semantics: Semantics) -> Tuned:
     from spatial_replay.replay import Tuning
 
     inputs = open_inputs(request)
@@ -95,7 +103,7 @@ def _tuned(request: EvaluationArguments, semantics: Semantics) -> Tuned:
         tuning = Tuning(
             inputs.source,
             inputs.files,
-            inputs.options(semantics),
+            inputs.options(semantics, keep),
             advance=advance,
         )
     return tuning.evaluate()

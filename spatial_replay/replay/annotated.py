@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 from spatial_replay import __version__
@@ -24,6 +25,7 @@ from spatial_replay.logs.topics import (
     REPLAYED_PREFIX,
 )
 from spatial_replay.replay.engine import Replay, Replayed
+from spatial_replay.replay.kept_messages import KEEP_ALL
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Window
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.overrides import SpecificationText, load_specifications
@@ -63,6 +65,8 @@ def run_replay(
         LogError: no sample in the log.
         OutputError: the output cannot be written.
     """
+    if options.keep is None and output is not None and not layer:
+        options = replace(options, keep=KEEP_ALL)
     replay = Replay(source, files, options, keep_series=keep_series, keep_leaves=keep_leaves)
     if output is None:
         return replay.run(advance=advance)
@@ -165,4 +169,6 @@ def _recorded_options(source: Source, options: ReplayOptions, *, layer: bool) ->
         recorded["each"] = dict(sorted(options.each.items()))
     if layer:
         recorded["layer"] = True
+    elif options.keep not in (None, KEEP_ALL):
+        recorded["keep"] = list(options.keep or ())
     return recorded

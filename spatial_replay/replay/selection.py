@@ -17,6 +17,7 @@ from spatial_replay.logs.topics import OBJECTS, protobuf_channel
 from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.instances import Choice, Instance, find_instances
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
+from spatial_replay.replay.kept_messages import source_keeping
 from spatial_replay.spec import check_names
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
@@ -54,12 +55,15 @@ class ReplayOptions:
         each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
         semantics: "ltlf", or "paper": Def. 16 of the paper to the letter.
         strict_names: objects and signals that the log never has are errors; otherwise they are unknown.
+        keep: which messages of the log a copy keeps: "all", "mapped", patterns of topics; () for the samples
+            only. None for all in a copy and, without one, those that need not be read for it.
     """
 
     window: Window = Window()
     each: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     semantics: Semantics = "ltlf"
     strict_names: bool = False
+    keep: tuple[str, ...] | None = None
 
 
 DEFAULT_OPTIONS = ReplayOptions()
@@ -98,6 +102,7 @@ class Selection:
     options: ReplayOptions
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "source", source_keeping(self.source, self.options.keep))
         _check_parameters(self.files, self.options.each)
         checked_semantics(self.options.semantics, self.files)
 

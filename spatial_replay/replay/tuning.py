@@ -24,6 +24,7 @@ from spatial_replay.logs.source import MemorySource, Source
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.replay.engine import Replayed, idle_templates, replayed_specs
+from spatial_replay.replay.kept_messages import KEEP_ALL
 from spatial_replay.replay.own_messages import OwnMessages
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Selection, first_sample_ns
 from spatial_replay.spec import parse_specification
@@ -83,8 +84,10 @@ class Tuning:
             UsageError: no sample in the window, an option that cannot work.
             SpecificationError: names that the log never has, if names are strict.
         """
-        selection = Selection(source, tuple(files), options)
-        self.name, self.options = source.name, options
+        keep = KEEP_ALL if options.keep is None else options.keep
+        selection = Selection(source, tuple(files), replace(options, keep=keep))
+        # evaluations read the samples in memory, which have no messages
+        self.name, self.options = source.name, replace(options, keep=None)
         self._attachments = source.attachments
         self._files, self._kept = tuple(files), logged_specifications(files)
         self.own = OwnMessages(selection)

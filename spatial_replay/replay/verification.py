@@ -13,6 +13,7 @@ from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import CERTIFICATE, METADATA
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.replay.annotated import load_files, run_replay
+from spatial_replay.replay.kept_messages import KEEP_ALL
 from spatial_replay.replay.selection import ReplayOptions, Window
 from spatial_replay.spec.formula import Specification
 
@@ -84,6 +85,7 @@ def verify_certificate(
             Window(**{name: options[name] for name in _WINDOW if name in options}),
             options.get("each", {}),
             _semantics(about),
+            keep=None if source is None else _kept(about, options),
         ),
         advance=advance,
     )
@@ -123,6 +125,13 @@ def _options(about: Mapping[str, str]) -> dict[str, Any]:
     except ValueError as error:
         raise LogError(f"the options in the log's metadata cannot be read: {error}") from error
     return options if isinstance(options, dict) else {}
+
+
+def _kept(about: Mapping[str, str], options: Mapping[str, Any]) -> tuple[str, ...] | None:
+    """Return which messages of its source a log kept: none in a recording, all in a copy by default."""
+    if about.get("written_by") != "replay":
+        return ()
+    return None if options.get("layer") else tuple(options.get("keep", KEEP_ALL))
 
 
 def _semantics(about: Mapping[str, str]) -> Semantics:

@@ -50,6 +50,8 @@ BLOCK_BYTES = 64 * 2**20
 AFTER_ALL_NS = 2**64
 _SAMPLES = "spatial_replay.ObjectStates"
 _CHANNEL, _PAYLOAD = itemgetter(1), itemgetter(4)
+_ORDER = itemgetter(0, 1, 2)
+"""Log time, channel and sequence; messages that share all three, as in copies of bags, keep their order."""
 
 
 @dataclass(frozen=True)
@@ -241,7 +243,7 @@ def _blocks(
         size += sum(map(len, map(_PAYLOAD, messages)))
         samples += sum(map(objects.__contains__, map(_CHANNEL, messages)))
         if number < len(places) and (size >= BLOCK_BYTES or samples >= BLOCK_SAMPLES):
-            waiting.sort()
+            waiting.sort(key=_ORDER)
             ready = _count_before(waiting, places[number].start_ns)
             if ready:
                 yield waiting[:ready]
@@ -249,7 +251,7 @@ def _blocks(
                 size = sum(map(len, map(_PAYLOAD, waiting)))
                 samples = sum(map(objects.__contains__, map(_CHANNEL, waiting)))
     if waiting:
-        waiting.sort()
+        waiting.sort(key=_ORDER)
         yield waiting
 
 

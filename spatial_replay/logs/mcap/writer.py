@@ -32,6 +32,8 @@ COMPRESSION_LEVEL = 1
 """Coordinates hardly shrink further at higher levels, which take several times as long."""
 WAITING_CHUNKS = 1024
 """Chunks that may wait for their compression."""
+WAITING_BYTES = 256 * 2**20
+"""Bytes of chunks that may wait for their compression: pictures and clouds of points make large ones."""
 
 
 class LogWriter:
@@ -72,6 +74,7 @@ class LogWriter:
         self._worker = ThreadPoolExecutor(1, "chunk-compression")
         self._compressor = zstandard.ZstdCompressor(level=COMPRESSION_LEVEL)
         self._packing: deque[Future[PackedChunk]] = deque()
+        self._packing_bytes: deque[int] = deque()
         self._closed = False
         self._write(MAGIC)
         self._write_record(records.Header(profile, library))
@@ -197,13 +200,19 @@ class LogWriter:
     def _close_chunk(self) -> None:
         if self._open:
             self._packing.append(self._worker.submit(pack, self._open, self._compressor))
+            self._packing_bytes.append(self._open_bytes)
             self._open, self._open_bytes = [], 0
             self._write_packed(WAITING_CHUNKS)
 
     def _write_packed(self, waiting: int) -> None:
         """Write chunks in their order until no more than `waiting` are left, and those that are ready."""
-        while self._packing and (len(self._packing) > waiting or self._packing[0].done()):
+        while self._packing and (
+            len(self._packing) > waiting
+            or sum(self._packing_bytes) > WAITING_BYTES
+            or self._packing[0].done()
+        ):
             chunk = self._packing.popleft().result()
+            self._packing_bytes.popleft()
             following = self._offset + len(chunk.record)
             index = records.ChunkIndex(
                 chunk_length=len(chunk.record),
