@@ -95,21 +95,23 @@ def _compare_with_log(
     """Return what does not fit the log, and its windows in samples as seconds."""
     # only needed with --log: log readers load the numerical libraries
     from spatial_replay.sources.open_log import open_source
-    from spatial_replay.trace.plausibility import Survey, plausibility_warnings, window_lines
+    from spatial_replay.trace.plausibility import LogNumbers, plausibility_warnings, window_lines
 
-    survey = Survey()
+    numbers = LogNumbers()
     names: set[str] = set()
     signals: set[str] = set()
+    classes: set[str] = set()
     with progress("samples") as advance:
         for block in open_source(log, **reading).iter_blocks():
             names.update(block.trace.names)
             signals.update(block.trace.signals)
-            survey = survey.extended(block.trace)
+            classes.update(name for name in block.trace.classes if name is not None)
+            numbers = numbers.extended(block.trace)
             warn(*block.trace.faults)
             advance(len(block.trace))
-    unknown = check_names(specification, sorted(names), sorted(signals))
-    doubtful = plausibility_warnings(specification, survey)
-    return (*unknown, *doubtful), window_lines(specification, survey)
+    unknown = check_names(specification, sorted(names), sorted(signals), classes=sorted(classes))
+    doubtful = plausibility_warnings(specification, numbers)
+    return (*unknown, *doubtful), window_lines(specification, numbers)
 
 
 def _heading(spec: NamedSpec) -> str:

@@ -28,7 +28,7 @@ from spatial_replay.spec.formula import (
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.resolve import Namespace, kind_of
 from spatial_replay.spec.syntax import BrokenStatement, ScaleStatement, SpecStatement, Statement
-from spatial_replay.spec.tokens import BINARY_TYPES, STATEMENT_TYPES, span_of, tokenize
+from spatial_replay.spec.tokens import BINARY_TYPES, STATEMENT_TYPES, quoted, span_of, tokenize
 from spatial_replay.spec.units import LENGTHS, units_of
 from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, substitute, terms_of
 
@@ -178,7 +178,12 @@ def _atoms(specification: Specification) -> Iterable[Atom]:
 
 
 def check_names(
-    specification: Specification, known: Iterable[str], signals: Iterable[str], *, where: str = "log"
+    specification: Specification,
+    known: Iterable[str],
+    signals: Iterable[str],
+    *,
+    where: str = "log",
+    classes: Iterable[str] = (),
 ) -> tuple[Diagnostic, ...]:
     """Compare the names of a specification with those of a log.
 
@@ -186,12 +191,14 @@ def check_names(
         known: names of the log's objects.
         signals: names of its numeric signals.
         where: what has them, if not a log.
+        classes: of its objects.
 
     Returns:
         An error for each object and signal that the log never has, with the nearest that it has; a
         warning for each object of the log that a definition of the same name hides.
     """
     objects, numeric = tuple(known), tuple(signals)
+    known_classes = tuple(classes)
     source = SourceText.of(specification.source, specification.filename)
     places, defined = _places(specification, source)
     missing = [("object", name, objects) for name in object_names(specification) if name not in objects]
@@ -201,7 +208,8 @@ def check_names(
             "error",
             places.get(name, Span(0, 0)),
             f"the {where} never has the {kind} {name!r}",
-            " ".join(filter(None, (nearest_hint(name, candidates), _listing(kind, candidates)))),
+            _class_hint(name, kind, known_classes)
+            or " ".join(filter(None, (nearest_hint(name, candidates), _listing(kind, candidates)))),
         )
         for kind, name, candidates in missing
     ]
@@ -213,6 +221,15 @@ def check_names(
 
 
 _LISTED = 12
+
+
+def _class_hint(name: str, kind: str, classes: Iterable[str]) -> str:
+    """Return the spelling of a class that was taken for an object; "" for none."""
+    meant = next((each for each in classes if each.casefold() == name.casefold()), None)
+    if kind != "object" or meant is None:
+        return ""
+    written = f"class {quoted(meant)}"
+    return f"it is a class: write {written} for all of them, or forall one in {written}: ..."
 
 
 def _listing(kind: str, names: tuple[str, ...]) -> str:

@@ -375,3 +375,9 @@ def test_a_title_names_no_object() -> None:
     specification = parse_specification('spec calm "cup" = G (cup ovlp plate)')
     (diagnosis,) = check_names(specification, ["plate"], [])
     assert diagnosis.column == len('spec calm "cup" = G (') + 1
+
+
+def test_a_class_in_the_place_of_an_object_gets_the_spelling_of_a_class() -> None:
+    specification = parse_specification("G (person dist robot >= 1)")
+    (diagnosis,) = check_names(specification, ["robot"], [], classes=["Person"])
+    assert 'write class "Person" for all of them' in diagnosis.hint
