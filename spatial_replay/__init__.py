@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from spatial_replay.api import info, replay_log, verify, write_report
     from spatial_replay.automata.automaton import Automaton
     from spatial_replay.automata.compile import automaton
+    from spatial_replay.automata.guards import Transition
     from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
     from spatial_replay.monitor.causes import Cause, LeastPart
     from spatial_replay.monitor.evaluate import Evaluation, evaluate
@@ -35,14 +36,17 @@ if TYPE_CHECKING:
     from spatial_replay.monitor.witness.atom import DecidingAtom, Measured
     from spatial_replay.monitor.witness.threshold import Threshold
     from spatial_replay.monitor.witness.witness import Witness, WitnessStep
+    from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Step
     from spatial_replay.planning.planner import Planner
+    from spatial_replay.planning.settings import Settings
+    from spatial_replay.recording.message_channel import MessageChannel
     from spatial_replay.recording.recorder import Recorder
     from spatial_replay.replay.engine import Replayed
     from spatial_replay.replay.verification import Verified
     from spatial_replay.sources.open_log import read_trace
     from spatial_replay.sources.overview import ObjectOverview, Overview
     from spatial_replay.spec.diagnostics import Diagnostic
-    from spatial_replay.spec.formula import Specification
+    from spatial_replay.spec.formula import NamedSpec, Specification
     from spatial_replay.spec.load import load_specification, parse_specification
     from spatial_replay.trace.sample import Sample
     from spatial_replay.trace.trace import Trace
@@ -51,18 +55,23 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Automaton",
+    "Candidate",
     "Cause",
+    "Consideration",
     "ConvexPart",
     "DecidingAtom",
     "Diagnostic",
     "Evaluation",
     "Footprint",
     "GeometryError",
+    "Guards",
     "LeastPart",
     "LogError",
     "Measured",
+    "MessageChannel",
     "MissingFileError",
     "Monitor",
+    "NamedSpec",
     "NoAutomatonError",
     "NodeResult",
     "NodeUpdate",
@@ -73,15 +82,18 @@ __all__ = [
     "Recorder",
     "Replayed",
     "Sample",
+    "Settings",
     "SpatialReplayError",
     "SpecResult",
     "SpecUpdate",
     "Specification",
     "SpecificationError",
+    "Step",
     "Threshold",
     "Trace",
     "TraceError",
     "TrackedObject",
+    "Transition",
     "Update",
     "UsageError",
     "Vacuous",
@@ -108,6 +120,7 @@ __getattr__, __dir__ = loaded_when_used(
         "api": ("info", "replay_log", "verify", "write_report"),
         "automata.automaton": ("Automaton",),
         "automata.compile": ("automaton",),
+        "automata.guards": ("Transition",),
         "geometry.footprint": ("ConvexPart", "Footprint", "TrackedObject"),
         "monitor.causes": ("Cause", "LeastPart"),
         "monitor.evaluate": ("Evaluation", "evaluate"),
@@ -119,14 +132,17 @@ __getattr__, __dir__ = loaded_when_used(
         "monitor.witness.atom": ("DecidingAtom", "Measured"),
         "monitor.witness.threshold": ("Threshold",),
         "monitor.witness.witness": ("Witness", "WitnessStep"),
+        "planning.decisions": ("Candidate", "Consideration", "Guards", "Step"),
         "planning.planner": ("Planner",),
+        "planning.settings": ("Settings",),
+        "recording.message_channel": ("MessageChannel",),
         "recording.recorder": ("Recorder",),
         "replay.engine": ("Replayed",),
         "replay.verification": ("Verified",),
         "sources.open_log": ("read_trace",),
         "sources.overview": ("ObjectOverview", "Overview"),
         "spec.diagnostics": ("Diagnostic",),
-        "spec.formula": ("Specification",),
+        "spec.formula": ("NamedSpec", "Specification"),
         "spec.load": ("load_specification", "parse_specification"),
         "trace.sample": ("Sample",),
         "trace.trace": ("Trace",),
