@@ -66,46 +66,44 @@ class LogNumbers:
         return (self.samples - 1) * 1e9 / span if span > 0 else None
 
 
-def window_lines(specification: Specification, numbers: LogNumbers) -> list[str]:
+def window_lines(specification: Specification, log: LogNumbers) -> list[str]:
     """Return each window given in samples, in seconds at the log's rate."""
-    if numbers.rate is None:
+    if log.rate is None:
         return []
     lines: dict[str, None] = {}
     for node in _nodes(specification):
         bound = node.bound if isinstance(node, Temporal) else None
         if bound is not None and bound.unit == "samples":
-            upper = "the end" if bound.upper is None else f"{bound.upper / numbers.rate:.3g} s"
+            upper = "the end" if bound.upper is None else f"{bound.upper / log.rate:.3g} s"
             name = f"{node.operator if isinstance(node, Temporal) else ''}{format_bound(bound)}"
-            lines[f"{name} is {bound.lower / numbers.rate:.3g} s to {upper}"] = None
-    return [f"at {numbers.rate:.4g} samples a second, {line}" for line in lines]
+            lines[f"{name} is {bound.lower / log.rate:.3g} s to {upper}"] = None
+    return [f"at {log.rate:.4g} samples a second, {line}" for line in lines]
 
 
-def plausibility_warnings(specification: Specification, numbers: LogNumbers) -> tuple[Diagnostic, ...]:
+def plausibility_warnings(specification: Specification, log: LogNumbers) -> tuple[Diagnostic, ...]:
     """Return a warning for each region and number that hardly fits what the log holds."""
     source = SourceText.of(specification.source, specification.filename)
     found: dict[str, Diagnostic] = {}
     for name, outline in specification.regions.items():
-        apart = _distance(outline, numbers.box)
-        if 0.0 < numbers.extent < apart:
+        apart = _distance(outline, log.box)
+        if 0.0 < log.extent < apart:
             start = max(source.text.find(f"region {name}"), 0)
             message = f"the region {name!r} is {apart:.4g} away from all that the log ever has"
-            hint = (
-                f"objects lie in x {numbers.box[0]:.4g} to {numbers.box[2]:.4g}, y {numbers.box[1]:.4g} to "
-            )
+            hint = f"objects lie in x {log.box[0]:.4g} to {log.box[2]:.4g}, y {log.box[1]:.4g} to "
             span = Span(start, start + len(f"region {name}"))
-            found[name] = source.diagnostic("warning", span, message, f"{hint}{numbers.box[3]:.4g}")
+            found[name] = source.diagnostic("warning", span, message, f"{hint}{log.box[3]:.4g}")
     for atom in _nodes(specification):
         if isinstance(atom, Atom) and atom.text not in found:
-            for message, hint in _doubts(atom, numbers):
+            for message, hint in _doubts(atom, log):
                 found.setdefault(atom.text, source.diagnostic("warning", atom.span, message, hint))
     return tuple(sorted(found.values(), key=lambda each: (each.line, each.column)))
 
 
-def _doubts(atom: Atom, numbers: LogNumbers) -> Iterator[tuple[str, str]]:
+def _doubts(atom: Atom, log: LogNumbers) -> Iterator[tuple[str, str]]:
     numbers = [each for each in atom.parameters if isinstance(each, float)]
     if atom.relation == "signal":
         name = str(atom.parameters[0])
-        low, high = (numbers.ranges or {}).get(name, (-inf, inf))
+        low, high = (log.ranges or {}).get(name, (-inf, inf))
         reach = max(high - low, abs(high), abs(low))
         for limit in numbers:
             if limit > high + reach or limit < low - reach:
@@ -115,9 +113,9 @@ def _doubts(atom: Atom, numbers: LogNumbers) -> Iterator[tuple[str, str]]:
         for length in numbers:
             if length < 0.0 and atom.relation != "dist":
                 yield f"{atom.relation!r} with the negative length {format_number(length)}", "is it a slip?"
-            elif 0.0 < numbers.extent * _FAR < abs(length):
+            elif 0.0 < log.extent * _FAR < abs(length):
                 message = f"{format_number(length)} is far more than anything in the log is apart"
-                yield message, f"all that it has lies within {numbers.extent:.4g}; is the unit the same?"
+                yield message, f"all that it has lies within {log.extent:.4g}; is the unit the same?"
 
 
 def _distance(outline: Outline, box: tuple[float, float, float, float]) -> float:
