@@ -146,7 +146,13 @@ class BlackBox:
 
     def _concluded(self, outcome: Outcome, end_ns: int) -> PlanDecision:
         """Return the last decision with its outcome."""
-        message = outcome_message(outcome, end_ns, self.planner.states, self._travelled)
+        message = PlanOutcome(
+            end_ns=end_ns,
+            succeeded=outcome.succeeded,
+            reason=outcome.reason,
+            states=self.planner.states,
+            travelled=[coordinate for point in self._travelled for coordinate in point],
+        )
         self._decision.outcome.CopyFrom(message)
         return self._decision
 
@@ -263,19 +269,6 @@ def decision_message(step: Step, specification: str, first_map: int) -> PlanDeci
         target=None if step.target is None else _target(step.target),
         pruned=pruned,
         reason=step.reason,
-    )
-
-
-def outcome_message(
-    outcome: Outcome, end_ns: int, states: Sequence[int], travelled: Sequence[tuple[float, float]]
-) -> PlanOutcome:
-    """Return the outcome of a step as a message, with the object's path and the automaton's states."""
-    return PlanOutcome(
-        end_ns=end_ns,
-        succeeded=outcome.succeeded,
-        reason=outcome.reason,
-        states=states,
-        travelled=[coordinate for point in travelled for coordinate in point],
     )
 
 

@@ -169,7 +169,7 @@ def proposition_maps(
         present = ", ".join(sample.objects) or "none"
         raise UsageError(f"there is no object {name!r} to move; the sample has: {present}")
     cells = workspace.grid if grid is None else grid
-    turns = turns_for(tracked, workspace.yaws)
+    turns = np.array(workspace.yaws) - (tracked.yaw or 0.0) if workspace.yaws else np.zeros(1)
     here = Trace.from_samples([sample])
     everywhere = _trace_over_cells(here, tracked, name, cells, turns)
     moves = np.array([concerns(each, name) for each in propositions], np.bool_)
@@ -341,11 +341,6 @@ def moved_batch(tracked: TrackedObject, positions: Floats, turns: Floats) -> Foo
         bottom=np.full(count, bottom),
         top=np.full(count, top),
     )
-
-
-def turns_for(tracked: TrackedObject, yaws: tuple[float, ...]) -> Floats:
-    """Return (A,) angles that turn an object to each orientation; [0] without orientations."""
-    return np.array(yaws) - (tracked.yaw or 0.0) if yaws else np.zeros(1)
 
 
 def _placed(vertices: Floats, centre: Floats, positions: Floats, turn: float) -> Floats:

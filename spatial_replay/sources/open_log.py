@@ -97,13 +97,7 @@ def read_trace(
         LogError: the file is not a log, or is damaged and `allow_damage` is not set.
     """
     source = open_source(
-        path,
-        concave=concave,
-        mapping=mapping,
-        on_time_jump=on_time_jump,
-        rate=rate,
-        lost=lost,
-        y_down=y_down,
+        path, concave=concave, mapping=mapping, on_time_jump=on_time_jump, rate=rate, lost=lost, y_down=y_down
     )
     traces = [replace(block.trace, remarks=block.remarks) for block in source.iter_blocks()]
     trace = Trace.concatenate(traces)

@@ -111,7 +111,7 @@ def survey(
         counter.add(message)
         if count % _STEP == 0:
             advance(_STEP)
-        if not whole and counter.knows_enough:
+        if not whole and not counter.missing:
             break
     mappable = suggest_topics(topics, counter.examples)
     faults = FaultList()
@@ -129,7 +129,7 @@ def survey(
 
 
 class _Counter:
-    """Counts messages, and decodes the first ones of each topic."""
+    """Counts messages, and decodes the first ones of each topic; `missing` are those not known enough."""
 
     def __init__(self, reader: MessageReader, topics: Sequence[Topic]) -> None:
         self.start_ns: int | None = None
@@ -141,7 +141,7 @@ class _Counter:
         self._undecodable: dict[str, tuple[int, str]] = {}
         self._looked_at: dict[str, int] = {}
         self._decoders: dict[str, Decoder] = {}
-        self._missing = {topic.name for topic in topics if topic.count != 0}
+        self.missing = {topic.name for topic in topics if topic.count != 0}
         for topic in topics:
             try:
                 self._decoders[topic.name] = reader.decoder(topic.name)
@@ -150,10 +150,6 @@ class _Counter:
                 self._remarks.append(_of_topic(topic.name, str(error)))
         self._declared = {topic.name: topic.count for topic in topics}
         self._bytes = dict.fromkeys(self._declared, 0)
-
-    @property
-    def knows_enough(self) -> bool:
-        return not self._missing
 
     def add(self, message: Message) -> None:
         time_ns, topic = message.log_time_ns, message.topic
@@ -164,7 +160,7 @@ class _Counter:
         if self.counts[topic] in _LOOKED_AT and topic in self.examples:
             self._look(message)
         if self.counts[topic] >= _ENOUGH or self.counts[topic] == self._declared[topic]:
-            self._missing.discard(topic)
+            self.missing.discard(topic)
 
     def _look(self, message: Message) -> None:
         topic = message.topic

@@ -211,7 +211,10 @@ class Trace:
             footprints=FootprintBatch.concatenate([trace.footprints for trace in traces]),
             yaw=_joined_floats(trace.yaw for trace in traces),
             uncertainty=_joined_floats(trace.uncertainty for trace in traces),
-            class_code=_joined_integers(_recoded(trace, code) for trace in traces),
+            class_code=_joined_integers(
+                np.array([code[name] for name in trace.classes], np.int64)[trace.class_code]
+                for trace in traces
+            ),
             classes=classes,
             signals={
                 name: _joined_floats(trace.signals.get(name, unknown[len(trace)]) for trace in traces)
@@ -289,10 +292,6 @@ def _renumber(rows: Integers) -> tuple[Integers, Integers]:
 
 def _class_order(classes: Iterable[str | None]) -> tuple[str | None, ...]:
     return tuple(sorted(set(classes), key=lambda name: (name is not None, name or "")))
-
-
-def _recoded(trace: Trace, code: Mapping[str | None, int]) -> Integers:
-    return np.array([code[name] for name in trace.classes], np.int64)[trace.class_code]
 
 
 def _joined_integers(arrays: Iterable[Integers]) -> Integers:
