@@ -45,6 +45,7 @@ def replay_log(
     *,
     output: PathName | None = None,
     layer: bool = False,
+    keep: Sequence[str] | None = None,
     constants: Mapping[str, float | str] | None = None,
     each: Mapping[str, str] | None = None,
     semantics: Semantics = "ltlf",
@@ -61,6 +62,8 @@ def replay_log(
         specifications: one or several, parsed or as files; None takes those that the log was written with.
         output: the annotated log to write (MCAP).
         layer: write the derived messages only, without the log's own.
+        keep: which of the log's own messages the output holds: "all" (as without it), "mapped" for those of
+            mapped topics, or patterns of topics such as "/camera/*"; several add up.
         constants: values in place of those that files and the log's own specifications give their constants.
         each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
         semantics: "ltlf", or "paper": Def. 16 of the paper to the letter.
@@ -74,12 +77,20 @@ def replay_log(
         LogError: the log cannot be read.
         OutputError: the output cannot be written.
     """
+    if isinstance(keep, str):
+        keep = (keep,)
+    if keep is not None and (output is None or layer):
+        raise UsageError(
+            "keep applies to an annotated log with the log's own messages; give output, not layer"
+        )
     source = _source(log, reading)
     window = Window(start_ns, end_ns, every)
     return run_replay(
         source,
         _files(specifications, source, constants),
-        ReplayOptions(window, dict(each or {}), semantics, strict_names),
+        ReplayOptions(
+            window, dict(each or {}), semantics, strict_names, None if keep is None else tuple(keep)
+        ),
         keep_series=True,
         keep_leaves=True,
         output=None if output is None else Path(output),

@@ -233,6 +233,14 @@ def test_a_keep_that_cannot_work_is_refused(
     assert not Path("c.mcap").exists()
 
 
+def test_keep_is_there_in_python_too(bag: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.mcap"
+    sr.replay_log(bag, SPEC, output=copy, keep=["/camera/*"], mapping=tmp_path / "drive.yaml")
+    assert {topic for topic, *_ in _mcap(copy)} == {"/camera/left"}
+    with pytest.raises(UsageError, match="give output"):
+        sr.replay_log(bag, SPEC, keep="mapped", mapping=tmp_path / "drive.yaml")
+
+
 def test_a_log_without_messages_has_none_to_keep() -> None:
     samples = [sample(0), sample(1)]
     with pytest.raises(UsageError, match="memory has no messages to keep; it holds samples only"):
