@@ -13,7 +13,9 @@ from spatial_replay.cli import run
 RECORDINGS = Path(__file__).parent.parent.parent / "recordings"
 LOG, SPEC = RECORDINGS / "table.jsonl", RECORDINGS / "table.spatial"
 WIDE = ("--const", "near=0.3", "--const", "deadline=4s")
-RELATED = "# related\nconst near = 0.08 # m\nconst far = near\nspec s = G (cup dist plate <= far)\n"
+RELATED = (
+    "# related\nconst near = 0.08 in [0, 3] # m\nconst far = 2 * near\nspec s = G (cup dist plate <= far)\n"
+)
 
 
 def _json(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, dict[str, object]]:
@@ -75,7 +77,7 @@ def test_a_recording_holds_the_values_it_was_made_with(
     assert capsys.readouterr().out == _edited(tmp_path).read_text()
 
 
-def test_a_constant_that_repeats_another_follows_it(
+def test_a_constant_that_is_computed_from_another_follows_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "s.spatial").write_text(RELATED)
