@@ -6,6 +6,7 @@ beyond it, `deciding_leaf` finds leaves by their numbers where it can.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
@@ -139,11 +140,13 @@ class LeafHistory:
         return self._blocks[0] if time_ns is None else self._blocks[0].between(0, time_ns + 1)
 
     def _leaf(self, path: DecidingPath, samples: SeriesBlock) -> DecidingLeaf | None:
-        """Return the leaf at the end of a path; None if it ends at a constant or an empty window."""
+        """Return the leaf at the end of a path; None if it has no finite number."""
         node, sample = path.steps[-1].node, path.steps[-1].sample
         index = self._leaf_of[node]
         if index is None:
             return None
         low, high = low_and_high(len(samples.leaves), wide=True)
-        number = samples.leaves[high if path.end is End.HIGH else low, index, sample]
-        return DecidingLeaf(node, index, float(number) + 0.0, int(samples.times_ns[sample]))
+        number = float(samples.leaves[high if path.end is End.HIGH else low, index, sample])
+        if not math.isfinite(number):
+            return None
+        return DecidingLeaf(node, index, number + 0.0, int(samples.times_ns[sample]))

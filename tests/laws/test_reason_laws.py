@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from foxglove_schemas_protobuf.Event_pb2 import Event
 from hypothesis import given, reject, settings
 
@@ -12,6 +14,7 @@ from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.source import MemorySource
 from spatial_replay.logs.topics import EVENTS
 from spatial_replay.monitor.result import SpecResult
+from spatial_replay.replay.document import document_from_replay
 from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Atom, Formula, Quantified, Specification, iter_nodes
@@ -57,13 +60,11 @@ def run_of(spec: Specification, recording: Recording) -> Run:
 
 
 def leaf_of(result: SpecResult) -> Formula | None:
-    """The leaf that the first cause names; None if that is a constant or an empty window."""
+    """The leaf that the first cause names; None if that has no number."""
     witness = result.causes[0].witness
     assert witness is not None
-    step = witness.path[-1]
-    return (
-        None if step.operator in ("true", "false") or witness.deciding is None else _node(result, step.node)
-    )
+    node = _node(result, witness.path[-1].node)
+    return node if math.isfinite(witness.upper) and isinstance(node, Atom | Quantified) else None
 
 
 def _node(result: SpecResult, node: int) -> Formula:
@@ -72,12 +73,16 @@ def _node(result: SpecResult, node: int) -> Formula:
 
 @settings(max_examples=40)
 @given(specifications(templates=False), recordings(max_size=8))
-def test_the_last_event_names_what_the_first_cause_names(spec: Specification, recording: Recording) -> None:
+def test_json_and_the_last_event_name_what_the_first_cause_names(
+    spec: Specification, recording: Recording
+) -> None:
     run = run_of(spec, recording)
     if run.result.verdict != "violated":
         return
     cause = run.result.causes[0]
     assert cause.witness is not None
+    worst = document_from_replay(run.replayed)["specifications"][0]["worst"]
+    assert (worst["node"], worst["time_ns"]) == (cause.node, cause.witness.time_ns)
     event, leaf = run.last_event, leaf_of(run.result)
     assert event["verdict"] == "violated"
     if leaf is None:
