@@ -18,6 +18,7 @@ from spatial_replay.cli.options import (
 )
 from spatial_replay.cli.output import print_verdicts
 from spatial_replay.cli.progress import progress
+from spatial_replay.errors import UsageError
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.semantics import Semantics
@@ -45,6 +46,8 @@ def report(request: EvaluationArguments, output: Path, semantics: Semantics) -> 
     from spatial_replay.report.write import write_report
 
     refuse_inputs(output, request.inputs)
+    if output.suffix.lower() not in (".html", ".htm"):
+        raise UsageError(f"-o {output}: report writes an HTML page; name it {output.stem}.html")
     inputs = open_inputs(request)
     with progress("samples") as advance:
         replayed = write_report(

@@ -19,6 +19,7 @@ from spatial_replay.monitor.witness.path import End, Evidence
 from spatial_replay.monitor.witness.threshold import Threshold
 from spatial_replay.monitor.witness.witness import Witness, find_witness
 from spatial_replay.spec.format import format_formula
+from spatial_replay.spec.expressions import Scaled
 from spatial_replay.spec.formula import NamedSpec, Number, Specification
 from spatial_replay.trace.sample import FOREVER, Sample
 from spatial_replay.trace.trace import Trace
@@ -78,12 +79,18 @@ class Violation:
         return () if self.witness is None else sentences_of(self.witness, first_ns=self.first_ns)
 
     def __str__(self) -> str:
-        when = time_text(self.time_ns, self.first_ns)
-        if self.atom is None:
-            return f"`{self.spec}` is violated since {when}, by {number_text(-self.robustness)}"
+        if self.atom is None or self.witness is None:
+            since = time_text(self.time_ns, self.first_ns)
+            return f"`{self.spec}` is violated since {since}, by {number_text(-self.robustness)}"
+        when = time_text(self.witness.time_ns, self.first_ns)
         number = self.atom.upper if self.atom.end is End.HIGH else self.atom.lower
         how = f"{'holds' if number >= 0.0 else 'fails'} by {number_text(abs(number))}"
-        return f"{_short(self.atom, self.spec, abs(number))}: `{self.atom.text}` {how} at {when}"
+        return f"{_short(self.atom, self.spec, abs(number) * _divisor(self.atom))}: `{self.atom.text}` {how} at {when}"
+
+
+def _divisor(atom: DecidingAtom) -> float:
+    """Return what `scale` divides the atom's number by, so that amounts are said in the log's own unit."""
+    return atom.atom.expression.divisor if isinstance(atom.atom.expression, Scaled) else 1.0
 
 
 def _short(atom: DecidingAtom, spec: str, amount: float) -> str:

@@ -95,3 +95,12 @@ def test_options_that_cannot_work_leave_no_report(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="is an input"):
         call("report", log, "--spec", spec, "-o", spec)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["s.spatial"]
+
+
+def test_a_report_never_takes_the_name_of_a_log(tmp_path: Path) -> None:
+    log = tmp_path / "run.mcap"
+    log.write_bytes(b"a log that is needed")
+    spec = RECORDINGS / "table.spatial"
+    with pytest.raises(UsageError, match=r"report writes an HTML page; name it run\.html"):
+        call("report", RECORDINGS / "table.jsonl", "--spec", spec, "-o", log)
+    assert log.read_bytes() == b"a log that is needed"

@@ -245,3 +245,15 @@ def test_infinite_and_missing_numbers_are_said_plainly() -> None:
     result = evaluated("spec s = G (missing >= 1)").result()
     assert math.isnan(result.robustness)
     assert "signal 'missing' has no finite value" in result.explain()
+
+
+def test_a_violation_says_amounts_in_the_units_of_the_log_and_the_time_of_its_atom():
+    text = "scale force = 15\nspec soft = G (force <= 14)\nspec soon = F[0s, 1s] (force >= 20)"
+    monitor = sr.Monitor(sr.parse_specification(text))
+    for half_seconds in range(4):
+        force = 14.2 if half_seconds == 2 else 13.0
+        update = monitor.update(sr.Sample(half_seconds * SECOND // 2, {}, {"force": force}))
+    soft, soon = map(str, update.violations)
+    assert soft.startswith("force is 0.2 too high: `force <= 14` fails") and soft.endswith("at 1.000 s")
+    # the best attempt before the window closed
+    assert soon.startswith("force is 5.8 too low: `force >= 20` fails") and soon.endswith("at 1.000 s")
