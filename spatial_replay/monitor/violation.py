@@ -18,8 +18,8 @@ from spatial_replay.monitor.witness.atom import DecidingAtom
 from spatial_replay.monitor.witness.path import End, Evidence
 from spatial_replay.monitor.witness.threshold import Threshold
 from spatial_replay.monitor.witness.witness import Witness, find_witness
-from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.expressions import Scaled
+from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import NamedSpec, Number, Specification
 from spatial_replay.trace.sample import FOREVER, Sample
 from spatial_replay.trace.trace import Trace
@@ -85,7 +85,8 @@ class Violation:
         when = time_text(self.witness.time_ns, self.first_ns)
         number = self.atom.upper if self.atom.end is End.HIGH else self.atom.lower
         how = f"{'holds' if number >= 0.0 else 'fails'} by {number_text(abs(number))}"
-        return f"{_short(self.atom, self.spec, abs(number) * _divisor(self.atom))}: `{self.atom.text}` {how} at {when}"
+        short = _short(self.atom, self.spec, abs(number) * _divisor(self.atom))
+        return f"{short}: `{self.atom.text}` {how} at {when}"
 
 
 def _divisor(atom: DecidingAtom) -> float:

@@ -91,7 +91,7 @@ def test_options_that_cannot_work_leave_no_report(tmp_path: Path) -> None:
     spec = tmp_path / "s.spatial"
     spec.write_text("spec s = F (no_such_thing ovlp plate)\n")
     with pytest.raises(SpecificationError):
-        call("report", log, "--spec", spec, "-o", output)
+        call("report", log, "--spec", spec, "--strict-names", "-o", output)
     with pytest.raises(UsageError, match="is an input"):
         call("report", log, "--spec", spec, "-o", spec)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["s.spatial"]
