@@ -78,7 +78,7 @@ def test_a_writer_that_leaves_out_zeros_is_read_too():
 
 
 def test_what_is_no_message_of_ours_is_named():
-    with pytest.raises(LogError, match=r"message 0 of 3 bytes is no spatial_replay\.Robustness"):
+    with pytest.raises(LogError, match=r"message 0 of 3 bytes is not a spatial_replay\.Robustness"):
         decode_robustness([b"\xff\xff\xff"])
 
 

@@ -223,7 +223,8 @@ def test_an_annotated_copy_needs_no_mapping(tmp_path: Path, mapping: Path) -> No
     topics: set[str] = set()
     for block in open_source(out).iter_blocks():
         topics |= {channel.topic for channel in block.messages.channels.values()}
-    assert topics == {"/a", "/b", "/spatial/objects"}
+    # the topic that no mapping reads is copied, too
+    assert topics == {"/a", "/b", "/words", "/spatial/objects"}
 
 
 def test_extensions_do_not_matter(tmp_path: Path, mapping: Path) -> None:

@@ -185,7 +185,7 @@ def test_what_is_violated_is_explained_at_once(open_page: Open) -> None:
 
 def test_a_time_in_an_explanation_leads_there(open_page: Open) -> None:
     page = open_page("violated", at="#t=9")
-    page.locator(".verdict").first.get_by_role("button", name="4.000 s").click()
+    page.locator(".verdict").first.get_by_role("button", name="4.000 s").last.click()
     expect(readout(page)).to_have_text("4.000 s / 9.967 s")
     expect(page.locator("#tree .which")).to_contain_text("table_set at 4.000 s")
 

@@ -102,7 +102,7 @@ def test_the_layout_is_printed(tmp_path: Path) -> None:
         (("--host", ""), "cannot listen at no address"),
         (("--semantics", "stl"), "stl"),
         (("--port", "70000"), "70000"),
-        (("--from", "99s"), "no sample in the window"),
+        (("--from", "99s"), "no sample in the requested window"),
     ],
 )
 def test_options_that_cannot_work_are_refused(options: tuple[str, ...], said: str, tmp_path: Path) -> None:

@@ -207,7 +207,7 @@ def test_a_class_that_appears_only_outside_the_window_gives_no_result() -> None:
 def test_all_names_that_the_log_never_has_are_reported_together() -> None:
     spec = parse_specification("spec s = F (cub ovlp hand)\nspec t = batery >= 1")
     with pytest.raises(SpecificationError) as error:
-        run_replay(PiecewiseSource(run(), 4), [spec])
+        run_replay(PiecewiseSource(run(), 4), [spec], ReplayOptions(strict_names=True))
     said = str(error.value)
     assert [d.line for d in error.value.diagnoses] == [1, 1, 2]
     assert "'cube'" in said
@@ -308,7 +308,8 @@ class TestOutputs:
         output = tmp_path / "out.mcap"
         output.write_bytes(b"before")
         with pytest.raises(SpecificationError):
-            run_replay(open_source(log), [parse_specification("G ghost ovlp cube")], output=output)
+            options = ReplayOptions(strict_names=True)
+            run_replay(open_source(log), [parse_specification("G ghost ovlp cube")], options, output=output)
         assert output.read_bytes() == b"before"
         assert sorted(path.name for path in tmp_path.iterdir()) == ["out.mcap", "run.mcap"]
 
