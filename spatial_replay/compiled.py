@@ -34,9 +34,12 @@ _Result = TypeVar("_Result")
 _COLD_S: Final = 2.0
 _WARM_S: Final = 0.15
 """How long a kernel may be interpreted before it is compiled, or loaded from the cache."""
-_COLD_GUESS_S: Final = 5e-6
-_WARM_GUESS_S: Final = 2e-6
+_COMPILER_S: Final = 0.25
+"""What loading the compiler costs besides, once in a process."""
+_GUESS_S: Final = 2e-6
 """For each element of its arrays, the time a kernel is expected to take when it was never run."""
+_LONG: Final = 3.0
+"""How many times that a kernel takes whose calls are long: it works on pairs of elements."""
 _STALE_S: Final = 7 * 24 * 3600.0
 _PACKAGE: Final = Path(__file__).parent
 
@@ -150,7 +153,10 @@ class _Kernel(Generic[_Arguments, _Result]):
             return _process.only == "interpreted"
         if not _process.interprets:
             return False
-        limit, guess = (_WARM_S, _WARM_GUESS_S) if _process.is_warm else (_COLD_S, _COLD_GUESS_S)
+        limit = _WARM_S if _process.is_warm else _COLD_S
+        guess = _GUESS_S * (_LONG if "nogil" in self._options else 1.0)
+        if not _process.has_compiler:
+            limit += _COMPILER_S
         expected = elements * (guess if self._element_s is None else self._element_s)
         return self._spent_s + expected <= limit
 
@@ -192,9 +198,12 @@ def _names(function: FunctionType) -> set[str]:
 
 
 def _elements(values: object) -> int:
-    """Return how many elements there are in arrays, also within tuples."""
+    """Return how many doubles there is room for in arrays, also within tuples.
+
+    Kernels pass over bytes quickly: they compare or copy them, or jump from record to record.
+    """
     if isinstance(values, np.ndarray):
-        return values.size
+        return values.nbytes // 8
     if isinstance(values, tuple):
         return sum(map(_elements, values))
     return 0
@@ -218,6 +227,11 @@ class _Process:
             self._folder = cache_folder()
             self._is_warm = self._folder is not None and _holds_code(self._folder)
         return self._is_warm
+
+    @property
+    def has_compiler(self) -> bool:
+        """Whether the compiler is loaded already."""
+        return "numba" in sys.modules
 
     def compile(self, function: Callable[..., Any], options: dict[str, Any]) -> Any:
         """Return a function that is compiled for the types of its arguments when it is called."""
