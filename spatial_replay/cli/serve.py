@@ -21,7 +21,7 @@ from spatial_replay.cli.progress import progress
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.semantics import Semantics
-    from spatial_replay.replay.tuning import Tuned
+    from spatial_replay.replay.loaded_log import Evaluated
 
 
 @click.command()
@@ -68,25 +68,25 @@ def serve(
       spatial-replay serve run.mcap --spec blocks.spatial
       spatial-replay serve run.mcap --spec blocks.spatial --layout > live.json
     """
-    tuned = _tuned(request, keep, semantics)
+    evaluated = _evaluated(request, keep, semantics)
     if layout:
-        click.echo(tuned.layout.data)
+        click.echo(evaluated.layout.data)
         return None
-    warn_of_input(tuned.replayed)
+    warn_of_input(evaluated.replayed)
     try:
-        _serve(tuned, host, port, play)
+        _serve(evaluated, host, port, play)
     except KeyboardInterrupt:
         # the regular way to stop the server
         return ExitCode.INTERRUPTED
     return None
 
 
-def _serve(tuned: Tuned, host: str, port: int, play: bool) -> None:
+def _serve(evaluated: Evaluated, host: str, port: int, play: bool) -> None:
     # imported here so that --help stays fast
     from spatial_replay.serve import open_server
 
-    with open_server(tuned, host=host, port=port, play=play) as server:
-        print_verdicts(tuned.replayed, None)
+    with open_server(evaluated, host=host, port=port, play=play) as server:
+        print_verdicts(evaluated.replayed, None)
         if not _is_loopback(host):
             warn(f"anyone who can reach {server.address} can read this log")
         click.echo(f"serving at {server.address}; stop with Ctrl-C")
@@ -95,18 +95,18 @@ def _serve(tuned: Tuned, host: str, port: int, play: bool) -> None:
         server.wait()
 
 
-def _tuned(request: EvaluationArguments, keep: tuple[str, ...], semantics: Semantics) -> Tuned:
-    from spatial_replay.replay import Tuning
+def _evaluated(request: EvaluationArguments, keep: tuple[str, ...], semantics: Semantics) -> Evaluated:
+    from spatial_replay.replay import LoadedLog
 
     inputs = open_inputs(request)
     with progress("samples") as advance:
-        tuning = Tuning(
+        loaded = LoadedLog(
             inputs.source,
             inputs.files,
             inputs.options(semantics, keep),
             advance=advance,
         )
-    return tuning.evaluate()
+    return loaded.evaluate()
 
 
 def _is_loopback(host: str) -> bool:

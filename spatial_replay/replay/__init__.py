@@ -1,7 +1,7 @@
 """Replay: a log and specifications in, verdicts and an annotated log out.
 
 `selection` picks the samples, `engine` evaluates them, `annotated` writes the log, `document` the JSON.
-`tuning` evaluates a log in memory with other constants, `playback` plays what that gives.
+`loaded_log` evaluates a log in memory with other constants, `playback` plays what that gives.
 
 Names are loaded when they are first used.
 """
@@ -16,21 +16,21 @@ if TYPE_CHECKING:
     from spatial_replay.replay.annotated import load_files, recorded_texts, run_replay
     from spatial_replay.replay.document import Explanation, document_from_replay, explain_results
     from spatial_replay.replay.engine import Replay, Replayed
+    from spatial_replay.replay.loaded_log import Evaluated, LoadedLog, constant_text, constant_values
     from spatial_replay.replay.playback import Playback
     from spatial_replay.replay.selection import ReplayOptions, Window, first_sample_ns, has_samples_from
     from spatial_replay.replay.table import QUANTITIES, export_table
-    from spatial_replay.replay.tuning import Tuned, Tuning, constant_text, constant_values
     from spatial_replay.replay.verification import verify_certificate
 
 __all__ = [
     "QUANTITIES",
+    "Evaluated",
     "Explanation",
+    "LoadedLog",
     "Playback",
     "Replay",
     "ReplayOptions",
     "Replayed",
-    "Tuned",
-    "Tuning",
     "Window",
     "constant_text",
     "constant_values",
@@ -54,7 +54,7 @@ __getattr__, __dir__ = loaded_when_used(
         "playback": ("Playback",),
         "selection": ("ReplayOptions", "Window", "first_sample_ns", "has_samples_from"),
         "table": ("QUANTITIES", "export_table"),
-        "tuning": ("Tuned", "Tuning", "constant_text", "constant_values"),
+        "loaded_log": ("Evaluated", "LoadedLog", "constant_text", "constant_values"),
         "verification": ("verify_certificate",),
     },
 )

@@ -9,8 +9,8 @@ import numpy as np
 
 from spatial_replay.annotate.scene_update import SceneState, scene_scale
 from spatial_replay.logs.messages import Channel, Messages, join, merge, select
+from spatial_replay.replay.loaded_log import Evaluated
 from spatial_replay.replay.own_messages import MessageCursor, latest_messages
-from spatial_replay.replay.tuning import Tuned
 
 _LOOK_BACK_NS: Final = 2_000_000_000
 """How far before a seek the latest message of each topic is looked for."""
@@ -26,19 +26,19 @@ class Playback:
     scene: it is drawn again at once, and what a viewer may still show of another time is deleted.
 
     Attributes:
-        tuned: the evaluation; another one of the same log may replace it before a `seek`.
+        evaluated: the evaluation; another one of the same log may replace it before a `seek`.
         start_ns, end_ns: from the first sample to the last sample or message of the log.
         time_ns: the time up to which messages were taken, inclusive.
     """
 
-    def __init__(self, tuned: Tuned) -> None:
+    def __init__(self, evaluated: Evaluated) -> None:
         """Begin before the first message; `seek` first."""
-        own = tuned.tuning.own
-        self._times_ns = tuned.tuning.inside.times_ns
+        own = evaluated.loaded.own
+        self._times_ns = evaluated.loaded.inside.times_ns
         self.start_ns, self.end_ns = int(self._times_ns[0]), own.end_ns
         self.time_ns = self.start_ns
-        self.tuned = tuned
-        self._annotator = tuned.annotator(SceneState(scale=scene_scale(tuned.tuning.inside)))
+        self.evaluated = evaluated
+        self._annotator = evaluated.annotator(SceneState(scale=scene_scale(evaluated.loaded.inside)))
         self._own = MessageCursor(own, self.start_ns)
         self._next = 0
         self._has_ended = False
@@ -46,9 +46,9 @@ class Playback:
     @property
     def channels(self) -> tuple[Channel, ...]:
         """All channels that may have messages."""
-        own = self.tuned.tuning.own
+        own = self.evaluated.loaded.own
         first = MessageCursor(own, self.start_ns).take_before(self.start_ns + 1)
-        derived = Messages(channels=dict(enumerate(self.tuned.evaluation.channels)))
+        derived = Messages(channels=dict(enumerate(self.evaluated.evaluation.channels)))
         return tuple(dict.fromkeys((*join([derived, first]).channels.values(), *own.channels)))
 
     def seek(self, time_ns: int) -> Messages:
@@ -63,10 +63,10 @@ class Playback:
         self.time_ns = min(max(time_ns, self.start_ns), self.end_ns)
         self._next = int(np.searchsorted(self._times_ns, self.time_ns, side="right"))
         shown = max(self._next - 1, 0)
-        self._annotator = self.tuned.annotator(replace(self._annotator.scene, written_ns=None))
+        self._annotator = self.evaluated.annotator(replace(self._annotator.scene, written_ns=None))
         self._has_ended = False
-        events = _last(merge(self._annotator.pass_over(*self.tuned.part(0, shown))))
-        derived = self._annotator.messages(*self.tuned.part(shown, self._next))
+        events = _last(merge(self._annotator.pass_over(*self.evaluated.part(0, shown))))
+        derived = self._annotator.messages(*self.evaluated.part(shown, self._next))
         shown_there = merge([events, *derived, self._seek_own(int(self._times_ns[shown]))])
         return join([shown_there, _last(self._end())])
 
@@ -79,7 +79,7 @@ class Playback:
         self.time_ns = min(max(time_ns, self.time_ns), self.end_ns)
         begin = self._next
         self._next = int(np.searchsorted(self._times_ns, self.time_ns, side="right"))
-        derived = self._annotator.messages(*self.tuned.part(begin, self._next))
+        derived = self._annotator.messages(*self.evaluated.part(begin, self._next))
         coming = merge([*derived, self._own.take_before(self.time_ns + 1)])
         return join([coming, self._end()])
 
@@ -93,11 +93,11 @@ class Playback:
         if self._has_ended or self.time_ns < self.end_ns:
             return Messages()
         self._has_ended = True
-        return merge(self._annotator.end(self.end_ns, self.tuned.evaluation.finals))
+        return merge(self._annotator.end(self.end_ns, self.evaluated.evaluation.finals))
 
     def _seek_own(self, sample_ns: int) -> Messages:
         """Return the latest of the log's own messages of each topic, and all those at the present time."""
-        own = self.tuned.tuning.own
+        own = self.evaluated.loaded.own
         since_ns = max(min(self.time_ns - _LOOK_BACK_NS, sample_ns), own.start_ns)
         self._own = MessageCursor(own, since_ns)
         messages = merge([own.few_before(since_ns), self._own.take_before(self.time_ns + 1)])

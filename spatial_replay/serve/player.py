@@ -15,8 +15,8 @@ from spatial_replay.logs.messages import Messages, messages_of, select
 from spatial_replay.logs.topics import CURVES_TOPIC, EVENT_LOG, EVENTS
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.verdict import Verdict
+from spatial_replay.replay.loaded_log import EditedFiles, Evaluated, constant_text, constant_values
 from spatial_replay.replay.playback import Playback
-from spatial_replay.replay.tuning import EditedFiles, Tuned, constant_text, constant_values
 from spatial_replay.serve.pace import PlaybackState
 from spatial_replay.serve.requests import PendingRequests, Values
 from spatial_replay.serve.session import Session
@@ -88,15 +88,15 @@ _MOST = 5
 """The most results, and constants, that a note names."""
 
 
-def verdict_note(tuned: Tuned) -> Note:
+def verdict_note(evaluated: Evaluated) -> Note:
     """Say the verdict of each result, the worst first, and which constants differ from the text."""
     order = (Verdict.VIOLATED, Verdict.UNKNOWN, Verdict.SATISFIED)
-    results = sorted(tuned.replayed.results, key=lambda result: order.index(result.verdict))
+    results = sorted(evaluated.replayed.results, key=lambda result: order.index(result.verdict))
     text = "; ".join(map(_result, results[:_MOST])) or "the template matched no objects"
     if len(results) > _MOST:
         text += f"; and {len(results) - _MOST} more, none worse"
-    level = Level.INFO if tuned.verdict is Verdict.SATISFIED else Level.WARNING
-    return Note(VERDICT, level, text + _changes(tuned))
+    level = Level.INFO if evaluated.verdict is Verdict.SATISFIED else Level.WARNING
+    return Note(VERDICT, level, text + _changes(evaluated))
 
 
 def _result(result: SpecResult) -> str:
@@ -104,11 +104,11 @@ def _result(result: SpecResult) -> str:
     return f"`{result.title}` is {result.verdict}: robustness {number}"
 
 
-def _changes(tuned: Tuned) -> str:
-    written = tuned.tuning.constants
+def _changes(evaluated: Evaluated) -> str:
+    written = evaluated.loaded.constants
     changed = [
         f"{name} = {constant_text(constant)}"
-        for name, constant in tuned.edited.constants.items()
+        for name, constant in evaluated.edited.constants.items()
         if constant != written[name]
     ]
     more = ", …" if len(changed) > _MOST else ""
@@ -158,20 +158,20 @@ class Player:
             self._seek(time_ns)
         if requests.topics:
             self._resend(requests.topics)
-        self._session.provide_evaluation(self._playback.tuned)
+        self._session.provide_evaluation(self._playback.evaluated)
 
     def _evaluate(self, edited: EditedFiles, time_ns: int) -> None:
         """Evaluate the whole log with other constants; after an error, restore the former values."""
-        before = self._playback.tuned
+        before = self._playback.evaluated
         try:
-            self._playback.tuned = before.tuning.evaluate(edited)
+            self._playback.evaluated = before.loaded.evaluate(edited)
         except SpatialReplayError as error:
             self._viewers.send_note(Note(CONSTANTS, Level.ERROR, str(error)))
             self._viewers.send_values(self._session.restore_values(constant_values(before.edited.constants)))
             return
         # viewers drop what they show of the log when the playback jumps, even to the same time
         self._viewers.send_state(self._session.state._replace(time_ns=time_ns, did_seek=True))
-        self._viewers.send_note(verdict_note(self._playback.tuned))
+        self._viewers.send_note(verdict_note(self._playback.evaluated))
 
     def _seek(self, time_ns: int) -> None:
         """Send what is shown at a time, and go on from there."""
@@ -185,7 +185,7 @@ class Player:
         time_ns = self._playback.time_ns
         if CURVES_TOPIC in topics:
             self._send_curves(time_ns)
-            self._viewers.send_note(verdict_note(self._playback.tuned))
+            self._viewers.send_note(verdict_note(self._playback.evaluated))
         self._viewers.publish(_on_topics(self._playback.seek(time_ns), topics))
         self._viewers.send_state(self._session.state)
         self._viewers.send_time(time_ns)
@@ -193,7 +193,7 @@ class Player:
     def _send_curves(self, time_ns: int) -> None:
         """Send the curves of the whole log; viewers drop them whenever they go to another time."""
         if self._viewers.wants(CURVES_TOPIC):
-            curves = [self._playback.tuned.curves]
+            curves = [self._playback.evaluated.curves]
             self._viewers.publish(messages_of(CURVES_CHANNEL, np.array([time_ns]), curves, 0))
 
     def _play_on(self) -> None:

@@ -11,7 +11,7 @@ from threading import Lock
 from typing import Any, Final, TypeVar
 
 from spatial_replay.errors import UsageError
-from spatial_replay.replay.tuning import EditedFiles, Tuned
+from spatial_replay.replay.loaded_log import EditedFiles, Evaluated
 
 Values = Mapping[str, float | str]
 """Numbers and, as texts, durations, by the names of constants."""
@@ -47,7 +47,7 @@ class PendingRequests:
 class Questions:
     """Answer one question after the other, on a thread of its own, so that no playback waits for them."""
 
-    def __init__(self, wait_for_evaluation: Callable[[], Tuned]) -> None:
+    def __init__(self, wait_for_evaluation: Callable[[], Evaluated]) -> None:
         """Begin without a question.
 
         Args:
@@ -59,7 +59,7 @@ class Questions:
         self._changing = Lock()
         self._is_over = False
 
-    def ask(self, work: Callable[[Tuned], _Answer]) -> _Answer:
+    def ask(self, work: Callable[[Evaluated], _Answer]) -> _Answer:
         """Compute something from what is shown now, in turn; what `work` raises is raised here.
 
         Raises:
@@ -101,8 +101,8 @@ def session_over() -> UsageError:
 class _Question:
     """Something to compute from an evaluation, and the place for the answer."""
 
-    work: Callable[[Tuned], Any]
-    tuned: Tuned
+    work: Callable[[Evaluated], Any]
+    evaluated: Evaluated
     answer: Future[Any] = field(default_factory=Future)
 
     def settle(self) -> None:
@@ -112,7 +112,7 @@ class _Question:
         # it may be refused while it is computed
         with suppress(InvalidStateError):
             try:
-                self.answer.set_result(self.work(self.tuned))
+                self.answer.set_result(self.work(self.evaluated))
             except Exception as error:
                 self.answer.set_exception(error)
 

@@ -194,7 +194,7 @@ class LiveServer:
         )
 
         def handle(request: ServiceRequest) -> bytes:
-            return self._questions.ask(lambda tuned: answer(name, tuned, request.payload))
+            return self._questions.ask(lambda evaluated: answer(name, evaluated, request.payload))
 
         return Service(
             name, schema=foxglove.ServiceSchema(name, request=request, response=response), handler=handle

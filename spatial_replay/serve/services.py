@@ -14,7 +14,7 @@ from jsonschema.exceptions import best_match
 from spatial_replay.annotate.foxglove_layout import LAYOUT
 from spatial_replay.errors import UsageError
 from spatial_replay.replay.document import document_from_replay, explain_results
-from spatial_replay.replay.tuning import Tuned, constant_values
+from spatial_replay.replay.loaded_log import Evaluated, constant_values
 
 _MOST_BYTES: Final = 1 << 16
 
@@ -29,10 +29,10 @@ class Service(NamedTuple):
 
     request: Mapping[str, Any]
     response: Mapping[str, Any]
-    answer: Callable[[Tuned, Mapping[str, Any]], Mapping[str, Any]]
+    answer: Callable[[Evaluated, Mapping[str, Any]], Mapping[str, Any]]
 
 
-def answer(name: str, tuned: Tuned, payload: bytes) -> bytes:
+def answer(name: str, evaluated: Evaluated, payload: bytes) -> bytes:
     """Answer a request.
 
     Args:
@@ -45,7 +45,7 @@ def answer(name: str, tuned: Tuned, payload: bytes) -> bytes:
     """
     service = SERVICES[name]
     request = _request(name, payload, service.request)
-    return json.dumps(service.answer(tuned, request), ensure_ascii=False, allow_nan=False).encode()
+    return json.dumps(service.answer(evaluated, request), ensure_ascii=False, allow_nan=False).encode()
 
 
 def _request(name: str, payload: bytes, schema: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -63,17 +63,17 @@ def _request(name: str, payload: bytes, schema: Mapping[str, Any]) -> Mapping[st
     return members
 
 
-def _evaluate(tuned: Tuned, request: Mapping[str, Any]) -> Mapping[str, Any]:
+def _evaluate(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, Any]:
     """Replay with other constants; what is shown stays as it is."""
     changed = request.get("constants", {})
     if changed:
-        tuned = tuned.tuning.evaluate({**constant_values(tuned.edited.constants), **changed})
-    results = tuple(replace(result, has_series=False) for result in tuned.replayed.results)
-    return document_from_replay(replace(tuned.replayed, results=results))
+        evaluated = evaluated.loaded.evaluate({**constant_values(evaluated.edited.constants), **changed})
+    results = tuple(replace(result, has_series=False) for result in evaluated.replayed.results)
+    return document_from_replay(replace(evaluated.replayed, results=results))
 
 
-def _explain(tuned: Tuned, request: Mapping[str, Any]) -> Mapping[str, Any]:
-    explanations = explain_results(tuned.replayed, node=request.get("node"), object=request.get("object"))
+def _explain(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, Any]:
+    explanations = explain_results(evaluated.replayed, node=request.get("node"), object=request.get("object"))
     return {"explanations": [each.document for each in explanations]}
 
 
@@ -114,7 +114,7 @@ SERVICES: Final[Mapping[str, Service]] = MappingProxyType(
 _PREFIX = "spatial-replay://"
 
 
-def asset(tuned: Tuned, uri: str) -> bytes | None:
+def asset(evaluated: Evaluated, uri: str) -> bytes | None:
     """Return a file: the layout, a specification with its present constants, or an automaton for Graphviz.
 
     Returns:
@@ -124,10 +124,10 @@ def asset(tuned: Tuned, uri: str) -> bytes | None:
     if not uri.startswith(_PREFIX):
         return None
     if (kind, name) == (LAYOUT, ""):
-        return tuned.layout.data
+        return evaluated.layout.data
     if kind == "specification":
-        return {file.filename: file.source.encode() for file in tuned.edited.files}.get(name)
+        return {file.filename: file.source.encode() for file in evaluated.edited.files}.get(name)
     if kind == "automaton" and name.endswith(".dot"):
-        automata = tuned.evaluation.automata_attachments("")
+        automata = evaluated.evaluation.automata_attachments("")
         return {each.name.rpartition("/")[2]: each.data for each in automata}.get(name)
     return None

@@ -10,8 +10,8 @@ from threading import Thread
 
 from spatial_replay.annotate.curves import CURVES_CHANNEL
 from spatial_replay.errors import UsageError
+from spatial_replay.replay.loaded_log import Evaluated
 from spatial_replay.replay.playback import Playback
-from spatial_replay.replay.tuning import Tuned
 from spatial_replay.serve.player import Player
 from spatial_replay.serve.requests import Questions
 from spatial_replay.serve.session import Session
@@ -42,12 +42,12 @@ class Serving:
 
 @contextmanager
 def open_server(
-    tuned: Tuned, *, host: str = LOOPBACK, port: int = PORT, play: bool = False
+    evaluated: Evaluated, *, host: str = LOOPBACK, port: int = PORT, play: bool = False
 ) -> Iterator[Serving]:
     """Serve a log to viewers, which play it and change the constants of its specifications.
 
     Args:
-        tuned: the evaluation to show first, with the constants as they are written.
+        evaluated: the evaluation to show first, with the constants as they are written.
         host: the address to listen at; anyone who can connect can read the log.
         port: 0 for any that is free.
         play: play at once; otherwise wait at the start for a viewer to do so.
@@ -62,9 +62,9 @@ def open_server(
         raise UsageError(
             "serving takes foxglove-sdk, which is not installed: pip install 'spatial-replay[live]'"
         ) from None
-    playback = Playback(tuned)
+    playback = Playback(evaluated)
     playback.seek(playback.start_ns)
-    session = Session(tuned.tuning, playback.start_ns, playback.end_ns)
+    session = Session(evaluated.loaded, playback.start_ns, playback.end_ns)
     questions = Questions(session.wait_for_evaluation)
     server = LiveServer(session, questions, (*playback.channels, CURVES_CHANNEL), host, port)
     loop = _in_background(Player(playback, session, server).run, "player")

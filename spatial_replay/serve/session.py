@@ -8,7 +8,7 @@ from concurrent.futures import Future
 from threading import Condition
 from typing import NamedTuple
 
-from spatial_replay.replay.tuning import Tuned, Tuning, constant_values
+from spatial_replay.replay.loaded_log import Evaluated, LoadedLog, constant_values
 from spatial_replay.serve.pace import Pace, PlaybackState, Status, Transport
 from spatial_replay.serve.requests import PendingRequests, Values, session_over
 
@@ -28,7 +28,7 @@ class Session:
     """
 
     def __init__(
-        self, tuning: Tuning, start_ns: int, end_ns: int, *, clock: Callable[[], float] = time.monotonic
+        self, loaded: LoadedLog, start_ns: int, end_ns: int, *, clock: Callable[[], float] = time.monotonic
     ) -> None:
         """Pause at the start, with constants as they are written.
 
@@ -36,19 +36,19 @@ class Session:
             start_ns, end_ns: first and last time.
             clock: seconds by which it plays.
         """
-        self._tuning = tuning
+        self._log = loaded
         self._pace = Pace(clock)
         self._transport = Transport(start_ns, end_ns)
-        self._values: Values = constant_values(tuning.constants)
+        self._values: Values = constant_values(loaded.constants)
         self._pending = PendingRequests()
-        self._awaited: Future[Tuned] | None = None
+        self._awaited: Future[Evaluated] | None = None
         self._requested = Condition()
         self._is_over = False
 
     @property
     def name(self) -> str:
         """The log's name."""
-        return self._tuning.name
+        return self._log.name
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -95,7 +95,7 @@ class Session:
         """
         with self._requested:
             changed = {**self._values, **values}
-            self._pending.edited = self._tuning.edit(changed)
+            self._pending.edited = self._log.edit(changed)
             self._values = changed
             self._requested.notify()
 
@@ -105,7 +105,7 @@ class Session:
             self._pending.topics.add(topic)
             self._requested.notify()
 
-    def wait_for_evaluation(self) -> Tuned:
+    def wait_for_evaluation(self) -> Evaluated:
         """Return what is shown, once the requests made so far are done.
 
         Raises:
@@ -174,11 +174,11 @@ class Session:
                 self._transport.pause(now)
             return self._transport.state(now)
 
-    def provide_evaluation(self, tuned: Tuned) -> None:
+    def provide_evaluation(self, evaluated: Evaluated) -> None:
         """Let `wait_for_evaluation` return."""
         awaited = self._take_awaited()
         if awaited is not None:
-            awaited.set_result(tuned)
+            awaited.set_result(evaluated)
 
     def end(self) -> None:
         """Let `wait_for_evaluation` raise, now and from now on."""
@@ -188,7 +188,7 @@ class Session:
         if awaited is not None:
             awaited.set_exception(session_over())
 
-    def _take_awaited(self) -> Future[Tuned] | None:
+    def _take_awaited(self) -> Future[Evaluated] | None:
         with self._requested:
             awaited, self._awaited = self._awaited, None
             return awaited

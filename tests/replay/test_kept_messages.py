@@ -22,7 +22,7 @@ from replay.runs import content_of, sample
 from spatial_replay.cli import run
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.source import MemorySource
-from spatial_replay.replay import ReplayOptions, Tuning, Window, run_replay, verify_certificate
+from spatial_replay.replay import LoadedLog, ReplayOptions, Window, run_replay, verify_certificate
 from spatial_replay.replay.playback import Playback
 from spatial_replay.sources import open_source
 
@@ -252,7 +252,7 @@ def test_a_live_playback_sends_what_a_copy_keeps(
     bag: Path, tmp_path: Path, keep: tuple[str, ...] | None
 ) -> None:
     source = open_source(bag, mapping=tmp_path / "drive.yaml")
-    playback = Playback(Tuning(source, [SPEC], ReplayOptions(keep=keep)).evaluate())
+    playback = Playback(LoadedLog(source, [SPEC], ReplayOptions(keep=keep)).evaluate())
     sent: Written = Counter()
     for messages in (playback.seek(playback.start_ns), playback.advance_to(playback.end_ns)):
         for number, time_ns, data in zip(

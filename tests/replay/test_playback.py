@@ -36,7 +36,7 @@ from spatial_replay.logs.topics import (
     SPECIFICATION,
     protobuf_channel,
 )
-from spatial_replay.replay import Playback, ReplayOptions, Tuning, Window, run_replay
+from spatial_replay.replay import LoadedLog, Playback, ReplayOptions, Window, run_replay
 from spatial_replay.sources.open_log import open_source
 
 ROOT = Path(__file__).parents[2]
@@ -56,7 +56,7 @@ def specification() -> sr.Specification:
 
 def playback(source: Source | None = None, window: Window | None = None) -> Playback:
     source = source or PiecewiseSource(run(COUNT), 7)
-    return Playback(Tuning(source, [specification()], ReplayOptions(window or Window())).evaluate())
+    return Playback(LoadedLog(source, [specification()], ReplayOptions(window or Window())).evaluate())
 
 
 def sent(messages: Messages) -> list[Sent]:
@@ -149,7 +149,7 @@ def test_external_messages_are_played_and_sent_again_after_a_seek(tmp_path: Path
     run_replay(source, [file], output=tmp_path / "annotated.mcap")
     content = content_of(tmp_path / "annotated.mcap")
     whole = [(topic, time_ns, data) for topic, time_ns, _, _, data in content.messages]
-    player = Playback(Tuning(source, [file]).evaluate())
+    player = Playback(LoadedLog(source, [file]).evaluate())
     middle_ns = (player.start_ns + player.end_ns) // 2
     steps = range(player.start_ns, player.end_ns, 333_333_333)
     assert played(player, 0, steps) == whole
@@ -202,8 +202,8 @@ def test_the_end_of_the_log_comes_last_and_once(tmp_path: Path) -> None:
 def test_another_evaluation_is_shown_at_the_present_time() -> None:
     player = playback()
     player.seek(5 * STEP_NS)
-    player.tuned = player.tuned.tuning.evaluate({"far": 2.0})
-    fresh = Playback(player.tuned)
+    player.evaluated = player.evaluated.loaded.evaluate({"far": 2.0})
+    fresh = Playback(player.evaluated)
     assert sent(player.seek(player.time_ns)) == sent(fresh.seek(5 * STEP_NS))
 
 
@@ -223,16 +223,16 @@ def test_a_playback_stays_within_the_log_and_never_goes_back(times_ns: list[int]
 def test_every_path_of_the_layout_is_in_the_messages(name: str, tmp_path: Path) -> None:
     log = ROOT / "recordings" / name
     file = sr.load_specification(log.with_suffix(".spatial"))
-    tuned = Tuning(open_source(log), [file]).evaluate()
-    player = Playback(tuned)
+    evaluated = LoadedLog(open_source(log), [file]).evaluate()
+    player = Playback(evaluated)
     output = tmp_path / "sent.mcap"
     with open_output(output) as stream:
         writer = LogWriter(stream)
-        writer.write_messages(messages_of(CURVES_CHANNEL, np.array([player.start_ns]), [tuned.curves], 0))
+        writer.write_messages(messages_of(CURVES_CHANNEL, np.array([player.start_ns]), [evaluated.curves], 0))
         writer.write_messages(player.seek(player.start_ns))
         writer.write_messages(player.advance_to(player.end_ns))
         writer.close()
-    layout = json.loads(tuned.layout.data)
+    layout = json.loads(evaluated.layout.data)
     assert panels(layout["layout"]) == set(layout["configById"])
     assert {"Plot!whole", "Parameters!constants"} <= set(layout["configById"])
     paths = paths_of(layout["configById"])

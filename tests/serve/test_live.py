@@ -36,7 +36,7 @@ from spatial_replay.logs.topics import (
     SPECIFICATION,
     protobuf_channel,
 )
-from spatial_replay.replay import Tuning, run_replay
+from spatial_replay.replay import LoadedLog, run_replay
 from spatial_replay.serve import Serving, open_server
 from spatial_replay.sources.open_log import open_source
 
@@ -58,8 +58,8 @@ def specification() -> sr.Specification:
 
 @contextmanager
 def served(count: int = COUNT) -> Iterator[Serving]:
-    tuning = Tuning(PiecewiseSource(run(count), 7), [specification()])
-    with open_server(tuning.evaluate(), port=0) as server:
+    loaded = LoadedLog(PiecewiseSource(run(count), 7), [specification()])
+    with open_server(loaded.evaluate(), port=0) as server:
         yield server
 
 
@@ -240,8 +240,8 @@ def test_invalid_values_change_nothing(server: Serving, values: dict[str, object
 
 def test_a_change_that_fails_in_evaluation_restores_the_former_values() -> None:
     text = "const wide = 1\nregion goal = box(0, 0, wide, 1)\nspec reach = F (cube ovlp goal)\n"
-    tuning = Tuning(PiecewiseSource(run(5), 7), [sr.parse_specification(text)])
-    with open_server(tuning.evaluate(), port=0) as server:
+    loaded = LoadedLog(PiecewiseSource(run(5), 7), [sr.parse_specification(text)])
+    with open_server(loaded.evaluate(), port=0) as server:
 
         async def looking(own: Viewer) -> None:
             await own.send(op="subscribeParameterUpdates", parameterNames=["wide"])
@@ -398,8 +398,8 @@ def test_messages_of_other_programs_are_played_if_viewers_can_decode_them(tmp_pa
             writer.write(objects, index * STEP_NS, payload)
             for channel in (first, second, notes, secret):
                 writer.write(channel, index * STEP_NS, b"12")
-    tuning = Tuning(open_source(log), [specification()])
-    with open_server(tuning.evaluate(), port=0) as server:
+    loaded = LoadedLog(open_source(log), [specification()])
+    with open_server(loaded.evaluate(), port=0) as server:
 
         async def looking(own: Viewer) -> None:
             assert {"/tf", "/notes"} <= {*own.channels}
@@ -417,7 +417,7 @@ def test_messages_of_other_programs_are_played_if_viewers_can_decode_them(tmp_pa
 
 def test_a_log_that_can_no_longer_be_read_is_reported(tmp_path: Path) -> None:
     log = record(run(COUNT), tmp_path / "run.mcap")
-    with open_server(Tuning(open_source(log), [specification()]).evaluate(), port=0) as server:
+    with open_server(LoadedLog(open_source(log), [specification()]).evaluate(), port=0) as server:
         log.unlink()
 
         async def looking(own: Viewer) -> None:
@@ -431,18 +431,18 @@ def test_a_log_that_can_no_longer_be_read_is_reported(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("host", ["8.8.8.8", "no.such.host.invalid", "a..b", "::2", ""])
 def test_an_address_of_another_machine_is_an_error(host: str) -> None:
-    tuning = Tuning(PiecewiseSource(run(3), 7), [specification()])
+    loaded = LoadedLog(PiecewiseSource(run(3), 7), [specification()])
     expected = f"cannot listen at {host or 'no address'}: .*; choose an address of this machine with --host"
-    with pytest.raises(UsageError, match=expected), open_server(tuning.evaluate(), host=host, port=0):
+    with pytest.raises(UsageError, match=expected), open_server(loaded.evaluate(), host=host, port=0):
         pass
 
 
 def test_a_port_in_use_is_an_error(server: Serving) -> None:
     port = int(server.address.rpartition(":")[2])
-    tuning = Tuning(PiecewiseSource(run(3), 7), [specification()])
+    loaded = LoadedLog(PiecewiseSource(run(3), 7), [specification()])
     with (
         pytest.raises(UsageError, match=f"port {port}: .*; choose another"),
-        open_server(tuning.evaluate(), port=port),
+        open_server(loaded.evaluate(), port=port),
     ):
         pass
 

@@ -24,7 +24,7 @@ from spatial_replay.annotate.curves import CURVES_CHANNEL
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.topics import ROBUSTNESS
-from spatial_replay.replay import Playback, Tuned, Tuning
+from spatial_replay.replay import Evaluated, LoadedLog, Playback
 from spatial_replay.serve.pace import MOST_LATE_S, PlaybackState, Status
 from spatial_replay.serve.player import MOST_A_SECOND, Level, Note, Player
 from spatial_replay.serve.requests import MOST_OPEN, Questions
@@ -78,16 +78,16 @@ class Clock:
         return self.now
 
 
-def tuning_of(count: int, step_ns: int = STEP_NS) -> Tuning:
+def loaded_of(count: int, step_ns: int = STEP_NS) -> LoadedLog:
     trace = replace(run(count), times_ns=np.arange(count) * step_ns)
-    return Tuning(PiecewiseSource(trace, 1_000), [sr.parse_specification(TEXT, filename="blocks.spatial")])
+    return LoadedLog(PiecewiseSource(trace, 1_000), [sr.parse_specification(TEXT, filename="blocks.spatial")])
 
 
 @contextmanager
-def playing(tuning: Tuning, clock: Clock) -> Iterator[tuple[Session, RecordingViewers]]:
-    playback = Playback(tuning.evaluate())
+def playing(loaded: LoadedLog, clock: Clock) -> Iterator[tuple[Session, RecordingViewers]]:
+    playback = Playback(loaded.evaluate())
     playback.seek(0)
-    session = Session(tuning, playback.start_ns, playback.end_ns, clock=clock)
+    session = Session(loaded, playback.start_ns, playback.end_ns, clock=clock)
     viewers = RecordingViewers()
     with ThreadPoolExecutor(1) as thread:
         running = thread.submit(Player(playback, session, viewers).run)
@@ -124,7 +124,7 @@ def play_to_the_end(session: Session, clock: Clock, waits: list[float]) -> None:
 
 def test_samples_are_sent_once_and_in_order() -> None:
     clock = Clock()
-    with playing(tuning_of(30), clock) as (session, viewers):
+    with playing(loaded_of(30), clock) as (session, viewers):
         session.control(is_playing=True, speed=4.0)
         sent = []
         for step in range(1, 5):
@@ -149,7 +149,7 @@ RATES = [
 @given(waits=st.lists(st.floats(0.001, 5.0), min_size=1, max_size=6))
 def test_late_turns_lose_no_sample(step_ns: float, speed: float, waits: list[float]) -> None:
     clock, step_ns = Clock(), math.ceil(step_ns)
-    with playing(tuning_of(300, step_ns), clock) as (session, viewers):
+    with playing(loaded_of(300, step_ns), clock) as (session, viewers):
         session.control(is_playing=True, speed=speed)
         play_to_the_end(session, clock, [*waits, 0.2])
         counts = Counter(robustness_times(viewers.until(is_over)))
@@ -158,7 +158,7 @@ def test_late_turns_lose_no_sample(step_ns: float, speed: float, waits: list[flo
 
 def test_a_fast_playback_is_thinned_to_what_viewers_can_take() -> None:
     clock, step_ns = Clock(), 1_000_000
-    with playing(tuning_of(2_000, step_ns), clock) as (session, viewers):
+    with playing(loaded_of(2_000, step_ns), clock) as (session, viewers):
         session.control(is_playing=True, speed=4.0)
         play_to_the_end(session, clock, [0.03125])
         sent = robustness_times(viewers.until(is_over))
@@ -169,7 +169,7 @@ def test_a_fast_playback_is_thinned_to_what_viewers_can_take() -> None:
 
 def test_a_late_playback_falls_behind_the_clock() -> None:
     clock = Clock()
-    with playing(tuning_of(6_000), clock) as (session, viewers):
+    with playing(loaded_of(6_000), clock) as (session, viewers):
         session.control(is_playing=True, speed=100.0)
         clock.now = 1e6
         assert session.state.time_ns == round(100.0 * MOST_LATE_S * 1e9)
@@ -179,7 +179,7 @@ def test_a_late_playback_falls_behind_the_clock() -> None:
 
 
 def test_curves_are_sent_again_while_a_log_plays() -> None:
-    with playing(tuning_of(40), Clock()) as (session, viewers):
+    with playing(loaded_of(40), Clock()) as (session, viewers):
         session.control(is_playing=True, speed=1.0)
         sent = viewers.until(
             lambda each: isinstance(each, Messages) and CURVES_CHANNEL in each.channels.values()
@@ -188,7 +188,7 @@ def test_curves_are_sent_again_while_a_log_plays() -> None:
 
 
 def test_requests_after_the_end_are_refused() -> None:
-    with playing(tuning_of(5), Clock()) as (session, _):
+    with playing(loaded_of(5), Clock()) as (session, _):
         assert session.wait_for_evaluation().verdict == "satisfied"
     with pytest.raises(UsageError, match="stopping"):
         session.wait_for_evaluation()
@@ -196,7 +196,7 @@ def test_requests_after_the_end_are_refused() -> None:
 
 def test_a_change_during_playback_loses_no_sample() -> None:
     clock = Clock()
-    with playing(tuning_of(40), clock) as (session, viewers):
+    with playing(loaded_of(40), clock) as (session, viewers):
         session.control(is_playing=True, speed=20.0, seek_ns=0)
         sent = viewers.until(lambda sent: sent == 0)
         clock.now = 0.1
@@ -211,8 +211,8 @@ def test_a_change_during_playback_loses_no_sample() -> None:
 
 def test_a_change_that_cannot_be_evaluated_restores_the_former_values() -> None:
     text = "const wide = 1\nregion goal = box(0, 0, wide, 1)\nspec reach = F (cube ovlp goal)\n"
-    tuning = Tuning(PiecewiseSource(run(5), 5), [sr.parse_specification(text, filename="blocks.spatial")])
-    with playing(tuning, Clock()) as (session, viewers):
+    loaded = LoadedLog(PiecewiseSource(run(5), 5), [sr.parse_specification(text, filename="blocks.spatial")])
+    with playing(loaded, Clock()) as (session, viewers):
         session.set_constants({"wide": 1e300})
         *_, note, values = viewers.until(lambda sent: isinstance(sent, Mapping))
         assert isinstance(note, Note)
@@ -237,22 +237,22 @@ def answering(session: Session) -> Iterator[Questions]:
 
 
 def test_an_error_in_an_answer_is_raised_where_it_was_asked() -> None:
-    with playing(tuning_of(5), Clock()) as (session, _), answering(session) as questions:
+    with playing(loaded_of(5), Clock()) as (session, _), answering(session) as questions:
         with pytest.raises(ZeroDivisionError):
-            questions.ask(lambda tuned: 1 // 0)
-        assert questions.ask(lambda tuned: 1) == 1
+            questions.ask(lambda evaluated: 1 // 0)
+        assert questions.ask(lambda evaluated: 1) == 1
 
 
 def test_a_long_question_does_not_hold_up_the_playback() -> None:
     clock, is_asked, may_answer = Clock(), Event(), Event()
 
-    def long_work(tuned: Tuned) -> str:
+    def long_work(evaluated: Evaluated) -> str:
         is_asked.set()
         may_answer.wait(PATIENCE_S)
-        return str(tuned.verdict)
+        return str(evaluated.verdict)
 
     with (
-        playing(tuning_of(30), clock) as (session, viewers),
+        playing(loaded_of(30), clock) as (session, viewers),
         answering(session) as questions,
         ThreadPoolExecutor(MOST_OPEN) as asking,
     ):
@@ -268,12 +268,12 @@ def test_a_long_question_does_not_hold_up_the_playback() -> None:
 def test_open_questions_are_refused_at_the_end() -> None:
     is_asked, may_end = Event(), Event()
 
-    def long_work(tuned: Tuned) -> bool:
+    def long_work(evaluated: Evaluated) -> bool:
         is_asked.set()
         return may_end.wait(PATIENCE_S)
 
     with (
-        playing(tuning_of(5), Clock()) as (session, _),
+        playing(loaded_of(5), Clock()) as (session, _),
         answering(session) as questions,
         ThreadPoolExecutor(2) as asking,
     ):
@@ -289,12 +289,12 @@ def test_open_questions_are_refused_at_the_end() -> None:
 def test_the_number_of_open_questions_is_limited() -> None:
     may_answer = Event()
     with (
-        playing(tuning_of(5), Clock()) as (session, _),
+        playing(loaded_of(5), Clock()) as (session, _),
         answering(session) as questions,
         ThreadPoolExecutor(MOST_OPEN + 1) as asking,
     ):
         asked = [
-            asking.submit(questions.ask, lambda tuned: may_answer.wait(PATIENCE_S))
+            asking.submit(questions.ask, lambda evaluated: may_answer.wait(PATIENCE_S))
             for _ in range(MOST_OPEN + 1)
         ]
         refused = next(as_completed(asked, PATIENCE_S))

@@ -19,7 +19,7 @@ from websockets.typing import Subprotocol
 import spatial_replay as sr
 from spatial_replay.logs.source import MemorySource
 from spatial_replay.logs.topics import CURVES_TOPIC, SCENE
-from spatial_replay.replay import Tuning
+from spatial_replay.replay import LoadedLog
 from spatial_replay.serve import open_server
 from spatial_replay.trace.trace import Trace
 
@@ -105,9 +105,9 @@ def bench_serve_windows(measure: Any) -> None:
 @contextmanager
 def viewing(trace: Trace, text: str) -> Iterator[Viewer]:
     """A viewer of a log and a specification with the constant `near`."""
-    tuning = Tuning(MemorySource(trace), [sr.parse_specification(f"const near = 70\n{text}")])
+    loaded = LoadedLog(MemorySource(trace), [sr.parse_specification(f"const near = 70\n{text}")])
     with (
-        open_server(tuning.evaluate(), port=0) as server,
+        open_server(loaded.evaluate(), port=0) as server,
         connect(server.address, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None) as connection,
     ):
         yield Viewer(connection)

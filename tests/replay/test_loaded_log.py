@@ -11,9 +11,9 @@ import spatial_replay as sr
 from replay.runs import PAST, STEP_NS, PiecewiseSource, run
 from spatial_replay.errors import LogError, SpecificationError, UsageError
 from spatial_replay.replay import (
+    Evaluated,
+    LoadedLog,
     ReplayOptions,
-    Tuned,
-    Tuning,
     Window,
     constant_text,
     constant_values,
@@ -35,19 +35,19 @@ def specification(text: str = WRITTEN, name: str = "blocks.spatial") -> sr.Speci
     return sr.parse_specification(text, filename=name)
 
 
-def tuning(*files: sr.Specification, size: int = 5, window: Window | None = None) -> Tuning:
-    return Tuning(
+def loaded(*files: sr.Specification, size: int = 5, window: Window | None = None) -> LoadedLog:
+    return LoadedLog(
         PiecewiseSource(run(40), size), files or [specification()], ReplayOptions(window or Window())
     )
 
 
-def numbers(tuned: Tuned) -> list[np.ndarray]:
-    return [stretch.series for stretch in tuned.stretches]
+def numbers(evaluated: Evaluated) -> list[np.ndarray]:
+    return [stretch.series for stretch in evaluated.stretches]
 
 
-def assert_equal(tuned: Tuned, evaluation: sr.Evaluation) -> None:
+def assert_equal(evaluated: Evaluated, evaluation: sr.Evaluation) -> None:
     expected = [result.series for result in evaluation.results]
-    for own, other in zip(numbers(tuned), expected, strict=True):
+    for own, other in zip(numbers(evaluated), expected, strict=True):
         np.testing.assert_array_equal(own, other)
 
 
@@ -58,28 +58,28 @@ SECONDS = st.integers(1, 40).map(lambda number: f"{number / 4}s")
 @settings(max_examples=25)
 @given(DISTANCES, SECONDS, st.integers(1, 41))
 def test_other_values_give_the_numbers_of_the_edited_text(far: float, soon: str, size: int) -> None:
-    tuned = tuning(size=size).evaluate({"far": far, "soon": soon})
+    evaluated = loaded(size=size).evaluate({"far": far, "soon": soon})
     edited = specification(TEXT.format(far=far, soon=soon))
-    assert_equal(tuned, sr.evaluate(edited, run(40)))
+    assert_equal(evaluated, sr.evaluate(edited, run(40)))
 
 
 @settings(max_examples=25)
 @given(st.lists(st.tuples(DISTANCES, SECONDS), min_size=1, max_size=4))
 def test_earlier_values_change_no_number(tried: list[tuple[float, str]]) -> None:
-    held = tuning()
+    held = loaded()
     for far, soon in tried:
         held.evaluate({"far": far, "soon": soon})
     assert_equal(held.evaluate(), sr.evaluate(specification(), run(40)))
 
 
 def test_written_and_present_values_of_constants_are_reported() -> None:
-    held = tuning()
+    held = loaded()
     assert {name: constant_text(each) for name, each in held.constants.items()} == {
         "far": "0.5",
         "soon": "2s",
     }
-    tuned = held.evaluate({"far": 1})
-    assert constant_values(tuned.edited.constants) == {"far": 1.0, "soon": "2s"}
+    evaluated = held.evaluate({"far": 1})
+    assert constant_values(evaluated.edited.constants) == {"far": 1.0, "soon": "2s"}
     assert constant_values(held.constants) == {"far": 0.5, "soon": "2s"}
 
 
@@ -95,7 +95,7 @@ def test_written_and_present_values_of_constants_are_reported() -> None:
     ],
 )
 def test_invalid_values_are_refused(values: dict[str, float | str], said: str) -> None:
-    held = tuning()
+    held = loaded()
     with pytest.raises(UsageError, match=said):
         held.evaluate(values)
     assert_equal(held.evaluate(), sr.evaluate(specification(), run(40)))
@@ -103,25 +103,25 @@ def test_invalid_values_are_refused(values: dict[str, float | str], said: str) -
 
 def test_a_value_that_makes_a_specification_invalid_is_refused() -> None:
     text = 'const wide = 0.5\nspec near = G (cube dist enlarge("cup 物", wide) >= 0)\n'
-    held = tuning(specification(text))
+    held = loaded(specification(text))
     with pytest.raises(SpecificationError):
         held.evaluate({"wide": -1.0})
 
 
 def test_a_constant_of_two_files_is_named_after_its_file() -> None:
     other = 'const far = 0.25\nconst own = 0.1\nspec wide = G (cube dist enlarge("cup 物", own) >= far)\n'
-    held = tuning(specification(), specification(other, "wide.spatial"))
+    held = loaded(specification(), specification(other, "wide.spatial"))
     assert list(held.constants) == ["blocks.far", "soon", "wide.far", "own"]
-    tuned = held.evaluate({"wide.far": 0.75})
-    assert constant_values(tuned.edited.constants)["blocks.far"] == 0.5
-    assert constant_values(tuned.edited.constants)["wide.far"] == 0.75
+    evaluated = held.evaluate({"wide.far": 0.75})
+    assert constant_values(evaluated.edited.constants)["blocks.far"] == 0.5
+    assert constant_values(evaluated.edited.constants)["wide.far"] == 0.75
     with pytest.raises(UsageError, match=r"blocks\.far"):
         held.evaluate({"far": 1.0})
 
 
 @pytest.mark.parametrize("window", [Window(2 * STEP_NS), Window(0, 20 * STEP_NS), Window(STEP_NS, every=3)])
 def test_a_window_gives_the_numbers_of_a_replay(window: Window) -> None:
-    held = Tuning(PiecewiseSource(run(40), 7), [specification(WRITTEN + PAST)], ReplayOptions(window))
+    held = LoadedLog(PiecewiseSource(run(40), 7), [specification(WRITTEN + PAST)], ReplayOptions(window))
     replayed = run_replay(
         PiecewiseSource(run(40), 4),
         [specification(WRITTEN + PAST)],
@@ -137,20 +137,20 @@ def test_a_window_gives_the_numbers_of_a_replay(window: Window) -> None:
 def test_a_template_is_evaluated_for_its_objects() -> None:
     text = "const far = 0.5\nspec calm(ego) = G (ego dist cube >= far)\n"
     source = PiecewiseSource(run(12), 5)
-    held = Tuning(source, [specification(text)], ReplayOptions(each={"ego": "class:dish"}))
+    held = LoadedLog(source, [specification(text)], ReplayOptions(each={"ego": "class:dish"}))
     assert [tree.object for tree in held.evaluate({"far": 0.0}).evaluation.trees] == ["cup 物"]
 
 
 def test_a_log_or_a_window_without_samples_is_an_error() -> None:
     with pytest.raises(LogError):
-        Tuning(PiecewiseSource(run(0), 5), [specification()])
+        LoadedLog(PiecewiseSource(run(0), 5), [specification()])
     with pytest.raises(UsageError, match="window"):
-        tuning(window=Window(10**15))
+        loaded(window=Window(10**15))
 
 
 def test_results_have_witnesses() -> None:
-    tuned = tuning().evaluate({"far": 4.0})
-    assert tuned.verdict == "violated"
-    [both] = tuned.replayed.results
+    evaluated = loaded().evaluate({"far": 4.0})
+    assert evaluated.verdict == "violated"
+    [both] = evaluated.replayed.results
     assert both.can_explain
     assert both.witness().verdict == "violated"

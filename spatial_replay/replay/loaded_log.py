@@ -1,6 +1,6 @@
 """A log in memory, evaluated again and again with other values for the constants of its specifications.
 
-`Tuning` holds the log, `EditedFiles` the specifications with some values, `Tuned` what they give.
+`LoadedLog` holds the log, `EditedFiles` the specifications with some values, `Evaluated` what they give.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ class EditedFiles:
 
     Attributes:
         files: as a log stores them.
-        constants: the values, by the names of `Tuning.constants`.
+        constants: the values, by the names of `LoadedLog.constants`.
     """
 
     files: tuple[Specification, ...]
     constants: Mapping[str, Constant]
 
 
-class Tuning:
+class LoadedLog:
     """A log in memory, with the specifications whose constants are changed.
 
     Measurements between footprints are cached, so that a change computes only the new ones.
@@ -129,7 +129,7 @@ class Tuning:
         ]
         return EditedFiles(tuple(stored), self._constants(edited))
 
-    def evaluate(self, values: Mapping[str, float | str] | EditedFiles | None = None) -> Tuned:
+    def evaluate(self, values: Mapping[str, float | str] | EditedFiles | None = None) -> Evaluated:
         """Evaluate the specifications over all samples, with other values for some constants.
 
         Args:
@@ -146,7 +146,7 @@ class Tuning:
         instances = [selection.instances(file) for file in edited.files]
         evaluation = AnnotatedEvaluation(edited.files, instances, options.semantics, self._attachments)
         self._check_size(evaluation)
-        return Tuned(self, edited, selection, evaluation, tuple(evaluation.extend(self.trace)))
+        return Evaluated(self, edited, selection, evaluation, tuple(evaluation.extend(self.trace)))
 
     def _constants(self, files: Sequence[Specification]) -> Mapping[str, Constant]:
         return MappingProxyType(
@@ -179,7 +179,7 @@ class Tuning:
 
 
 @dataclass(frozen=True, eq=False)
-class Tuned:
+class Evaluated:
     """An evaluation of the whole log with some values for the constants.
 
     Attributes:
@@ -189,7 +189,7 @@ class Tuned:
         stretches: for each of its trees, every sample.
     """
 
-    tuning: Tuning
+    loaded: LoadedLog
     edited: EditedFiles
     selection: Selection
     evaluation: AnnotatedEvaluation
@@ -203,34 +203,34 @@ class Tuned:
     @cached_property
     def replayed(self) -> Replayed:
         """The results as those of a replay; without a certificate, since no log is written."""
-        tuning = self.tuning
-        times_ns = tuning.inside.times_ns
+        loaded = self.loaded
+        times_ns = loaded.inside.times_ns
         return Replayed(
-            log=tuning.name,
-            samples=len(tuning.inside),
-            first_ns=tuning.first_ns,
+            log=loaded.name,
+            samples=len(loaded.inside),
+            first_ns=loaded.first_ns,
             start_ns=int(times_ns[0]),
             end_ns=int(times_ns[-1]),
-            faults=tuning.faults,
-            remarks=tuning.remarks,
-            missing=tuning.missing,
-            unreadable=tuning.inside.unreadable_count,
+            faults=loaded.faults,
+            remarks=loaded.remarks,
+            missing=loaded.missing,
+            unreadable=loaded.inside.unreadable_count,
             results=replayed_specs(self.evaluation, self.edited.files, self.stretches, self.selection),
             vacuous=idle_templates(self.edited.files, self.evaluation.trees),
             certificate=MappingProxyType({}),
-            semantics=tuning.options.semantics,
+            semantics=loaded.options.semantics,
         )
 
     @cached_property
     def curves(self) -> bytes:
         """The message of /spatial/curves."""
-        return encode_curves(self.tuning.inside.times_ns, self.replayed.results, self.tuning.first_ns)
+        return encode_curves(self.loaded.inside.times_ns, self.replayed.results, self.loaded.first_ns)
 
     @cached_property
     def layout(self) -> Attachment:
         """The viewer layout for a server of this log."""
-        topics = {each.topic for each in self.tuning.own.channels}
-        return live_layout_attachment(self.evaluation.contents(SceneBounds.of(self.tuning.inside), topics))
+        topics = {each.topic for each in self.loaded.own.channels}
+        return live_layout_attachment(self.evaluation.contents(SceneBounds.of(self.loaded.inside), topics))
 
     def annotator(self, scene: SceneState | None = None) -> Annotator:
         """Return the annotator of these samples, before the first; see `AnnotatedEvaluation`."""
@@ -238,7 +238,7 @@ class Tuned:
 
     def part(self, begin: int, end: int) -> tuple[Trace, list[SeriesBlock]]:
         """Return samples `begin` to before `end` of those in the window, with their evaluation."""
-        trace = self.tuning.inside.slice(begin, end)
+        trace = self.loaded.inside.slice(begin, end)
         if not len(trace):
             return trace, [stretch.between(0, 0) for stretch in self.stretches]
         first_ns, last_ns = trace.times_ns[[0, -1]].tolist()
@@ -253,12 +253,12 @@ def constant_text(constant: Constant) -> str:
 
 
 def constant_value(constant: Constant) -> float | str:
-    """Return a constant as `Tuning.edit` takes it: a number or, as a text, a duration."""
+    """Return a constant as `LoadedLog.edit` takes it: a number or, as a text, a duration."""
     return constant.value if constant.duration_ns is None else constant_text(constant)
 
 
 def constant_values(constants: Mapping[str, Constant]) -> dict[str, float | str]:
-    """Return constants as `Tuning.edit` takes them."""
+    """Return constants as `LoadedLog.edit` takes them."""
     return {name: constant_value(each) for name, each in constants.items()}
 
 
