@@ -16,12 +16,11 @@ from spatial_replay.cli.options import (
     evaluation_options,
     naming_option,
     open_inputs,
-    text_from_duration_ns,
-    time_point_from_text,
     warn_of_input,
 )
 from spatial_replay.cli.progress import progress
 from spatial_replay.errors import UsageError
+from spatial_replay.trace.time_points import text_from_duration_ns, time_point_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.replay import Explanation

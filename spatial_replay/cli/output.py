@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from spatial_replay.cli.options import text_from_duration_ns
 from spatial_replay.text import counted, json_number
+from spatial_replay.trace.time_points import text_from_duration_ns
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message

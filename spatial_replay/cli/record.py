@@ -14,7 +14,6 @@ from spatial_replay.cli.options import (
     ReadArguments,
     add_options,
     constants_option,
-    duration_ns_from_text,
     gather,
     input_files,
     load_spec_options,
@@ -26,6 +25,7 @@ from spatial_replay.cli.options import (
 )
 from spatial_replay.cli.progress import progress
 from spatial_replay.text import counted
+from spatial_replay.trace.time_points import duration_ns_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.simulation.injection import Injection

@@ -11,7 +11,6 @@ import click
 from spatial_replay.cli.application import exit_code_from_verdicts
 from spatial_replay.cli.options import (
     EvaluationArguments,
-    duration_ns_from_text,
     evaluation_options,
     keep_option,
     naming_option,
@@ -24,6 +23,7 @@ from spatial_replay.cli.output import print_verdicts, write_document
 from spatial_replay.cli.progress import progress
 from spatial_replay.errors import UsageError
 from spatial_replay.text import nearest_hint
+from spatial_replay.trace.time_points import duration_ns_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.semantics import Semantics

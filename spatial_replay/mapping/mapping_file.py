@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterator
 from collections.abc import Mapping as Table
 from functools import cache
 from importlib.resources import files
@@ -17,9 +16,10 @@ from math import pi
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any, cast
 
-from spatial_replay.errors import MissingFileError, UsageError
+from spatial_replay.errors import UsageError
+from spatial_replay.mapping.checked_yaml import checked_document, read_yaml_text
 from spatial_replay.mapping.field_paths import FieldPath, NameTemplate
 from spatial_replay.mapping.model import (
     UNITS_NS,
@@ -35,16 +35,12 @@ from spatial_replay.mapping.model import (
     age_ns,
     duration_ns,
 )
-from spatial_replay.mapping.yaml_document import LARGEST_TEXT, Document, Place, document_from_text
+from spatial_replay.mapping.yaml_document import Document, Place
 from spatial_replay.text import nearest_hint
 from spatial_replay.trace.axes import Axes
 
-if TYPE_CHECKING:
-    from jsonschema.protocols import Validator
-
 SCHEMA_FILE = "mapping.schema.json"
 
-_MOST_FAULTS = 100
 _NO_TIME = re.compile(r"0+(\.0*)?[nums]*", re.ASCII)
 _SIGNAL_KEYS = frozenset({"signals", "max_age", "clock", "stamp", "optional"})
 """Keys that do not concern objects: a topic with signals and no other keys has no objects."""
@@ -57,18 +53,8 @@ def load_mapping(path: str | PathLike[str]) -> LogMapping:
         MissingFileError: there is no such file.
         UsageError: the file is not a valid mapping; all errors are listed.
     """
-    try:
-        with Path(path).open("rb") as stream:
-            data = stream.read(LARGEST_TEXT + 1)
-    except (OSError, ValueError) as error:
-        raise MissingFileError.of(path, error) from None
-    name = Path(path).name
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise UsageError(f"{name}:{line}: a byte is not UTF-8; give a text file") from None
-    return parse_mapping(text, name)
+    text = read_yaml_text(path)
+    return parse_mapping(text, Path(path).name)
 
 
 def parse_mapping(text: str, name: str = "mapping") -> LogMapping:
@@ -80,21 +66,7 @@ def parse_mapping(text: str, name: str = "mapping") -> LogMapping:
     Raises:
         UsageError: the text is not a valid mapping; all errors are listed.
     """
-    document = document_from_text(text)
-    faults = list(document.faults)
-    if not faults:
-        # one error for each place; a contradiction says more than the schema
-        violations = [
-            fault for error in _validator().iter_errors(document.value) for fault in _described(error)
-        ]
-        by_place = dict(violations + _contradictions(document))
-        faults = [
-            (document.line_of(place), f"{_text_from_place(place)}{what}") for place, what in by_place.items()
-        ]
-    if faults:
-        lines = [f"{name}:{line}: {what}" for line, what in sorted(faults)]
-        more = [f"… and {len(lines) - _MOST_FAULTS} more"] if len(lines) > _MOST_FAULTS else []
-        raise UsageError("\n".join(lines[:_MOST_FAULTS] + more))
+    document = checked_document(text, name, _schema(), _contradictions, "a mapping")
     try:
         return _mapping(document, name)
     except UsageError as error:
@@ -152,13 +124,6 @@ def _durations(value: Any) -> list[tuple[Place, Any]]:
     ]
     tables += [(("topics", topic), entry, "max_age") for topic, entry in value["topics"].items()]
     return [((*place, key), table.get(key)) for place, table, key in tables if isinstance(table, dict)]
-
-
-def _text_from_place(place: Place) -> str:
-    text = ""
-    for step in place:
-        text += f"[{step}]" if isinstance(step, int) else f"{'.' if text else ''}{step[:80]}"
-    return f"{text}: " if text else ""
 
 
 def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) -> TopicMapping:
@@ -251,55 +216,6 @@ def _signal(name: str, value: Any) -> SignalMapping:
 
 
 @cache
-def _validator() -> Validator:
-    from jsonschema import Draft202012Validator
-
+def _schema() -> Table[str, Any]:
     text = files(__package__).joinpath(SCHEMA_FILE).read_text(encoding="utf-8")
-    return Draft202012Validator(json.loads(text))
-
-
-def _described(error: Any) -> Iterator[tuple[Place, str]]:
-    """Iterate over the places of a violation of the schema, with what belongs there."""
-    place: Place = tuple(error.absolute_path)
-    keyword = error.validator
-    if keyword == "anyOf" and isinstance(error.instance, dict | list):
-        branches: dict[int, list[Any]] = {}
-        for each in error.context:
-            branches.setdefault(each.schema_path[0], []).append(each)
-        for branch in branches.values():
-            # not an alternative that failed because the whole value has another type
-            if not any(each.validator == "type" and len(each.absolute_path) == len(place) for each in branch):
-                for each in branch:
-                    yield from _described(each)
-                return
-    if keyword == "additionalProperties" and isinstance(error.instance, dict):
-        known = list(error.schema.get("properties", {}))
-        for key in error.instance:
-            if key not in known:
-                hint = nearest_hint(key, known) or f"known are {', '.join(known)}"
-                yield (*place, key), f"unknown key; {hint}"
-    elif keyword == "required":
-        missing = [key for key in error.validator_value if key not in error.instance]
-        yield place, f"the key {missing[0]!r} is missing"
-    elif "propertyNames" in error.absolute_schema_path:
-        yield place, "a name is empty; give it a name"
-    else:
-        wanted = error.schema.get("description", _around(error))
-        yield place, f"expected {wanted}; got {_shown(error.instance)}"
-
-
-def _around(error: Any) -> str:
-    """Return what belongs where a rule without a description was violated: that of the rule around it."""
-    parent = error.parent
-    while parent is not None and "description" not in parent.schema:
-        parent = parent.parent
-    fallback = f"something that fits {error.validator} {error.validator_value}"
-    return fallback if parent is None else str(parent.schema["description"])
-
-
-def _shown(value: object) -> str:
-    """Return a short text for a value."""
-    if isinstance(value, dict):
-        return f"keys {', '.join(map(str, value))[:60]}" if value else "{}"
-    text = json.dumps(value, ensure_ascii=False, default=str)
-    return text if len(text) <= 60 else text[:59] + "…"
+    return cast("Table[str, Any]", json.loads(text))

@@ -50,16 +50,21 @@ class Document:
         return self.lines.get(place, 1)
 
 
-def document_from_text(text: str) -> Document:
-    """Read a YAML text; errors are in `faults` of the document."""
+def document_from_text(text: str, what: str = "a mapping", largest: int = LARGEST_TEXT) -> Document:
+    """Read a YAML text; errors are in `faults` of the document.
+
+    Args:
+        what: what the text is, for errors.
+        largest: size in bytes.
+    """
     import yaml
 
     document = Document()
-    if len(text.encode("utf-8", "surrogatepass")) > LARGEST_TEXT:
-        document.faults.append((1, f"the file is larger than {LARGEST_TEXT // 1024} KiB; a mapping is not"))
+    if len(text.encode("utf-8", "surrogatepass")) > largest:
+        document.faults.append((1, f"the file is larger than {largest // 1024} KiB; {what} is not"))
         return document
     try:
-        if fault := _unsupported(yaml.parse(text, Loader=yaml.SafeLoader)):
+        if fault := _unsupported(yaml.parse(text, Loader=yaml.SafeLoader), what):
             document.faults.append(fault)
             return document
         node = yaml.compose(text, Loader=yaml.SafeLoader)
@@ -76,8 +81,8 @@ def document_from_text(text: str) -> Document:
     return document
 
 
-def _unsupported(events: Iterable[yaml.Event]) -> tuple[int, str] | None:
-    """Find the first feature that mappings do not need and that could make a short text mean much."""
+def _unsupported(events: Iterable[yaml.Event], what: str) -> tuple[int, str] | None:
+    """Find the first feature that such files do not need and that could make a short text mean much."""
     import yaml
 
     depth = 0
@@ -91,7 +96,7 @@ def _unsupported(events: Iterable[yaml.Event]) -> tuple[int, str] | None:
             return line, f"{event.value[:40]!r} holds half a character; write it whole"
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > _DEEPEST:
-            return line, f"it is nested more than {_DEEPEST} deep; a mapping is not"
+            return line, f"it is nested more than {_DEEPEST} deep; {what} is not"
     return None
 
 

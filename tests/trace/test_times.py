@@ -1,4 +1,4 @@
-"""Times as people write them on the command line."""
+"""Times as people write them."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from spatial_replay import UsageError
-from spatial_replay.cli.options import (
+from spatial_replay.trace.sample import LATEST_NS
+from spatial_replay.trace.time_points import (
     TimePoint,
     duration_ns_from_text,
     text_from_duration_ns,
     time_point_from_text,
 )
-from spatial_replay.trace.sample import LATEST_NS
 
 times_ns = st.integers(0, LATEST_NS)
 zones = st.integers(-14 * 60, 14 * 60).map(lambda minutes: timezone(timedelta(minutes=minutes)))
