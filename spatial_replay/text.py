@@ -1,10 +1,11 @@
-"""Text for people: counts, numbers in JSON, printable text, suggestions for misspelt names."""
+"""Text for people: counts, sentences with times, numbers in JSON, printable text, suggestions for names."""
 
 from __future__ import annotations
 
 import difflib
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Final
 
 _LONGEST: Final = 300
@@ -12,6 +13,33 @@ _LONGEST: Final = 300
 _LONGEST_NAME: Final = 100
 _MOST_NAMES: Final = 2_000
 """Bounds of the comparison, which takes quadratic time: names come from logs and may be hostile."""
+
+
+@dataclass(frozen=True, slots=True)
+class Instant:
+    """A time in a sentence, printed in seconds since `first_ns`."""
+
+    time_ns: int
+    first_ns: int
+
+    def __str__(self) -> str:
+        return f"{(self.time_ns - self.first_ns) / 1e9:.3f} s"
+
+
+class Sentence(str):
+    """A sentence that knows the times in it, so that a page can link them.
+
+    Attributes:
+        parts: what it is made of, in order.
+    """
+
+    __slots__ = ("parts",)
+    parts: tuple[str | Instant, ...]
+
+    def __new__(cls, *parts: str | Instant) -> Sentence:
+        made = super().__new__(cls, "".join(map(str, parts)))
+        made.parts = parts
+        return made
 
 
 def counted(count: int, noun: str) -> str:

@@ -14,7 +14,7 @@ from spatial_replay.lazy import Displayed
 from spatial_replay.monitor.causes import Cause, LeastPart, conjuncts_of, find_causes, find_least
 from spatial_replay.monitor.offline import full_signal, window_signal
 from spatial_replay.monitor.semantics import Semantics, require_ltlf
-from spatial_replay.monitor.sentences import cause_sentences, sentences_of, time_text, verdict_sentence
+from spatial_replay.monitor.sentences import cause_sentences, sentences_of, verdict_sentence
 from spatial_replay.monitor.stream import NEVER, InstanceStream, SeriesBlock
 from spatial_replay.monitor.vacuity import Vacuous, find_vacuous
 from spatial_replay.monitor.verdict import Verdict, final_verdict
@@ -23,6 +23,7 @@ from spatial_replay.monitor.witness.witness import Witness, find_witness
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, NamedSpec, iter_nodes, operator_of
+from spatial_replay.text import Instant, Sentence
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,9 +295,9 @@ class SpecResult(Displayed):
         first_ns = self.evidence.first_ns() if first_ns is None else first_ns
         return "\n".join(self.sentences(first_ns))
 
-    def sentences(self, first_ns: int) -> tuple[str, ...]:
+    def sentences(self, first_ns: int) -> tuple[Sentence, ...]:
         """Return the sentences of `explain`, which count time from `first_ns`."""
-        found: list[str] = []
+        found: list[Sentence] = []
         if self.can_explain and not self.causes:
             found += sentences_of(self.witness(), first_ns=first_ns, since_ns=self.since_ns())
         else:
@@ -307,14 +308,14 @@ class SpecResult(Displayed):
             found += about if cause.node else about[1:]
         return (*found, *(each.message for each in self.vacuous))
 
-    def _headline(self, first_ns: int) -> str:
+    def _headline(self, first_ns: int) -> Sentence:
         instance = f" for {self.object}" if self.object is not None else ""
         settled_ns = self.satisfied_at_ns if self.violated_at_ns is None else self.violated_at_ns
         return verdict_sentence(
             f"`{self.name}`{instance}",
             self.verdict,
             (self.lower, self.upper),
-            certain_since=None if settled_ns is None else time_text(settled_ns, first_ns),
+            certain_since=None if settled_ns is None else Instant(settled_ns, first_ns),
             least=self.least,
         )
 

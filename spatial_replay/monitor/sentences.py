@@ -10,6 +10,7 @@ from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom, Measured
 from spatial_replay.monitor.witness.threshold import Threshold
 from spatial_replay.monitor.witness.witness import Witness, WitnessStep
+from spatial_replay.text import Instant, Sentence
 
 _DIGITS = 6
 _LONGEST = 60
@@ -19,7 +20,7 @@ _EDGES = {"min_x": "left", "max_x": "right", "min_y": "lower", "max_y": "upper"}
 
 def sentences_of(
     witness: Witness, *, first_ns: int, since_ns: int | None = None, is_open: bool = False
-) -> tuple[str, ...]:
+) -> tuple[Sentence, ...]:
     """Return sentences on why a node has its verdict: what decided it, and what would flip it.
 
     Args:
@@ -28,7 +29,8 @@ def sentences_of(
         is_open: whether samples after those evaluated may change it.
     """
     if witness.is_settled:
-        sentences = [_settled(witness, first_ns)]
+        since = Instant(witness.settled_ns or 0, first_ns)
+        sentences = [_settled(_title(witness), witness.verdict, since)]
     else:
         sentences = [_verdict(witness, first_ns, since_ns, is_open)]
     if witness.deciding is None:
@@ -39,21 +41,21 @@ def sentences_of(
         sentences.append(_uncertain(witness, witness.deciding, first_ns))
     else:
         sentences.append(_decision(witness, witness.deciding, first_ns))
-        sentences.append(_flip(witness, witness.deciding, witness.threshold))
+        sentences.append(Sentence(_flip(witness, witness.deciding, witness.threshold)))
     if witness.open_end is not None:
         sentences.append(_open_end(*witness.open_end, first_ns))
     return tuple(sentences)
 
 
-def cause_sentences(cause: Cause, *, first_ns: int, object: str | None = None) -> tuple[str, ...]:
+def cause_sentences(cause: Cause, *, first_ns: int, object: str | None = None) -> tuple[Sentence, ...]:
     """Return sentences on one cause of a verdict: since when, what decided it, and what would flip it."""
     if cause.witness is not None:
         return sentences_of(cause.witness, first_ns=first_ns)
     instance = f" for {object}" if object is not None else ""
     if cause.settled_ns is not None:
-        since = time_text(cause.settled_ns, first_ns)
-        return (f"`{cause.spec}`{instance} is {cause.verdict} since {since}, whatever came after.",)
-    return (f"`{cause.spec}`{instance} is {cause.verdict}: robustness {number_text(cause.robustness)}.",)
+        return (_settled(f"`{cause.spec}`{instance}", cause.verdict, Instant(cause.settled_ns, first_ns)),)
+    robustness = number_text(cause.robustness)
+    return (Sentence(f"`{cause.spec}`{instance} is {cause.verdict}: robustness {robustness}."),)
 
 
 def verdict_sentence(
@@ -61,20 +63,20 @@ def verdict_sentence(
     verdict: Verdict,
     ends: tuple[float, float],
     *,
-    certain_since: str | None = None,
+    certain_since: Instant | None = None,
     least: LeastPart | None = None,
-) -> str:
+) -> Sentence:
     """Return a sentence on the verdict of a result as a whole.
 
     Args:
         title: what the result is called.
         ends: of its interval for the finished log.
-        certain_since: since when it is certain, in words.
+        certain_since: since when it is certain.
         least: the part that its number is of, if that is another than the first cause.
     """
-    since = f", certain since {certain_since}" if certain_since is not None else ""
+    since = (", certain since ", certain_since) if certain_since is not None else ()
     of = f" (the least robustness is that of `{least.name}`)" if least is not None else ""
-    return f"{title} is {verdict}: {_robustness(*ends)}{since}{of}."
+    return Sentence(f"{title} is {verdict}: {_robustness(*ends)}", *since, f"{of}.")
 
 
 def number_text(number: float) -> str:
@@ -82,18 +84,16 @@ def number_text(number: float) -> str:
     return f"{number:.{_DIGITS}g}"
 
 
-def time_text(time_ns: int, first_ns: int) -> str:
-    """Return a time in seconds since another."""
-    return f"{(time_ns - first_ns) / 1e9:.3f} s"
-
-
-def _verdict(witness: Witness, first_ns: int, since_ns: int | None, is_open: bool) -> str:
-    title = witness.path[0].name or witness.path[0].text
-    instance = f" for {witness.object}" if witness.object is not None else ""
+def _verdict(witness: Witness, first_ns: int, since_ns: int | None, is_open: bool) -> Sentence:
     numbers = _robustness(witness.lower, witness.upper)
-    since = f", since {time_text(since_ns, first_ns)}" if since_ns is not None else ""
+    since = (", since ", Instant(since_ns, first_ns)) if since_ns is not None else ()
     so_far, later = (" so far", "; later samples may change that") if is_open else ("", "")
-    return f"`{title}`{instance} is {witness.verdict}{so_far}: {numbers}{since}{later}."
+    return Sentence(f"{_title(witness)} is {witness.verdict}{so_far}: {numbers}", *since, f"{later}.")
+
+
+def _title(witness: Witness) -> str:
+    instance = f" for {witness.object}" if witness.object is not None else ""
+    return f"`{witness.path[0].name or witness.path[0].text}`{instance}"
 
 
 def _robustness(lower: float, upper: float) -> str:
@@ -103,37 +103,34 @@ def _robustness(lower: float, upper: float) -> str:
     return f"robustness {low}" if lower == upper else f"robustness between {low} and {high}"
 
 
-def _settled(witness: Witness, first_ns: int) -> str:
-    title = witness.path[0].name or witness.path[0].text
-    instance = f" for {witness.object}" if witness.object is not None else ""
-    since = time_text(witness.settled_ns or 0, first_ns)
-    return f"`{title}`{instance} is {witness.verdict} since {since}, whatever came after."
+def _settled(title: str, verdict: Verdict, since: Instant) -> Sentence:
+    return Sentence(f"{title} is {verdict} since ", since, ", whatever came after.")
 
 
-def reason_sentence(witness: Witness, *, first_ns: int) -> str:
+def reason_sentence(witness: Witness, *, first_ns: int) -> Sentence:
     """Return one sentence on what decided a verdict or, for an unknown one, on what was not known."""
     deciding = witness.deciding
     if deciding is None or deciding.unknown or witness.verdict is Verdict.UNKNOWN:
         _, reason, *_ = sentences_of(witness, first_ns=first_ns)
         return reason
-    return f"`{deciding.text}` {_how_it_decides(witness, deciding, first_ns)}"
+    return Sentence(f"`{deciding.text}` ", *_how_it_decides(witness, deciding, first_ns).parts)
 
 
-def _decision(witness: Witness, deciding: DecidingAtom, first_ns: int) -> str:
-    return f"What decides is `{deciding.text}`, which {_how_it_decides(witness, deciding, first_ns)}"
+def _decision(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentence:
+    how = _how_it_decides(witness, deciding, first_ns)
+    return Sentence(f"What decides is `{deciding.text}`, which ", *how.parts)
 
 
-def _how_it_decides(witness: Witness, deciding: DecidingAtom, first_ns: int) -> str:
+def _how_it_decides(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentence:
     amount = deciding.value if deciding.lower == deciding.upper else _end(witness, deciding)
     how = f"holds by {number_text(amount)}" if amount >= 0.0 else f"fails by {number_text(-amount)}"
     if amount == 0.0:
         how = "just holds"
     what = " and ".join(map(_measured, deciding.measured))
-    when = time_text(witness.time_ns, first_ns)
     where = (
         _in_time_of_all(witness) if witness.path[-1].operator == deciding.atom.relation else _in_time(witness)
     )
-    return f"{how} at {when}{where}: {what}."
+    return Sentence(f"{how} at ", Instant(witness.time_ns, first_ns), f"{where}: {what}.")
 
 
 def _end(witness: Witness, deciding: DecidingAtom) -> float:
@@ -240,40 +237,46 @@ def _rounded(number: float, *, up: bool) -> str:
     return f"{rounded.normalize():f}" if is_plain else str(rounded.normalize()).lower()
 
 
-def _unknown(witness: Witness, deciding: DecidingAtom, first_ns: int) -> str:
+def _unknown(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentence:
     reasons = " and ".join(deciding.unknown)
-    when = time_text(witness.time_ns, first_ns)
-    return f"`{deciding.text}` is unknown at {when}, where it could decide{_in_time(witness)}: {reasons}."
-
-
-def _uncertain(witness: Witness, deciding: DecidingAtom, first_ns: int) -> str:
-    low, high = number_text(deciding.lower), number_text(deciding.upper)
-    return (
-        f"`{deciding.text}` lies between {low} and {high} at {time_text(witness.time_ns, first_ns)}"
-        f"{_in_time(witness)}: the uncertainty of the objects leaves open whether it holds."
+    return Sentence(
+        f"`{deciding.text}` is unknown at ",
+        Instant(witness.time_ns, first_ns),
+        f", where it could decide{_in_time(witness)}: {reasons}.",
     )
 
 
-def _open_end(deciding: DecidingAtom, time_ns: int, first_ns: int) -> str:
-    """Name what leaves the robustness open, where the verdict is known."""
-    when = time_text(time_ns, first_ns)
-    if deciding.unknown:
-        return (
-            f"By how much is open: `{deciding.text}` is unknown at {when}, {' and '.join(deciding.unknown)}."
-        )
+def _uncertain(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentence:
     low, high = number_text(deciding.lower), number_text(deciding.upper)
-    return f"By how much is uncertain: `{deciding.text}` lies between {low} and {high} at {when}."
+    return Sentence(
+        f"`{deciding.text}` lies between {low} and {high} at ",
+        Instant(witness.time_ns, first_ns),
+        f"{_in_time(witness)}: the uncertainty of the objects leaves open whether it holds.",
+    )
 
 
-def _dead_end(step: WitnessStep, first_ns: int) -> str:
-    when = time_text(step.time_ns, first_ns)
-    match step.operator:
-        case "true" | "false":
-            return f"What decides is the constant `{step.text}`."
-        case "X" | "WX":
-            return f"What decides is `{step.text}` at {when}: the log has no next sample."
-        case "Y":
-            return f"What decides is `{step.text}` at {when}: there is no sample before."
-        case "forall" | "exists":
-            return f"What decides is `{step.text}` at {when}: no object is in its group."
-    return f"What decides is `{step.text}` at {when}: no sample lies in its window."
+def _open_end(deciding: DecidingAtom, time_ns: int, first_ns: int) -> Sentence:
+    """Name what leaves the robustness open, where the verdict is known."""
+    when = Instant(time_ns, first_ns)
+    if deciding.unknown:
+        reasons = " and ".join(deciding.unknown)
+        return Sentence(f"By how much is open: `{deciding.text}` is unknown at ", when, f", {reasons}.")
+    low, high = number_text(deciding.lower), number_text(deciding.upper)
+    what = f"By how much is uncertain: `{deciding.text}` lies between {low} and {high} at "
+    return Sentence(what, when, ".")
+
+
+_DEAD_ENDS = {
+    "X": "the log has no next sample",
+    "WX": "the log has no next sample",
+    "Y": "there is no sample before",
+    "forall": "no object is in its group",
+    "exists": "no object is in its group",
+}
+
+
+def _dead_end(step: WitnessStep, first_ns: int) -> Sentence:
+    if step.operator in ("true", "false"):
+        return Sentence(f"What decides is the constant `{step.text}`.")
+    why = _DEAD_ENDS.get(step.operator, "no sample lies in its window")
+    return Sentence(f"What decides is `{step.text}` at ", Instant(step.time_ns, first_ns), f": {why}.")

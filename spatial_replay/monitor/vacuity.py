@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ from spatial_replay.spec.formula import (
     operands_of,
 )
 from spatial_replay.spec.walks import iter_terms, without_enlargement
+from spatial_replay.text import Instant, Sentence
 
 Reason: TypeAlias = Literal[
     "empty window", "antecedent never held", "no members", "past the end", "no instances"
@@ -53,14 +54,14 @@ class Vacuous:
     node: int | None
     text: str
     reason: Reason
-    message: str
+    message: Sentence
 
 
 def no_instances(name: str, parameter: str) -> Vacuous:
     """Return the entry of a template that no object fits."""
     text = f"{name}({parameter})"
     message = f"`{text}` was never evaluated: no object stands for {parameter}."
-    return Vacuous(None, text, "no instances", message)
+    return Vacuous(None, text, "no instances", Sentence(message))
 
 
 def find_vacuous(evidence: Evidence, leaves: Floats, times_ns: Integers) -> tuple[Vacuous, ...]:
@@ -85,13 +86,20 @@ def find_vacuous(evidence: Evidence, leaves: Floats, times_ns: Integers) -> tupl
         path = deciding_path(instance.formula, done, times_ns, 0, End.LOW)
         node, sample = path.steps[-1].node, path.steps[-1].sample
         if node not in {each.node for each in found}:
-            found += _infinite(node, nodes[node], (int(times_ns[sample]) - int(times_ns[0])) / 1e9)
-    bound = [format_formula(evidence.bound(node)) for node in nodes]
-    named = (
-        replace(each, text=bound[each.node or 0], message=each.message.replace("{}", bound[each.node or 0]))
-        for each in found
+            found += _infinite(node, nodes[node], Instant(int(times_ns[sample]), int(times_ns[0])))
+    return tuple(
+        Vacuous(each.node, text, each.reason, Sentence(f"`{text}` ", *each.what))
+        for each in sorted(found, key=lambda each: each.node)
+        for text in (format_formula(evidence.bound(nodes[each.node])),)
     )
-    return tuple(sorted(named, key=lambda each: each.node or 0))
+
+
+class _Idle(NamedTuple):
+    """A part that decided nothing, and the rest of the sentence that begins with its text."""
+
+    node: int
+    reason: Reason
+    what: tuple[str | Instant, ...]
 
 
 # ---------------------------------------------------------------------------------------------- scopes
@@ -160,22 +168,21 @@ def windows_of(formula: Temporal, times_ns: Integers) -> tuple[Integers, Integer
 
 def _empty_windows(
     nodes: Sequence[Formula], scopes: Sequence[_Samples], times_ns: Integers
-) -> Iterator[Vacuous]:
+) -> Iterator[_Idle]:
     for identifier, (node, scope) in enumerate(zip(nodes, scopes, strict=True)):
         if not isinstance(node, Temporal) or not scope.any():
             continue
         begin, end = windows_of(node, times_ns)
         if not (begin < end)[scope].any():
-            what = f"the log has no {_NEXT[node.operator]}" if node.operator in _NEXT else _NO_SAMPLE
-            yield Vacuous(identifier, "", "empty window", f"`{{}}` was never tested: {what}.")
-
-
-_NO_SAMPLE = "no sample of the log lies in its window"
+            what = "no sample of the log lies in its window"
+            if node.operator in _NEXT:
+                what = f"the log has no {_NEXT[node.operator]}"
+            yield _Idle(identifier, "empty window", (f"was never tested: {what}.",))
 
 
 def _idle_implications(
     nodes: Sequence[Formula], scopes: Sequence[_Samples], done: OfflineNodes, formula: Formula
-) -> Iterator[Vacuous]:
+) -> Iterator[_Idle]:
     antecedents: dict[int, int] = {}
     for identifier, parent, _ in iter_nodes(formula):
         if parent is not None:
@@ -184,19 +191,16 @@ def _idle_implications(
         if isinstance(node, Boolean) and node.operator == "->" and scope.any():
             high = done.ends(antecedents[identifier])[1]
             if not (high[scope] >= 0.0).any():
-                yield _idle(identifier, node)
+                yield _untested(identifier, node)
 
 
-def _idle(identifier: int, implication: Boolean) -> Vacuous:
+def _untested(identifier: int, implication: Boolean) -> _Idle:
     antecedent = format_formula(implication.operands[0])
-    return Vacuous(
-        identifier, "", "antecedent never held", f"`{{}}` was never tested: `{antecedent}` never held."
-    )
+    what = f"was never tested: `{antecedent}` never held."
+    return _Idle(identifier, "antecedent never held", (what,))
 
 
-def _idle_bodies(
-    nodes: Sequence[Formula], scopes: Sequence[_Samples], evidence: Evidence
-) -> Iterator[Vacuous]:
+def _idle_bodies(nodes: Sequence[Formula], scopes: Sequence[_Samples], evidence: Evidence) -> Iterator[_Idle]:
     """Find implications in the bodies of quantifiers, whose antecedent held for none of the members."""
     for identifier, (node, scope) in enumerate(zip(nodes, scopes, strict=True)):
         if not isinstance(node, Quantified) or not scope.any():
@@ -208,7 +212,7 @@ def _idle_bodies(
         high = columns[low_and_high(len(columns), wide=True)[1]]
         for (implication, _), ends in zip(inner, high, strict=True):
             if not (ends[scope] >= 0.0).any():
-                yield _idle(identifier, implication)
+                yield _untested(identifier, implication)
 
 
 def _implications(node: Quantified) -> Iterator[tuple[Boolean, Formula]]:
@@ -227,7 +231,7 @@ def _implications(node: Quantified) -> Iterator[tuple[Boolean, Formula]]:
 
 def _empty_groups(
     nodes: Sequence[Formula], scopes: Sequence[_Samples], evidence: Evidence
-) -> Iterator[Vacuous]:
+) -> Iterator[_Idle]:
     groups: dict[Group | Earlier, bool] = {}
     open_groups = {
         identifier: list(_open_groups(evidence.bound(node)))
@@ -240,9 +244,8 @@ def _empty_groups(
         empty = [group for group in own if not groups[group]]
         if empty:
             names = " or ".join(f"`{format_term(group)}`" for group in dict.fromkeys(empty))
-            yield Vacuous(
-                identifier, "", "no members", f"`{{}}` decided nothing: no object was ever in {names}."
-            )
+            what = f"decided nothing: no object was ever in {names}."
+            yield _Idle(identifier, "no members", (what,))
 
 
 def _open_groups(formula: Formula) -> Iterator[Group | Earlier]:
@@ -255,12 +258,10 @@ def _open_groups(formula: Formula) -> Iterator[Group | Earlier]:
             yield replace(term, term=whole) if isinstance(term, Earlier) else whole
 
 
-def _infinite(identifier: int, node: Formula, seconds: float) -> Iterator[Vacuous]:
+def _infinite(identifier: int, node: Formula, when: Instant) -> Iterator[_Idle]:
     """Yield why a result is infinite, from the node that its number is of."""
     if isinstance(node, Temporal):
         side = "past the end" if node.operator in FUTURE_OPERATORS else "before the start"
-        message = f"`{{}}` decides at {seconds:.3f} s, where it looks {side} of the log."
-        yield Vacuous(identifier, "", "past the end", message)
+        yield _Idle(identifier, "past the end", ("decides at ", when, f", where it looks {side} of the log."))
     elif isinstance(node, Atom | Quantified):
-        message = f"`{{}}` decides at {seconds:.3f} s, where no object is in its group."
-        yield Vacuous(identifier, "", "no members", message)
+        yield _Idle(identifier, "no members", ("decides at ", when, ", where no object is in its group."))

@@ -12,7 +12,7 @@ from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.causes import Conjunct, conjuncts_of
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.program import Program, compile_formula
-from spatial_replay.monitor.sentences import number_text, sentences_of, time_text
+from spatial_replay.monitor.sentences import number_text, sentences_of
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom
 from spatial_replay.monitor.witness.path import End, Evidence
@@ -21,6 +21,7 @@ from spatial_replay.monitor.witness.witness import Witness, find_witness
 from spatial_replay.spec.expressions import Scaled
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import NamedSpec, Number, Specification
+from spatial_replay.text import Instant
 from spatial_replay.trace.sample import FOREVER, Sample
 from spatial_replay.trace.trace import Trace
 
@@ -80,9 +81,9 @@ class Violation:
 
     def __str__(self) -> str:
         if self.atom is None or self.witness is None:
-            since = time_text(self.time_ns, self.first_ns)
+            since = Instant(self.time_ns, self.first_ns)
             return f"`{self.spec}` is violated since {since}, by {number_text(-self.robustness)}"
-        when = time_text(self.witness.time_ns, self.first_ns)
+        when = Instant(self.witness.time_ns, self.first_ns)
         number = self.atom.upper if self.atom.end is End.HIGH else self.atom.lower
         how = f"{'holds' if number >= 0.0 else 'fails'} by {number_text(abs(number))}"
         short = _short(self.atom, self.spec, abs(number) * _divisor(self.atom))

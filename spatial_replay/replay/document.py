@@ -17,7 +17,7 @@ from spatial_replay.monitor.witness.atom import Measured
 from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.replay.engine import Replayed
 from spatial_replay.spec.formula import iter_nodes
-from spatial_replay.text import json_number
+from spatial_replay.text import Sentence, json_number
 
 
 def document_from_replay(
@@ -184,7 +184,7 @@ class Explanation:
 
     verdict: Verdict
     time_ns: int
-    sentences: tuple[str, ...]
+    sentences: tuple[Sentence, ...]
     document: Mapping[str, Any]
 
 

@@ -19,6 +19,7 @@ from spatial_replay.report.scene_panel import ReportedScene
 from spatial_replay.report.tree_panel import final_text
 from spatial_replay.spec.formula import NamedSpec, Specification
 from spatial_replay.spec.units import Unit
+from spatial_replay.text import Sentence
 from spatial_replay.trace.axes import Axes
 
 MOST_DRAWN: Final = 24
@@ -58,7 +59,7 @@ class ReportedResult:
 
     result: SpecResult
     relations: frozenset[str]
-    sentences: tuple[str, ...]
+    sentences: tuple[Sentence, ...]
     decided_ns: int | None
     pointer: Pointer | None
     named: Mapping[str, NamedSpec]

@@ -16,7 +16,6 @@ from typing import Final
 
 from spatial_replay import __version__
 from spatial_replay.monitor.causes import settled_time
-from spatial_replay.monitor.sentences import time_text
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.notebook.figures import Html, element
 from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
@@ -25,7 +24,7 @@ from spatial_replay.report.contents import ReportedResult, RunReport, worst_firs
 from spatial_replay.report.data import page_data
 from spatial_replay.report.tree_panel import final_text
 from spatial_replay.spec.units import is_mixed
-from spatial_replay.text import counted, printable
+from spatial_replay.text import Instant, Sentence, counted, printable
 
 _CALENDAR_NS: Final = 500_000_000 * 10**9
 """Times from here on count from 1970; smaller ones are of clocks that start at power-on."""
@@ -91,7 +90,7 @@ def _about(report: RunReport) -> Iterator[str]:
     yield ", ".join(file.filename for file in report.files)
     if report.first_ns >= _CALENDAR_NS:
         yield f"{datetime.fromtimestamp(report.first_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
-    start, end = (time_text(time_ns, report.first_ns) for time_ns in (report.start_ns, report.end_ns))
+    start, end = (str(Instant(time_ns, report.first_ns)) for time_ns in (report.start_ns, report.end_ns))
     yield f"{start} to {end}" if report.start_ns != report.first_ns else end
     yield counted(report.samples, "sample")
     yield f"semantics {report.semantics}"
@@ -129,7 +128,7 @@ def _verdicts(report: RunReport) -> Iterator[Html]:
     if not report.results:
         yield element("p", "The templates matched no objects.")
     for part in report.vacuous:
-        yield element("p", *_with_code(part.message))
+        yield element("p", *_sentence(part.message, report.first_ns))
     places = {id(result): place for place, result in enumerate(report.drawn)}
     are_many = len(report.results) > _MANY
     worst = worst_first([each.result.verdict for each in report.results])
@@ -140,7 +139,7 @@ def _verdicts(report: RunReport) -> Iterator[Html]:
         is_unfolded = is_reported and not (are_many and number)
         unfolded = {"open": ""} if each.sentences and is_unfolded else {}
         attributes = {"class": "verdict", **drawn, **unfolded}
-        content = [element("p", *_with_code(sentence)) for sentence in each.sentences]
+        content = [element("p", *_sentence(sentence, report.first_ns)) for sentence in each.sentences]
         content += [_specs(each, report.first_ns)] if each.sentences else []
         yield element(
             "details" if content else "div", _summary(each, report.first_ns), *content, **attributes
@@ -152,11 +151,11 @@ def _summary(each: ReportedResult, first_ns: int) -> Html:
     result = each.result
     numbers = [f"robustness {each.robustness_text or 'not determined'}"]
     if result.violated_at_ns is not None:
-        numbers.append(f"violated since {time_text(result.violated_at_ns, first_ns)}")
+        numbers.append(f"violated since {Instant(result.violated_at_ns, first_ns)}")
     elif result.satisfied_at_ns is not None:
-        numbers.append(f"satisfied since {time_text(result.satisfied_at_ns, first_ns)}")
+        numbers.append(f"satisfied since {Instant(result.satisfied_at_ns, first_ns)}")
     elif result.verdict is Verdict.SATISFIED and result.first_satisfied_ns is not None:
-        numbers.append(f"first satisfied at {time_text(result.first_satisfied_ns, first_ns)}")
+        numbers.append(f"first satisfied at {Instant(result.first_satisfied_ns, first_ns)}")
     decided_nothing = "a part decided nothing" if len(result.vacuous) == 1 else "parts decided nothing"
     marks = [element("span", decided_nothing, **{"class": "chip is-vacuous"})] if result.vacuous else []
     return element(
@@ -187,7 +186,7 @@ def _specs(each: ReportedResult, first_ns: int) -> Html:
         about = (None, None) if spec is None else (spec.id, spec.title)
         numbers = f"robustness {final_text(node.robustness, node.final_lower, node.final_upper)}"
         if settled_ns is not None:
-            numbers += f", violated since {time_text(settled_ns, first_ns)}"
+            numbers += f", violated since {Instant(settled_ns, first_ns)}"
         line = element("span", text(numbers), **{"class": "numbers"})
         rows.append(
             element("li", _chip(node.verdict), *_requirement(about[0], node.name or "", about[1]), line)
@@ -201,10 +200,14 @@ def _specs(each: ReportedResult, first_ns: int) -> Html:
     return element("div", *parts)
 
 
-def _with_code(sentence: str) -> Iterator[Html]:
-    """Yield a sentence with its quoted parts as code."""
-    for number, part in enumerate(sentence_parts(sentence)):
-        yield element("code", text(part)) if number % 2 else text(part)
+def _sentence(sentence: Sentence, first_ns: int) -> Iterator[Html]:
+    """Yield a sentence: quoted parts as code, times with their ns since the log's first sample."""
+    for part in sentence.parts:
+        if isinstance(part, Instant):
+            yield element("span", str(part), **{"data-time-ns": str(part.time_ns - first_ns)})
+            continue
+        for number, piece in enumerate(sentence_parts(part)):
+            yield element("code", text(piece)) if number % 2 else text(piece)
 
 
 def _chip(verdict: str) -> Html:
