@@ -1,0 +1,314 @@
+"""One log evaluated with all its specifications: a task in, rows out.
+
+A task is sent to the process that evaluates it, so it holds the texts of its specifications, and nothing that
+is open. Its rows are values, too. Nothing here knows where rows are stored or shown.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Final, Literal, TypeAlias
+
+from spatial_replay.batch.suite import DEFAULT_CONDITIONS, Conditions
+from spatial_replay.errors import (
+    GeometryError,
+    LogError,
+    SpatialReplayError,
+    SpecificationError,
+    TraceError,
+    UsageError,
+)
+from spatial_replay.logs.source import Source
+from spatial_replay.monitor.result import SpecResult
+from spatial_replay.monitor.sentences import reason_sentence
+from spatial_replay.monitor.vacuity import no_instances
+from spatial_replay.monitor.verdict import Verdict
+from spatial_replay.monitor.witness.witness import Witness
+from spatial_replay.replay.engine import Replay, Replayed
+from spatial_replay.replay.selection import ReplayOptions, Window, first_sample_ns
+from spatial_replay.sources.open_log import open_source
+from spatial_replay.spec.diagnostics import SourceText
+from spatial_replay.spec.formula import NamedSpec, Specification
+from spatial_replay.spec.overrides import SpecificationText, load_specifications
+from spatial_replay.text import printable
+from spatial_replay.trace.time_points import time_point_from_text
+
+ErrorKind: TypeAlias = Literal["usage", "log", "machine"]
+"""Whose an error is: of the options or files given, of the log, or of the machine and this program."""
+
+_LONGEST: Final = 2_000
+"""Characters of a text in a row."""
+_MOST: Final = 20
+"""Faults, remarks and the like in a row; the last of them says how many more there are."""
+_KINDS: Final[tuple[tuple[tuple[type[Exception], ...], ErrorKind], ...]] = (
+    ((UsageError, SpecificationError), "usage"),
+    ((LogError, TraceError, GeometryError), "log"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A log to evaluate.
+
+    Attributes:
+        log: its path or address.
+        specs: the texts of the specification files.
+        conditions: how to read the log and evaluate them; objects for parameters that no specification has
+            are ignored, since a batch may have evaluated those already.
+    """
+
+    log: str
+    specs: tuple[SpecificationText, ...]
+    conditions: Conditions = DEFAULT_CONDITIONS
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """The result of one spec over one log, or the error in its place.
+
+    Attributes:
+        spec: its name.
+        object: the object that a template's parameter stands for, or None.
+        requirement, title: the id and sentence of the spec, or None.
+        line: of the spec in its file, from 1.
+        verdict: None if there is an error.
+        robustness, lower, upper: NaN where not determined.
+        first_satisfied_ns, violated_at_ns, satisfied_at_ns: as in `SpecResult`.
+        atom, atom_time_ns, atom_objects: what decides the verdict: the first cause of a violation.
+        reason: one sentence on what decided; "" under the paper's semantics.
+        explanation: what `explain` says, in sentences.
+        vacuous: sentences on the parts that decided nothing.
+        samples: how many were evaluated.
+        start_ns: time of the first of them.
+        duration_ns: from the first to the last.
+        faults, remarks, missing: what was lost while reading, what was remarkable, names that the log lacks.
+        seconds: how long reading and evaluating the log took, for all its specifications.
+        error: why there is no verdict, or None.
+        error_kind: see `ErrorKind`; None without an error.
+    """
+
+    spec: str
+    object: str | None
+    requirement: str | None
+    title: str | None
+    line: int
+    verdict: Verdict | None = None
+    robustness: float = float("nan")
+    lower: float = float("nan")
+    upper: float = float("nan")
+    first_satisfied_ns: int | None = None
+    violated_at_ns: int | None = None
+    satisfied_at_ns: int | None = None
+    atom: str | None = None
+    atom_time_ns: int | None = None
+    atom_objects: tuple[str, ...] = ()
+    reason: str = ""
+    explanation: tuple[str, ...] = ()
+    vacuous: tuple[str, ...] = ()
+    samples: int = 0
+    start_ns: int | None = None
+    duration_ns: int | None = None
+    faults: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
+    seconds: float = 0.0
+    error: str | None = None
+    error_kind: ErrorKind | None = None
+
+
+def rows_from_task(task: Task) -> tuple[tuple[Row, ...], ...]:
+    """Open a log once, evaluate all its specifications over it, and return their rows.
+
+    Returns:
+        For each of `task.specs` one row for each of its results, in the order of the text, and for each
+        object of a template. What goes wrong with the log is a row with the error for each of them: nothing
+        is raised but an interruption.
+    """
+    begin = time.perf_counter()
+    try:
+        files = parsed_specifications(task.specs, task.conditions)
+        source, options = opened_task(task, files)
+        replay = Replay(source, files, options, keep_leaves=True)
+        replayed = replay.run()
+        rows = [_rows_of_file(replay, replayed, file, index) for index, file in enumerate(files)]
+    except Exception as error:  # one log must not end a batch
+        return error_rows(task, *error_from_exception(error))
+    seconds = time.perf_counter() - begin
+    return tuple(tuple(replace(row, seconds=seconds) for row in each) for each in rows)
+
+
+def opened_task(task: Task, files: Sequence[Specification]) -> tuple[Source, ReplayOptions]:
+    """Return the open log of a task and the options of its replay.
+
+    Raises:
+        UsageError, LogError: it cannot be opened, or its first sample cannot be read.
+    """
+    conditions = task.conditions
+    source = open_source(task.log, mapping=conditions.mapping, **dict(conditions.reading))
+    parameters = {spec.parameter for file in files for spec in file.results}
+    each = {name: objects for name, objects in conditions.each if name in parameters}
+    window = _window(source, conditions)
+    return source, ReplayOptions(window, each, conditions.semantics, conditions.strict_names)
+
+
+def _window(source: Source, conditions: Conditions) -> Window:
+    if conditions.start is None and conditions.end is None:
+        return Window(every=conditions.every)
+    first_ns, whole = first_sample_ns(source), Window()
+    ends = [
+        unbounded if text is None else time_point_from_text(text).absolute_ns(first_ns)
+        for text, unbounded in ((conditions.start, whole.start_ns), (conditions.end, whole.end_ns))
+    ]
+    return Window(ends[0], ends[1], conditions.every)
+
+
+@lru_cache(maxsize=64)
+def parsed_specifications(
+    specs: tuple[SpecificationText, ...], conditions: Conditions
+) -> tuple[Specification, ...]:
+    """Parse specifications with a case's values for their constants; the same are parsed once.
+
+    Raises:
+        SpecificationError: one has errors.
+        UsageError: a value of a constant that none has.
+    """
+    return tuple(load_specifications(specs, profile=conditions.profile, constants=dict(conditions.constants)))
+
+
+def error_from_exception(error: Exception) -> tuple[str, ErrorKind]:
+    """Return what an error says, and whose it is."""
+    kind: ErrorKind = "machine"
+    for kinds, whose in _KINDS:
+        if isinstance(error, kinds):
+            kind = whose
+    if isinstance(error, SpatialReplayError):
+        return str(error), kind
+    if isinstance(error, MemoryError):
+        return "out of memory", kind
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror, kind
+    return f"internal error: {type(error).__name__}: {error}", kind
+
+
+def error_rows(task: Task, message: str, kind: ErrorKind) -> tuple[tuple[Row, ...], ...]:
+    """Return the rows of a task without results: one for each spec, with the error.
+
+    A specification that cannot be parsed has one row, with an empty name.
+    """
+    error = _cut(message)
+    rows: list[tuple[Row, ...]] = []
+    for text in task.specs:
+        try:
+            (file,) = parsed_specifications((text,), replace(task.conditions, constants=()))
+        except SpatialReplayError:
+            rows.append((Row("", None, None, None, 1, error=error, error_kind=kind),))
+            continue
+        lines = _lines(file)
+        rows.append(
+            tuple(
+                Row(spec.name, None, spec.id, spec.title, lines[spec.name], error=error, error_kind=kind)
+                for spec in file.results
+            )
+        )
+    return tuple(rows)
+
+
+def _rows_of_file(replay: Replay, replayed: Replayed, file: Specification, index: int) -> tuple[Row, ...]:
+    lines = _lines(file)
+    log = _row_of_log(replayed)
+    pairs = zip(replay.trees, replayed.results, strict=True)
+    # a name that another file has, too, is that of the file's own text here
+    results = [replace(result, name=result.spec.name) for tree, result in pairs if tree.file == index]
+    rows = [_row(log, result, replayed.first_ns, lines[result.name]) for result in results]
+    evaluated = {result.name for result in results}
+    idle = [spec for spec in file.results if spec.name not in evaluated and spec.parameter is not None]
+    rows += [_idle_row(log, spec, lines[spec.name]) for spec in idle]
+    return tuple(rows)
+
+
+def _row_of_log(replayed: Replayed) -> Row:
+    """Return a row with what all rows of a log share."""
+    return Row(
+        "",
+        None,
+        None,
+        None,
+        1,
+        samples=replayed.samples,
+        start_ns=replayed.start_ns,
+        duration_ns=replayed.end_ns - replayed.start_ns,
+        faults=_some(replayed.faults),
+        remarks=_some(replayed.remarks),
+        missing=_some([each.message for each in replayed.missing]),
+    )
+
+
+def _row(log: Row, result: SpecResult, first_ns: int, line: int) -> Row:
+    witness = _witness(result)
+    deciding = None if witness is None else witness.deciding
+    return replace(
+        log,
+        spec=result.name,
+        object=result.object,
+        requirement=result.spec.id,
+        title=result.spec.title,
+        line=line,
+        verdict=result.verdict,
+        robustness=result.robustness,
+        lower=result.lower,
+        upper=result.upper,
+        first_satisfied_ns=result.first_satisfied_ns,
+        violated_at_ns=result.violated_at_ns,
+        satisfied_at_ns=result.satisfied_at_ns,
+        atom=None if deciding is None else _cut(deciding.text),
+        atom_time_ns=None if witness is None else witness.time_ns,
+        atom_objects=() if deciding is None else tuple(deciding.objects),
+        reason="" if witness is None else _cut(reason_sentence(witness, first_ns=first_ns)),
+        explanation=_some(result.sentences(first_ns)),
+        vacuous=_some([part.message for part in result.vacuous]),
+    )
+
+
+def _witness(result: SpecResult) -> Witness | None:
+    """Return the witness of the first cause or, of a satisfied result, that of its verdict."""
+    if not result.can_explain:
+        return None
+    return result.causes[0].witness if result.causes else result.witness()
+
+
+def _idle_row(log: Row, spec: NamedSpec, line: int) -> Row:
+    """Return the row of a template that no object of the log fits: nothing violates it."""
+    message = no_instances(spec.name, spec.parameter or "").message
+    endless = float("inf")
+    return replace(
+        log,
+        spec=spec.name,
+        requirement=spec.id,
+        title=spec.title,
+        line=line,
+        verdict=Verdict.SATISFIED,
+        robustness=endless,
+        lower=endless,
+        upper=endless,
+        explanation=(message,),
+        vacuous=(message,),
+    )
+
+
+def _lines(file: Specification) -> dict[str, int]:
+    """Return the line of each spec in the file's text."""
+    text = SourceText.of(file.source, file.filename)
+    return {spec.name: text.line_of(spec.span.start) for spec in file.specs}
+
+
+def _some(texts: Sequence[str]) -> tuple[str, ...]:
+    """Return texts of bounded length and number, with a note on what is left out."""
+    listed = [_cut(text) for text in texts[:_MOST]]
+    return (*listed, f"… and {len(texts) - _MOST} more") if len(texts) > _MOST else tuple(listed)
+
+
+def _cut(text: str) -> str:
+    return "\n".join(printable(line, _LONGEST) for line in text.split("\n")[:_MOST])

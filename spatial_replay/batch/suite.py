@@ -1,0 +1,280 @@
+"""Suites: which logs are evaluated with which specifications, and what is expected of them.
+
+A suite is a YAML file, or what a command line says. It names logs as people write them: patterns, folders,
+addresses; `log_files` finds them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files
+from os import PathLike
+from pathlib import Path
+from typing import Any, Final, TypeAlias, TypeVar, cast
+
+from spatial_replay.errors import UsageError
+from spatial_replay.mapping.checked_yaml import checked_document, read_yaml_text
+from spatial_replay.mapping.yaml_document import Document, Place
+from spatial_replay.monitor.semantics import Semantics
+from spatial_replay.monitor.verdict import Verdict
+from spatial_replay.trace.time_points import time_point_from_text
+
+LARGEST_SUITE: Final = 8 * 2**20
+"""Bytes of a suite file."""
+_Value = TypeVar("_Value")
+_READING: Final = ("on_time_jump", "rate", "lost", "y_down", "concave")
+Pairs: TypeAlias = tuple[tuple[str, _Value], ...]
+"""A table that can be hashed, and sent to another process."""
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """How logs are read, and how specifications are evaluated over them.
+
+    Attributes:
+        mapping: the mapping file, or None.
+        reading: further keyword arguments of `open_source`.
+        start, end: the window, as people write times; None for the whole log.
+        every: every `every`th sample is evaluated.
+        each: for each parameter of a template its objects: "all", "class:NAME".
+        semantics: "ltlf" or "paper".
+        strict_names: names that a log never has are errors.
+        constants: values in place of those that the specifications give their constants.
+        profile: relation profile of specifications without a `use` line.
+    """
+
+    mapping: Path | None = None
+    reading: Pairs[Any] = ()
+    start: str | None = None
+    end: str | None = None
+    every: int = 1
+    each: Pairs[str] = ()
+    semantics: Semantics = "ltlf"
+    strict_names: bool = False
+    constants: Pairs[float | str] = ()
+    profile: str | None = None
+
+
+DEFAULT_CONDITIONS: Final = Conditions()
+
+
+@dataclass(frozen=True, slots=True)
+class Expectation:
+    """What a case expects of every result.
+
+    Attributes:
+        verdict: the verdict that passes.
+        at_least: the least robustness that passes, or None.
+        allow_unknown: whether an unknown verdict passes, too.
+    """
+
+    verdict: Verdict = Verdict.SATISFIED
+    at_least: float | None = None
+    allow_unknown: bool = False
+
+    def failure(self, verdict: Verdict, robustness: float) -> str | None:
+        """Return why a result does not pass, in a few words; None if it does.
+
+        Args:
+            robustness: NaN if it is not determined, which no least robustness accepts.
+        """
+        if verdict is Verdict.UNKNOWN and self.allow_unknown:
+            return None
+        if verdict is not self.verdict:
+            return f"{verdict}, expected {self.verdict}"
+        if self.at_least is not None and not robustness >= self.at_least:
+            return f"robustness {robustness:.6g}, expected at least {self.at_least:.6g}"
+        return None
+
+
+DEFAULT_EXPECTATION: Final = Expectation()
+
+
+@dataclass(frozen=True, slots=True)
+class LogPattern:
+    """Logs as they are written: a file, a folder, a pattern, an address.
+
+    Attributes:
+        place: file and line where it is written, for errors; "" on a command line.
+    """
+
+    text: str
+    place: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Logs that are evaluated with the same specifications under the same conditions.
+
+    Attributes:
+        name: unique in its suite.
+        logs: relative paths are relative to the suite's folder.
+        specs: the specification files.
+        requirements: ids of requirements that the case is about; a spec can have one of its own.
+    """
+
+    name: str
+    logs: tuple[LogPattern, ...]
+    specs: tuple[Path, ...]
+    conditions: Conditions = DEFAULT_CONDITIONS
+    expectation: Expectation = DEFAULT_EXPECTATION
+    requirements: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Suite:
+    """The cases of a batch.
+
+    Attributes:
+        name: for reports: the stem of the suite's file.
+        folder: what relative paths of logs are relative to.
+        cases: at least one; their names differ.
+        path: the suite's file, or None.
+    """
+
+    name: str
+    folder: Path
+    cases: tuple[Case, ...]
+    path: Path | None = None
+
+    @classmethod
+    def of_logs(
+        cls,
+        logs: Sequence[str],
+        specs: Sequence[Path],
+        conditions: Conditions = DEFAULT_CONDITIONS,
+        expectation: Expectation = DEFAULT_EXPECTATION,
+    ) -> Suite:
+        """Return a suite of one case, named "logs", with paths relative to the current folder."""
+        patterns = tuple(LogPattern(log) for log in logs)
+        return cls("batch", Path(), (Case("logs", patterns, tuple(specs), conditions, expectation),))
+
+
+def load_suite(path: str | PathLike[str]) -> Suite:
+    """Load a suite file (YAML; `schemas/suite.schema.json`).
+
+    Keys beside `cases` hold for every case that does not have its own. Paths are relative to the file.
+
+    Raises:
+        MissingFileError: there is no such file.
+        UsageError: the file is not a valid suite, or names a specification or mapping that does not exist;
+            all errors are listed, with their lines.
+    """
+    path = Path(path)
+    text = read_yaml_text(path, LARGEST_SUITE)
+
+    def find(document: Document) -> list[tuple[Place, str]]:
+        return list(_contradictions(document.value, path.parent))
+
+    document = checked_document(text, path.name, _schema(), find, "a suite", LARGEST_SUITE)
+    value = cast("dict[str, Any]", document.value)
+    common = {key: each for key, each in value.items() if key != "cases"}
+    cases = tuple(
+        _case({**common, **entry}, _LogPlaces(document, path.name, number), path.parent)
+        for number, entry in enumerate(value["cases"])
+    )
+    return Suite(path.stem.removesuffix(".replay"), path.parent, cases, path)
+
+
+@dataclass(frozen=True, slots=True)
+class _LogPlaces:
+    """Where the logs of a case are written."""
+
+    document: Document = field(repr=False)
+    name: str
+    case: int
+
+    def place(self, number: int) -> str:
+        return f"{self.name}:{self.document.line_of(('cases', self.case, 'logs', number))}"
+
+
+def _case(entry: Mapping[str, Any], places: _LogPlaces, folder: Path) -> Case:
+    """Return a case from an entry that is valid."""
+    mapping = entry.get("mapping")
+    start, end = entry.get("from"), entry.get("to")
+    return Case(
+        name=entry["name"],
+        logs=tuple(LogPattern(log, places.place(n)) for n, log in enumerate(_listed(entry["logs"]))),
+        specs=tuple(folder / spec for spec in dict.fromkeys(_listed(entry["specs"]))),
+        conditions=Conditions(
+            mapping=None if mapping is None else folder / mapping,
+            reading=tuple((key, entry[key]) for key in _READING if key in entry),
+            start=None if start is None else str(start),
+            end=None if end is None else str(end),
+            every=entry.get("every", 1),
+            each=_pairs(entry.get("each", {})),
+            semantics=entry.get("semantics", "ltlf"),
+            strict_names=entry.get("strict_names", False),
+            constants=_pairs(entry.get("constants", {})),
+        ),
+        expectation=Expectation(
+            Verdict(entry.get("expect", "satisfied")),
+            entry.get("at_least"),
+            entry.get("allow_unknown", False),
+        ),
+        requirements=tuple(_listed(entry.get("requirements", ()))),
+    )
+
+
+def _contradictions(value: Any, folder: Path) -> Iterator[tuple[Place, str]]:
+    """Yield what a schema cannot express; the value may be any."""
+    if not isinstance(value, dict):
+        return
+    yield from _wrong_values(value, (), folder)
+    cases = value.get("cases")
+    first: dict[str, int] = {}
+    for number, entry in enumerate(cases if isinstance(cases, list) else ()):
+        if not isinstance(entry, dict):
+            continue
+        yield from _wrong_values(entry, ("cases", number), folder)
+        name = entry.get("name")
+        if isinstance(name, str) and first.setdefault(name, number) != number:
+            yield ("cases", number, "name"), f"there is a case {name[:60]!r} already; give it another name"
+        if "specs" not in entry and "specs" not in value:
+            yield ("cases", number), "it has no specs; give it some, or the whole suite"
+        both = {**value, **entry}
+        if both.get("expect", "satisfied") != "satisfied" and "at_least" in both:
+            what = f"at_least applies to satisfied results, and {both['expect']} ones are expected"
+            yield ("cases", number, "at_least"), what
+
+
+def _wrong_values(entry: Mapping[str, Any], place: Place, folder: Path) -> Iterator[tuple[Place, str]]:
+    """Yield times that are none, and files that do not exist."""
+    for key in ("from", "to"):
+        if isinstance(entry.get(key), str | int):
+            try:
+                time_point_from_text(str(entry[key]))
+            except UsageError as error:
+                yield (*place, key), str(error)
+    specs = entry.get("specs")
+    named = [((*place, "mapping"), entry.get("mapping"))]
+    named += [
+        ((*place, "specs", n), spec) for n, spec in enumerate(specs if isinstance(specs, list) else [specs])
+    ]
+    for where, name in named:
+        if isinstance(name, str) and name and not _is_file(folder / name):
+            yield where, f"there is no file {name[:200]!r}; paths are relative to the suite's file"
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def _pairs(table: Mapping[str, _Value]) -> Pairs[_Value]:
+    return tuple(sorted(table.items()))
+
+
+def _listed(value: Any) -> Sequence[Any]:
+    return [value] if isinstance(value, str) else value
+
+
+@cache
+def _schema() -> Mapping[str, Any]:
+    text = files(__package__).joinpath("suite.schema.json").read_text(encoding="utf-8")
+    return cast("Mapping[str, Any]", json.loads(text))
