@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as shortened
 from typing import Literal, TypeAlias, TypedDict, Unpack
 
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.output_file import refuse_inputs
 from spatial_replay.logs.source import MemorySource, Source
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.replay.annotated import load_files, run_replay
 from spatial_replay.replay.engine import Replayed
 from spatial_replay.replay.selection import ReplayOptions, Window
 from spatial_replay.replay.verification import Verified, verify_certificate
+from spatial_replay.report.write import refuse_output
 from spatial_replay.report.write import write_report as write_page
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.sources.overview import Overview, overview_of
@@ -39,6 +40,26 @@ class Reading(TypedDict, total=False):
     y_down: bool | None
 
 
+class Evaluating(Reading, total=False):
+    """How to evaluate a log, and how to read it: the options of `replay_log` and `write_report`.
+
+    Attributes:
+        constants: values in place of those that files and the log's own specifications give their constants.
+        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
+        semantics: "ltlf" unless given, or "paper": Def. 16 of the paper to the letter.
+        start_ns, end_ns, every: evaluate every `every`th sample from `start_ns` to before `end_ns`.
+        strict_names: objects and signals that the log never has are errors; otherwise they are unknown.
+    """
+
+    constants: Mapping[str, float | str] | None
+    each: Mapping[str, str] | None
+    semantics: Semantics
+    start_ns: int
+    end_ns: int
+    every: int
+    strict_names: bool
+
+
 def replay_log(
     log: Log,
     specifications: Specifications | None = None,
@@ -46,14 +67,7 @@ def replay_log(
     output: PathName | None = None,
     layer: bool = False,
     keep: Sequence[str] | None = None,
-    constants: Mapping[str, float | str] | None = None,
-    each: Mapping[str, str] | None = None,
-    semantics: Semantics = "ltlf",
-    start_ns: int = 0,
-    end_ns: int = FOREVER,
-    every: int = 1,
-    strict_names: bool = False,
-    **reading: Unpack[Reading],
+    **options: Unpack[Evaluating],
 ) -> Replayed:
     """Evaluate specifications over a log, and write the annotated log if a file is named.
 
@@ -64,12 +78,8 @@ def replay_log(
         layer: write the derived messages only, without the log's own.
         keep: which of the log's own messages the output holds: "all" (as without it), "mapped" for those of
             mapped topics, or patterns of topics such as "/camera/*"; several add up.
-        constants: values in place of those that files and the log's own specifications give their constants.
-        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
-        semantics: "ltlf", or "paper": Def. 16 of the paper to the letter.
-        start_ns, end_ns, every: evaluate every `every`th sample from `start_ns` to before `end_ns`.
-        strict_names: objects and signals that the log never has are errors; otherwise they are unknown.
-        reading: how to read the log, as for `read_trace`.
+        options: how to evaluate it (`constants`, `each`, `semantics`, `start_ns`, `end_ns`, `every`,
+            `strict_names`; see `Evaluating`), and how to read it, as for `read_trace`.
 
     Raises:
         UsageError: options that do not work, a missing file, an output that is an input.
@@ -83,18 +93,16 @@ def replay_log(
         raise UsageError(
             "keep applies to an annotated log with the log's own messages; give output, not layer"
         )
-    source = _source(log, reading)
-    window = Window(start_ns, end_ns, every)
+    constants, how = _evaluation(options)
+    source = _source(log, options)
     return run_replay(
         source,
         _files(specifications, source, constants),
-        ReplayOptions(
-            window, dict(each or {}), semantics, strict_names, None if keep is None else tuple(keep)
-        ),
+        replace(how, keep=None if keep is None else tuple(keep)),
         keep_series=True,
         keep_leaves=True,
         output=None if output is None else Path(output),
-        inputs=_inputs(log, specifications, reading),
+        inputs=_inputs(log, specifications, options),
         layer=layer,
     )
 
@@ -104,32 +112,28 @@ def write_report(
     specifications: Specifications | None = None,
     *,
     output: PathName,
-    constants: Mapping[str, float | str] | None = None,
-    each: Mapping[str, str] | None = None,
-    semantics: Semantics = "ltlf",
-    start_ns: int = 0,
-    end_ns: int = FOREVER,
-    every: int = 1,
-    strict_names: bool = False,
-    **reading: Unpack[Reading],
+    **options: Unpack[Evaluating],
 ) -> Replayed:
     """Evaluate specifications over a log and write a report as one HTML page.
 
     Args:
-        output: the page to write.
+        output: the page to write; its name ends in .html.
 
     The other arguments and errors are those of `replay_log`.
     """
-    source = _source(log, reading)
-    inputs = _inputs(log, specifications, reading)
-    refuse_inputs(Path(output), inputs)
-    return write_page(
-        source,
-        _files(specifications, source, constants),
-        Path(output),
-        ReplayOptions(Window(start_ns, end_ns, every), dict(each or {}), semantics, strict_names),
-        inputs=inputs,
-    )
+    constants, how = _evaluation(options)
+    inputs = _inputs(log, specifications, options)
+    refuse_output(Path(output), inputs)
+    source = _source(log, options)
+    return write_page(source, _files(specifications, source, constants), Path(output), how, inputs=inputs)
+
+
+def _evaluation(options: Evaluating) -> tuple[Mapping[str, float | str] | None, ReplayOptions]:
+    """Take the options of evaluating out, and return them; those of reading remain."""
+    window = Window(options.pop("start_ns", 0), options.pop("end_ns", FOREVER), options.pop("every", 1))
+    each, constants = options.pop("each", None), options.pop("constants", None)
+    semantics, strict_names = options.pop("semantics", "ltlf"), options.pop("strict_names", False)
+    return constants, ReplayOptions(window, dict(each or {}), semantics, strict_names)
 
 
 def verify(log: PathName, source: PathName | None = None, **reading: Unpack[Reading]) -> Verified:

@@ -74,3 +74,10 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
     copy.write_bytes(LOG.read_bytes())
     with pytest.raises(sr.UsageError, match=r"copy\.jsonl"):
         sr.write_report(copy, SPEC, output=copy)
+    log = tmp_path / "run.mcap"
+    log.write_bytes(b"a log that is needed")
+    with pytest.raises(sr.UsageError, match=r"report writes an HTML page; name it run\.html"):
+        sr.write_report(LOG, SPEC, output=log)
+    assert log.read_bytes() == b"a log that is needed"
+    with pytest.raises(TypeError, match="evry"):
+        sr.replay_log(LOG, SPEC, evry=2)  # type: ignore[call-arg]

@@ -32,7 +32,6 @@ from spatial_replay.spec.formula import (
     iter_nodes,
     operator_of,
 )
-from spatial_replay.spec.overrides import text_with_constants
 from spatial_replay.spec.relations import RELATION_NAMES
 
 DIMENSIONLESS = "1"
@@ -201,7 +200,7 @@ def specification_attachments(files: Sequence[Specification], prefix: str) -> li
 
 
 def _self_contained(file: Specification) -> Specification:
-    for text_of in (attrgetter("source"), text_with_constants, format_specification):
+    for text_of in (attrgetter("source"), format_specification):
         try:
             text = text_of(file)
             read_back = parse_specification(text, filename=file.filename)

@@ -18,7 +18,6 @@ from spatial_replay.cli.options import (
 )
 from spatial_replay.cli.output import print_verdicts
 from spatial_replay.cli.progress import progress
-from spatial_replay.errors import UsageError
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.semantics import Semantics
@@ -42,12 +41,9 @@ def report(request: EvaluationArguments, output: Path, semantics: Semantics) -> 
       spatial-replay report run.mcap --spec edited.spatial --semantics paper -o run.html
     """
     # imported here so that --help stays fast
-    from spatial_replay.logs.output_file import refuse_inputs
-    from spatial_replay.report.write import write_report
+    from spatial_replay.report.write import refuse_output, write_report
 
-    refuse_inputs(output, request.inputs)
-    if output.suffix.lower() not in (".html", ".htm"):
-        raise UsageError(f"-o {output}: report writes an HTML page; name it {output.stem}.html")
+    refuse_output(output, request.inputs)
     inputs = open_inputs(request)
     with progress("samples") as advance:
         replayed = write_report(

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from spatial_replay.errors import UsageError
 from spatial_replay.logs import topics as log_topics
 from spatial_replay.logs.messages import Messages
-from spatial_replay.logs.output_file import replacing
+from spatial_replay.logs.output_file import refuse_inputs, replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.source import Source, axes_of
 from spatial_replay.monitor.result import SpecResult
@@ -62,6 +63,17 @@ class Collector:
         return self._paths[name, object or ""].path
 
 
+def refuse_output(output: Path, inputs: Sequence[Path] = ()) -> None:
+    """Check that a report may be written, before the log is read.
+
+    Raises:
+        UsageError: the output is not named like a page, is an input, is a folder, or is in none.
+    """
+    refuse_inputs(output, inputs)
+    if output.suffix.lower() not in (".html", ".htm"):
+        raise UsageError(f"{output}: report writes an HTML page; name it {output.stem}.html")
+
+
 def write_report(
     source: Source,
     files: Sequence[Specification],
@@ -80,11 +92,12 @@ def write_report(
         advance: called with the number of samples of each block that is done.
 
     Raises:
-        UsageError: an option that cannot work, no sample in the window, the output is an input.
+        UsageError: an option that cannot work, no sample in the window, and what `refuse_output` refuses.
         SpecificationError: names that the log never has, if names are strict.
         LogError: no sample in the log.
         OutputError: the output cannot be written.
     """
+    refuse_output(output, inputs)
     collector = Collector()
     replay = Replay(source, files, options, keep_series=True, keep_leaves=True, show=collector.scene.add)
     with replacing(output, inputs) as stream:

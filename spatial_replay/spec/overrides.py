@@ -1,4 +1,4 @@
-"""Constants given from outside: for the specifications of several files, and written into their texts."""
+"""Constants given from outside, for the specifications of several files."""
 
 from __future__ import annotations
 
@@ -7,16 +7,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 
-from lark import Token
-
 from spatial_replay.errors import UsageError
-from spatial_replay.spec.diagnostics import Faults, SourceText, nearest_hint
-from spatial_replay.spec.format import format_duration, format_number
-from spatial_replay.spec.formula import Constant, Specification
+from spatial_replay.spec.diagnostics import nearest_hint
+from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import load_specification, parse_specification
-from spatial_replay.spec.parser import split_statements
-from spatial_replay.spec.relations import RELATION_NAMES
-from spatial_replay.spec.tokens import tokenize
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?", re.ASCII)
 
@@ -77,28 +71,6 @@ def load_specifications(
     ]
 
 
-def text_with_constants(file: Specification) -> str:
-    """Return the text of a specification with its constants' values, comments and everything else kept.
-
-    A constant that repeats another one follows it and stays as it is written.
-    """
-    text = file.source
-    for _ in file.constants:
-        written = parse_specification(text, filename=file.filename, profile=file.profile).constants
-        changed = [name for name, value in file.constants.items() if written.get(name) != value]
-        if not changed:
-            break
-        values = _values_by_name(text)
-        # one that is a plain number first: others may follow from it
-        name = min(changed, key=lambda each: any(token.type == "NAME" for token in values.get(each, ())))
-        if name not in values:
-            break
-        tokens = values[name]
-        start, end = tokens[0].start_pos or 0, tokens[-1].end_pos or 0
-        text = f"{text[:start]}{_written(file.constants[name])}{text[end:]}"
-    return text
-
-
 def _parsed(
     source: Path | SpecificationText, profile: str | None, constants: Mapping[str, float | str]
 ) -> Specification:
@@ -131,21 +103,3 @@ def _check_names(files: Sequence[Specification], constants: Mapping[str, float |
         if name not in known:
             hint = nearest_hint(name, known) or f"the constants are: {', '.join(own) or 'none'}"
             raise UsageError(f"there is no constant {name!r}; {hint}")
-
-
-def _values_by_name(text: str) -> dict[str, Sequence[Token]]:
-    """Return the tokens of the value of each constant that a text defines."""
-    faults = Faults(SourceText.of(text, "<text>"))
-    values: dict[str, Sequence[Token]] = {}
-    for group in split_statements(tokenize(text, RELATION_NAMES, faults), faults):
-        match group.tokens:
-            case [Token(type="CONST"), Token() as name, Token(type="EQUAL"), *value] if value:
-                ends = (index for index, token in enumerate(value) if token.type == "IN")
-                values.setdefault(str(name), value[: next(ends, len(value))])
-    return values
-
-
-def _written(constant: Constant) -> str:
-    if constant.duration_ns is not None:
-        return format_duration(constant.duration_ns)
-    return format_number(constant.value)
