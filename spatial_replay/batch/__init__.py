@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.batch.rows import Row, Task, rows_from_task
+    from spatial_replay.batch.rows import ResultRow, Task, rows_from_task
     from spatial_replay.batch.suite import Case, Conditions, Expectation, LogPattern, Suite, load_suite
 
 __all__ = [
@@ -22,7 +22,7 @@ __all__ = [
     "Conditions",
     "Expectation",
     "LogPattern",
-    "Row",
+    "ResultRow",
     "Suite",
     "Task",
     "load_suite",
@@ -32,7 +32,7 @@ __all__ = [
 __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
-        "rows": ("Row", "Task", "rows_from_task"),
+        "rows": ("ResultRow", "Task", "rows_from_task"),
         "suite": ("Case", "Conditions", "Expectation", "LogPattern", "Suite", "load_suite"),
     },
 )

@@ -66,7 +66,7 @@ class Task:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class ResultRow:
     """The result of one spec over one log, or the error in its place.
 
     Attributes:
@@ -119,7 +119,7 @@ class Row:
     error_kind: ErrorKind | None = None
 
 
-def rows_from_task(task: Task) -> tuple[tuple[Row, ...], ...]:
+def rows_from_task(task: Task) -> tuple[tuple[ResultRow, ...], ...]:
     """Open a log once, evaluate all its specifications over it, and return their rows.
 
     Returns:
@@ -193,30 +193,34 @@ def error_from_exception(error: Exception) -> tuple[str, ErrorKind]:
     return f"internal error: {type(error).__name__}: {error}", kind
 
 
-def error_rows(task: Task, message: str, kind: ErrorKind) -> tuple[tuple[Row, ...], ...]:
+def error_rows(task: Task, message: str, kind: ErrorKind) -> tuple[tuple[ResultRow, ...], ...]:
     """Return the rows of a task without results: one for each spec, with the error.
 
     A specification that cannot be parsed has one row, with an empty name.
     """
     error = _cut(message)
-    rows: list[tuple[Row, ...]] = []
+    rows: list[tuple[ResultRow, ...]] = []
     for text in task.specs:
         try:
             (file,) = parsed_specifications((text,), replace(task.conditions, constants=()))
         except SpatialReplayError:
-            rows.append((Row("", None, None, None, 1, error=error, error_kind=kind),))
+            rows.append((ResultRow("", None, None, None, 1, error=error, error_kind=kind),))
             continue
         lines = _lines(file)
         rows.append(
             tuple(
-                Row(spec.name, None, spec.id, spec.title, lines[spec.name], error=error, error_kind=kind)
+                ResultRow(
+                    spec.name, None, spec.id, spec.title, lines[spec.name], error=error, error_kind=kind
+                )
                 for spec in file.results
             )
         )
     return tuple(rows)
 
 
-def _rows_of_file(replay: Replay, replayed: Replayed, file: Specification, index: int) -> tuple[Row, ...]:
+def _rows_of_file(
+    replay: Replay, replayed: Replayed, file: Specification, index: int
+) -> tuple[ResultRow, ...]:
     lines = _lines(file)
     log = _row_of_log(replayed)
     pairs = zip(replay.trees, replayed.results, strict=True)
@@ -229,9 +233,9 @@ def _rows_of_file(replay: Replay, replayed: Replayed, file: Specification, index
     return tuple(rows)
 
 
-def _row_of_log(replayed: Replayed) -> Row:
+def _row_of_log(replayed: Replayed) -> ResultRow:
     """Return a row with what all rows of a log share."""
-    return Row(
+    return ResultRow(
         "",
         None,
         None,
@@ -246,7 +250,7 @@ def _row_of_log(replayed: Replayed) -> Row:
     )
 
 
-def _row(log: Row, result: SpecResult, first_ns: int, line: int) -> Row:
+def _row(log: ResultRow, result: SpecResult, first_ns: int, line: int) -> ResultRow:
     witness = _witness(result)
     deciding = None if witness is None else witness.deciding
     return replace(
@@ -279,7 +283,7 @@ def _witness(result: SpecResult) -> Witness | None:
     return result.causes[0].witness if result.causes else result.witness()
 
 
-def _idle_row(log: Row, spec: NamedSpec, line: int) -> Row:
+def _idle_row(log: ResultRow, spec: NamedSpec, line: int) -> ResultRow:
     """Return the row of a template that no object of the log fits: nothing violates it."""
     message = no_instances(spec.name, spec.parameter or "").message
     endless = float("inf")
