@@ -62,6 +62,16 @@ def printable(text: str, longest: int = _LONGEST) -> str:
     return shown if len(shown) <= longest else shown[: longest - 1] + "…"
 
 
+def escaped(text: str, kept: str = "") -> str:
+    """Return a text with escapes such as `\\x1b` in place of unprintable characters, but those in `kept`."""
+    if text.isprintable():
+        return text
+    return "".join(
+        each if each.isprintable() or each in kept else each.encode("unicode_escape").decode()
+        for each in text
+    )
+
+
 def nearest_hint(name: str, known: Iterable[str]) -> str:
     """Return "did you mean …?" with the known name closest to `name`, or ""."""
     if len(name) > _LONGEST_NAME:

@@ -18,6 +18,7 @@ from typing import NoReturn
 import click
 
 from spatial_replay import __version__
+from spatial_replay.cli.terminal import PROGRAM, show, show_diagnostics, show_message
 from spatial_replay.errors import (
     GeometryError,
     LogError,
@@ -29,7 +30,6 @@ from spatial_replay.errors import (
 )
 from spatial_replay.text import counted
 
-PROGRAM = "spatial-replay"
 COMPLETION_VARIABLE = "_SPATIAL_REPLAY_COMPLETE"
 DEBUG_VARIABLE = "SPATIAL_REPLAY_DEBUG"
 
@@ -205,20 +205,7 @@ def message_from_error(error: BaseException) -> str:
 def report_error(error: BaseException) -> None:
     """Write an error to standard error; with its traceback if SPATIAL_REPLAY_DEBUG is set."""
     if os.environ.get(DEBUG_VARIABLE):
-        click.echo("".join(traceback.format_exception(error)), err=True, nl=False)
+        show(*"".join(traceback.format_exception(error)).splitlines(), err=True)
     if isinstance(error, SpecificationError):
-        for diagnosis in error.diagnoses:
-            click.echo(diagnosis, err=True)
-    _print_message("error", message_from_error(error), colour="red")
-
-
-def warn(*messages: str) -> None:
-    """Write warnings to standard error, each as "spatial-replay: warning: …"."""
-    for message in messages:
-        _print_message("warning", message, colour="yellow")
-
-
-def _print_message(severity: str, message: str, colour: str) -> None:
-    coloured = sys.stderr.isatty() and not os.environ.get("NO_COLOR")
-    label = click.style(f"{severity}:", fg=colour, bold=True) if coloured else f"{severity}:"
-    click.echo(f"{PROGRAM}: {label} {message}", err=True, color=coloured)
+        show_diagnostics(error.diagnoses)
+    show_message("error", message_from_error(error), "red")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from spatial_replay.cli.application import warn
 from spatial_replay.cli.options import (
     ReadArguments,
     constants_option,
@@ -16,14 +16,20 @@ from spatial_replay.cli.options import (
     profile_option,
     reading_options,
     require_choice,
+    strict_names_option,
 )
 from spatial_replay.cli.progress import progress
+from spatial_replay.cli.terminal import show, show_diagnostics, show_json, warn
 from spatial_replay.errors import NoAutomatonError, SpecificationError, UsageError
-from spatial_replay.spec import check_names, format_formula
+from spatial_replay.spec import format_formula
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import iter_branches, label_of, title_text
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operator_of
 from spatial_replay.spec.tokens import quoted
+from spatial_replay.text import counted, json_number
+
+if TYPE_CHECKING:
+    from spatial_replay.monitor.plausibility import ThresholdRange
 
 _STANDARD_OUTPUT = "-"
 _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
@@ -34,9 +40,10 @@ _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
 @click.option(
     "--log",
     type=click.Path(path_type=Path),
-    help="Log whose objects and signals to compare names with.",
+    help="Log to compare names, thresholds and windows with.",
 )
 @constants_option
+@strict_names_option
 @profile_option
 @reading_options
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
@@ -50,6 +57,7 @@ def check(
     specification: Path,
     log: Path | None,
     constants: Mapping[str, float | str],
+    strict_names: bool,
     profile: str | None,
     as_json: bool,
     dfa: str | None,
@@ -76,42 +84,70 @@ def check(
     inputs = [specification] if log is None else [specification, log]
     if dfa is not None:
         _check_automaton_options(parsed, of, dfa, inputs)
-    compared, windows = _compare_with_log(parsed, log, reading) if log is not None else ((), ())
-    diagnostics = [*parsed.warnings, *compared]
-    errors = [each for each in diagnostics if each.severity == "error"]
-    for each in diagnostics:
-        if each.severity == "warning":
-            click.echo(each, err=True)
-    if errors:
-        raise SpecificationError(errors)
-    click.echo(_json_of(parsed, diagnostics, windows) if as_json else _text_of(parsed, windows))
+    compared = _compare_with_log(parsed, log, reading, strict_names) if log is not None else _Compared()
+    diagnostics = [*parsed.warnings, *compared.diagnostics]
+    show_diagnostics(diagnostics)
+    if any(each.severity == "error" for each in diagnostics):
+        raise SpecificationError([each for each in diagnostics if each.severity == "error"])
+    if as_json:
+        show_json(_document(parsed, diagnostics, compared))
+    else:
+        show(*_lines(parsed, compared))
     if dfa is not None:
         _write_automata(parsed, of, dfa, inputs, quiet=as_json)
 
 
-def _compare_with_log(
-    specification: Specification, log: Path, reading: ReadArguments
-) -> tuple[tuple[Diagnostic, ...], Sequence[str]]:
-    """Return what does not fit the log, and its windows in samples as seconds."""
-    # only needed with --log: log readers load the numerical libraries
-    from spatial_replay.sources.open_log import open_source
-    from spatial_replay.trace.plausibility import LogNumbers, plausibility_warnings, window_lines
+@dataclass(frozen=True, slots=True)
+class _Compared:
+    """What a comparison with a log found.
 
-    numbers = LogNumbers()
-    names: set[str] = set()
-    signals: set[str] = set()
-    classes: set[str] = set()
+    Attributes:
+        diagnostics: what does not fit.
+        windows: those in samples, as seconds.
+        ranges: what is compared with thresholds.
+        summary: of all, in one line.
+    """
+
+    diagnostics: tuple[Diagnostic, ...] = ()
+    windows: Sequence[str] = ()
+    ranges: Sequence[ThresholdRange] = ()
+    summary: str = ""
+
+
+def _compare_with_log(
+    specification: Specification, log: Path, reading: ReadArguments, strict_names: bool
+) -> _Compared:
+    """Compare names, thresholds, regions and windows with what a log has."""
+    # only needed with --log: log readers load the numerical libraries
+    from spatial_replay.monitor.plausibility import LogNumbers, plausibility_warnings, window_lines
+    from spatial_replay.replay import LogNames
+    from spatial_replay.sources.open_log import open_source
+
+    numbers, names = LogNumbers(specification), LogNames()
+    source = open_source(log, **reading)
     with progress("samples") as advance:
-        for block in open_source(log, **reading).iter_blocks():
-            names.update(block.trace.names)
-            signals.update(block.trace.signals)
-            classes.update(name for name in block.trace.classes if name is not None)
-            numbers = numbers.extended(block.trace)
+        for block in source.iter_blocks():
+            names.add(block.trace)
+            numbers.add(block.trace)
             warn(*block.trace.faults)
             advance(len(block.trace))
-    unknown = check_names(specification, sorted(names), sorted(signals), classes=sorted(classes))
+    unknown = names.check(specification, {})
+    missing = sum(each.severity == "error" for each in unknown)
+    if not strict_names:
+        unknown = tuple(replace(each, severity="warning") for each in unknown)
     doubtful = plausibility_warnings(specification, numbers)
-    return (*unknown, *doubtful), window_lines(specification, numbers)
+    found = [counted(missing, "name") + " that it never has"] if missing else []
+    others = len(unknown) - missing + len(doubtful)
+    found += [counted(others, "other warning" if missing else "warning")] if others else []
+    summary = (
+        f"compared with {counted(numbers.samples, 'sample')} of {source.name} over {numbers.seconds:.3f} s: "
+    )
+    return _Compared(
+        (*unknown, *doubtful),
+        window_lines(specification, numbers),
+        tuple(numbers.ranges.values()),
+        summary + (" and ".join(found) or "all names, thresholds and windows fit"),
+    )
 
 
 def _heading(spec: NamedSpec) -> str:
@@ -119,12 +155,14 @@ def _heading(spec: NamedSpec) -> str:
     return head if spec.title is None else f"{head} {quoted(title_text(spec))}"
 
 
-def _text_of(specification: Specification, windows: Sequence[str]) -> str:
-    blocks = [
-        "\n".join([_heading(spec), *(f"  {line}" for line in _tree_lines(spec.formula))])
-        for spec in specification.results
-    ]
-    return "\n\n".join([*blocks, "\n".join(windows)] if windows else blocks)
+def _lines(specification: Specification, compared: _Compared) -> Iterator[str]:
+    for number, spec in enumerate(specification.results):
+        if number:
+            yield ""
+        yield _heading(spec)
+        yield from (f"  {line}" for line in _tree_lines(spec.formula))
+    if compared.summary:
+        yield from ("", *compared.windows, *map(str, compared.ranges), compared.summary)
 
 
 def _tree_lines(formula: Formula) -> Iterator[str]:
@@ -135,34 +173,42 @@ def _tree_lines(formula: Formula) -> Iterator[str]:
         yield f"{identifier:>{width}}  {stem}{label_of(node)}"
 
 
-def _json_of(specification: Specification, diagnostics: list[Diagnostic], windows: Sequence[str]) -> str:
-    return json.dumps(
-        {
-            "file": specification.filename,
-            "profile": specification.profile,
-            "specifications": [
-                {
-                    "name": spec.name,
-                    "parameter": spec.parameter,
-                    "requirement": spec.id,
-                    "title": spec.title,
-                    "nodes": _node_rows(spec.formula),
-                }
-                for spec in specification.results
-            ],
-            "constants": {
-                name: {"value": each.value, "duration_ns": each.duration_ns, "range": each.range}
-                for name, each in specification.constants.items()
-            },
-            "windows": list(windows),
-            "warnings": [
-                {"line": each.line, "column": each.column, "message": each.message, "hint": each.hint}
-                for each in diagnostics
-            ],
+def _document(
+    specification: Specification, diagnostics: list[Diagnostic], compared: _Compared
+) -> dict[str, object]:
+    return {
+        "file": specification.filename,
+        "profile": specification.profile,
+        "specifications": [
+            {
+                "name": spec.name,
+                "parameter": spec.parameter,
+                "requirement": spec.id,
+                "title": spec.title,
+                "nodes": _node_rows(spec.formula),
+            }
+            for spec in specification.results
+        ],
+        "constants": {
+            name: {"value": each.value, "duration_ns": each.duration_ns, "range": each.range}
+            for name, each in specification.constants.items()
         },
-        indent=2,
-        ensure_ascii=False,
-    )
+        "windows": list(compared.windows),
+        "thresholds": [
+            {
+                "atom": each.atom.text,
+                "least": json_number(each.least) if each.known else None,
+                "greatest": json_number(each.greatest) if each.known else None,
+                "known": each.known,
+                "holding": each.holding,
+            }
+            for each in compared.ranges
+        ],
+        "warnings": [
+            {"line": each.line, "column": each.column, "message": each.message, "hint": each.hint}
+            for each in diagnostics
+        ],
+    }
 
 
 def _node_rows(formula: Formula) -> list[dict[str, object]]:
@@ -226,7 +272,7 @@ def _write_automata(
     text = dict(zip(_AUTOMATON_FILES, (dot_text, hoa_text, svg_text), strict=True))[path.suffix](chosen)
     with replacing(path, inputs) as stream:
         stream.write(text.encode())
-    click.echo(f"wrote {path}: {size_words(chosen)}", err=quiet)
+    show(f"wrote {path}: {size_words(chosen)}", err=quiet)
 
 
 def _print_automata(specification: Specification, names: Sequence[str]) -> None:
@@ -236,7 +282,7 @@ def _print_automata(specification: Specification, names: Sequence[str]) -> None:
     faults = []
     for name in names:
         try:
-            click.echo("\n" + words_text(automaton(specification, name)))
+            show("", *words_text(automaton(specification, name)).split("\n"))
         except NoAutomatonError as error:
             faults.append(str(error))
     if faults:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import click
 from click.shell_completion import get_completion_class
 
-from spatial_replay.cli.application import COMPLETION_VARIABLE, PROGRAM
+from spatial_replay.cli.application import COMPLETION_VARIABLE
+from spatial_replay.cli.terminal import PROGRAM, show_file
 from spatial_replay.errors import UsageError
 
 
@@ -22,4 +23,4 @@ def completion(context: click.Context, shell: str) -> None:
     kind = get_completion_class(shell)
     if kind is None:
         raise UsageError(f"no completion for {shell!r}; choose bash, zsh or fish")
-    click.echo(kind(context.find_root().command, {}, PROGRAM, COMPLETION_VARIABLE).source())
+    show_file(kind(context.find_root().command, {}, PROGRAM, COMPLETION_VARIABLE).source())

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import click
 
-from spatial_replay.cli.application import exit_code_from_verdicts, warn
+from spatial_replay.cli.application import exit_code_from_verdicts
 from spatial_replay.cli.options import (
     EvaluationArguments,
     EvaluationInputs,
@@ -19,6 +18,7 @@ from spatial_replay.cli.options import (
     warn_of_input,
 )
 from spatial_replay.cli.progress import progress
+from spatial_replay.cli.terminal import show, show_json, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.trace.time_points import text_from_duration_ns, time_point_from_text
 
@@ -70,9 +70,10 @@ def explain(
         warn(f"--at {at} is after the last sample, at {last}")
     results = explain_results(replayed, node=node, object=object_name, goes_on=goes_on)
     if as_json:
-        click.echo(json.dumps([each.document for each in results], indent=2, ensure_ascii=False))
+        show_json([each.document for each in results])
     else:
-        click.echo("\n\n".join("\n".join([*_requirement(each), *each.sentences]) for each in results))
+        for number, each in enumerate(results):
+            show(*([""] if number else []), *_requirement(each), *each.sentences)
     return exit_code_from_verdicts((each.verdict for each in results), bool(replayed.faults))
 
 

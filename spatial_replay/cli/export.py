@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spatial_replay.cli.application import ExitCode, warn
+from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import output_option
 from spatial_replay.cli.progress import progress
+from spatial_replay.cli.terminal import show, warn
 from spatial_replay.text import counted
 
 if TYPE_CHECKING:
@@ -51,5 +52,5 @@ def export(annotated: Path, output: Path, quantity: Quantity) -> int:
             advance=advance,
         )
     warn(*faults)
-    click.echo(f"wrote {output}: {counted(rows, 'row')}, {counted(columns, 'node')}")
+    show(f"wrote {output}: {counted(rows, 'row')}, {counted(columns, 'node')}")
     return ExitCode.DAMAGED if faults else ExitCode.SATISFIED

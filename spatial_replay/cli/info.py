@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import shutil
 from collections.abc import Iterable, Iterator
@@ -13,12 +12,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spatial_replay.cli.application import ExitCode, warn
+from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import ReadArguments, reading_options
 from spatial_replay.cli.output import decision_lines, decision_rows
 from spatial_replay.cli.progress import progress
+from spatial_replay.cli.terminal import show, show_file, show_json, warn
 from spatial_replay.errors import UsageError
-from spatial_replay.text import counted
+from spatial_replay.text import counted, escaped
 
 if TYPE_CHECKING:
     from spatial_replay.bags.reader import MessageReader
@@ -95,10 +95,9 @@ def info(
     faults = tuple(dict.fromkeys((*overview.faults, *(surveyed.faults if surveyed else ()))))
     warn(*dict.fromkeys((*faults, *(surveyed.remarks if surveyed else ()), *overview.remarks)))
     if as_json:
-        click.echo(json.dumps(_document(overview, surveyed, faults), indent=2, ensure_ascii=False))
+        show_json(_document(overview, surveyed, faults))
     else:
-        for line in _lines(overview, surveyed, bool(faults)):
-            click.echo(line)
+        show(*_lines(overview, surveyed, bool(faults)))
     return ExitCode.DAMAGED if faults else ExitCode.SATISFIED
 
 
@@ -111,10 +110,9 @@ def _print_decisions(log: Path, as_json: bool) -> int:
     if as_json:
         rows = decision_rows(recorded.decisions)
         document = {"name": log.name, "damaged": bool(recorded.faults), "decisions": rows}
-        click.echo(json.dumps(document, indent=2, ensure_ascii=False))
+        show_json(document)
     else:
-        for line in decision_lines(log, recorded.decisions, shutil.get_terminal_size((100, 24)).columns):
-            click.echo(line)
+        show(*decision_lines(log, recorded.decisions, shutil.get_terminal_size((100, 24)).columns))
     return ExitCode.DAMAGED if recorded.faults else ExitCode.SATISFIED
 
 
@@ -126,7 +124,7 @@ def _print_layout(log: Path) -> int:
     source = open_source(log)
     for attachment in source.attachments():
         if attachment.name == LAYOUT:
-            click.echo(attachment.data.decode("utf-8", "replace"))
+            show_file(attachment.data.decode("utf-8", "replace"))
             return ExitCode.SATISFIED
     raise UsageError(
         f"{source.name} has no layout; logs written by spatial-replay record or replay -o have one"
@@ -153,8 +151,8 @@ def _print_specification(log: Path, name: str) -> int:
         raise UsageError(f"{source.name} has no specification {name!r}; files: {files}; specs: {specs}")
     for each in chosen:
         if len(chosen) > 1:
-            click.echo(f"# {each.filename}")
-        click.echo(each.text, nl=not each.text.endswith("\n"))
+            show(f"# {each.filename}")
+        show_file(each.text)
     return ExitCode.SATISFIED
 
 
@@ -183,7 +181,7 @@ def _print_mapping(log: Path, reader: MessageReader | None, as_json: bool) -> in
     with progress("messages") as advance:
         surveyed = survey(reader, advance, whole=False)
     warn(*surveyed.faults, *surveyed.remarks)
-    click.echo(surveyed.mapping, nl=False)
+    show_file(surveyed.mapping)
     return ExitCode.DAMAGED if surveyed.faults else ExitCode.SATISFIED
 
 
@@ -307,7 +305,8 @@ def _unreadable(count: int) -> str:
 
 def _table(rows: Iterable[tuple[str, ...]]) -> Iterator[str]:
     """Yield rows as lines with aligned columns."""
-    cells = list(rows)
+    # escaped here, so that what is printed is as wide as what is measured
+    cells = [tuple(map(escaped, row)) for row in rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     for row in cells:
         yield "  " + "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict, TypeVar
 
 import click
 
-from spatial_replay.cli.application import warn
+from spatial_replay.cli.terminal import show_diagnostics, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.text import counted
 from spatial_replay.trace.time_points import time_point_from_text
@@ -204,6 +204,12 @@ def input_files(*files: Path, reading: ReadArguments) -> tuple[Path, ...]:
     return files if mapping is None else (*files, mapping)
 
 
+strict_names_option = click.option(
+    "--strict-names",
+    is_flag=True,
+    help="Refuse names that the log never has, instead of warning that they are unknown.",
+)
+
 _EVALUATION = (
     click.argument("log", type=click.Path(path_type=Path)),
     specs_option("Specification file; repeat for several.  [default: those in the log]"),
@@ -224,11 +230,7 @@ _EVALUATION = (
         help="Objects to evaluate a template for: one class, or VAR=all.",
     ),
     constants_option,
-    click.option(
-        "--strict-names",
-        is_flag=True,
-        help="Refuse names that the log never has, instead of warning that they are unknown.",
-    ),
+    strict_names_option,
     profile_option,
 )
 
@@ -268,8 +270,7 @@ def open_inputs(request: EvaluationArguments) -> EvaluationInputs:
 
     source = open_source(request.log, **request.reading)
     files = load_files(request.specs, source, profile=request.profile, constants=request.constants)
-    for warning in (warning for file in files for warning in file.warnings):
-        click.echo(warning, err=True)
+    show_diagnostics(warning for file in files for warning in file.warnings)
     window, each = _window(source, request), _each(request.choices)
     return EvaluationInputs(source, files, window, each, request.strict_names)
 
@@ -345,8 +346,7 @@ def require_choice(specification: Specification, of: str | None) -> None:
 def warn_of_input(result: Replayed | Recorded) -> None:
     """Warn of what was lost, remarkable or unreadable in a log, and of names that it never has."""
     warn(*result.faults, *result.remarks)
-    for name in result.missing:
-        click.echo(replace(name, severity="warning"), err=True)
+    show_diagnostics(replace(name, severity="warning") for name in result.missing)
     if result.unreadable:
         count = counted(result.unreadable, "observation")
         one = result.unreadable == 1

@@ -10,9 +10,8 @@ from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Final
 
-import click
-
-from spatial_replay.text import counted, json_number
+from spatial_replay.cli.terminal import Coloured, show, show_json
+from spatial_replay.text import counted, escaped, json_number
 from spatial_replay.trace.time_points import text_from_duration_ns
 
 if TYPE_CHECKING:
@@ -29,20 +28,21 @@ def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | Non
     """Print one line for each result, and another one for a sliding window."""
     seconds = (replayed.end_ns - replayed.start_ns) / 1e9
     damaged = ", damaged: verdicts are over what could be read" if replayed.faults else ""
-    click.echo(f"{replayed.log}: {counted(replayed.samples, 'sample')} over {seconds:.3f} s{damaged}")
-    titles = [_titled(result) for result in replayed.results]
+    show(f"{replayed.log}: {counted(replayed.samples, 'sample')} over {seconds:.3f} s{damaged}")
+    # escaped here, so that what is printed is as wide as what is measured
+    titles = [escaped(_titled(result)) for result in replayed.results]
     width = max(map(len, titles), default=0)
     for title, result in zip(titles, replayed.results, strict=True):
-        verdict = click.style(f"{result.verdict:<9}", fg=_COLOURS[result.verdict], bold=True)
-        click.echo(f"  {title:<{width}}  {verdict}  {_numbers(result, replayed.first_ns)}")
+        verdict = Coloured(f"{result.verdict:<9}", _COLOURS[result.verdict])
+        show((f"  {title:<{width}}  ", verdict, f"  {_numbers(result, replayed.first_ns)}"))
         for line in _below(result, replayed.first_ns):
-            click.echo(f"  {'':<{width}}  {line}")
+            show(f"  {'':<{width}}  {line}")
         if window_ns is not None:
-            click.echo(f"  {'':<{width}}  {_over_window(result, replayed.first_ns, window_ns)}")
+            show(f"  {'':<{width}}  {_over_window(result, replayed.first_ns, window_ns)}")
     for part in replayed.vacuous:
-        click.echo(f"  vacuous: {part.message}")
+        show(f"  vacuous: {part.message}")
     if output is not None:
-        click.echo(f"wrote {output}")
+        show(f"wrote {output}")
 
 
 def write_document(
@@ -52,14 +52,11 @@ def write_document(
     from spatial_replay.logs.output_file import replacing
     from spatial_replay.replay import document_from_replay
 
-    text = json.dumps(
-        document_from_replay(replayed, signal=signal, window_ns=window_ns),
-        ensure_ascii=False,
-        allow_nan=False,
-    )
+    document = document_from_replay(replayed, signal=signal, window_ns=window_ns)
     if file == "-":
-        click.echo(text)
+        show_json(document, indent=None)
         return
+    text = json.dumps(document, ensure_ascii=False, allow_nan=False)
     with replacing(Path(file), inputs) as stream:
         stream.write(text.encode() + b"\n")
 

@@ -18,6 +18,7 @@ from spatial_replay.cli.options import (
 )
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.record import SCENARIOS, SimulationArguments, parse_injections, simulation_options
+from spatial_replay.cli.terminal import show
 from spatial_replay.text import counted
 
 
@@ -90,16 +91,16 @@ def planning_command(scenario: str) -> click.Command:
                 inputs=() if spec is None else (spec,),
                 advance=advance,
             )
-        click.echo(
+        show(
             f"wrote {output}: {counted(planned.samples, 'sample')} over {planned.seconds:.3f} s; "
             f"{counted(planned.steps, 'motion')}, {counted(planned.pruned, 'edge')} given up"
         )
-        click.echo(f"planning took {planned.planning_s:.2f} s", err=True)
-        click.echo(f"the planner: {planned.reason}")
+        show(f"planning took {planned.planning_s:.2f} s", err=True)
+        show(f"the planner: {planned.reason}")
         if planned.ended == "no path":
             command_line = shlex.join(["spatial-replay", "info", str(output), "--decisions"])
-            click.echo(f"  {command_line} shows what was tried, and why it was given up")
-        click.echo(f"the log: {planned.name} is {planned.verdict}")
+            show(f"  {command_line} shows what was tried, and why it was given up")
+        show(f"the log: {planned.name} is {planned.verdict}")
         # a planner that timed out ended the run: an unreached goal is then no violation
         return exit_code_from_verdicts(["unknown" if planned.ended == "wait" else planned.verdict])
 

@@ -24,6 +24,7 @@ from spatial_replay.cli.options import (
     warn_of_input,
 )
 from spatial_replay.cli.progress import progress
+from spatial_replay.cli.terminal import show
 from spatial_replay.text import counted
 from spatial_replay.trace.time_points import duration_ns_from_text
 
@@ -144,11 +145,11 @@ def recording_command(scenario: str) -> click.Command:
                 inputs=specs,
                 advance=advance,
             )
-        click.echo(
+        show(
             f"wrote {output}: {counted(recorded.samples, 'sample')} over {recorded.seconds:.3f} s of "
             f"{counted(len(recorded.objects), 'object')}: {', '.join(recorded.objects)}"
         )
-        click.echo(f"the robot: {recorded.outcome}")
+        show(f"the robot: {recorded.outcome}")
         return ExitCode.SATISFIED
 
     return command
@@ -205,7 +206,7 @@ def tracks(
         recorded = record_source(source, output, files, inputs=inputs, advance=advance)
     warn_of_input(recorded)
     seconds = (recorded.end_ns - recorded.start_ns) / 1e9
-    click.echo(
+    show(
         f"wrote {output}: {counted(recorded.samples, 'sample')} over {seconds:.3f} s of "
         f"{counted(len(recorded.objects), 'object')}: {_listed(recorded.objects)}"
     )

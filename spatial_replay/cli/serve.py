@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spatial_replay.cli.application import ExitCode, warn
+from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import (
     EvaluationArguments,
     evaluation_options,
@@ -18,6 +18,7 @@ from spatial_replay.cli.options import (
 )
 from spatial_replay.cli.output import print_verdicts
 from spatial_replay.cli.progress import progress
+from spatial_replay.cli.terminal import show, show_file, warn
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.semantics import Semantics
@@ -70,7 +71,7 @@ def serve(
     """
     evaluated = _evaluated(request, keep, semantics)
     if layout:
-        click.echo(evaluated.layout.data)
+        show_file(evaluated.layout.data.decode())
         return None
     warn_of_input(evaluated.replayed)
     try:
@@ -89,9 +90,9 @@ def _serve(evaluated: Evaluated, host: str, port: int, play: bool) -> None:
         print_verdicts(evaluated.replayed, None)
         if not _is_loopback(host):
             warn(f"anyone who can reach {server.address} can read this log")
-        click.echo(f"serving at {server.address}; stop with Ctrl-C")
-        click.echo(f"  in Foxglove or Lichtblick: Open connection, Foxglove WebSocket, {server.address}")
-        click.echo("  layout to import there: run the same command with --layout > live.json")
+        show(f"serving at {server.address}; stop with Ctrl-C")
+        show(f"  in Foxglove or Lichtblick: Open connection, Foxglove WebSocket, {server.address}")
+        show("  layout to import there: run the same command with --layout > live.json")
         server.wait()
 
 

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import click
 
-from spatial_replay.cli.application import ExitCode, warn
+from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import ReadArguments, reading_options
 from spatial_replay.cli.progress import progress
+from spatial_replay.cli.terminal import show, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.text import counted
 
@@ -55,7 +56,7 @@ def verify(log: Path, source: Path | None, decisions: bool, reading: ReadArgumen
     faults = list(verified.faults)
     differences = [f"{log.name}: {each}" for each in verified.differences]
     if verified.recorded and not differences:
-        click.echo(f"{log.name}: samples, messages, specifications and results match")
+        show(f"{log.name}: samples, messages, specifications and results match")
     if decisions:
         planned = own if original is None else original
         with progress("samples") as advance:
@@ -63,11 +64,11 @@ def verify(log: Path, source: Path | None, decisions: bool, reading: ReadArgumen
         faults += recomputed.faults
         differences += [f"{planned.name}: {each}" for each in recomputed.differences]
         if not recomputed.differences:
-            click.echo(
+            show(
                 f"{planned.name}: {counted(recomputed.decisions, 'decision')} recomputed with "
                 f"{counted(recomputed.maps, 'map')}, all match"
             )
     warn(*dict.fromkeys(faults))
     for difference in differences:
-        click.echo(difference)
+        show(difference)
     return ExitCode.VIOLATED if differences else ExitCode.SATISFIED

@@ -7,6 +7,7 @@ import os
 import click
 
 from spatial_replay.cli.progress import progress
+from spatial_replay.cli.terminal import show
 from spatial_replay.errors import OutputError
 
 
@@ -35,4 +36,4 @@ def warmup(jobs: int | None) -> None:
         raise OutputError(
             "no folder for compiled code can be written; name one with SPATIAL_REPLAY_CACHE=FOLDER"
         )
-    click.echo(f"compiled into {folder}")
+    show(f"compiled into {folder}")

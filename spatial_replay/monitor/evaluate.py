@@ -31,7 +31,8 @@ class Evaluation(Displayed):
 
     Attributes:
         specification: what was evaluated.
-        objects, signals: the names in the trace.
+        objects, signals, classes: the names in the trace.
+        each: the objects that templates were evaluated for, by parameter.
     """
 
     results: tuple[SpecResult, ...]
@@ -39,16 +40,21 @@ class Evaluation(Displayed):
     specification: Specification
     objects: tuple[str, ...]
     signals: tuple[str, ...]
+    classes: tuple[str, ...]
+    each: Mapping[str, str]
 
     @cached_property
     def remarks(self) -> tuple[Diagnostic, ...]:
         """Diagnostics about the specification's names in this trace (see `check_names`).
 
         A warning for each object and signal that the trace never has, and which is therefore unknown in every
-        sample, and for each object hidden by a definition of the same name.
+        sample, for each class that a template was to be evaluated for and that it never has, and for each
+        object hidden by a definition of the same name.
         """
         # computed on demand: it takes as long as the evaluation itself
-        found = check_names(self.specification, self.objects, self.signals)
+        found = check_names(
+            self.specification, self.objects, self.signals, classes=self.classes, each=self.each
+        )
         return tuple(replace(remark, severity="warning") for remark in found)
 
     @cached_property
@@ -158,8 +164,8 @@ def evaluate(
         start_ns, end_ns: evaluate the samples from start to before end; terms that look back (`a[-3]`) may
             look before the start.
         each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
-        strict_names: objects and signals that the trace never has are errors; otherwise they are unknown, and
-            `Evaluation.remarks` warns of them.
+        strict_names: names that the trace never has are errors; otherwise objects and signals are unknown, a
+            template has no result for a class, and `Evaluation.remarks` warns of them.
 
     Raises:
         SpecificationError: with `strict_names`, names that the trace never has.
@@ -176,7 +182,7 @@ def evaluate(
     if begin >= end:
         raise UsageError(_nothing_in_window(trace, start_ns, end_ns))
     if strict_names:
-        _require_names(specification, trace)
+        _require_names(specification, trace, each or {})
     stream = EvaluationStream(
         find_instances(specification, each or {}, [trace], *window),
         specification.regions,
@@ -186,7 +192,15 @@ def evaluate(
         SpecResult.from_stream(own, Evidence(own.instance, specification.regions, lambda: [trace]), block)
         for own, block in zip(stream.streams, stream.extend(trace), strict=True)
     )
-    return Evaluation(results, semantics, specification, trace.names, tuple(trace.signals))
+    return Evaluation(
+        results,
+        semantics,
+        specification,
+        trace.names,
+        tuple(trace.signals),
+        _classes(trace),
+        dict(each or {}),
+    )
 
 
 def _require_trace(value: object) -> None:
@@ -195,8 +209,14 @@ def _require_trace(value: object) -> None:
         raise UsageError(f"trace is {shortened(value)}; {remedy}")
 
 
-def _require_names(specification: Specification, trace: Trace) -> None:
-    remarks = check_names(specification, trace.names, tuple(trace.signals), where="trace")
+def _classes(trace: Trace) -> tuple[str, ...]:
+    return tuple(name for name in trace.classes if name)
+
+
+def _require_names(specification: Specification, trace: Trace, each: Mapping[str, str]) -> None:
+    remarks = check_names(
+        specification, trace.names, tuple(trace.signals), where="trace", classes=_classes(trace), each=each
+    )
     missing = [remark for remark in remarks if remark.severity == "error"]
     if missing:
         raise SpecificationError(missing)

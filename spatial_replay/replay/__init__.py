@@ -18,7 +18,13 @@ if TYPE_CHECKING:
     from spatial_replay.replay.engine import Replay, Replayed
     from spatial_replay.replay.loaded_log import Evaluated, LoadedLog, constant_text, constant_values
     from spatial_replay.replay.playback import Playback
-    from spatial_replay.replay.selection import ReplayOptions, Window, first_sample_ns, has_samples_from
+    from spatial_replay.replay.selection import (
+        LogNames,
+        ReplayOptions,
+        Window,
+        first_sample_ns,
+        has_samples_from,
+    )
     from spatial_replay.replay.table import QUANTITIES, export_table
     from spatial_replay.replay.verification import verify_certificate
 
@@ -27,6 +33,7 @@ __all__ = [
     "Evaluated",
     "Explanation",
     "LoadedLog",
+    "LogNames",
     "Playback",
     "Replay",
     "ReplayOptions",
@@ -52,7 +59,7 @@ __getattr__, __dir__ = loaded_when_used(
         "document": ("Explanation", "document_from_replay", "explain_results"),
         "engine": ("Replay", "Replayed"),
         "playback": ("Playback",),
-        "selection": ("ReplayOptions", "Window", "first_sample_ns", "has_samples_from"),
+        "selection": ("LogNames", "ReplayOptions", "Window", "first_sample_ns", "has_samples_from"),
         "table": ("QUANTITIES", "export_table"),
         "loaded_log": ("Evaluated", "LoadedLog", "constant_text", "constant_values"),
         "verification": ("verify_certificate",),

@@ -25,7 +25,13 @@ from spatial_replay.monitor.stream import SeriesBlock, join_blocks
 from spatial_replay.monitor.vacuity import Vacuous, no_instances
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.monitor.witness.path import Evidence
-from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Selection, first_sample_ns
+from spatial_replay.replay.selection import (
+    DEFAULT_OPTIONS,
+    LogNames,
+    ReplayOptions,
+    Selection,
+    first_sample_ns,
+)
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.trace import Trace
@@ -118,8 +124,7 @@ class Replay:
         self._faults: list[str] = []
         self._remarks: list[str] = []
         self._topics: set[str] = set()
-        self._names: set[str] = set()
-        self._signals: set[str] = set()
+        self._names = LogNames()
         self._samples = self._unreadable = self._encoded = self._end_ns = 0
         self._times: list[int] = []
 
@@ -180,8 +185,7 @@ class Replay:
 
     def _add(self, trace: Trace, own: Messages, stretches: Sequence[SeriesBlock]) -> None:
         self._faults += trace.faults
-        self._names.update(trace.names)
-        self._signals.update(trace.signals)
+        self._names.add(trace)
         self._samples += len(trace)
         self._unreadable += trace.unreadable_count
         if len(trace):
@@ -204,7 +208,7 @@ class Replay:
     def _replayed(self) -> Replayed:
         if not self._samples:
             raise self._selection.nothing_to_evaluate(self._faults)
-        missing = self._selection.missing_names(self._names, self._signals)
+        missing = self._selection.missing_names(self._names)
         options = self._selection.options
         return Replayed(
             log=self._source.name,

@@ -26,7 +26,13 @@ from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.replay.engine import Replayed, idle_templates, replayed_specs
 from spatial_replay.replay.kept_messages import KEEP_ALL
 from spatial_replay.replay.own_messages import OwnMessages
-from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Selection, first_sample_ns
+from spatial_replay.replay.selection import (
+    DEFAULT_OPTIONS,
+    LogNames,
+    ReplayOptions,
+    Selection,
+    first_sample_ns,
+)
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_duration, format_specification
@@ -103,7 +109,9 @@ class LoadedLog:
         self.inside = selection.inside(self.trace)
         if not len(self.inside):
             raise selection.nothing_to_evaluate(self.faults)
-        self.missing = selection.missing_names(self.trace.names, tuple(self.trace.signals))
+        names = LogNames()
+        names.add(self.trace)
+        self.missing = selection.missing_names(names)
         self.first_ns = first_sample_ns(source) if options.window.start_ns else int(self.trace.times_ns[0])
         self._places = _places(self._files)
         self.constants: Mapping[str, Constant] = self._constants(self._files)

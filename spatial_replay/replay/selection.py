@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
@@ -15,7 +15,7 @@ from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.source import Source, read_ahead, read_blocks, within
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
 from spatial_replay.monitor.atoms.delays import look_back
-from spatial_replay.monitor.instances import Choice, Instance, find_instances
+from spatial_replay.monitor.instances import Instance, find_instances
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
 from spatial_replay.replay.kept_messages import source_keeping
 from spatial_replay.spec import check_names
@@ -54,7 +54,8 @@ class ReplayOptions:
         window: the samples to evaluate.
         each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
         semantics: "ltlf", or "paper": Def. 16 of the paper to the letter.
-        strict_names: objects and signals that the log never has are errors; otherwise they are unknown.
+        strict_names: names that the log never has are errors; otherwise objects and signals are unknown, and
+            a template has no result for a class.
         keep: which messages of the log a copy keeps: "all", "mapped", patterns of topics; () for the samples
             only. None for all in a copy and, without one, those that need not be read for it.
     """
@@ -84,6 +85,26 @@ def first_sample_ns(source: Source) -> int:
 def has_samples_from(source: Source, time_ns: int) -> bool:
     """Say whether a log has samples at or after a time."""
     return any(len(block.trace) for block in read_blocks(source, time_ns))
+
+
+@dataclass(slots=True)
+class LogNames:
+    """The names of a log, collected while it is read: of its objects, signals and classes."""
+
+    objects: set[str] = field(default_factory=set)
+    signals: set[str] = field(default_factory=set)
+    classes: set[str] = field(default_factory=set)
+
+    def add(self, trace: Trace) -> None:
+        """Add those of some samples."""
+        self.objects.update(trace.names)
+        self.signals.update(trace.signals)
+        self.classes.update(name for name in trace.classes if name)
+
+    def check(self, file: Specification, each: Mapping[str, str]) -> tuple[Diagnostic, ...]:
+        """Compare the names of a specification with these (see `check_names`)."""
+        objects, signals, classes = sorted(self.objects), sorted(self.signals), sorted(self.classes)
+        return check_names(file, objects, signals, classes=classes, each=each)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,37 +175,30 @@ class Selection:
         """Return what is to be evaluated of a specification; for templates, the source is read for objects.
 
         Raises:
-            UsageError: a template without its objects, or objects of a class that the log does not have.
+            UsageError: a template without its objects.
         """
         parameters = {spec.parameter for spec in file.results}
         own = {
             parameter: choice for parameter, choice in self.options.each.items() if parameter in parameters
         }
-        choices = [Choice.parse(parameter, choice) for parameter, choice in own.items()]
-        classes: set[str | None] = set()
-        traces = self._iter_with_classes(classes)
-        instances = find_instances(file, own, traces, self.window.start_ns, self.window.end_ns)
-        for choice in choices:
-            self._check_class(choice, classes)
-        return instances
+        return find_instances(file, own, self.iter_traces(), self.window.start_ns, self.window.end_ns)
 
-    def missing_names(self, objects: Collection[str], signals: Collection[str]) -> tuple[Diagnostic, ...]:
-        """Return a warning for each object and signal that a specification names and the log never has.
+    def missing_names(self, names: LogNames) -> tuple[Diagnostic, ...]:
+        """Return a warning for each object, signal and class that is asked for and that the log never has.
 
         Args:
-            objects, signals: names in the window.
+            names: those in the window.
 
         Raises:
             SpecificationError: it lacks some, and names are strict.
         """
-        missing = self._missing_names(set(objects), set(signals))
+        missing = self._missing_names(names)
         if missing and not self.window.is_whole:
             # an object that appears outside the window is no mistake in the specification
-            names, others = set(objects), set(signals)
+            whole = LogNames()
             for block in read_blocks(self.source):
-                names.update(block.trace.names)
-                others.update(block.trace.signals)
-            missing = self._missing_names(names, others)
+                whole.add(block.trace)
+            missing = self._missing_names(whole)
         if missing and self.options.strict_names:
             raise SpecificationError(missing)
         return tuple(replace(each, severity="warning") for each in missing)
@@ -209,28 +223,8 @@ class Selection:
             f"{(last_ns - first_ns) / 1e9:.3f} s"
         )
 
-    def _iter_with_classes(self, classes: set[str | None]) -> Iterator[Trace]:
-        """Read the samples, and collect the classes of their objects in `classes`."""
-        for block, trace in self.iter_blocks():
-            classes.update(block.trace.classes)
-            yield trace
-
-    def _check_class(self, choice: Choice, classes: set[str | None]) -> None:
-        """Check that the log has an object of the chosen class, in the window or elsewhere."""
-        if not any(map(choice.fits, classes)) and not self.window.is_whole:
-            for block in read_blocks(self.source):
-                classes.update(block.trace.classes)
-        if choice.class_name is not None and not any(map(choice.fits, classes)):
-            known = ", ".join(sorted(name for name in classes if name)) or "none"
-            raise UsageError(
-                f"no object of {self.source.name} is of the class {choice.class_name!r}; "
-                f"its classes are: {known}"
-            )
-
-    def _missing_names(self, objects: set[str], signals: set[str]) -> list[Diagnostic]:
-        remarks = [
-            remark for file in self.files for remark in check_names(file, sorted(objects), sorted(signals))
-        ]
+    def _missing_names(self, names: LogNames) -> list[Diagnostic]:
+        remarks = [remark for file in self.files for remark in names.check(file, self.options.each)]
         return [remark for remark in remarks if remark.severity == "error"]
 
 

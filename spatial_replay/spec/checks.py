@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from types import MappingProxyType
@@ -32,6 +32,9 @@ from spatial_replay.spec.tokens import BINARY_TYPES, STATEMENT_TYPES, quoted, sp
 from spatial_replay.spec.units import LENGTHS, units_of
 from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, substitute, terms_of
 
+_NO_CHOICE: Mapping[str, str] = MappingProxyType({})
+_LISTED = 12
+"""Names that a hint lists."""
 _TIGHTNESS = MappingProxyType({"IFF": 0, "IMPLIES": 1, "OR": 2, "XOR": 3, "AND": 4})
 
 
@@ -184,6 +187,7 @@ def check_names(
     *,
     where: str = "log",
     classes: Iterable[str] = (),
+    each: Mapping[str, str] = _NO_CHOICE,
 ) -> tuple[Diagnostic, ...]:
     """Compare the names of a specification with those of a log.
 
@@ -192,10 +196,12 @@ def check_names(
         signals: names of its numeric signals.
         where: what has them, if not a log.
         classes: of its objects.
+        each: for parameters of templates, the objects that they stand for: "all", "class:NAME".
 
     Returns:
-        An error for each object and signal that the log never has, with the nearest that it has; a
-        warning for each object of the log that a definition of the same name hides.
+        An error for each object and signal that the log never has, and each class that a template is to be
+        evaluated for, with the nearest that it has; a warning for each object of the log that a definition
+        of the same name hides.
     """
     objects, numeric = tuple(known), tuple(signals)
     known_classes = tuple(classes)
@@ -213,14 +219,20 @@ def check_names(
         )
         for kind, name, candidates in missing
     ]
+    for spec in specification.results:
+        kind, _, name = each.get(spec.parameter or "", "all").partition(":")
+        if kind == "class" and name.casefold() not in {known.casefold() for known in known_classes}:
+            hint = " ".join(
+                filter(None, (nearest_hint(name, known_classes), _listing("class", known_classes)))
+            )
+            found.append(
+                source.diagnostic("error", spec.span, f"the {where} never has the class {name!r}", hint)
+            )
     for name, span in defined.items():
         if name in objects:
             message = f"the {where} has an object {name!r}, which this definition hides"
             found.append(source.diagnostic("warning", span, message, "give the definition another name"))
     return tuple(sorted(found, key=lambda each: (each.line, each.column)))
-
-
-_LISTED = 12
 
 
 def _class_hint(name: str, kind: str, classes: Iterable[str]) -> str:
@@ -233,10 +245,11 @@ def _class_hint(name: str, kind: str, classes: Iterable[str]) -> str:
 
 
 def _listing(kind: str, names: tuple[str, ...]) -> str:
+    kinds = "classes" if kind == "class" else f"{kind}s"
     if not names:
-        return f"it has no {kind}s"
+        return f"it has no {kinds}"
     listed = ", ".join(names[:_LISTED])
-    return f"its {kind}s are {listed}" + (", ..." if len(names) > _LISTED else "")
+    return f"its {kinds} are {listed}" + (", ..." if len(names) > _LISTED else "")
 
 
 def _places(specification: Specification, source: SourceText) -> tuple[dict[str, Span], dict[str, Span]]:

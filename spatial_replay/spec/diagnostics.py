@@ -11,6 +11,7 @@ from typing import Literal
 
 from spatial_replay.errors import SpecificationError
 from spatial_replay.spec.formula import Span
+from spatial_replay.text import escaped
 
 MAX_FAULTS = 100
 """Faults reported together; beyond, only their number."""
@@ -47,8 +48,9 @@ class Diagnostic:
         shown = "".join(character if character.isprintable() else " " for character in piece)
         offset = self.column - 1 - first
         caret = " " * offset + "^" * max(1, min(self.width, _SHOWN - offset))
-        head = f"{self.filename}:{self.line}:{self.column}: {self.severity}: {self.message}"
-        tail = f"\n  {self.hint}" if self.hint else ""
+        place = f"{escaped(self.filename)}:{self.line}:{self.column}"
+        head = f"{place}: {self.severity}: {escaped(self.message)}"
+        tail = f"\n  {escaped(self.hint)}" if self.hint else ""
         return f"{head}\n  {shown}\n  {caret}{tail}"
 
 

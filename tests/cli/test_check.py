@@ -17,7 +17,7 @@ spec done = reach and safe
 """
 LOG = """\
 {"time_ns": 0, "objects": [{"name": "cube", "polygon": [[0, 0], [1, 0], [1, 1]]}]}
-{"time_ns": 9, "objects": [{"name": "hans", "parts": [{"vertices": [[5, 5]], "radius": 1}]}]}
+{"time_ns": 6000000000, "objects": [{"name": "hans", "parts": [{"vertices": [[5, 5]], "radius": 1}]}]}
 """
 
 
@@ -84,12 +84,16 @@ def test_names_are_compared_with_those_in_a_log(
 ) -> None:
     log = tmp_path / "run.jsonl"
     log.write_text(LOG)
-    assert run(["check", str(specification), "--log", str(log)]) == 2
-    said = capsys.readouterr().err
-    assert "hand" in said
-    assert "hans" in said
-    log.write_text(LOG.replace("hans", "hand"))
     assert run(["check", str(specification), "--log", str(log)]) == 0
+    output = capsys.readouterr()
+    assert "3:30: warning: the log never has the object 'hand'" in output.err
+    assert "did you mean 'hans'?" in output.err
+    assert output.out.endswith("2 samples of run.jsonl over 6.000 s: 1 name that it never has\n")
+    assert run(["check", str(specification), "--log", str(log), "--strict-names"]) == 2
+    assert "3:30: error: the log never has the object 'hand'" in capsys.readouterr().err
+    log.write_text(LOG.replace("hans", "hand"))
+    assert run(["check", str(specification), "--log", str(log), "--strict-names"]) == 0
+    assert capsys.readouterr().out.endswith("all names, thresholds and windows fit\n")
 
 
 def test_the_profile_of_a_file_without_a_use_line_can_be_chosen(tmp_path: Path) -> None:
@@ -100,7 +104,8 @@ def test_the_profile_of_a_file_without_a_use_line_can_be_chosen(tmp_path: Path) 
 
 
 SLOW = "".join(
-    f'{{"time_ns": {500_000_000 * n}, "objects": [{{"name": "cube", "polygon": [[0, 0], [1, 0], [1, 1]]}}], '
+    f'{{"time_ns": {500_000_000 * n}, "objects": [{{"name": "cube", "polygon": [[0, 0], [1, 0], [1, 1]]}}, '
+    f'{{"name": "crate", "polygon": [[{2 + n / 10}, 0], [3, 0], [3, 1]]}}], '
     f'"signals": {{"battery": 0.{9 - n}}}}}\n'
     for n in range(4)
 )
@@ -123,10 +128,15 @@ def test_with_a_log_windows_in_samples_are_shown_in_seconds(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("region goal = box(100, 100, 101, 101)\nspec s = F (cube enclosedin goal)", "'goal' is 140 away"),
+        ("region goal = box(100, 100, 101, 101)\nspec s = F (cube enclosedin goal)", "'goal' is 1"),
         ("spec s = F (cube closeto[-1] cube[-1])", "'closeto' with the negative length -1"),
         ("spec s = F (cube closeto[1000] cube[-1])", "1000 is far more than anything in the log is apart"),
-        ("spec s = G (battery >= 20)", "'battery' never comes near 20"),
+        ("spec s = G (battery >= 20)", "never holds in this log: its signal is never above 0.9"),
+        ("spec s = G (battery >= 0.0001)", "always holds in this log: its signal is never below 0.6"),
+        ("spec s = G (crate dist cube >= -5)", "always holds in this log: the distance is never below 1"),
+        ("spec s = F (crate dist cube < 0.05)", "never holds in this log: the distance is never below 1"),
+        ("spec s = F[0s, 60s] (battery <= 0.7)", "F[0s, 60s] is longer than this log"),
+        ("spec s = G[7, 9] (battery >= 0.7)", "no sample of this log lies in the window G[7, 9]"),
     ],
 )
 def test_with_a_log_numbers_that_hardly_fit_it_are_warned_of(
@@ -136,4 +146,28 @@ def test_with_a_log_numbers_that_hardly_fit_it_are_warned_of(
     log.write_text(SLOW)
     spec.write_text(text)
     assert run(["check", str(spec), "--log", str(log)]) == 0
-    assert message in capsys.readouterr().err
+    output = capsys.readouterr()
+    assert message in output.err
+    assert output.out.endswith("over 1.500 s: 1 warning\n")
+
+
+def test_with_a_log_the_numbers_behind_each_threshold_are_shown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, spec = tmp_path / "slow.jsonl", tmp_path / "s.spatial"
+    log.write_text(SLOW)
+    spec.write_text(
+        "spec s = G (battery >= 0.75 or crate dist cube <= 1.5 or 1.05 <= crate dist cube <= 1.25)"
+    )
+    assert run(["check", str(spec), "--log", str(log), "--json"]) == 0
+    *shown, _chained = json.loads(capsys.readouterr().out)["thresholds"]
+    assert [(each["atom"], each["holding"], each["known"]) for each in shown] == [
+        ("battery >= 0.75", 2, 4),
+        ("crate dist cube <= 1.5", 4, 4),
+    ]
+    assert [each["least"] for each in shown] == pytest.approx([0.6, 1.0])
+    assert [each["greatest"] for each in shown] == pytest.approx([0.9, 1.3])
+    assert run(["check", str(spec), "--log", str(log)]) == 0
+    said = capsys.readouterr().out
+    assert "battery >= 0.75: goes from 0.6 to 0.9, holds in 2 of 4 samples\n" in said
+    assert "1.05 <= crate dist cube <= 1.25: goes from 1 to 1.3, holds in 2 of 4 samples\n" in said

@@ -219,8 +219,13 @@ def test_a_template_requires_each(folder: Path) -> None:
     assert (without.returncode, without.stdout) == (2, "")
     assert "near(ego) is a template: say what ego stands for, --each ego=class:NAME" in without.stderr
     unknown = run_program(*replay, "--each", "ego=class:dog", cwd=folder)
-    assert (unknown.returncode, unknown.stdout) == (2, "")
-    assert "is of the class 'dog'; its classes are: Block, dish" in unknown.stderr
+    assert unknown.returncode == 0
+    assert "vacuous: `near(ego)` was never evaluated: no object stands for ego." in unknown.stdout
+    assert "near.spatial:1:6: warning: the log never has the class 'dog'" in unknown.stderr
+    assert "its classes are Block, dish" in unknown.stderr
+    gate = run_program(*replay, "--each", "ego=class:dog", "--fail-on", "vacuous", "--json", "-", cwd=folder)
+    assert gate.returncode == 1
+    assert json.loads(gate.stdout)["log"]["missing"] == ["the log never has the class 'dog'"]
 
 
 def test_every_error_of_a_specification_is_reported(folder: Path) -> None:

@@ -188,13 +188,29 @@ def test_the_objects_of_templates_take_one_pass() -> None:
         ({}, "near.ego. is a template"),
         ({"egg": "all"}, "no template has a parameter 'egg'"),
         ({"ego": "dish"}, "ego='dish' chooses no objects"),
-        ({"ego": "class:dosh"}, "no object of run is of the class 'dosh'; its classes are: Block, dish"),
     ],
 )
 def test_invalid_choices_of_objects_are_reported(each: dict[str, str], said: str) -> None:
     spec = parse_specification("spec near(ego) = G (ego dist cube <= 9)")
     with pytest.raises(UsageError, match=said):
         run_replay(PiecewiseSource(run(), 4), [spec], ReplayOptions(each=each))
+
+
+def test_a_class_that_the_log_never_has_gives_a_warning_and_no_result() -> None:
+    text = "spec near(ego) = G (ego dist cube <= 9)\nspec held = F (cube ovlp hand)"
+    each = {"ego": "class:dosh"}
+    replayed = run_replay(PiecewiseSource(run(), 4), [parse_specification(text)], ReplayOptions(each=each))
+    assert [result.name for result in replayed.results] == ["held"]
+    assert [part.reason for part in replayed.vacuous] == ["no instances"]
+    (missing,) = (each for each in replayed.missing if "class" in each.message)
+    assert (missing.line, missing.message) == (1, "the log never has the class 'dosh'")
+    assert missing.hint == "did you mean 'dish'? its classes are Block, dish"
+    with pytest.raises(SpecificationError, match="never has the class 'dosh'"):
+        run_replay(
+            PiecewiseSource(run(), 4),
+            [parse_specification(text)],
+            ReplayOptions(each=each, strict_names=True),
+        )
 
 
 def test_a_class_that_appears_only_outside_the_window_gives_no_result() -> None:

@@ -62,8 +62,10 @@ def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
     match part:
         case Signal():
             values = scene.trace.signals.get(part.name)
-            if values is None or not np.isfinite(values[scene.skip]):
-                yield f"signal {part.name!r} has no finite value"
+            if values is None:
+                yield f"there is no signal {part.name!r}"
+            elif not np.isfinite(values[scene.skip]):
+                yield f"signal {part.name!r} has no finite value in the sample"
         case Number() | Sum() | Negative() | Minimum() | Maximum() | Scaled():
             return
         case _:

@@ -1,0 +1,80 @@
+"""What is printed: everything goes through here, so that names from a log cannot steer a terminal."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
+
+import click
+
+from spatial_replay.text import escaped
+
+if TYPE_CHECKING:
+    from spatial_replay.errors import Diagnosis
+
+PROGRAM: Final = "spatial-replay"
+
+
+class Coloured(NamedTuple):
+    """A piece of a line, in one of the colours of `click.style`, and bold."""
+
+    text: str
+    colour: str
+
+
+Line: TypeAlias = str | tuple[str | Coloured, ...]
+
+
+def show(*lines: Line, err: bool = False) -> None:
+    """Print lines, with escapes such as `\\x1b` in place of what is not printable.
+
+    Args:
+        lines: each without its end; a line end within is escaped.
+        err: print to standard error.
+    """
+    for line in lines:
+        pieces = (line,) if isinstance(line, (str, Coloured)) else line
+        click.echo("".join(map(_piece, pieces)), err=err, color=False if os.environ.get("NO_COLOR") else None)
+
+
+def _piece(piece: str | Coloured) -> str:
+    if isinstance(piece, Coloured):
+        return click.style(escaped(piece.text), fg=piece.colour, bold=True)
+    return escaped(piece)
+
+
+def show_json(value: Any, indent: int | None = 2) -> None:
+    """Print a value as JSON, with JSON's escapes in place of what is not printable."""
+    text = json.dumps(value, indent=indent, ensure_ascii=False, allow_nan=False)
+    click.echo(
+        "".join(each if each == "\n" or each.isprintable() else json.dumps(each)[1:-1] for each in text)
+    )
+
+
+def show_file(text: str) -> None:
+    """Print the text of a file: as it is to a file or a pipe, escaped to a terminal."""
+    if sys.stdout.isatty():
+        text = "\n".join(escaped(line, "\t") for line in text.splitlines()) + "\n"
+    click.echo(text, nl=not text.endswith("\n"))
+
+
+def show_diagnostics(diagnostics: Iterable[Diagnosis]) -> None:
+    """Print errors and warnings about a specification to standard error."""
+    for diagnostic in diagnostics:
+        show(*str(diagnostic).split("\n"), err=True)
+
+
+def show_message(severity: str, message: str, colour: str) -> None:
+    """Print "spatial-replay: SEVERITY: MESSAGE" to standard error; further lines are indented."""
+    first, *others = message.split("\n")
+    label = Coloured(f"{severity}:", colour)
+    show((f"{PROGRAM}: ", label, f" {first}"), *(f"  {line.lstrip()}" for line in others), err=True)
+
+
+def warn(*messages: str) -> None:
+    """Print warnings to standard error, each as "spatial-replay: warning: …"."""
+    for message in messages:
+        show_message("warning", message, "yellow")

@@ -1,0 +1,264 @@
+"""Numbers of a specification against those of a log: thresholds out of reach, regions far away, windows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from math import hypot, inf
+from typing import Literal
+
+import numpy as np
+
+from spatial_replay.monitor.atoms.measurements import leaf_values
+from spatial_replay.monitor.atoms.terms import TraceScene
+from spatial_replay.spec.diagnostics import Diagnostic, SourceText
+from spatial_replay.spec.format import format_bound, format_number
+from spatial_replay.spec.formula import (
+    Atom,
+    Bound,
+    Expression,
+    Formula,
+    Measurement,
+    Outline,
+    Signal,
+    SignedDistance,
+    Span,
+    Specification,
+    Temporal,
+    Variable,
+)
+from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, terms_of
+from spatial_replay.text import counted
+from spatial_replay.trace.trace import Trace
+
+_LENGTH_RELATIONS = frozenset({"closeto", "farfrom", "touch", "moved", "dist"})
+_FAR = 10.0
+"""Beyond so many times the extent of all that was seen, a length is most likely in another unit."""
+_APART = 5.0
+"""A threshold below the least number divided by this, or above the greatest times it, is far away."""
+
+
+@dataclass(frozen=True, slots=True)
+class ThresholdRange:
+    """What an atom compares with its threshold, over a log.
+
+    Attributes:
+        atom: with one distance or signal in it.
+        least, greatest: of the distance or signal; least > greatest if it is never known.
+        known, holding: samples in which it is known, and in which the atom holds.
+    """
+
+    atom: Atom
+    least: float = inf
+    greatest: float = -inf
+    known: int = 0
+    holding: int = 0
+
+    @property
+    def holds(self) -> Literal["always", "never", "sometimes", "unknown"]:
+        if not self.known:
+            return "unknown"
+        return "never" if not self.holding else "always" if self.holding == self.known else "sometimes"
+
+    def __str__(self) -> str:
+        if not self.known:
+            return f"{self.atom.text}: unknown in every sample"
+        span = f"goes from {self.least:.4g} to {self.greatest:.4g}"
+        if self.holds == "sometimes":
+            return f"{self.atom.text}: {span}, holds in {self.holding:,} of {counted(self.known, 'sample')}"
+        return f"{self.atom.text}: {span}, {self.holds} holds"
+
+
+class LogNumbers:
+    """What a log holds in numbers, and what a specification compares with them, collected block by block.
+
+    Attributes:
+        box: xmin, ymin, xmax, ymax of all footprints; empty (xmin > xmax) without any.
+        samples: how many there are.
+        times_ns: of the first and the last one.
+    """
+
+    def __init__(self, specification: Specification) -> None:
+        """Start before the first sample."""
+        self.box: tuple[float, float, float, float] = (inf, inf, -inf, -inf)
+        self.samples = 0
+        self.times_ns = (0, 0)
+        self._regions = specification.regions
+        self._ranges = {
+            each.text: ThresholdRange(each)
+            for each in _nodes(specification)
+            if isinstance(each, Atom) and _compared(each) is not None
+        }
+
+    def add(self, trace: Trace) -> None:
+        """Add the next samples."""
+        if not len(trace):
+            return
+        vertices = trace.footprints.vertices
+        if len(vertices):
+            margin = float(trace.footprints.radius.max(initial=0.0))
+            (left, low), (right, high) = vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()
+            lower = (min(self.box[0], left - margin), min(self.box[1], low - margin))
+            self.box = (*lower, max(self.box[2], right + margin), max(self.box[3], high + margin))
+        self.times_ns = (
+            self.times_ns[0] if self.samples else int(trace.times_ns[0]),
+            int(trace.times_ns[-1]),
+        )
+        self.samples += len(trace)
+        self._add_ranges(trace)
+
+    def _add_ranges(self, trace: Trace) -> None:
+        atoms = [each.atom for each in self._ranges.values()]
+        if not atoms:
+            return
+        parts = [_compared(atom) or atom.expression for atom in atoms]
+        compared = [replace(atom, expression=part) for atom, part in zip(atoms, parts, strict=True)]
+        # low and high ends of each; they differ where something is unknown
+        leaves = leaf_values(TraceScene(trace, self._regions), [*compared, *atoms], {})
+        low, high = leaves[0], leaves[min(1, len(leaves) - 1)]
+        known = np.isfinite(low) & (low == high)
+        for row, atom in enumerate(atoms):
+            values = low[row, known[row]]
+            if not len(values):
+                continue
+            seen = self._ranges[atom.text]
+            self._ranges[atom.text] = ThresholdRange(
+                atom,
+                min(seen.least, float(values.min())),
+                max(seen.greatest, float(values.max())),
+                seen.known + len(values),
+                seen.holding + int((low[len(atoms) + row, known[row]] >= 0.0).sum()),
+            )
+
+    @property
+    def ranges(self) -> Mapping[str, ThresholdRange]:
+        """What each atom with a threshold compares with it, by the atom's text."""
+        return self._ranges
+
+    @property
+    def extent(self) -> float:
+        """The diagonal of `box`; 0 if nothing was seen."""
+        left, bottom, right, top = self.box
+        return hypot(right - left, top - bottom) if left <= right else 0.0
+
+    @property
+    def seconds(self) -> float:
+        """From the first sample to the last."""
+        return (self.times_ns[1] - self.times_ns[0]) / 1e9
+
+    @property
+    def rate(self) -> float | None:
+        """Samples a second, on average; None of fewer than two samples."""
+        return (self.samples - 1) / self.seconds if self.seconds > 0.0 else None
+
+
+def window_lines(specification: Specification, log: LogNumbers) -> list[str]:
+    """Return each window given in samples, in seconds at the log's rate."""
+    if log.rate is None:
+        return []
+    lines: dict[str, None] = {}
+    for node in _nodes(specification):
+        bound = node.bound if isinstance(node, Temporal) else None
+        if bound is not None and bound.unit == "samples":
+            upper = "the end" if bound.upper is None else f"{bound.upper / log.rate:.3g} s"
+            name = f"{node.operator if isinstance(node, Temporal) else ''}{format_bound(bound)}"
+            lines[f"{name} is {bound.lower / log.rate:.3g} s to {upper}"] = None
+    return [f"at {log.rate:.4g} samples a second, {line}" for line in lines]
+
+
+def plausibility_warnings(specification: Specification, log: LogNumbers) -> tuple[Diagnostic, ...]:
+    """Return a warning for each region, number and window that hardly fits what the log holds."""
+    source = SourceText.of(specification.source, specification.filename)
+    found: dict[str, Diagnostic] = {}
+    for name, outline in specification.regions.items():
+        apart = _distance(outline, log.box)
+        if 0.0 < log.extent < apart:
+            start = max(source.text.find(f"region {name}"), 0)
+            message = f"the region {name!r} is {apart:.4g} away from all that the log ever has"
+            hint = f"objects lie in x {log.box[0]:.4g} to {log.box[2]:.4g}, y {log.box[1]:.4g} to "
+            span = Span(start, start + len(f"region {name}"))
+            found[name] = source.diagnostic("warning", span, message, f"{hint}{log.box[3]:.4g}")
+    for node in _nodes(specification):
+        doubts: Iterator[tuple[str, str]] = iter(())
+        key = ""
+        if isinstance(node, Atom):
+            key, doubts = node.text, _doubts(node, log)
+        elif isinstance(node, Temporal) and node.bound is not None:
+            key = f"{node.operator}{format_bound(node.bound)}"
+            doubts = _doubts_of_window(key, node.bound, log)
+        for message, hint in doubts:
+            found.setdefault(key, source.diagnostic("warning", node.span, message, hint))
+    return tuple(sorted(found.values(), key=lambda each: (each.line, each.column)))
+
+
+def _doubts(atom: Atom, log: LogNumbers) -> Iterator[tuple[str, str]]:
+    limits = [each for each in atom.parameters if isinstance(each, float)]
+    lengths = limits if atom.relation in _LENGTH_RELATIONS else []
+    for length in lengths:
+        if length < 0.0 and atom.relation != "dist":
+            yield f"{atom.relation!r} with the negative length {format_number(length)}", "is it a slip?"
+        elif 0.0 < log.extent * _FAR < abs(length):
+            message = f"{format_number(length)} is far more than anything in the log is apart"
+            yield message, f"all that it has lies within {log.extent:.4g}; is the unit the same?"
+    taken = log.ranges.get(atom.text)
+    if taken is None or taken.holds not in ("always", "never"):
+        return
+    for limit in limits:
+        if _is_far(limit, taken, is_length=bool(lengths)):
+            below = limit < taken.least
+            end, side = (taken.least, "below") if below else (taken.greatest, "above")
+            what = "its signal is" if atom.relation == "signal" else "the distance is"
+            message = f"`{atom.text}` {taken.holds} holds in this log: {what} never {side} {end:.4g}"
+            yield message, f"no value comes near {format_number(limit)}; is it the threshold you mean?"
+
+
+def _is_far(limit: float, taken: ThresholdRange, *, is_length: bool) -> bool:
+    """Return whether no number that was taken comes near a threshold."""
+    least, greatest = taken.least, taken.greatest
+    if least <= limit <= greatest:
+        return False
+    if is_length and limit < 0.0:
+        # only what overlaps has a negative distance
+        return True
+    reach = max(greatest - least, abs(least), abs(greatest))
+    if limit < least - reach or limit > greatest + reach:
+        return True
+    if least > 0.0 and limit > 0.0:
+        return limit < least / _APART or limit > greatest * _APART
+    return False
+
+
+def _doubts_of_window(text: str, bound: Bound, log: LogNumbers) -> Iterator[tuple[str, str]]:
+    if not log.samples:
+        return
+    in_time = bound.unit != "samples"
+    lasts = log.times_ns[1] - log.times_ns[0] if in_time else log.samples - 1
+    ends = f"{log.seconds:.3f} s" if in_time else counted(log.samples, "sample")
+    if bound.lower > lasts:
+        yield f"no sample of this log lies in the window {text}", f"the log has {ends}"
+    elif bound.upper is not None and bound.upper > lasts:
+        yield f"the window {text} is longer than this log", f"the log has {ends}, so its end decides"
+
+
+def _distance(outline: Outline, box: tuple[float, float, float, float]) -> float:
+    """Return how far the bounding boxes of an outline and of the log are apart; 0 if they meet."""
+    xs, ys = zip(*outline.vertices, strict=True)
+    apart_x = max(box[0] - max(xs), min(xs) - box[2], 0.0)
+    apart_y = max(box[1] - max(ys), min(ys) - box[3], 0.0)
+    return max(0.0, hypot(apart_x, apart_y) - outline.radius)
+
+
+def _compared(atom: Atom) -> Expression | None:
+    """Return the signal or distance that an atom compares; None if that is not one, or has a variable."""
+    parts = {each for each in iter_expressions(atom.expression) if isinstance(each, (Signal, Measurement))}
+    part = parts.pop() if len(parts) == 1 else None
+    if not isinstance(part, (Signal, SignedDistance)) or not any(
+        isinstance(x, float) for x in atom.parameters
+    ):
+        return None
+    return None if any(isinstance(base_of(term), Variable) for term in terms_of(part)) else part
+
+
+def _nodes(specification: Specification) -> Iterator[Formula]:
+    for spec in specification.results:
+        yield from iter_formulas(spec.formula)
