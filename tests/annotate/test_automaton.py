@@ -9,20 +9,16 @@ from pathlib import Path
 import pytest
 
 from replay.runs import PiecewiseSource, content_of
-from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.compile import automaton, stored_text
+from spatial_replay import Automaton, Footprint, Recorder, Sample, Trace, automaton, parse_specification
+from spatial_replay.automata import stored_text
 from spatial_replay.automata.propositions import Propositions
-from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.logs.messages import Attachment, MemorySink
+from spatial_replay.logs import Attachment, MemorySink
 from spatial_replay.logs.schemas import AutomatonState_pb2
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
-from spatial_replay.recording import Recorder, Recording
+from spatial_replay.recording import Recording
 from spatial_replay.replay import ReplayOptions, run_replay
-from spatial_replay.sources.open_log import open_source
-from spatial_replay.spec.load import parse_specification
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay.sources import open_source
 
 FALSE, TRUE, UNKNOWN = (
     AutomatonState_pb2.TRUTH_FALSE,

@@ -8,11 +8,8 @@ from dataclasses import replace
 import pytest
 
 from replay.runs import SPECIFICATION, PiecewiseSource, run, sample
-from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay import Footprint, Sample, Trace, TrackedObject, parse_specification
 from spatial_replay.replay import run_replay
-from spatial_replay.spec.load import parse_specification
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
 
 
 def _certificate(trace: Trace, text: str = SPECIFICATION) -> Mapping[str, str]:

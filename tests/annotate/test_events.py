@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from mcap.records import Message
 
 import spatial_replay as sr
-from spatial_replay.logs.source import MemorySource
+from spatial_replay.logs import MemorySource
 from spatial_replay.replay import ReplayOptions, Window, run_replay
 
 STEP_NS = 10**8

@@ -13,9 +13,9 @@ import spatial_replay as sr
 from annotate.layouts import layout_of, panels, paths_of
 from annotate.message_paths import split, values
 from spatial_replay.annotate.foxglove_layout import LayoutContents, layout_for_live
-from spatial_replay.logs.source import MemorySource
+from spatial_replay.logs import MemorySource
 from spatial_replay.replay import ReplayOptions, run_replay
-from spatial_replay.sources.open_log import open_source
+from spatial_replay.sources import open_source
 
 TEXT = "spec near = F a closeto[2] b\nspec apart = G a farfrom[0] b"
 

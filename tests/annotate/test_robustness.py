@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from spatial_replay import LogError
 from spatial_replay.annotate.robustness import VERDICTS, decode_robustness, encode_robustness
-from spatial_replay.errors import LogError
 from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
 from spatial_replay.monitor.verdict import online_verdict
 

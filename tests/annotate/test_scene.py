@@ -11,16 +11,13 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from spatial_replay import ConvexPart, Footprint, Sample, Trace, TrackedObject, parse_specification
 from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.scene_update import PERIOD_NS, SceneEncoder
 from spatial_replay.annotate.violations import EvaluatedResult, leaf_pairs
-from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
 from spatial_replay.spec.formula import Atom, Outline, RegionName, SignedDistance, TrackedName, iter_nodes
-from spatial_replay.spec.load import parse_specification
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
 
 FRAME_NS = 1_000_000_000 // 30
 REGIONS = {

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import pytest
 
+from spatial_replay import NamedSpec, Specification
 from spatial_replay.annotate.specification import ReportedTree, encode_specification, unit_of
 from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
-from spatial_replay.spec.format import format_specification
+from spatial_replay.spec import format_specification
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
     Group,
     Misalignment,
-    NamedSpec,
     Number,
     Quantified,
     Signal,
     SignedDistance,
     Span,
-    Specification,
     Temporal,
     TrackedName,
     Truth,

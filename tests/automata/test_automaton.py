@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from spatial_replay import Automaton, UsageError, automaton, parse_specification
-from spatial_replay.automata import Transition, dot_text, hoa_text, words_text
+from spatial_replay import Automaton, Transition, UsageError, automaton, parse_specification
+from spatial_replay.automata import dot_text, hoa_text, words_text
 
 TASK = """\
 spec safe = not (robot ovlp hand)

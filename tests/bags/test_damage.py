@@ -20,8 +20,8 @@ from bags.bag_files import (
     write_ros1,
     write_ros2,
 )
+from spatial_replay import LogError
 from spatial_replay.bags import Message, open_messages
-from spatial_replay.errors import LogError
 
 SENT = drive(60)
 

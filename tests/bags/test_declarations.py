@@ -22,10 +22,9 @@ from bags.bag_files import (
     write_ros1,
     write_ros2,
 )
-from spatial_replay.cli.application import run
-from spatial_replay.errors import LogError
+from spatial_replay import LogError, read_trace
+from spatial_replay.cli import run
 from spatial_replay.logs.read_options import FaultList, count_of
-from spatial_replay.sources import read_trace
 
 MAPPING = "topics: {/a: {position: [x, y], shape: {disc: 0.5}}}"
 

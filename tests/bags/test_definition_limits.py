@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
+from spatial_replay import LogError
 from spatial_replay.bags import Topic
 from spatial_replay.bags.decoders import decoder_of
-from spatial_replay.errors import LogError
 from spatial_replay.logs import Schema
 
 LINE = "=" * 80

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from spatial_replay import LogError
 from spatial_replay.bags.ros_definitions import (
     check_definitions,
     definitions_from_msg,
@@ -15,7 +16,6 @@ from spatial_replay.bags.ros_definitions import (
     msg_from_definitions,
 )
 from spatial_replay.bags.ros_types import ros_decoder, ros_definitions, standard_schema
-from spatial_replay.errors import LogError
 from spatial_replay.logs import Schema
 
 SEPARATOR = "=" * 80

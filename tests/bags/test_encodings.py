@@ -23,8 +23,8 @@ from bags.bag_files import (
     write_json_mcap,
     write_mcap,
 )
+from spatial_replay import LogError
 from spatial_replay.bags import open_messages
-from spatial_replay.errors import LogError
 
 POSES = build_file_descriptor_set(PosesInFrame).SerializeToString()
 

@@ -28,14 +28,12 @@ from bags.bag_files import (
     write_ros1,
     write_ros2,
 )
+from spatial_replay import Footprint, LogError, Trace, UsageError, read_trace
 from spatial_replay.annotate.certificate import SampleHash
-from spatial_replay.cli.application import run
-from spatial_replay.errors import LogError, UsageError
-from spatial_replay.geometry.footprint import Footprint
+from spatial_replay.cli import run
 from spatial_replay.logs import Block
 from spatial_replay.logs.source import within
-from spatial_replay.sources import open_source, read_trace
-from spatial_replay.trace.trace import Trace
+from spatial_replay.sources import open_source
 
 MAPPING = """\
 sample: {topic: /b}

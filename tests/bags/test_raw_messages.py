@@ -29,9 +29,10 @@ from bags.bag_files import (
     write_ros1,
     write_ros2,
 )
+from spatial_replay import read_trace
 from spatial_replay.bags import open_messages
 from spatial_replay.mapping import MappedSource
-from spatial_replay.sources import open_source, read_trace
+from spatial_replay.sources import open_source
 
 MAPPING = """\
 sample: {topic: /b}

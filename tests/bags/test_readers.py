@@ -20,8 +20,8 @@ from bags.bag_files import (
     write_ros1,
     write_ros2,
 )
+from spatial_replay import LogError, MissingFileError
 from spatial_replay.bags import MessageReader, Topic, open_messages
-from spatial_replay.errors import LogError, MissingFileError
 
 Write = Callable[[Path, list[Sent]], Path]
 

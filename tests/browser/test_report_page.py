@@ -20,7 +20,7 @@ from report.report_pages import (
 )
 from spatial_replay.replay import load_files
 from spatial_replay.report.write import write_report
-from spatial_replay.sources.open_log import open_source
+from spatial_replay.sources import open_source
 
 Open = Callable[..., Page]
 HOSTILE = (

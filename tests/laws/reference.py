@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
+from spatial_replay import ConvexPart, Footprint, TrackedObject
 from spatial_replay.spec.formula import (
     ANY_CLASS,
     Atom,

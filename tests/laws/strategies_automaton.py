@@ -5,9 +5,9 @@ from __future__ import annotations
 from hypothesis import strategies as st
 
 from laws.strategies_monitor import LEAVES
-from spatial_replay import Automaton, Specification, automaton
+from spatial_replay import Automaton, NamedSpec, Specification, automaton
 from spatial_replay.automata import Compiler
-from spatial_replay.spec.formula import Boolean, Bound, Formula, NamedSpec, Temporal, Truth
+from spatial_replay.spec.formula import Boolean, Bound, Formula, Temporal, Truth
 
 _leaves = st.one_of(st.sampled_from(LEAVES), st.sampled_from(LEAVES), st.builds(Truth, st.booleans()))
 

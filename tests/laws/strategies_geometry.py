@@ -7,7 +7,7 @@ import math
 import numpy as np
 from hypothesis import strategies as st
 
-from spatial_replay.geometry.footprint import ConvexPart, Footprint
+from spatial_replay import ConvexPart, Footprint
 
 coordinates = st.integers(-400, 400).map(lambda value: value / 16)
 """Numbers of a coarse grid: shapes that touch, share edges or lie on one line come up often."""

@@ -10,11 +10,8 @@ from hypothesis import strategies as st
 from laws.reference import ANYTHING, Interval
 from laws.strategies_geometry import convex_parts
 from laws.strategies_spec import Vocabulary, formula_texts
-from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay import Footprint, Sample, Trace, TrackedObject, parse_specification
 from spatial_replay.spec.formula import Atom, Boolean, Bound, Signal, Temporal, Truth
-from spatial_replay.spec.load import parse_specification
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
 
 # ------------------------------------------------------------------- formulas over leaves of any value
 

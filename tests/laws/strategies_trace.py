@@ -8,9 +8,8 @@ import numpy as np
 from hypothesis import strategies as st
 
 from laws.strategies_geometry import angles, footprints, radii
-from spatial_replay.geometry.footprint import TrackedObject
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import ABSENT, Trace
+from spatial_replay import Sample, Trace, TrackedObject
+from spatial_replay.trace.trace import ABSENT
 
 NAMES = ("a", "B", "cup", "ä", "物", "𝄞", "very long name of an object " * 5)
 names = st.sampled_from(NAMES)

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from laws.reference import Prefix
 from laws.strategies_automaton import compiled, formulas_and_symbols, formulas_with_automata
 from laws.strategies_monitor import leaf_runs
-from spatial_replay import Automaton, Specification, automaton
+from spatial_replay import Automaton, NamedSpec, Specification, automaton
 from spatial_replay.automata import TransitionTable, automaton_from, stored_text
-from spatial_replay.spec.formula import NamedSpec
 
 known = st.booleans()
 perhaps_unknown = st.sampled_from([False, True, None])

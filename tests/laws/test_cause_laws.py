@@ -10,21 +10,12 @@ from hypothesis import strategies as st
 
 import spatial_replay as sr
 from laws.strategies_monitor import formulas_of_leaves, leaf_runs, recordings, specifications
+from spatial_replay import NamedSpec, Specification
 from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.monitor.witness.path import End, deciding_path
 from spatial_replay.monitor.witness.unfinished import evaluate_unfinished
-from spatial_replay.spec.formula import (
-    Boolean,
-    Formula,
-    NamedSpec,
-    Quantified,
-    Specification,
-    Temporal,
-    Truth,
-    iter_nodes,
-    operands_of,
-)
+from spatial_replay.spec.formula import Boolean, Formula, Quantified, Temporal, Truth, iter_nodes, operands_of
 
 _NUMBERS = st.sampled_from([-9.0, -3.0, -1.5, 0.0, 0.25, 1.0, 2.5, 7.0])
 

@@ -12,16 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laws.strategies_monitor import Recording, cuts, recordings, specifications
+from spatial_replay import Specification, UsageError, evaluate, parse_specification
 from spatial_replay.annotate.events import EncodedEvent, EventReporter
 from spatial_replay.annotate.specification import reported_trees
 from spatial_replay.annotate.verdict_changes import LASTING, SATISFIED, START, NodeStates, track
-from spatial_replay.errors import UsageError
-from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
 from spatial_replay.monitor.stream import EvaluationStream
-from spatial_replay.spec.formula import Specification
-from spatial_replay.spec.load import parse_specification
 
 _VALUES = st.one_of(st.sampled_from([-2.0, -1.0, 0.0, 1.0, math.inf, -math.inf]), st.just(math.nan))
 _SETTLED = st.sampled_from([None] * 12 + [0.5, -0.5])

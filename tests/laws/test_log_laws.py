@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laws.strategies_trace import traces
-from spatial_replay.errors import LogError
+from spatial_replay import LogError, Trace, read_trace
 from spatial_replay.logs import (
     LogWriter,
     McapSource,
@@ -27,8 +27,7 @@ from spatial_replay.logs import (
 from spatial_replay.logs.objects.wire import WireTemplate
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
-from spatial_replay.sources import open_source, read_trace
-from spatial_replay.trace.trace import Trace
+from spatial_replay.sources import open_source
 
 CHANNEL = protobuf_channel(OBJECTS, ObjectStates)
 

@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from spatial_replay import Footprint
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.geometry.outline import convex_hull
 from spatial_replay.mapping.field_paths import FieldError, FieldPath, getter, style_of, walk
 from spatial_replay.mapping.footprints import BOX, Solids, footprints_from_solids

@@ -10,12 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import spatial_replay as sr
+from spatial_replay import Planner, Settings
 from spatial_replay.planning import (
     MOST_MOTIONS,
     Grid,
     Outcome,
-    Planner,
-    Settings,
     Workspace,
     centre_of,
     moved_object,

@@ -8,16 +8,13 @@ from foxglove_schemas_protobuf.Event_pb2 import Event
 from hypothesis import given, reject, settings
 
 from laws.strategies_monitor import Recording, recordings, specifications
+from spatial_replay import Replayed, Specification, SpecificationError, SpecResult
 from spatial_replay.annotate.scene_update import DrawnViolation, SceneFrames
-from spatial_replay.errors import SpecificationError
-from spatial_replay.logs.messages import Messages
-from spatial_replay.logs.source import MemorySource
+from spatial_replay.logs import MemorySource, Messages
 from spatial_replay.logs.topics import EVENTS
-from spatial_replay.monitor.result import SpecResult
-from spatial_replay.replay.document import document_from_replay
-from spatial_replay.replay.engine import Replay, Replayed
-from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import Atom, Formula, Quantified, Specification, iter_nodes
+from spatial_replay.replay import Replay, document_from_replay
+from spatial_replay.spec import format_formula
+from spatial_replay.spec.formula import Atom, Formula, Quantified, iter_nodes
 
 
 class Run:

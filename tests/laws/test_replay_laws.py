@@ -16,15 +16,19 @@ from hypothesis import strategies as st
 
 from laws.strategies_monitor import NAMES, Recording, recordings, specifications
 from replay.runs import PiecewiseSource, content_of, record, run, write_tracks
-from spatial_replay.errors import SpecificationError
+from spatial_replay import (
+    Recorder,
+    Replayed,
+    Sample,
+    Specification,
+    SpecificationError,
+    Trace,
+    parse_specification,
+)
 from spatial_replay.logs.topics import EVENT_LOG, EVENTS
-from spatial_replay.recording import Recorder, record_source
-from spatial_replay.replay import Replayed, ReplayOptions, Window, load_files, run_replay
-from spatial_replay.sources.open_log import open_source
-from spatial_replay.spec.formula import Specification
-from spatial_replay.spec.load import parse_specification
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay.recording import record_source
+from spatial_replay.replay import ReplayOptions, Window, load_files, run_replay
+from spatial_replay.sources import open_source
 
 FEW = settings(max_examples=25)
 

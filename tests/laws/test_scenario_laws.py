@@ -9,12 +9,7 @@ from tempfile import TemporaryDirectory
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.monitor.evaluate import evaluate
-from spatial_replay.sources import read_trace
-from spatial_replay.spec.load import parse_specification
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay import Footprint, Sample, Trace, evaluate, parse_specification, read_trace
 
 LENGTHS = st.floats(0.1, 5)
 PLACES = st.floats(-10, 10)

@@ -9,10 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from spatial_replay.errors import LogError, SpatialReplayError, UsageError
-from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.sources import open_source, read_trace
-from spatial_replay.trace.sample import Sample
+from spatial_replay import Footprint, LogError, Sample, SpatialReplayError, UsageError, read_trace
+from spatial_replay.sources import open_source
 
 Write = Callable[..., Path]
 

@@ -11,13 +11,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spatial_replay.errors import LogError, SpatialReplayError, UsageError
-from spatial_replay.geometry.footprint import Footprint
+from spatial_replay import (
+    Footprint,
+    LogError,
+    SpatialReplayError,
+    UsageError,
+    evaluate,
+    parse_specification,
+    read_trace,
+)
 from spatial_replay.logs.messages import BLOCK_SAMPLES
-from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.recording import record_source
-from spatial_replay.sources import open_source, read_trace
-from spatial_replay.spec.load import parse_specification
+from spatial_replay.sources import open_source
 
 Write = Callable[..., Path]
 

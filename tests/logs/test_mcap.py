@@ -13,8 +13,16 @@ from mcap.reader import make_reader
 from mcap.writer import IndexType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 
-from spatial_replay.errors import LogError, OutputError, UsageError
-from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay import (
+    Footprint,
+    LogError,
+    OutputError,
+    Sample,
+    Trace,
+    TrackedObject,
+    UsageError,
+    read_trace,
+)
 from spatial_replay.logs import (
     Channel,
     LogWriter,
@@ -28,9 +36,7 @@ from spatial_replay.logs.mcap.writer import CHUNK_BYTES
 from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import OBJECTS, ROBUSTNESS, protobuf_channel
-from spatial_replay.sources import open_source, read_trace
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay.sources import open_source
 
 SAMPLES = protobuf_channel(OBJECTS, ObjectStates)
 

@@ -8,11 +8,9 @@ import random
 import numpy as np
 import pytest
 
-from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
+from spatial_replay import ConvexPart, Footprint, Sample, Trace, TrackedObject
 from spatial_replay.logs import decode_objects, encode_objects
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
 
 
 def regular_polygon(corners, x, y):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from spatial_replay.errors import OutputError, UsageError
+from spatial_replay import OutputError, UsageError
 from spatial_replay.logs.output_file import open_output, refuse_inputs, replacing
 
 

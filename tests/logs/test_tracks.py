@@ -8,12 +8,10 @@ import json
 import numpy as np
 import pytest
 
-from spatial_replay.errors import LogError, MissingFileError, UsageError
-from spatial_replay.geometry.footprint import Footprint
+from spatial_replay import Footprint, LogError, MissingFileError, Trace, UsageError, read_trace
 from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.read_options import MOST_FAULTS
-from spatial_replay.sources import open_source, read_trace
-from spatial_replay.trace.trace import Trace
+from spatial_replay.sources import open_source
 
 SQUARE = [[0, 0], [1, 0], [1, 1], [0, 1]]
 

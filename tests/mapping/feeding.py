@@ -10,10 +10,9 @@ from typing import Any
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from spatial_replay.bags import Message
-from spatial_replay.bags.topic import Decoder, Topic
+from spatial_replay import Trace
+from spatial_replay.bags import Decoder, Message, Topic
 from spatial_replay.mapping import Assembler, ReadingPlan, parse_mapping
-from spatial_replay.trace.trace import Trace
 
 SECOND = 10**9
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapping.feeding import SECOND, Feed, make
-from spatial_replay.errors import LogError, UsageError
+from spatial_replay import LogError, UsageError
 
 POINT = {"x": 1.0, "y": 2.0, "z": 0.0}
 TURN = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}

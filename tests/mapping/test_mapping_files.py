@@ -10,8 +10,8 @@ import pytest
 from jsonschema import Draft202012Validator
 
 from mapping.feeding import Feed, make, pose_stamped
+from spatial_replay import MissingFileError, UsageError
 from spatial_replay.bags import Topic
-from spatial_replay.errors import MissingFileError, UsageError
 from spatial_replay.mapping import ReadingPlan, load_mapping, parse_mapping
 from spatial_replay.mapping import mapping_file as schema
 from spatial_replay.mapping.model import FOREVER_NS, Sampling, ShapeMapping, SignalMapping, Uncertainty

@@ -8,7 +8,7 @@ import pytest
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from mapping.feeding import pose_stamped, tf, transform
-from spatial_replay.errors import UsageError
+from spatial_replay import UsageError
 from spatial_replay.mapping.field_paths import (
     FieldError,
     FieldPath,

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from spatial_replay import Trace
 from spatial_replay.bags import open_messages
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.mapping import Assembler, ReadingPlan, parse_mapping
-from spatial_replay.trace.trace import Trace
 
 TURTLES = ("two_turtles.bag", "two_turtles_lz4.bag", "two_turtles_mcap", "two_turtles_sqlite3")
 POSES = """

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from mapping.feeding import SECOND, Feed, header, make, pose_stamped, ros
+from spatial_replay import LogError, Trace, UsageError
 from spatial_replay.bags.columns import MessageColumns
-from spatial_replay.errors import LogError, UsageError
 from spatial_replay.mapping import Assembler, ReadingPlan, parse_mapping
-from spatial_replay.trace.trace import Trace
 
 MS = 10**6
 

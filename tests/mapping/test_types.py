@@ -13,7 +13,7 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from mapping.feeding import SECOND, Feed, Made, header, make, pose, pose_stamped, ros, tf, transform
-from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay import Footprint, TrackedObject
 
 QUARTER = (0.0, 0.0, sin(pi / 4), cos(pi / 4))
 

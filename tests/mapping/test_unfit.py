@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from mapping.feeding import SECOND, Feed, make, pose_stamped
+from spatial_replay import UsageError
 from spatial_replay.bags import Topic
-from spatial_replay.errors import UsageError
 from spatial_replay.mapping import Assembler, ReadingPlan, parse_mapping
 
 HUGE = 10**400

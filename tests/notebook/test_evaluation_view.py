@@ -6,7 +6,7 @@ import pytest
 import spatial_replay as sr
 from monitor.scenes import judged, numbers, points
 from pages import shown
-from spatial_replay.errors import UsageError
+from spatial_replay import UsageError
 
 RISING = numbers(x=[-2.0, -1.0, 1.0, 2.0])
 PARTS = "spec up = F x >= 0\nspec low = G x <= 1\nspec both = up and low\nspec other = F x >= 2"

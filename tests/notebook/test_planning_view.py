@@ -7,17 +7,8 @@ import spatial_replay as sr
 from pages import shown
 from planning.kinematics import BLOCKS, PUSHING, block, run
 from planning.plans import PUSH, record_plan_of
-from spatial_replay.errors import LogError, UsageError
-from spatial_replay.planning import (
-    FREE,
-    Grid,
-    Planner,
-    Settings,
-    Workspace,
-    gradient_map,
-    proposition_maps,
-    read_steps,
-)
+from spatial_replay import LogError, Planner, Settings, UsageError
+from spatial_replay.planning import FREE, Grid, Workspace, gradient_map, proposition_maps, read_steps
 
 SAMPLE = sr.Sample(
     0, {"cup": block(1, 1, size=1), "mat": block(6, 6, size=4), "<jug>": sr.Footprint.disc(1, 6, 1)}

@@ -6,15 +6,8 @@ from dataclasses import replace
 
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, PUSHING, Table
-from spatial_replay.planning import (
-    PLAN_METADATA,
-    BlackBox,
-    Grid,
-    Planner,
-    Settings,
-    Workspace,
-    text_from_settings,
-)
+from spatial_replay import Planner, Settings
+from spatial_replay.planning import PLAN_METADATA, BlackBox, Grid, Workspace, text_from_settings
 from spatial_replay.runs.run_log import run_log
 
 PUSH = Settings(

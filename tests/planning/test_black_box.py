@@ -14,13 +14,12 @@ from mcap.reader import make_reader
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, block
 from planning.plans import PUSH, record_plan_of
-from spatial_replay.errors import LogError, UsageError
+from spatial_replay import LogError, Settings, UsageError, load_specification
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_PATH
 from spatial_replay.planning import (
     Grid,
     Reason,
-    Settings,
     Workspace,
     planner_of,
     read_decisions,
@@ -30,8 +29,7 @@ from spatial_replay.planning import (
 )
 from spatial_replay.planning.decision_log import CELL
 from spatial_replay.replay import ReplayOptions, Window, load_files, run_replay, verify_certificate
-from spatial_replay.sources.open_log import open_source
-from spatial_replay.spec import load_specification
+from spatial_replay.sources import open_source
 
 RECORDED = Path(__file__).resolve().parents[2] / "recordings" / "push.mcap"
 

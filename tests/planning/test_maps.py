@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import spatial_replay as sr
-from spatial_replay.errors import UsageError
+from spatial_replay import UsageError
 from spatial_replay.planning import FREE, Grid, Workspace, centre_of, gradient_map, proposition_maps
 from spatial_replay.planning.maps import CONSTRAINED, OCCUPIED, OUT_OF_REACH
 

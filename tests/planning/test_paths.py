@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spatial_replay.errors import UsageError
+from spatial_replay import UsageError
 from spatial_replay.planning import shortest_path
 
 ROOT_2 = math.sqrt(2.0)

@@ -10,17 +10,16 @@ import pytest
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, run
 from planning.plans import PUSH, record_plan_of
+from spatial_replay import Planner, Settings
 from spatial_replay.planning import (
     Grid,
-    Planner,
-    Settings,
     Workspace,
     moved_object,
     read_decisions,
     read_steps,
     recompute_decisions,
 )
-from spatial_replay.sources.open_log import open_source
+from spatial_replay.sources import open_source
 
 DONE = "green rightof red"
 TIMED = {

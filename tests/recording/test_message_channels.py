@@ -24,7 +24,7 @@ import spatial_replay as sr
 from replay.runs import SPECIFICATION, content_of, sample
 from spatial_replay.cli import run
 from spatial_replay.replay import run_replay, verify_certificate
-from spatial_replay.sources.open_log import open_source
+from spatial_replay.sources import open_source
 
 SPEC = sr.parse_specification(SPECIFICATION, filename="blocks.spatial")
 JOINTS = {"type": "object", "title": "JointStates", "properties": {"position": {"type": "array"}}}

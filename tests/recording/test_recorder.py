@@ -17,12 +17,11 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
 from replay.runs import PAST, SPECIFICATION, content_of, run, sample
-from spatial_replay.errors import OutputError, TraceError, UsageError
-from spatial_replay.recording import ENDING, Recorder
+from spatial_replay import OutputError, Recorder, TraceError, UsageError, parse_specification, read_trace
+from spatial_replay.recording import ENDING
 from spatial_replay.replay import load_files, run_replay
-from spatial_replay.sources.open_log import open_source, read_trace
+from spatial_replay.sources import open_source
 from spatial_replay.spec import format_specification
-from spatial_replay.spec.load import parse_specification
 
 SPEC = parse_specification(SPECIFICATION, filename="blocks.spatial")
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 
 from replay.runs import SPECIFICATION, run
-from spatial_replay.errors import TraceError
-from spatial_replay.logs.messages import MemorySink
+from spatial_replay import TraceError, parse_specification
+from spatial_replay.logs import MemorySink
 from spatial_replay.recording import ENDING, Recording
-from spatial_replay.spec.load import parse_specification
 
 
 def test_metadata_comes_before_the_samples() -> None:

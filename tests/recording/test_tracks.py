@@ -12,13 +12,11 @@ from pathlib import Path
 import pytest
 
 from replay.runs import SPECIFICATION, PiecewiseSource, content_of, run, write_tracks
-from spatial_replay.errors import LogError, OutputError, UsageError
-from spatial_replay.logs.messages import Block
+from spatial_replay import LogError, OutputError, Trace, UsageError, parse_specification, read_trace
+from spatial_replay.logs import Block
 from spatial_replay.recording import ENDING, record_source
 from spatial_replay.replay import run_replay
-from spatial_replay.sources.open_log import open_source, read_trace
-from spatial_replay.spec.load import parse_specification
-from spatial_replay.trace.trace import Trace
+from spatial_replay.sources import open_source
 
 
 def test_a_track_file_becomes_a_log_of_the_same_samples(tmp_path: Path) -> None:

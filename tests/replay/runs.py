@@ -10,12 +10,10 @@ from typing import Any
 
 from mcap.reader import make_reader
 
-from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
-from spatial_replay.logs.messages import Attachment, Block
+from spatial_replay import ConvexPart, Footprint, Sample, Trace, TrackedObject
+from spatial_replay.logs import Attachment, Block
 from spatial_replay.logs.source import within
 from spatial_replay.recording import record_source
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
 
 STEP_NS = 250_000_000
 SPECIFICATION = """\

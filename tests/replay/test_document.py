@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from replay.runs import SPECIFICATION, PiecewiseSource, run
+from spatial_replay import parse_specification
 from spatial_replay.replay import document_from_replay, run_replay
-from spatial_replay.spec.load import parse_specification
 
 
 @pytest.fixture

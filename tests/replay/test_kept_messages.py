@@ -19,11 +19,10 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import spatial_replay as sr
 from bags.bag_files import SECOND, START_NS, TEXT, Sent, drive, text, write_ros1, write_ros2
 from replay.runs import content_of, sample
+from spatial_replay import UsageError
 from spatial_replay.cli import run
-from spatial_replay.errors import UsageError
-from spatial_replay.logs.source import MemorySource
-from spatial_replay.replay import LoadedLog, ReplayOptions, Window, run_replay, verify_certificate
-from spatial_replay.replay.playback import Playback
+from spatial_replay.logs import MemorySource
+from spatial_replay.replay import LoadedLog, Playback, ReplayOptions, Window, run_replay, verify_certificate
 from spatial_replay.sources import open_source
 
 TURTLES = """\

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import spatial_replay as sr
 from replay.runs import PAST, STEP_NS, PiecewiseSource, run
-from spatial_replay.errors import LogError, SpecificationError, UsageError
+from spatial_replay import LogError, SpecificationError, UsageError
 from spatial_replay.replay import (
     Evaluated,
     LoadedLog,

@@ -20,12 +20,10 @@ from annotate.layouts import panels, paths_of
 from annotate.message_paths import values
 from replay.runs import STEP_NS, PiecewiseSource, content_of, record, run, sample
 from spatial_replay.annotate.curves import CURVES_CHANNEL
-from spatial_replay.logs.mcap.writer import LogWriter
-from spatial_replay.logs.messages import Channel, Messages, merge, messages_of
-from spatial_replay.logs.objects.encode import encode_objects
+from spatial_replay.logs import Channel, LogWriter, Messages, Source, encode_objects
+from spatial_replay.logs.messages import merge, messages_of
 from spatial_replay.logs.output_file import open_output
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import (
     CURVES_TOPIC,
     EVENT_LOG,
@@ -37,7 +35,7 @@ from spatial_replay.logs.topics import (
     protobuf_channel,
 )
 from spatial_replay.replay import LoadedLog, Playback, ReplayOptions, Window, run_replay
-from spatial_replay.sources.open_log import open_source
+from spatial_replay.sources import open_source
 
 ROOT = Path(__file__).parents[2]
 TEXT = """\

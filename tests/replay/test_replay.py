@@ -13,13 +13,20 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from replay.runs import PAST, SPECIFICATION, STEP_NS, PiecewiseSource, content_of, record, run, sample
-from spatial_replay.errors import LogError, OutputError, SpecificationError, UsageError
-from spatial_replay.logs.messages import Block
+from spatial_replay import (
+    LogError,
+    OutputError,
+    Replayed,
+    SpecificationError,
+    Trace,
+    UsageError,
+    load_specification,
+    parse_specification,
+)
+from spatial_replay.logs import Block
 from spatial_replay.recording import record_source
-from spatial_replay.replay import Replayed, ReplayOptions, Window, load_files, run_replay
-from spatial_replay.sources.open_log import open_source
-from spatial_replay.spec.load import load_specification, parse_specification
-from spatial_replay.trace.trace import Trace
+from spatial_replay.replay import ReplayOptions, Window, load_files, run_replay
+from spatial_replay.sources import open_source
 
 SPEC = parse_specification(SPECIFICATION, filename="blocks.spatial")
 ANNOTATION = {

@@ -10,10 +10,9 @@ from pathlib import Path
 import pytest
 
 from replay.runs import SPECIFICATION, PiecewiseSource, record, run
-from spatial_replay.errors import UsageError
-from spatial_replay.replay import QUANTITIES, Replayed, ReplayOptions, Window, export_table, run_replay
-from spatial_replay.sources.open_log import open_source
-from spatial_replay.spec.load import parse_specification
+from spatial_replay import Replayed, UsageError, parse_specification
+from spatial_replay.replay import QUANTITIES, ReplayOptions, Window, export_table, run_replay
+from spatial_replay.sources import open_source
 
 
 @pytest.fixture

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 import spatial_replay as sr
+from spatial_replay import Trace
 from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.logs.source import MemorySource
+from spatial_replay.logs import MemorySource
 from spatial_replay.replay import ReplayOptions, load_files
 from spatial_replay.report.write import write_report
-from spatial_replay.sources.open_log import open_source
-from spatial_replay.trace.trace import Trace
+from spatial_replay.sources import open_source
 
 RECORDINGS = Path(__file__).parent.parent.parent / "recordings"
 TYPES = {"f8": "<f8", "f4": "<f4", "i4": "<i4", "u2": "<u2", "u1": "u1"}

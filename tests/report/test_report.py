@@ -22,10 +22,10 @@ from report.report_pages import (
     report_of_trace,
     two_discs,
 )
-from spatial_replay.errors import UsageError
+from spatial_replay import UsageError
 from spatial_replay.replay import Window, load_files, run_replay
 from spatial_replay.report.write import write_report
-from spatial_replay.sources.open_log import open_source
+from spatial_replay.sources import open_source
 
 HOSTILE = (
     "</script><img src=x onerror=alert(1)>",

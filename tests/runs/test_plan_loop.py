@@ -9,7 +9,8 @@ import pytest
 
 import spatial_replay as sr
 from planning.kinematics import Table, block
-from spatial_replay.planning import BlackBox, Grid, Planner, Settings, Workspace
+from spatial_replay import Planner, Settings
+from spatial_replay.planning import BlackBox, Grid, Workspace
 from spatial_replay.runs.planned import HOLDING_SAMPLES, MOST_WAITING_SAMPLES, PlanLoop
 from spatial_replay.runs.run_log import run_log
 

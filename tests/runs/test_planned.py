@@ -10,7 +10,7 @@ import spatial_replay as sr
 from spatial_replay.planning import read_decisions, recompute_decisions
 from spatial_replay.replay import load_files, run_replay, verify_certificate
 from spatial_replay.runs.planned import PlannedRun, record_plan
-from spatial_replay.sources.open_log import open_source
+from spatial_replay.sources import open_source
 
 
 @pytest.fixture(scope="module")

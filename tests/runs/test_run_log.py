@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import spatial_replay as sr
-from spatial_replay.logs.messages import Channel, Messages
+from spatial_replay.logs import Channel, Messages
 from spatial_replay.replay import verify_certificate
 from spatial_replay.runs.run_log import RunLog, run_log
-from spatial_replay.sources.open_log import open_source
+from spatial_replay.sources import open_source
 
 REMARKS = Channel("/remarks", "json", None)
 

@@ -18,11 +18,9 @@ from websockets.exceptions import WebSocketException
 import spatial_replay as sr
 from replay.runs import STEP_NS, PiecewiseSource, content_of, record, run
 from serve.viewer import ENDED, PATIENCE_S, PAUSED, PLAYING, PROTOCOL, Message, State, Viewer, viewer
+from spatial_replay import UsageError
 from spatial_replay.annotate.curves import MOST_POINTS
-from spatial_replay.errors import UsageError
-from spatial_replay.logs.mcap.writer import LogWriter
-from spatial_replay.logs.messages import Channel, Schema
-from spatial_replay.logs.objects.encode import encode_objects
+from spatial_replay.logs import Channel, LogWriter, Schema, encode_objects
 from spatial_replay.logs.output_file import open_output
 from spatial_replay.logs.schemas.Curves_pb2 import Curves
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
@@ -38,7 +36,7 @@ from spatial_replay.logs.topics import (
 )
 from spatial_replay.replay import LoadedLog, run_replay
 from spatial_replay.serve import Serving, open_server
-from spatial_replay.sources.open_log import open_source
+from spatial_replay.sources import open_source
 
 TEXT = """\
 const far = 0.5

@@ -20,9 +20,9 @@ from hypothesis import strategies as st
 
 import spatial_replay as sr
 from replay.runs import STEP_NS, PiecewiseSource, run
+from spatial_replay import UsageError
 from spatial_replay.annotate.curves import CURVES_CHANNEL
-from spatial_replay.errors import UsageError
-from spatial_replay.logs.messages import Messages
+from spatial_replay.logs import Messages
 from spatial_replay.logs.topics import ROBUSTNESS
 from spatial_replay.replay import Evaluated, LoadedLog, Playback
 from spatial_replay.serve.pace import MOST_LATE_S, PlaybackState, Status

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spatial_replay.logs.messages import Channel, Messages
+from spatial_replay.logs import Channel, Messages
 from spatial_replay.logs.topics import EVENTS, ROBUSTNESS, SCENE
 from spatial_replay.serve.player import thin
 

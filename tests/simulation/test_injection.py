@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from simulation.worlds import world
-from spatial_replay.errors import UsageError
+from spatial_replay import UsageError
 from spatial_replay.simulation.injection import Injection
 
 GOAL = (0.36, -0.2)

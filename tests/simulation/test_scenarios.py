@@ -7,9 +7,8 @@ import math
 import pytest
 
 from simulation.worlds import off, world
-from spatial_replay import evaluate
+from spatial_replay import Trace, evaluate
 from spatial_replay.simulation.worlds import default_specification
-from spatial_replay.trace.trace import Trace
 
 
 def test_the_pushing_script_satisfies_its_specification() -> None:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shapely import MultiPoint, Polygon
 
-from spatial_replay.geometry.footprint import Footprint
+from spatial_replay import Footprint
 from spatial_replay.simulation.shapes import Box, Cylinder, Pose, footprint, height
 
 SIZES = st.floats(0.01, 0.5)

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 
 from simulation.worlds import centre, off, world
-from spatial_replay.errors import UsageError
-from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay import Sample, TrackedObject, UsageError
 from spatial_replay.simulation.shapes import Box, footprint, height
 from spatial_replay.simulation.worlds import SCENARIOS, default_specification, make_world
 from spatial_replay.spec import object_names
-from spatial_replay.trace.sample import Sample
 
 
 def tracked(sample: Sample, name: str) -> TrackedObject:

@@ -8,10 +8,10 @@ from contextlib import contextmanager
 
 import pytest
 
+from spatial_replay import Sample
 from spatial_replay.simulation.injection import Injection
 from spatial_replay.simulation.tabletop import Tabletop
 from spatial_replay.simulation.worlds import make_world
-from spatial_replay.trace.sample import Sample
 
 NO_SIMULATOR = "PyBullet is not installed; it has wheels for Python 3.11"
 
