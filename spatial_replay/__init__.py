@@ -21,7 +21,7 @@ from spatial_replay.errors import (
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.api import info, replay_log, verify, write_report
+    from spatial_replay.api import info, replay_log, tune, verify, write_report
     from spatial_replay.automata.automaton import Automaton
     from spatial_replay.automata.compile import automaton
     from spatial_replay.automata.guards import Transition
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from spatial_replay.spec.load import load_specification, parse_specification
     from spatial_replay.trace.sample import Sample
     from spatial_replay.trace.trace import Trace
+    from spatial_replay.tuning.tuned import Tuning
 
 __version__ = "0.1.0"
 
@@ -94,6 +95,7 @@ __all__ = [
     "TraceError",
     "TrackedObject",
     "Transition",
+    "Tuning",
     "Update",
     "UsageError",
     "Vacuous",
@@ -110,6 +112,7 @@ __all__ = [
     "parse_specification",
     "read_trace",
     "replay_log",
+    "tune",
     "verify",
     "write_report",
 ]
@@ -117,7 +120,7 @@ __all__ = [
 __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
-        "api": ("info", "replay_log", "verify", "write_report"),
+        "api": ("info", "replay_log", "tune", "verify", "write_report"),
         "automata.automaton": ("Automaton",),
         "automata.compile": ("automaton",),
         "automata.guards": ("Transition",),
@@ -146,5 +149,6 @@ __getattr__, __dir__ = loaded_when_used(
         "spec.load": ("load_specification", "parse_specification"),
         "trace.sample": ("Sample",),
         "trace.trace": ("Trace",),
+        "tuning.tuned": ("Tuning",),
     },
 )

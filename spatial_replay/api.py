@@ -1,4 +1,4 @@
-"""What the commands do with whole logs, as functions: replay, report, verify, info."""
+"""What the commands do with whole logs, as functions: replay, report, tune, verify, info."""
 
 from __future__ import annotations
 
@@ -18,11 +18,14 @@ from spatial_replay.replay.selection import ReplayOptions, Window
 from spatial_replay.replay.verification import Verified, verify_certificate
 from spatial_replay.report.write import refuse_output
 from spatial_replay.report.write import write_report as write_page
-from spatial_replay.sources.open_log import open_source
+from spatial_replay.sources.open_log import open_source, read_trace
 from spatial_replay.sources.overview import Overview, overview_of
 from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.overrides import load_specifications
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
+from spatial_replay.tuning.margins import load_runs
+from spatial_replay.tuning.tuned import Tuning, tune_runs
 
 PathName: TypeAlias = str | PathLike[str]
 Log: TypeAlias = PathName | Trace
@@ -134,6 +137,52 @@ def _evaluation(options: Evaluating) -> tuple[Mapping[str, float | str] | None, 
     each, constants = options.pop("each", None), options.pop("constants", None)
     semantics, strict_names = options.pop("semantics", "ltlf"), options.pop("strict_names", False)
     return constants, ReplayOptions(window, dict(each or {}), semantics, strict_names)
+
+
+def tune(
+    specification: Specification | PathName,
+    good: Log | Sequence[Log],
+    bad: Log | Sequence[Log] = (),
+    *,
+    vary: Mapping[str, tuple[float | str, float | str] | None] | None = None,
+    constants: Mapping[str, float | str] | None = None,
+    each: Mapping[str, str] | None = None,
+    seed: int = 0,
+    **reading: Unpack[Reading],
+) -> Tuning:
+    """Find the constants with which all good runs are satisfied and all bad ones are violated.
+
+    With bad runs those of the widest margin: the least of the good runs' robustness and the bad runs' negated
+    one is the greatest. With good runs only the tightest ones that satisfy them all.
+
+    Args:
+        specification: parsed, or as a file.
+        good, bad: logs in any format, or traces.
+        vary: the values to try, by name: `{"near": (40, 100), "hold": ("1s", "4s")}`; None takes the range in
+            the text. Without it all constants are tuned that have a range there.
+        constants: values of others, in place of those in the file.
+        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
+        seed: of the search over several constants; the same seed finds the same values.
+        reading: how to read the logs, as for `read_trace`.
+
+    Raises:
+        UsageError: no good run, a constant that cannot be tuned, a run that does not fit the specification.
+        SpecificationError: a specification with errors.
+        LogError: a log cannot be read.
+    """
+    if isinstance(specification, Specification):
+        if constants:
+            raise UsageError("constants are for files; give parse_specification(text, constants=…) its own")
+        file = specification
+    else:
+        (file,) = load_specifications([Path(specification)], constants=constants)
+    runs = load_runs(_logs(good), _logs(bad), lambda path: read_trace(path, **reading))
+    return tune_runs(file, runs, dict(vary or {}), each=each, seed=seed)
+
+
+def _logs(logs: Log | Sequence[Log]) -> list[Path | Trace]:
+    listed = [logs] if isinstance(logs, Trace | str | PathLike) else list(logs)
+    return [each if isinstance(each, Trace) else Path(each) for each in listed]
 
 
 def verify(log: PathName, source: PathName | None = None, **reading: Unpack[Reading]) -> Verified:

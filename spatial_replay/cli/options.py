@@ -210,6 +210,14 @@ strict_names_option = click.option(
     help="Refuse names that the log never has, instead of warning that they are unknown.",
 )
 
+choices_option = click.option(
+    "--each",
+    "choices",
+    multiple=True,
+    metavar="VAR=class:C",
+    help="Objects to evaluate a template for: one class, or VAR=all.",
+)
+
 _EVALUATION = (
     click.argument("log", type=click.Path(path_type=Path)),
     specs_option("Specification file; repeat for several.  [default: those in the log]"),
@@ -222,13 +230,7 @@ _EVALUATION = (
         default=1,
         help="Use every Nth sample of the log; bounds in samples count only these.",
     ),
-    click.option(
-        "--each",
-        "choices",
-        multiple=True,
-        metavar="VAR=class:C",
-        help="Objects to evaluate a template for: one class, or VAR=all.",
-    ),
+    choices_option,
     constants_option,
     strict_names_option,
     profile_option,
@@ -271,11 +273,16 @@ def open_inputs(request: EvaluationArguments) -> EvaluationInputs:
     source = open_source(request.log, **request.reading)
     files = load_files(request.specs, source, profile=request.profile, constants=request.constants)
     show_diagnostics(warning for file in files for warning in file.warnings)
-    window, each = _window(source, request), _each(request.choices)
+    window, each = _window(source, request), objects_by_parameter(request.choices)
     return EvaluationInputs(source, files, window, each, request.strict_names)
 
 
-def _each(choices: tuple[str, ...]) -> dict[str, str]:
+def objects_by_parameter(choices: tuple[str, ...]) -> dict[str, str]:
+    """Read `--each`: for each parameter of a template, the objects that it stands for.
+
+    Raises:
+        UsageError: an incomplete choice, or two for one parameter.
+    """
     each: dict[str, str] = {}
     for choice in choices:
         parameter, equals, objects = choice.partition("=")

@@ -76,6 +76,39 @@ class OfflineNodes:
         return self.columns[low, node], self.columns[high, node]
 
 
+@dataclass(frozen=True, eq=False)
+class OfflineFormula:
+    """A formula compiled once, to be evaluated over several logs.
+
+    Attributes:
+        table: (R, OFFLINE_WIDTH), its rows.
+        nodes, width: how many nodes it has, and columns with those of other rows.
+    """
+
+    table: Integers
+    nodes: int
+    width: int
+
+    @classmethod
+    def of(cls, formula: Formula, order: Sequence[Atom | Quantified]) -> OfflineFormula:
+        """Compile a formula.
+
+        Args:
+            order: which leaf is which.
+        """
+        table = OfflineTable(order)
+        nodes = [table.add(node) for _, _, node in iter_nodes(formula)]
+        instructions = table.instructions(nodes)
+        return cls(instructions, len(nodes), int(instructions[:, OFFLINE_TARGET].max()) + 1)
+
+    def evaluate(self, leaves: Floats, times_ns: Integers) -> OfflineNodes:
+        """Evaluate every node over all samples; see `evaluate_offline`."""
+        columns = np.empty((len(leaves), self.width, len(times_ns)))
+        extrema = np.empty(len(times_ns))
+        run_offline(self.table, np.ascontiguousarray(leaves), times_ns, 0, len(times_ns), columns, extrema)
+        return OfflineNodes(columns[:, : self.nodes])
+
+
 def evaluate_offline(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
 ) -> OfflineNodes:
@@ -86,11 +119,7 @@ def evaluate_offline(
         leaves: (C, A, T), their intervals (see `leaf_values`).
         times_ns: (T,), increasing.
     """
-    table, nodes, width = _compiled(formula, order)
-    columns = np.empty((len(leaves), width, len(times_ns)))
-    extrema = np.empty(len(times_ns))
-    run_offline(table, np.ascontiguousarray(leaves), times_ns, 0, len(times_ns), columns, extrema)
-    return OfflineNodes(columns[:, :nodes])
+    return OfflineFormula.of(formula, order).evaluate(leaves, times_ns)
 
 
 def full_signal(
@@ -113,12 +142,12 @@ def window_signal(
     """
     if isinstance(width_ns, bool) or not isinstance(width_ns, int) or not 0 < width_ns <= LATEST_NS:
         raise UsageError(f"a window of {width_ns!r} ns; give its width as an integer, 1 to 2**63 - 1 ns")
-    table, nodes, width = _compiled(formula, order)
+    compiled = OfflineFormula.of(formula, order)
     leaves = np.ascontiguousarray(leaves[:2])
     starts = np.searchsorted(times_ns, times_ns - width_ns, side="right").astype(np.int64)
-    columns = np.empty((len(leaves), width, len(times_ns)))
-    result = np.empty((len(leaves), nodes, len(times_ns)))
-    run_windows(table, leaves, times_ns, starts, columns, np.empty(len(times_ns)), result)
+    columns = np.empty((len(leaves), compiled.width, len(times_ns)))
+    result = np.empty((len(leaves), compiled.nodes, len(times_ns)))
+    run_windows(compiled.table, leaves, times_ns, starts, columns, np.empty(len(times_ns)), result)
     return _determined(result)
 
 
@@ -127,14 +156,6 @@ def new_leaves(formula: Formula, order: Sequence[Atom | Quantified]) -> list[Ato
     table = OfflineTable(order)
     table.add(formula)
     return table.leaves[len(order) :]
-
-
-def _compiled(formula: Formula, order: Sequence[Atom | Quantified]) -> tuple[Integers, int, int]:
-    """Compile a formula; return its table, number of nodes and number of columns."""
-    table = OfflineTable(order)
-    nodes = [table.add(node) for _, _, node in iter_nodes(formula)]
-    instructions = table.instructions(nodes)
-    return instructions, len(nodes), int(instructions[:, OFFLINE_TARGET].max()) + 1
 
 
 def _determined(ends: Floats) -> Floats:

@@ -23,6 +23,7 @@ _VIEWS: Mapping[str, str] = MappingProxyType(
         "spatial_replay.planning.maps": "planning_view",
         "spatial_replay.planning.read": "planning_view",
         "spatial_replay.spec.formula": "specification_view",
+        "spatial_replay.tuning.tuned": "tuning_view",
     }
 )
 """The view that registers the types of a module."""

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
+from io import BytesIO
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 from spatial_replay.errors import UsageError
 from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
@@ -52,6 +53,20 @@ def new_panel(size: tuple[float, float]) -> Axes:
         UsageError: matplotlib is not installed.
     """
     return new_panels(1, 1, size)[0]
+
+
+def picture(ax: Axes, kind: Literal["png", "svg"]) -> bytes:
+    """Return the figure of some axes as a file, and close it; equal figures give equal bytes."""
+    from matplotlib import pyplot, rc_context
+
+    stream, figure = BytesIO(), ax.get_figure(root=True)
+    if figure is None:
+        raise UsageError("these axes are in no figure; draw into new ones")
+    with rc_context({"svg.hashsalt": "spatial-replay"}):
+        # without the time of writing
+        figure.savefig(stream, format=kind, dpi=144, metadata={"Date": None} if kind == "svg" else None)
+    pyplot.close(figure)
+    return stream.getvalue()
 
 
 def signed_colours() -> Colormap:

@@ -95,10 +95,11 @@ def _rounded(result: Fraction, is_duration: bool) -> Value:
 # ------------------------------------------------------------------------------------------------ ranges
 
 
-def constant_of(value: Value, ends: tuple[Value, Value] | None) -> Constant:
+def constant_of(written: Quantity, value: Value, ends: tuple[Value, Value] | None) -> Constant:
     """Return a constant as specifications list it."""
+    is_computed = any(True for _ in names_in(written))
     span = None if ends is None else (_plain(ends[0]), _plain(ends[1]))
-    return Constant(_plain(value), value.ns if isinstance(value, Duration) else None, span)
+    return Constant(_plain(value), value.ns if isinstance(value, Duration) else None, span, is_computed)
 
 
 def _plain(value: Value) -> float:
@@ -155,7 +156,7 @@ def replaced(
 
 
 def _given(name: str, value: object, written: Value | None) -> str:
-    new = _read(name, value)
+    new = value_given(name, value)
     if written is not None and isinstance(new, Duration) != isinstance(written, Duration):
         was, example = (
             ("a duration", "'2s' or '500ms'") if isinstance(written, Duration) else ("a number", "80")
@@ -165,7 +166,7 @@ def _given(name: str, value: object, written: Value | None) -> str:
     return text_of(new)
 
 
-def _read(name: str, value: object) -> Value:
+def value_given(name: str, value: object) -> Value:
     """Return the value given for a constant from outside.
 
     Raises:

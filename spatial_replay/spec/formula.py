@@ -306,11 +306,13 @@ class Constant:
     Attributes:
         duration_ns: None for a number.
         range: the least and greatest value that its line allows, or None.
+        is_computed: whether it follows from other constants.
     """
 
     value: float
     duration_ns: int | None = None
     range: tuple[float, float] | None = None
+    is_computed: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -168,7 +168,7 @@ class Namespace:
             fault = None if ends is None else range_fault(value, ends)
             if fault is not None:
                 self.faults.add(statement.value.span, f"const {name!r}: {fault[0]}", fault[1])
-            found[name] = constant_of(value, ends)
+            found[name] = constant_of(statement.value, value, ends)
         return found
 
     def _report_not_a_number(self, name: Name, statement: Statement | None) -> None:

@@ -1,0 +1,225 @@
+"""`spatial-replay tune`: find the constants that fit recorded runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from spatial_replay.cli.application import ExitCode
+from spatial_replay.cli.options import (
+    ReadArguments,
+    choices_option,
+    constants_option,
+    input_files,
+    load_spec_options,
+    objects_by_parameter,
+    output_option,
+    profile_option,
+    reading_options,
+)
+from spatial_replay.cli.progress import progress
+from spatial_replay.cli.terminal import show, show_diagnostics, show_json
+from spatial_replay.errors import UsageError
+from spatial_replay.text import counted
+
+if TYPE_CHECKING:
+    from spatial_replay.tuning import TunedConstant, Tuning
+    from spatial_replay.tuning.varied import Value
+
+_PICTURES = (".png", ".svg", ".html")
+_MANY = frozenset({"--good", "--bad"})
+_MOST_LISTED = 20
+"""The most runs that are listed; JSON has all."""
+
+
+class _ManyLogs(click.Command):
+    """A command whose options --good and --bad take all that follows, as shells expand `good/*.mcap`."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        return super().parse_args(ctx, list(_one_by_one(args)))
+
+
+def _one_by_one(arguments: list[str]) -> Iterator[str]:
+    repeated: str | None = None
+    is_first = False
+    for argument in arguments:
+        if argument in _MANY:
+            repeated, is_first = argument, True
+            yield argument
+        elif argument.startswith("-") and argument != "-":
+            repeated = None
+            yield argument
+        else:
+            if repeated is not None and not is_first:
+                yield repeated
+            is_first = False
+            yield argument
+
+
+def _read_ranges(
+    context: click.Context, parameter: click.Parameter, texts: tuple[str, ...]
+) -> dict[str, tuple[Value, Value] | None]:
+    ranges: dict[str, tuple[Value, Value] | None] = {}
+    for text in texts:
+        name, equals, span = (part.strip() for part in text.partition("="))
+        low, colon, high = (part.strip() for part in span.partition(":"))
+        if not name or (equals and not (colon and low and high)):
+            raise UsageError(
+                f"--vary: {text!r} is incomplete; write NAME=LOW:HIGH, such as near=40:100 or hold=1s:4s"
+            )
+        if name in ranges:
+            raise UsageError(f"--vary: {name!r} is given twice; give one range")
+        ranges[name] = (low, high) if equals else None
+    return ranges
+
+
+@click.command(cls=_ManyLogs)
+@click.option(
+    "--spec",
+    "spec",
+    metavar="SPEC",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="Specification file.",
+)
+@click.option(
+    "--good",
+    metavar="LOG...",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="Runs that have to satisfy it.",
+)
+@click.option(
+    "--bad",
+    metavar="LOG...",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="Runs that have to violate it.",
+)
+@click.option(
+    "--vary",
+    "ranges",
+    metavar="NAME[=LOW:HIGH]",
+    multiple=True,
+    callback=_read_ranges,
+    help="Constant to tune, and the values to try; repeat for several."
+    "  [default: those with a range in the text]",
+)
+@click.option("--write", is_flag=True, help="Write the values found into SPEC; only the numbers change.")
+@output_option("Picture of the margins over the first two constants to write (.png, .svg, .html).")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="Seed of the search over several constants.",
+)
+@choices_option
+@constants_option
+@profile_option
+@reading_options
+def tune(
+    spec: Path,
+    good: tuple[Path, ...],
+    bad: tuple[Path, ...],
+    ranges: dict[str, tuple[Value, Value] | None],
+    write: bool,
+    output: Path | None,
+    as_json: bool,
+    seed: int,
+    choices: tuple[str, ...],
+    constants: Mapping[str, float | str],
+    profile: str | None,
+    reading: ReadArguments,
+) -> ExitCode:
+    """Find the constants with which good runs satisfy a specification and bad runs violate it.
+
+    With good and bad runs these are the values of the widest margin between them; with good runs only, the
+    tightest ones. Constants to tune have a range in the text, const near = 70 in [40, 100], or are named by
+    --vary. Bounds of windows, such as F[0s, hold], are tuned like thresholds.
+
+    Exits with 0 if there are such values, and with 1 if not: then the runs that contradict each other are
+    listed.
+
+    \b
+    Examples:
+      spatial-replay tune --spec blocks.spatial --good good/*.mcap --bad bad/*.mcap
+      spatial-replay tune --spec blocks.spatial --good good/*.mcap --vary near=40:100 --write
+      spatial-replay tune --spec blocks.spatial --good a.mcap --bad b.mcap --vary near=40:100 \\
+        --vary hold=1s:4s -o surface.png
+    """
+    # imported here so that --help stays fast
+    from spatial_replay.logs.output_file import refuse_inputs
+    from spatial_replay.replay.specification_files import write_constants
+    from spatial_replay.sources.open_log import read_trace
+    from spatial_replay.tuning import load_runs, tune_runs
+
+    if not good:
+        raise UsageError("there is no good run to satisfy; give at least one: --good LOG")
+    (file,) = load_spec_options([spec], profile, constants)
+    show_diagnostics(file.warnings)
+    if output is not None:
+        if output.suffix.lower() not in _PICTURES:
+            raise UsageError(f"-o {output}: the picture is {', '.join(_PICTURES)}; name it {output.stem}.png")
+        refuse_inputs(output, input_files(spec, *good, *bad, reading=reading))
+    with progress("logs", 2 * len(good + bad)) as advance:
+        runs = load_runs(good, bad, lambda path: read_trace(path, **reading), advance)
+        tuning = tune_runs(file, runs, ranges, each=objects_by_parameter(choices), seed=seed, advance=advance)
+    changed: tuple[str, ...] = ()
+    if write and tuning.is_found:
+        changed = write_constants(spec, tuning.plain_constants, profile=profile)
+    if output is not None:
+        _write_picture(tuning, output)
+    if as_json:
+        show_json(tuning.document)
+    else:
+        show(*_lines(tuning))
+        if write and tuning.is_found:
+            show(f"{spec}: {', '.join(changed)} written" if changed else f"{spec} has these values already")
+        if output is not None:
+            show(f"wrote {output}")
+    return ExitCode.SATISFIED if tuning.is_found else ExitCode.VIOLATED
+
+
+def _lines(tuning: Tuning) -> Iterator[str]:
+    count = {is_good: sum(run.is_good == is_good for run in tuning.runs) for is_good in (True, False)}
+    runs = counted(count[True], "good run") + (
+        f" and {counted(count[False], 'bad run')}" if count[False] else ""
+    )
+    if tuning.conflict is not None:
+        names = ", ".join(constant.name for constant in tuning.constants)
+        yield f"no values of {names} fit {runs}"
+        yield from (f"  {part}" for part in tuning.conflict.message.split("; "))
+        return
+    kind = "widest margin" if count[False] else "tightest values"
+    yield f"{kind} for {runs}: {tuning.margin:.6g}" if count[False] else f"{kind} for {runs}"
+    rows = [_row(constant) for constant in tuning.constants]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        yield "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+    closest = sorted(tuning.runs, key=lambda run: run.margin)
+    yield "closest runs:" if len(closest) > _MOST_LISTED else "runs, the closest first:"
+    width = max(len(run.name) for run in closest[:_MOST_LISTED])
+    for run in closest[:_MOST_LISTED]:
+        kind = "good" if run.is_good else "bad "
+        yield f"  {run.name:<{width}}  {kind}  {run.verdict:<9}  robustness {run.robustness:.6g}"
+    if len(closest) > _MOST_LISTED:
+        yield f"  … and {counted(len(closest) - _MOST_LISTED, 'more run')}"
+
+
+def _row(constant: TunedConstant) -> tuple[str, str, str, str]:
+    def text(value: Any) -> str:
+        return value if isinstance(value, str) else f"{value:.12g}"
+
+    span = f"every value from {text(constant.low)} to {text(constant.high)} fits"
+    return constant.name, text(constant.value), f"({text(constant.written)} as written)", span
+
+
+def _write_picture(tuning: Tuning, output: Path) -> None:
+    from spatial_replay.notebook.tuning_view import write_surface
+
+    write_surface(tuning, output)

@@ -1,0 +1,157 @@
+"""Tuned constants in notebooks: a table of values, and the margins of the runs as curves or as a surface."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.logs.output_file import replacing
+from spatial_replay.notebook import html, plot
+from spatial_replay.notebook.figures import (
+    INK,
+    Html,
+    element,
+    new_panel,
+    picture,
+    plain,
+    quiet,
+    signed_colours,
+    table,
+    verdict_mark,
+)
+from spatial_replay.palette import NEGATIVE, POSITIVE
+from spatial_replay.text import counted
+from spatial_replay.tuning.tuned import Surface, Tuning
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_MOST_RUNS: Final = 50
+"""The most runs in a table."""
+_MOST_LINES: Final = 40
+"""The most runs whose change of verdict is drawn as a line of its own."""
+
+
+@html.register(Tuning)
+def tuning_html(tuning: Tuning) -> Html:
+    """Return the values found, or why there are none, and the runs, the closest first."""
+    name = element("b", tuning.specification.filename)
+    if tuning.conflict is not None:
+        return element("div", name, f": no values fit all runs. {tuning.conflict.message}.")
+    rows = [
+        (each.name, str(each.value), str(each.written), f"{each.low} to {each.high}")
+        for each in tuning.constants
+    ]
+    closest = sorted(tuning.runs, key=lambda run: run.margin)
+    runs = [
+        (run.name, "good" if run.is_good else "bad", verdict_mark(run.verdict), f"{run.robustness:.6g}")
+        for run in closest[:_MOST_RUNS]
+    ]
+    left_out = len(closest) - len(runs)
+    return element(
+        "div",
+        element("div", name, f": margin {tuning.margin:.6g}"),
+        table(["constant", "value", "as written", "every value that fits"], rows),
+        table(["run", "is", "verdict", "robustness"], runs),
+        quiet(f"… and {counted(left_out, 'run')} more") if left_out else Html(""),
+    )
+
+
+@plot.register(Tuning)
+def draw_tuning(tuning: Tuning, *names: str, points: int = 25, ax: Axes | None = None) -> Axes:
+    """Draw the margins over one or two constants; without names over the first two.
+
+    Raises:
+        UsageError: a constant that was not varied; matplotlib is not installed.
+    """
+    return draw_surface(tuning.surface(*names, points=points), ax)
+
+
+@plot.register(Surface)
+def draw_surface(surface: Surface, ax: Axes | None = None) -> Axes:
+    """Draw where which runs have the right verdict.
+
+    For one constant a curve for each run; for two the least margin as colours, and for each run a line where
+    its verdict changes: solid for good runs, dashed for bad ones. A circle marks the values found.
+
+    Raises:
+        UsageError: matplotlib is not installed.
+    """
+    ax = ax or new_panel((6.4, 4.4))
+    (_draw_curves if len(surface.names) == 1 else _draw_colours)(surface, ax)
+    ax.set_xlabel(plain(surface.names[0]))
+    _name_runs(surface, ax)
+    return ax
+
+
+def write_surface(tuning: Tuning, output: Path) -> None:
+    """Write the margins over the first two constants as a picture (.png, .svg), or as a page with the values.
+
+    Raises:
+        UsageError: matplotlib is not installed.
+        OutputError: the file cannot be written.
+    """
+    ending = output.suffix.lower()
+    data = picture(draw_tuning(tuning), "png" if ending == ".png" else "svg")
+    if ending == ".html":
+        drawing = data.decode("utf-8")
+        head = '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>Tuning</title></head>\n'
+        body = f"<body style='font-family:system-ui,sans-serif'>{drawing[drawing.index('<svg') :]}\n"
+        data = f"{head}{body}{tuning_html(tuning)}\n</body></html>\n".encode()
+    with replacing(output) as stream:
+        stream.write(data)
+
+
+def _draw_curves(surface: Surface, ax: Axes) -> None:
+    margins = _finite(surface.margins[:, 0])
+    for (_, is_good), margin in zip(surface.runs, margins, strict=True):
+        ax.plot(surface.x, margin, color=POSITIVE if is_good else NEGATIVE, linewidth=1, alpha=0.6)
+    ax.plot(surface.x, margins.min(axis=0), color=INK, linewidth=2, label="least")
+    ax.axhline(0.0, color=INK, linewidth=0.8, linestyle=":")
+    if surface.found is not None:
+        ax.axvline(surface.found[0], color=INK, linewidth=0.8)
+    ax.set_ylabel("margin")
+    ax.legend(loc="best", frameon=False)
+
+
+def _draw_colours(surface: Surface, ax: Axes) -> None:
+    least = _finite(surface.least)
+    most = float(np.abs(least).max()) or 1.0
+    mesh = ax.pcolormesh(
+        surface.x, surface.y, least, cmap=signed_colours(), vmin=-most, vmax=most, shading="nearest"
+    )
+    figure = ax.get_figure(root=True)
+    if figure is not None:
+        figure.colorbar(mesh, ax=ax, label="least margin")
+    for (_, is_good), margins in list(zip(surface.runs, surface.margins, strict=True))[:_MOST_LINES]:
+        if min(margins.shape) > 1 and margins.min() < 0.0 <= margins.max():
+            ax.contour(
+                surface.x,
+                surface.y,
+                _finite(margins),
+                levels=[0.0],
+                colors=[POSITIVE if is_good else NEGATIVE],
+                linestyles="solid" if is_good else "dashed",
+                linewidths=1,
+            )
+    if surface.found is not None:
+        ax.plot(*surface.found, marker="o", markersize=7, color="white", markeredgecolor=INK)
+    ax.set_ylabel(plain(surface.names[1]))
+
+
+def _name_runs(surface: Surface, ax: Axes) -> None:
+    good = sum(is_good for _, is_good in surface.runs)
+    bad = len(surface.runs) - good
+    runs = counted(good, "good run") + (f", {counted(bad, 'bad run')}" if bad else "")
+    ax.set_title(plain(f"{runs}: margin over {' and '.join(surface.names)}"), loc="left", fontsize=10)
+
+
+def _finite(margins: Floats) -> Floats:
+    """Return margins with infinite ones in place by the largest finite one."""
+    finite = np.abs(margins[np.isfinite(margins)])
+    most = float(finite.max()) if len(finite) else 1.0
+    clipped: Floats = np.clip(margins, -most, most)
+    return clipped

@@ -1,0 +1,308 @@
+"""Search for the values of constants, on their grids.
+
+Looser values raise the robustness of every run. So for a good run all values hold from some number on, and
+for a bad one all up to some number: these are found exactly, by bisection. A run is bisected only if it does
+not hold at the value found so far; in a random order few of many runs are.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from spatial_replay.errors import UsageError
+from spatial_replay.tuning.margins import Margins, Point
+
+_PARTS: Final = 1 << 20
+"""Steps by which all constants together are tightened."""
+_ROUNDS, _GENERATIONS, _CANDIDATES = 6, 25, 6
+"""Bounds of the search over several constants: rounds of adding runs, generations in a round, and candidates
+of a generation for each constant."""
+_FAR: Final = 1e12
+"""In place of an infinite margin."""
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """The end of a search.
+
+    Attributes:
+        point: where it ended.
+        is_held: whether every run has the right verdict there.
+        conflict: runs that have not all the right verdict at any point, as far as was searched; () if held.
+    """
+
+    point: Point
+    is_held: bool
+    conflict: tuple[int, ...] = ()
+
+
+class Search:
+    """A search for the best point, for given runs; the same seed gives the same point."""
+
+    def __init__(self, margins: Margins, seed: int = 0) -> None:
+        self._margins, self._seed = margins, seed
+        numbers = list(range(len(margins.runs)))
+        random.Random(seed).shuffle(numbers)
+        self._good = [number for number in numbers if margins.runs[number].is_good]
+        self._bad = [number for number in numbers if not margins.runs[number].is_good]
+        self._steps = tuple(constant.steps for constant in margins.varied)
+
+    def best(self) -> Found:
+        """Return the tightest point if all runs are good, else the one with the widest margin.
+
+        Raises:
+            UsageError: the tightest is asked for of a constant without a direction; the library for several
+                constants is not installed.
+        """
+        if not self._bad:
+            return self._tightest()
+        if len(self._steps) == 1 and self._margins.directions[0] is not None:
+            return self._widest_of_one()
+        return self._widest_of_several()
+
+    def holds(self, point: Point) -> bool:
+        """Return whether every run has the right verdict."""
+        return self._all_hold([*self._bad, *self._good], point)
+
+    def limit(self, run: int) -> int | None:
+        """Return the number at which a run holds by the narrowest, for one constant with a direction.
+
+        Returns:
+            None if it holds nowhere.
+        """
+        steps = self._steps[0]
+        is_good = self._margins.runs[run].is_good
+
+        def at(easiness: int) -> Point:
+            return (self._numbered(0, easiness if is_good else steps - easiness),)
+
+        return at(self._least([run], steps, at))[0] if self._margins.holds(run, at(steps)) else None
+
+    def interval(self, point: Point, axis: int, least: float = 0.0) -> tuple[int, int]:
+        """Return the numbers around a point's, on one axis, at which all margins are at least so large."""
+        return self._edge(point, axis, -1, least), self._edge(point, axis, 1, least)
+
+    # ---------------------------------------------------------------------------------------- one constant
+
+    def _tightest(self) -> Found:
+        """Tighten all constants together, then one after the other, while every run stays satisfied."""
+        for constant, direction in zip(self._margins.varied, self._margins.directions, strict=True):
+            if direction is None:
+                raise UsageError(
+                    f"greater values of {constant.name} are looser in one place and tighter in another, so "
+                    "none is the tightest; give bad runs, too"
+                )
+        loosest = self._at([_PARTS] * len(self._steps), _PARTS)
+        failing = tuple(run for run in self._good if not self._margins.holds(run, loosest))
+        if failing:
+            return Found(loosest, is_held=False, conflict=failing)
+        together = self._least(self._good, _PARTS, lambda part: self._at([part] * len(self._steps), _PARTS))
+        point = self._at([together] * len(self._steps), _PARTS)
+        for axis, steps in enumerate(self._steps):
+
+            def along(looseness: int, axis: int = axis, point: Point = point) -> Point:
+                return self._with(point, axis, self._numbered(axis, looseness))
+
+            point = along(self._least(self._good, steps, along))
+        return Found(point, is_held=True)
+
+    def _widest_of_one(self) -> Found:
+        steps = self._steps[0]
+
+        def at(looseness: int) -> Point:
+            return (self._numbered(0, looseness),)
+
+        loosest, tightest = at(steps), at(0)
+        alone = [run for run in self._good if not self._margins.holds(run, loosest)]
+        alone += [run for run in self._bad if not self._margins.holds(run, tightest)]
+        if alone:
+            return Found(self._margins.start, is_held=False, conflict=tuple(alone))
+        first = self._least(self._good, steps, at)
+        last = steps - self._least(self._bad, steps, lambda tightness: at(steps - tightness))
+        if first > last:
+            failing = [run for run in self._good if not self._margins.holds(run, at(last))]
+            failing += [run for run in self._bad if not self._margins.holds(run, at(first))]
+            return Found(at(first), is_held=False, conflict=tuple(failing))
+        number = self._crossing(first, last, at)
+        widest = max(number, max(number - 1, first), key=lambda each: self._least_margin(at(each)))
+        least = self._least_margin(at(widest))
+        interval = self.interval(at(widest), 0, least)
+        return Found((self._margins.varied[0].roundest(*interval),), is_held=True)
+
+    def _crossing(self, first: int, last: int, at: Callable[[int], Point]) -> int:
+        """Return the least looseness at which the good have the wider margin; the last if there is none.
+
+        Runs that have the least margin nowhere between the ends are left out as these move together.
+        """
+        margin = self._margins.margin
+        good, bad = self._good, self._bad
+        while first < last:
+            middle = (first + last) // 2
+            least_good = min(margin(run, at(last)) for run in good) if good else np.inf
+            least_bad = min(margin(run, at(first)) for run in bad)
+            good = [run for run in good if margin(run, at(first)) <= least_good]
+            bad = [run for run in bad if margin(run, at(last)) <= least_bad]
+            goods = min((margin(run, at(middle)) for run in good), default=np.inf)
+            if goods >= min(margin(run, at(middle)) for run in bad):
+                last = middle
+            else:
+                first = middle + 1
+        return first
+
+    def _least(self, runs: Iterable[int], most: int, at: Callable[[int], Point]) -> int:
+        """Return the least number from which on every run holds; all hold at `most`."""
+        number = 0
+        for run in runs:
+            if not self._margins.holds(run, at(number)):
+                low, high = number, most
+                while high - low > 1:
+                    middle = (low + high) // 2
+                    if self._margins.holds(run, at(middle)):
+                        high = middle
+                    else:
+                        low = middle
+                number = high
+        return number
+
+    # ------------------------------------------------------------------------------------ several constants
+
+    def _widest_of_several(self) -> Found:
+        """Optimise over the runs that decide, and add those that turn out to, until none is missing."""
+        start = self._margins.start
+        deciding = self._worst(start, [])
+        point = start
+        for _ in range(_ROUNDS):
+            point = self._optimised(deciding, point)
+            missing = self._worst(point, deciding)
+            if not missing:
+                break
+            deciding += missing
+        if not self.holds(point):
+            return Found(point, is_held=False, conflict=self._conflict(point))
+        return Found(self._centred(point), is_held=True)
+
+    def _worst(self, point: Point, known: Sequence[int]) -> list[int]:
+        """Return the good and the bad run of the least margin, if it is less than that of the known runs."""
+        margin = self._margins.margin
+        least = min((margin(run, point) for run in known), default=np.inf)
+        worst = [min(runs, key=lambda run: margin(run, point)) for runs in (self._good, self._bad) if runs]
+        return [run for run in worst if run not in known and (not known or margin(run, point) < least)]
+
+    def _optimised(self, runs: Sequence[int], start: Point) -> Point:
+        """Return the best point for some runs that the optimiser finds."""
+        try:
+            from scipy.optimize import differential_evolution
+        except ImportError:
+            remedy = "pip install 'spatial-replay[tune]'"
+            raise UsageError(
+                f"tuning several constants needs SciPy, which is not installed: {remedy}"
+            ) from None
+
+        def cost(shares: Sequence[float]) -> float:
+            point = tuple(round(share * steps) for share, steps in zip(shares, self._steps, strict=True))
+            least = min(self._margins.margin(run, point) for run in runs)
+            return -min(max(least, -_FAR), _FAR)
+
+        found = differential_evolution(
+            cost,
+            [(0.0, 1.0)] * len(self._steps),
+            rng=np.random.default_rng(self._seed),
+            x0=[number / steps for number, steps in zip(start, self._steps, strict=True)],
+            init="sobol",
+            popsize=_CANDIDATES,
+            maxiter=_GENERATIONS,
+            polish=False,
+        )
+        point = tuple(round(share * steps) for share, steps in zip(found.x, self._steps, strict=True))
+        return self._climbed(runs, point)
+
+    def _climbed(self, runs: Sequence[int], point: Point) -> Point:
+        """Move a point along single axes while the least margin grows, by steps that halve."""
+
+        def value(each: Point) -> float:
+            return min(self._margins.margin(run, each) for run in runs)
+
+        best = value(point)
+        sizes = [max(steps >> 4, 1) for steps in self._steps]
+        for _ in range(12):
+            for axis, size in enumerate(sizes):
+                for step in (-size, size):
+                    moved = self._with(point, axis, min(max(point[axis] + step, 0), self._steps[axis]))
+                    if (margin := value(moved)) > best:
+                        point, best = moved, margin
+            sizes = [max(size >> 1, 1) for size in sizes]
+        return point
+
+    def _centred(self, point: Point) -> Point:
+        """Move each number to the middle of those that give no lesser margin."""
+        least = self._least_margin(point)
+        for axis, constant in enumerate(self._margins.varied):
+            number = constant.roundest(*self.interval(point, axis, least))
+            moved = self._with(point, axis, number)
+            # between the ends a constant without a direction may have a lesser margin
+            point = moved if self._all_hold(self._good + self._bad, moved, least) else point
+        return point
+
+    def _conflict(self, point: Point) -> tuple[int, ...]:
+        """Return the runs that conflict: one or two for which no point is found, else all that fail."""
+        margin = self._margins.margin
+        worst = [min(runs, key=lambda run: margin(run, point)) for runs in (self._good, self._bad) if runs]
+        for few in (*[[run] for run in worst], worst):
+            best = self._optimised(few, point)
+            if not self._all_hold(few, best):
+                return tuple(few)
+        return tuple(run for run in self._good + self._bad if not self._margins.holds(run, point))
+
+    # ---------------------------------------------------------------------------------------------- points
+
+    def _numbered(self, axis: int, looseness: int) -> int:
+        """Return the number on an axis of a value that is so many steps looser than the tightest."""
+        return self._steps[axis] - looseness if self._margins.directions[axis] == -1 else looseness
+
+    def _at(self, parts: Sequence[int], whole: int) -> Point:
+        """Return the point whose looseness is this part of the whole, on each axis."""
+        return tuple(
+            self._numbered(axis, part * self._steps[axis] // whole) for axis, part in enumerate(parts)
+        )
+
+    def _with(self, point: Point, axis: int, number: int) -> Point:
+        return (*point[:axis], number, *point[axis + 1 :])
+
+    def _all_hold(self, runs: Sequence[int], point: Point, least: float = 0.0) -> bool:
+        return all(self._margins.holds(run, point, least) for run in runs)
+
+    def _least_margin(self, point: Point) -> float:
+        return min(self._margins.margin(run, point) for run in (*self._good, *self._bad))
+
+    def _edge(self, point: Point, axis: int, towards: int, least: float) -> int:
+        """Return the last number in one direction up to which all margins are at least so large."""
+        runs, end = [*self._bad, *self._good], self._steps[axis] if towards > 0 else 0
+
+        def holds(number: int) -> bool:
+            nonlocal runs
+            moved = self._with(point, axis, number)
+            for index, run in enumerate(runs):
+                if not self._margins.holds(run, moved, least):
+                    # it is the likeliest to fail again
+                    runs = [run, *runs[:index], *runs[index + 1 :]]
+                    return False
+            return True
+
+        inside, size = point[axis], 1
+        outside = inside
+        while inside != end and inside == outside:
+            outside = min(inside + size, end) if towards > 0 else max(inside - size, end)
+            if holds(outside):
+                inside, size = outside, 2 * size
+        while abs(outside - inside) > 1:
+            middle = (inside + outside) // 2
+            if holds(middle):
+                inside = middle
+            else:
+                outside = middle
+        return inside

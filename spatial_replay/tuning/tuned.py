@@ -1,0 +1,361 @@
+"""What tuning found: values with their ranges, the margin of every run, runs that conflict, and surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+
+from spatial_replay.errors import UsageError
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.lazy import Displayed
+from spatial_replay.monitor.verdict import Verdict, final_verdict
+from spatial_replay.spec import parse_specification
+from spatial_replay.spec.diagnostics import nearest_hint
+from spatial_replay.spec.formula import Specification
+from spatial_replay.text import counted, json_number
+from spatial_replay.tuning.direction import Direction
+from spatial_replay.tuning.margins import LabelledRun, Margins, Point
+from spatial_replay.tuning.search import Found, Search
+from spatial_replay.tuning.varied import Value, text_of_constant, varied_constants
+
+MOST_RUNS: Final = 10_000
+MOST_SAMPLES: Final = 1 << 25
+"""Bounds of what is held in memory: runs, and samples of all of them together."""
+MOST_CONSTANTS: Final = 10
+_MOST_NAMED: Final = 5
+"""The most conflicting runs that a sentence names."""
+
+
+@dataclass(frozen=True, slots=True)
+class TunedConstant:
+    """A constant with the value found for it.
+
+    Attributes:
+        value, written: the value found and the one in the text: a number, or a duration as a text.
+        low, high: the ends of the values around it that hold for every run, the other constants as found; a
+            step beyond either, unless it ends the range that was tried, some run does not.
+        tried: the range that was tried.
+        step: the least difference of two values, or the seconds of it.
+        direction: 1 if greater values are looser, -1 if they are tighter, None if neither is certain.
+    """
+
+    name: str
+    value: Value
+    written: Value
+    low: Value
+    high: Value
+    tried: tuple[Value, Value]
+    step: float
+    direction: Direction | None
+
+
+@dataclass(frozen=True, slots=True)
+class RunMargin:
+    """A run with the values found.
+
+    Attributes:
+        robustness: the least of all results, at its lower end if the run is good and its upper end if bad.
+        margin: how far that is from the wrong verdict: negated for a bad run, negative if it is wrong.
+    """
+
+    name: str
+    is_good: bool
+    verdict: Verdict
+    robustness: float
+    margin: float
+
+
+@dataclass(frozen=True, slots=True)
+class Conflict:
+    """Why no values were found.
+
+    Attributes:
+        runs: names of the runs that cannot all have the right verdict.
+        message: what each of them needs, as far as that is known.
+    """
+
+    runs: tuple[str, ...]
+    message: str
+
+
+@dataclass(frozen=True, eq=False)
+class Surface(Displayed):
+    """The margin of every run over the values of one or two constants, the others as found.
+
+    Attributes:
+        names: of the constants, that along x first.
+        x, y: (X,) and (Y,), their values, durations in seconds; y is (1,) of NaN for one constant.
+        margins: (R, Y, X); -inf where the specification is invalid.
+        runs: (R,) names of the runs, and whether each is good.
+        found: the values found, or None.
+    """
+
+    names: tuple[str, ...]
+    x: Floats
+    y: Floats
+    margins: Floats
+    runs: tuple[tuple[str, bool], ...]
+    found: tuple[float, ...] | None
+
+    @property
+    def least(self) -> Floats:
+        """(Y, X), the least margin of all runs."""
+        least: Floats = self.margins.min(axis=0)
+        return least
+
+
+@dataclass(frozen=True, eq=False)
+class Tuning(Displayed):
+    """The values found for constants, or why there are none.
+
+    Attributes:
+        is_found: whether every run has the right verdict with these values.
+        constants: the constants that were varied; if nothing was found, as far as the search came.
+        margin: the least margin of all runs.
+        runs: every run, in the order given.
+        conflict: why nothing was found, or None.
+        specification: the specification with the values, its comments and layout kept.
+    """
+
+    is_found: bool
+    constants: tuple[TunedConstant, ...]
+    margin: float
+    runs: tuple[RunMargin, ...]
+    conflict: Conflict | None
+    specification: Specification
+    _margins: Margins = field(repr=False)
+    _point: Point = field(repr=False)
+
+    @property
+    def values(self) -> dict[str, Value]:
+        """The values by name, as `parse_specification` takes them."""
+        return {constant.name: constant.value for constant in self.constants}
+
+    @property
+    def plain_constants(self) -> dict[str, Value]:
+        """All constants of the specification that follow from no others, with the values found."""
+        return {
+            name: each.value if each.duration_ns is None else text_of_constant(each)
+            for name, each in self.specification.constants.items()
+            if not each.is_computed
+        }
+
+    def surface(self, *names: str, points: int = 25) -> Surface:
+        """Compute the margins over one or two constants; without names over the first two.
+
+        Args:
+            points: how many values of each constant.
+
+        Raises:
+            UsageError: a constant that was not varied, more than two, fewer than 2 points or more than 200.
+        """
+        known = [constant.name for constant in self.constants]
+        chosen = names or tuple(known[:2])
+        for name in chosen:
+            if name not in known:
+                hint = nearest_hint(name, known) or f"varied were: {', '.join(known)}"
+                raise UsageError(f"{name!r} was not varied; {hint}")
+        if len({*chosen}) != len(chosen) or len(chosen) > 2:
+            raise UsageError(f"a surface is over one or two constants, not over {', '.join(chosen)}")
+        if not 2 <= points <= 200:
+            raise UsageError(f"points is {points}; give 2 to 200")
+        axes = [known.index(name) for name in chosen]
+        varied = [self._margins.varied[axis] for axis in axes]
+        grids = [np.unique(np.linspace(0, each.steps, points).round().astype(np.int64)) for each in varied]
+        rows = grids[1] if len(grids) > 1 else np.array([self._point[axes[0]]])
+        margins = np.empty((len(self.runs), len(rows), len(grids[0])))
+        for row, y in enumerate(rows.tolist()):
+            for column, x in enumerate(grids[0].tolist()):
+                moved = list(self._point)
+                moved[axes[-1]] = y
+                moved[axes[0]] = x
+                margins[:, row, column] = [
+                    self._margins.margin(run, tuple(moved)) for run in range(len(self.runs))
+                ]
+        values = [
+            np.array([_number(each.decimal(number), each.written.duration_ns) for number in grid.tolist()])
+            for each, grid in zip(varied, grids, strict=True)
+        ]
+        found = tuple(
+            _number(each.decimal(self._point[axis]), each.written.duration_ns)
+            for each, axis in zip(varied, axes, strict=True)
+        )
+        return Surface(
+            chosen,
+            values[0],
+            values[1] if len(values) > 1 else np.full(1, np.nan),
+            margins,
+            tuple((run.name, run.is_good) for run in self.runs),
+            found if self.is_found else None,
+        )
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """This as values for JSON."""
+        return {
+            "found": self.is_found,
+            "margin": json_number(self.margin),
+            "constants": [
+                {
+                    "name": each.name,
+                    "value": each.value,
+                    "written": each.written,
+                    "low": each.low if self.is_found else None,
+                    "high": each.high if self.is_found else None,
+                    "tried": list(each.tried),
+                    "step": each.step,
+                    "direction": each.direction,
+                }
+                for each in self.constants
+            ],
+            "runs": [
+                {
+                    "name": run.name,
+                    "good": run.is_good,
+                    "verdict": run.verdict,
+                    "robustness": json_number(run.robustness),
+                    "margin": json_number(run.margin),
+                }
+                for run in self.runs
+            ],
+            "conflict": None
+            if self.conflict is None
+            else {"runs": list(self.conflict.runs), "message": self.conflict.message},
+        }
+
+
+def tune_runs(
+    specification: Specification,
+    runs: Sequence[LabelledRun],
+    ranges: Mapping[str, tuple[Value, Value] | None],
+    *,
+    each: Mapping[str, str] | None = None,
+    seed: int = 0,
+    advance: Callable[[int], None] = lambda runs: None,
+) -> Tuning:
+    """Find the constants with which all good runs are satisfied and all bad ones are violated.
+
+    With bad runs those of the widest margin: the least of the good runs' robustness and the bad runs' negated
+    one is the greatest. With good runs only the tightest ones: all are tightened together, in proportion to
+    their ranges, and then one after the other.
+
+    Args:
+        ranges: the values to try for each constant, by name; None takes the range in the text, and no ranges
+            all constants that have one there.
+        each: for each parameter of a template, the objects that it stands for.
+        seed: of the search over several constants; the same seed finds the same values.
+        advance: called with the number of runs that are prepared.
+
+    Raises:
+        UsageError: no good run, too many runs, a constant that cannot be tuned, a run that does not fit the
+            specification.
+    """
+    _check(specification, runs)
+    varied = varied_constants(specification, ranges)
+    if len(varied) > MOST_CONSTANTS:
+        raise UsageError(
+            f"{len(varied)} constants are more than the {MOST_CONSTANTS} that are tuned together"
+        )
+    parse = partial(_with_values, specification)
+    margins = Margins(runs, parse, varied, each or {}, advance=advance)
+    search = Search(margins, seed)
+    found = search.best()
+    return _tuning(specification, margins, search, found)
+
+
+def _check(specification: Specification, runs: Sequence[LabelledRun]) -> None:
+    if specification.relations:
+        names = ", ".join(sorted(specification.relations))
+        raise UsageError(f"relations given in Python cannot be tuned ({names}); write them as def")
+    if not any(run.is_good for run in runs):
+        raise UsageError("there is no good run to satisfy; give at least one that did what it should")
+    if len(runs) > MOST_RUNS:
+        raise UsageError(f"{len(runs)} runs are more than {MOST_RUNS}; tune on some of them")
+    samples = sum(len(run.trace) for run in runs)
+    if samples > MOST_SAMPLES:
+        raise UsageError(f"the runs have {samples} samples, more than {MOST_SAMPLES}; tune on some of them")
+
+
+def _with_values(specification: Specification, values: Mapping[str, Value]) -> Specification:
+    return parse_specification(
+        specification.source,
+        filename=specification.filename,
+        profile=specification.profile,
+        constants=values,
+    )
+
+
+def _tuning(specification: Specification, margins: Margins, search: Search, found: Found) -> Tuning:
+    constants = []
+    for axis, one in enumerate(margins.varied):
+        number = found.point[axis]
+        low, high = search.interval(found.point, axis) if found.is_held else (number, number)
+        duration_ns = one.written.duration_ns
+        constants.append(
+            TunedConstant(
+                one.name,
+                one.value(number),
+                one.written.value if duration_ns is None else text_of_constant(one.written),
+                one.value(low),
+                one.value(high),
+                (one.value(0), one.value(one.steps)),
+                _number(one.step, duration_ns),
+                margins.directions[axis],
+            )
+        )
+    listed = []
+    for number, run in enumerate(margins.runs):
+        robustness = margins.robustness(number, found.point)
+        lower, upper = (-np.inf, np.inf) if robustness is None else robustness
+        listed.append(
+            RunMargin(
+                run.name,
+                run.is_good,
+                final_verdict(lower, upper),
+                lower if run.is_good else upper,
+                margins.margin(number, found.point),
+            )
+        )
+    return Tuning(
+        found.is_held,
+        tuple(constants),
+        min(run.margin for run in listed),
+        tuple(listed),
+        None if found.is_held else _conflict(margins, search, found),
+        margins.specification(found.point) or specification,
+        margins,
+        found.point,
+    )
+
+
+def _conflict(margins: Margins, search: Search, found: Found) -> Conflict:
+    conflict = sorted(found.conflict, key=lambda run: (margins.margin(run, found.point), run))
+    names = tuple(margins.runs[run].name for run in conflict)
+    is_exact = len(margins.varied) == 1 and margins.directions[0] is not None
+    parts = [_needs(margins, search, run, is_exact) for run in conflict[:_MOST_NAMED]]
+    more = len(names) - len(parts)
+    if more:
+        parts.append(f"and {counted(more, 'other run')} likewise")
+    return Conflict(names, "; ".join(parts))
+
+
+def _needs(margins: Margins, search: Search, run: int, is_exact: bool) -> str:
+    """Say which values a run needs, in a part of a sentence."""
+    one = margins.runs[run]
+    what = "satisfied" if one.is_good else "violated"
+    if not is_exact:
+        return f"{one.name} has to be {what}"
+    constant, limit = margins.varied[0], search.limit(run)
+    if limit is None:
+        span = f"from {constant.text(0)} to {constant.text(constant.steps)}"
+        return f"{one.name} is not {what} with any {constant.name} {span}"
+    rises = (margins.directions[0] == 1) == one.is_good
+    return f"{one.name} is {what} only with {constant.name} {'>=' if rises else '<='} {constant.text(limit)}"
+
+
+def _number(value: Any, duration_ns: int | None) -> float:
+    return float(value) if duration_ns is None else float(value) / 1e9
