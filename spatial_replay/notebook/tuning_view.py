@@ -75,7 +75,7 @@ def draw_surface(surface: Surface, ax: Axes | None = None) -> Axes:
     """Draw where which runs have the right verdict.
 
     For one constant a curve for each run; for two the least margin as colours, and for each run a line where
-    its verdict changes: solid for good runs, dashed for bad ones. A circle marks the values found.
+    its verdict changes, which is dashed if the run is bad. A circle marks the values found.
 
     Raises:
         UsageError: matplotlib is not installed.
