@@ -74,6 +74,8 @@ class _Bar:
 
     def _appear(self) -> None:
         self._shown = _started(self._description, self._total, self._done)
+        # the work went on while the bar was made
+        self._update()
 
     def close(self) -> None:
         self._timer.cancel()
