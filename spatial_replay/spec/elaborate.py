@@ -46,6 +46,7 @@ from spatial_replay.spec.syntax import (
     TermSyntax,
     TruthSyntax,
 )
+from spatial_replay.spec.tokens import quoted
 from spatial_replay.spec.walks import base_of, iter_formulas, other_names, substitute
 
 
@@ -379,7 +380,13 @@ class Elaborator:
             self.resolver.fault(name.span, scope, message, f"write a relation, such as a ovlp {name.text}")
         else:
             hint = self.faults.nearest(name.text, self._formula_names())
-            hint = hint or f"an object needs a relation, such as {name.text} ovlp b"
+            if name.text.lower() in ("true", "false"):
+                hint = f"truth values are written {name.text.lower()}"
+            written = name.text if name.text.isidentifier() else quoted(name.text)
+            hint = hint or (
+                f"an object needs a relation, such as {written} ovlp b, "
+                f"and a signal a comparison, such as {written} >= 1.0"
+            )
             self.resolver.fault(name.span, scope, f"no spec is named {name.text!r}", hint)
 
     def _formula_names(self) -> Iterator[str]:

@@ -19,6 +19,7 @@ from lark.lexer import Lexer
 from spatial_replay.spec.builder import MAX_DEPTH, StatementError, TreeBuilder
 from spatial_replay.spec.diagnostics import Faults, nearest_hint
 from spatial_replay.spec.formula import Span
+from spatial_replay.spec.spellings import meant
 from spatial_replay.spec.syntax import BrokenStatement, FormulaSyntax, Name, SpecStatement, Statement
 from spatial_replay.spec.tokens import BINARY_TYPES, KEYWORDS, STATEMENT_TYPES, quoted, span_of
 
@@ -318,6 +319,9 @@ def _report(
     position = next((index for index, other in enumerate(tokens) if other is token), len(tokens))
     before = tokens[position - 1] if position else None
     span = _place(token, tokens)
+    if position and (other := meant(tokens, position, accepted)) is not None:
+        faults.add(span, *other)
+        return
     if token.type == "$END":
         faults.add(span, f"the statement ends too early: expected {_expected(accepted)}")
         return

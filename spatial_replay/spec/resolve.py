@@ -182,7 +182,9 @@ class Namespace:
             self.faults.add(name.span, "a text, where a number or a duration is expected", hint)
         elif statement is None:
             consts = (each for each, what in self.definitions.items() if isinstance(what, ConstStatement))
-            hint = self.faults.nearest(name.text, consts) or f"define it: const {name.text} = 1.0"
+            hint = self.faults.nearest(name.text, consts) or (
+                f"define it: const {name.text} = 1.0; a signal is compared with a number, not with a signal"
+            )
             self.faults.add(name.span, f"unknown constant {name.text!r}", hint)
         elif not isinstance(statement, BrokenStatement):
             self.faults.add(name.span, f"{name.text!r} is {kind_of(statement)}; a number is expected here")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
 from types import MappingProxyType
 
@@ -33,9 +33,56 @@ _INFIX_WORDS: Mapping[str, tuple[str, str]] = MappingProxyType(
     }
 )
 _MEANT: Mapping[str, str] = MappingProxyType(
-    {"f": "F", "g": "G", "x": "X", "globally": "G", "finally": "F", "Always": "G", "Eventually": "F"}
+    {
+        **{word: operator for word, (_, operator) in _PREFIX_WORDS.items()},
+        **dict.fromkeys(("g", "globally", "alw"), "G"),
+        **dict.fromkeys(("f", "finally", "ev", "sometime", "sometimes"), "F"),
+        **{"x": "X", "wx": "WX", "h": "H", "o": "O", "y": "Y", "never": "G not", "if": "->"},
+        **{"[]": "G", "<>": "F"},
+    }
 )
-"""Words that may just as well be names, and the operators they are taken for."""
+"""What in lower case is taken for an operator, though it may just as well be a name, and the operator."""
+_MEANT_BETWEEN: Mapping[str, str] = MappingProxyType(
+    {
+        **{"iff": "<->", "unless": "W", "weak_until": "W", "releases": "R", "then": "->", "therefore": "->"},
+        **{word.lower(): operator for word, (_, operator) in _INFIX_WORDS.items()},
+    }
+)
+_MEANT_RELATIONS: Mapping[str, str] = MappingProxyType(
+    {
+        **dict.fromkeys(("in", "inside", "within", "contained_in"), "enclosedin"),
+        **dict.fromkeys(("near", "close", "close_to", "nearby"), "closeto[e]"),
+        **dict.fromkeys(("far", "far_from", "away_from"), "farfrom[e]"),
+        **dict.fromkeys(("overlap", "overlaps", "overlapping", "intersects", "collides", "hits"), "ovlp"),
+        **dict.fromkeys(("touches", "touching"), "touch[e]"),
+        **dict.fromkeys(("over", "on_top_of"), "above"),
+        **dict.fromkeys(("under", "beneath"), "below"),
+    }
+)
+_MEANT_SIGNS: Mapping[str, str] = MappingProxyType(
+    {
+        **dict.fromkeys(("/\\", "∧"), "write and, or &"),
+        **dict.fromkeys(("\\/", "\u2228"), "write or, or |"),
+        **dict.fromkeys(("~", "¬"), "write not, or !"),
+        **dict.fromkeys(("→", "⇒", "-->", "==>"), "write ->"),
+        **dict.fromkeys(("↔", "⇔", "<=>", "<-->"), "write <->"),
+        **dict.fromkeys(("□", "◻", "☐"), "always is written G, as in G (a ovlp b)"),
+        **dict.fromkeys(("◇", "◊", "⋄"), "eventually is written F, as in F (a ovlp b)"),
+        **{"○": "next is written X, as in X (a ovlp b)", "∀": "write forall", "∃": "write exists"},
+        **{"≤": "write <=", "≥": "write >=", "≠": "write not (... == ...)", "\u2212": "write -"},
+        **{"%": "a share is written as the log has it: 20 % of a signal from 0 to 1 is 0.2"},
+        **{";": "a statement ends with its line; leave it out"},
+        **dict.fromkeys(("{", "}"), "numbers stand in square brackets: F[0, 5s], closeto[0.1]"),
+        **dict.fromkeys(("//", "/*"), "a comment begins with #"),
+        **dict.fromkeys(
+            ("'", "“", "”", "„", "\u2018", "\u2019", "`"), 'names with other characters stand in "quotes"'
+        ),
+    }
+)
+_LENGTHS = frozenset({"m", "cm", "mm", "km", "um", "in", "ft", "px"})
+_TIMES: Mapping[str, float] = MappingProxyType({"us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "sec": 1.0})
+_DEFINING = frozenset({"let", "var", "val", "define", "param", "parameter", "constant", "set"})
+_STATEMENTS = frozenset({"CONST", "REGION", "GROUP", "DEF", "SPEC"})
 
 _BEFORE_FORMULA = frozenset({"EQUAL", "LPAR", "RSQB", "COLON", "AND", "OR", "XOR", "IMPLIES", "IFF", "NOT"})
 _AFTER_OPERAND = frozenset({"NAME", "RPAR", "RSQB", "NUMBER", "TRUTH"})
@@ -59,7 +106,11 @@ def read_spellings(tokens: list[Token], faults: Faults) -> list[Token]:
         elif token.type in ("RPAR", "RSQB") and brackets:
             brackets.pop()
         following = tokens[index + 1 : index + 3]
-        if token.type == "COLON" and brackets and brackets[-1] == "LSQB":
+        pair = token.value + following[0].value if following else ""
+        if pair in ("[]", "<>") and _starts(result) and following[0].start_pos == token.end_pos:
+            _report(_as(token, "ERROR", pair), faults)
+            result.append(_as(token, "ERROR", pair))
+        elif token.type == "COLON" and brackets and brackets[-1] == "LSQB":
             # G[0:5], as other tools write windows
             result.append(_as(token, "COMMA", ","))
         elif token.type == "NAME" and following and not _is_quoted(token):
@@ -78,11 +129,16 @@ def _word(token: Token, before: Sequence[Token], after: Sequence[Token], macros:
     prefix, infix = _PREFIX_WORDS.get(token.value), _INFIX_WORDS.get(token.value)
     if infix is not None and _is_between(before, after):
         return _as(token, *infix)
-    if (prefix is None and token.value not in _MEANT) or not _is_in_front(before, after):
+    if (prefix is None and _plain(token) not in _MEANT) or not _is_in_front(before, after):
         return token
     if token.value in macros and after[0].type == "LPAR":
         return token
     return _as(token, "ERROR", token.value) if prefix is None else _as(token, *prefix)
+
+
+def _plain(token: Token) -> str:
+    """Return a word as the tables have it: `G_` and `Globally` are no more than other cases."""
+    return str(token.value).lower().removesuffix("_")
 
 
 def _holds_formula(after: Sequence[Token]) -> bool:
@@ -98,15 +154,16 @@ def _holds_formula(after: Sequence[Token]) -> bool:
 
 
 def _report(token: Token, faults: Faults) -> None:
-    meant = _MEANT[token.value]
-    hint = f"the operator is written {meant}, as in {meant} (a ovlp b); a macro is defined with def"
-    faults.add(Span(token.start_pos or 0, token.end_pos or 0), f"{token.value!r} is not an operator", hint)
+    meant = _MEANT[_plain(token)]
+    example = "a ovlp b -> c ovlp d" if meant == "->" else f"{meant} (a ovlp b)"
+    hint = f"the operator is written {meant}, as in {example}; a macro is defined with def"
+    end = (token.start_pos or 0) + len(token.value)
+    faults.add(Span(token.start_pos or 0, end), f"{token.value!r} is not an operator", hint)
 
 
 def _is_in_front(before: Sequence[Token], after: Sequence[Token]) -> bool:
     """Return whether a prefix operator can stand here, and no name can."""
-    first = not before or before[-1].type in _BEFORE_FORMULA or before[-1].type in ("PREFIX", "INFIX")
-    if not first and not (len(before) > 1 and before[-2].type == "USE"):
+    if not _starts(before):
         return False
     if after[0].type == "LSQB":
         return len(after) > 1 and after[1].type != "MINUS"
@@ -114,6 +171,14 @@ def _is_in_front(before: Sequence[Token], after: Sequence[Token]) -> bool:
     if after[0].value in _INFIX_WORDS and after[0].type == "NAME":
         return len(after) > 1 and after[1].type in _RELATIONS
     return after[0].type in STARTS_FORMULA - {"MINUS"}
+
+
+def _starts(before: Sequence[Token]) -> bool:
+    """Return whether a formula can start behind these tokens."""
+    first = (
+        not before or before[-1].type in _BEFORE_FORMULA or before[-1].type in ("PREFIX", "INFIX", "ERROR")
+    )
+    return first or (len(before) > 1 and before[-2].type == "USE")
 
 
 def _is_between(before: Sequence[Token], after: Sequence[Token]) -> bool:
@@ -133,3 +198,126 @@ def _as(token: Token, kind: str, value: str) -> Token:
 
 def _is_quoted(token: Token) -> bool:
     return (token.end_pos or 0) - (token.start_pos or 0) > len(token.value)
+
+
+# ------------------------------------------------------------------------------------ what was meant
+
+
+def meant_sign(sign: str) -> str:
+    """Return how something is written that is a sign elsewhere, or ""."""
+    return _MEANT_SIGNS.get(sign) or _MEANT_SIGNS.get(sign[:1], "")
+
+
+def unit_hint(number: str, unit: str) -> str:
+    """Return how a number with a unit is written, or "" where the unit is none."""
+    if unit in _LENGTHS:
+        return f"lengths have no unit, but that of the log's footprints: write {number}, converted to it"
+    if unit in _TIMES:
+        return f"units of time are s and ms: write {format(float(number) * _TIMES[unit], 'g')}s"
+    return f"write it without the blank: {number}{unit}" if unit in ("s", "ms") else ""
+
+
+def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> tuple[str, str] | None:
+    """Return message and hint for a token that cannot stand where it does, if it is of another language.
+
+    Args:
+        position: of the token; the number of tokens for their end.
+        accepted: types of tokens that could stand there.
+    """
+    missing = Token("$END", "")
+    token = tokens[position] if position < len(tokens) else missing
+    last, before, *_ = [*reversed(tokens[max(0, position - 2) : position]), missing, missing]
+    after = tokens[position + 1] if position + 1 < len(tokens) else missing
+    found = f"{token.value!r} cannot stand here"
+    if window := _meant_window(tokens, position):
+        return found, f"a window is written with both of its ends: {window}"
+    if last.type in _STATEMENTS and token.type != "NAME" and token.value.isidentifier():
+        kind = "a relation" if "RELATION" not in accepted and token.type in _RELATIONS else "a reserved word"
+        return f"{token.value!r} is {kind}, so no name for a {last.value}", "give it another name"
+    if "EQUAL" in accepted and tokens[0].type in _STATEMENTS:
+        return _meant_definition(tokens, position)
+    if last.type == "NUMBER" and token.type == "NAME":
+        hint = unit_hint(last.value, token.value)
+        return f"{token.value!r} is no unit here", hint or f"only s and ms are units: leave out {token.value}"
+    if token.type == "COMMA" and last.type == after.type == "NUMBER" and token.end_pos == after.start_pos:
+        return "a comma within a number", f"decimals have a point: {last.value}.{after.value}"
+    if token.type == "NOT" and "RELATION" in accepted and after.type in _RELATIONS:
+        return (
+            "'not' cannot stand within a relation",
+            f"write it in front: not {last.value} {after.value} ...",
+        )
+    if token.type in ("NAME", "IN"):
+        return _meant_word(token, last, after, accepted)
+    if token.type in ("EQUAL", "COLON") and position == 1 and last.type == "NAME":
+        written = "".join(each.value for each in tokens[position:] if each.type not in ("EQUAL", "COLON"))
+        hint = f"equality is written ==; a number is defined by const {last.value} = {written or '1.0'}"
+        return found, hint
+    if last.type == "NAME" and before.type == "COMPARE" and token.type in ("COMPARE", "$END"):
+        return _meant_comparison(tokens, position)
+    if token.type == "COMPARE" and last.type in ("RPAR", "AND", "OR"):
+        hint = "a comparison is about a signal, battery >= 1.5, or a distance, a dist b <= 2"
+        return found, f"{hint}; a range is two comparisons, joined by and"
+    return None
+
+
+def _meant_window(tokens: Sequence[Token], position: int) -> str:
+    """Return the window that was meant behind the nearest operator; "" where none was begun."""
+    start = next((n for n in range(position - 1, max(-1, position - 5), -1) if _is_temporal(tokens[n])), None)
+    if start is None:
+        return ""
+    inner = tokens[start + 1 : start + 6]
+    kinds = [each.type for each in inner]
+    numbers = [each.value.strip(".") for each in inner if each.type == "NUMBER"]
+    operator = tokens[start].value
+    match kinds:
+        case ["COMPARE", "NUMBER", *_] | ["LSQB", "COMPARE", "NUMBER", *_]:
+            sign = next(each.value for each in inner if each.type == "COMPARE")
+            return f"{operator}[{numbers[0]}, inf]" if sign[0] == ">" else f"{operator}[0, {numbers[0]}]"
+        case ["LSQB", "NUMBER", "RSQB", *_]:
+            return f"{operator}[0, {numbers[0]}]"
+        case ["LSQB", "NUMBER", "NUMBER", *_] | ["LPAR", "NUMBER", "COMMA", "NUMBER", *_]:
+            return f"{operator}[{numbers[0]}, {numbers[1]}]"
+    return ""
+
+
+def _is_temporal(token: Token) -> bool:
+    return token.type in ("PREFIX", "INFIX")
+
+
+def _meant_definition(tokens: Sequence[Token], position: int) -> tuple[str, str] | None:
+    """Return what was meant between the name of a statement and its =."""
+    token, name = tokens[position] if position < len(tokens) else None, tokens[1].value
+    if token is None or token.type in ("NAME", "EQUAL"):
+        return None
+    if token.type in ("MINUS", "SLASH", "PLUS", "STAR"):
+        return f"{token.value!r} cannot stand in a name", "a name has letters, digits and _"
+    return f"{token.value!r} stands where = is missing", f"write {tokens[0].value} {name} = ..."
+
+
+def _meant_word(token: Token, last: Token, after: Token, accepted: Collection[str]) -> tuple[str, str] | None:
+    word = str(token.value).lower()
+    if last.value.lower() in _DEFINING and after.type == "EQUAL":
+        message = f"{last.value!r} begins no statement"
+        return message, f"a number is defined by const {token.value} = 1.0, a formula by spec"
+    if "RELATION" in accepted:
+        if word in ("is", "are") and after.type in _RELATIONS:
+            return f"{token.value!r} cannot stand here", f"leave it out: {last.value} {after.value} ..."
+        if word in _MEANT_RELATIONS:
+            hint = f"write {last.value} {_MEANT_RELATIONS[word]} {after.value or 'b'}"
+            return f"unknown relation {token.value!r}", hint
+    if "AND" in accepted and word in _MEANT_BETWEEN:
+        return f"{token.value!r} is not an operator", f"the operator is written {_MEANT_BETWEEN[word]}"
+    if "AND" in accepted and word in ("for", "within", "during"):
+        return f"{token.value!r} cannot stand here", "a window stands behind its operator: F[0, 5s] (...)"
+    return None
+
+
+def _meant_comparison(tokens: Sequence[Token], position: int) -> tuple[str, str] | None:
+    """Return what was meant by `5 <= battery` and by `5 <= battery <= 8`."""
+    limit, sign, name = (each.value for each in tokens[position - 3 : position])
+    turned = sign.translate(str.maketrans("<>", "><"))
+    first = f"{name} {turned} {limit}"
+    if position == len(tokens):
+        return "a comparison that begins with its number", f"the signal comes first: {first}"
+    then = tokens[position + 1].value if position + 1 < len(tokens) else "..."
+    return "a range of a signal", f"write {first} and {name} {tokens[position].value} {then}"

@@ -14,7 +14,7 @@ from lark import Token
 
 from spatial_replay.spec.diagnostics import Faults
 from spatial_replay.spec.formula import Span
-from spatial_replay.spec.spellings import STARTS_FORMULA, read_spellings
+from spatial_replay.spec.spellings import STARTS_FORMULA, meant_sign, read_spellings, unit_hint
 
 STATEMENT_TYPES: frozenset[str] = frozenset({"USE", "CONST", "SCALE", "REGION", "GROUP", "DEF", "SPEC"})
 BINARY_TYPES: frozenset[str] = frozenset({"AND", "OR", "XOR", "IMPLIES", "IFF", "INFIX"})
@@ -68,13 +68,12 @@ _TOKEN = re.compile(
     | (?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?(?P<unit>[A-Za-z_][A-Za-z0-9_]*)?)
     | (?P<word>[A-Za-z_][A-Za-z0-9_]*)
     | (?P<quoted>"(?:[^"\\\r\n]|\\[^\r\n])*")
+    | (?P<foreign>/\\|\\/|<=>|<-->|-->|==>|//[^\r\n]*|/\*[^\r\n]*)
     | (?P<sign><->|->|<=|>=|==|=>|!=|&&|\|\||[<>!&|()\[\],:=+*/-])
     | (?P<unknown>"[^\r\n]*|[^\sA-Za-z0-9_"\#()\[\],:=<>!&|.+*/-]+|.)
     """,
     re.VERBOSE | re.DOTALL,
 )
-_LENGTHS = frozenset({"m", "cm", "mm", "km", "um", "in", "ft", "px"})
-_TIMES: Mapping[str, float] = MappingProxyType({"us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "sec": 1.0})
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _ESCAPED = re.compile(r"\\(.)", re.DOTALL)
 
@@ -135,8 +134,12 @@ def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token
         elif kind == "quoted":
             token_type = "TITLE" if _is_title_expected(tokens) else "NAME"
             value = _unquoted(value, span, faults)
+        elif kind == "foreign":
+            sign = value[:2] if value[:2] in ("//", "/*") else value
+            faults.add(span, f"'{sign}' is not part of the language", meant_sign(sign))
+            token_type = "ERROR"
         elif kind == "unknown":
-            _report_unknown(value, span, faults, tokens)
+            _report_unknown(value, span, faults, tokens, text[found.end() : found.end() + 1])
             token_type = "ERROR"
         else:
             token_type = "NUMBER"
@@ -184,15 +187,17 @@ def _unquoted(literal: str, span: Span, faults: Faults) -> str:
 
 
 def _unit_hint(text: str, unit: str) -> str:
-    number = text.removesuffix(unit)
-    if unit in _LENGTHS:
-        return f"lengths have no unit, but that of the log's footprints: write {number}, converted to it"
-    if unit in _TIMES:
-        return f"units of time are s and ms: write {format(float(number) * _TIMES[unit], 'g')}s"
-    return f"units of time are s and ms; a name is written in quotes: {quoted(text)}"
+    hint = unit_hint(text.removesuffix(unit), unit)
+    return hint or f"units of time are s and ms; a name is written in quotes: {quoted(text)}"
 
 
-def _report_unknown(text: str, span: Span, faults: Faults, before: Sequence[Token]) -> None:
+def _report_unknown(text: str, span: Span, faults: Faults, before: Sequence[Token], after: str) -> None:
+    if text == "." and (not after or after.isspace()):
+        faults.add(span, "a full stop behind a statement", meant_sign(";"))
+        return
+    if text == "}" and any(token.value == "{" for token in before[-8:]):
+        # it is reported where it opens
+        return
     if text == "." and before and before[-1].type == "NAME" and before[-1].end_pos == span.start:
         owner = before[-1].value
         message = f"an object has no fields, so nothing is behind {owner!r}"
@@ -204,7 +209,7 @@ def _report_unknown(text: str, span: Span, faults: Faults, before: Sequence[Toke
     if text.startswith('"'):
         faults.add(span, "a quoted name does not end on its line", 'close it with "')
         return
-    hint = "a name with other characters than A-Z, a-z, 0-9 and _ is written in quotes"
+    hint = meant_sign(text) or "a name with other characters than A-Z, a-z, 0-9 and _ is written in quotes"
     faults.add(span, f"the character {text[0]!r} is not part of the language", hint)
 
 
