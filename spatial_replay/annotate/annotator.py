@@ -1,13 +1,8 @@
-"""Specifications evaluated over samples, and the messages of an annotated log that report the results.
-
-`AnnotatedEvaluation` evaluates; an `Annotator` encodes what the evaluation gives: the specification, its
-robustness, automaton states, events and the scene.
-"""
+"""The messages of an annotated log that report results: robustness, automaton states, events, the scene."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from functools import cached_property
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from foxglove_schemas_protobuf.Event_pb2 import Event
@@ -17,19 +12,15 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from spatial_replay.annotate.automaton_state import (
     AutomatonRun,
     SpecAutomaton,
-    automata_attachments,
-    automata_metadata,
-    automata_of,
 )
 from spatial_replay.annotate.events import EncodedEvent, EventReporter
-from spatial_replay.annotate.foxglove_layout import LayoutContents, SceneBounds, layout_attachment
 from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.robustness import encode_robustness
 from spatial_replay.annotate.scene_update import SceneEncoder, SceneFrames, SceneState
-from spatial_replay.annotate.specification import ReportedTree, encode_specification, reported_trees
+from spatial_replay.annotate.specification import ReportedTree, encode_specification
 from spatial_replay.annotate.violations import EvaluatedResult, leaf_pairs, violated_since
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.messages import Attachment, Channel, Messages, merge, messages_of
+from spatial_replay.logs.messages import Channel, Messages, messages_of
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
 from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
@@ -45,7 +36,7 @@ from spatial_replay.logs.topics import (
 )
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
+from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.vacuity import Vacuous
 from spatial_replay.monitor.verdict import final_verdict
 from spatial_replay.spec.formula import Outline, Specification, iter_nodes
@@ -237,123 +228,7 @@ _EVENTS = protobuf_channel(EVENTS, Event)
 _EVENT_LOG = protobuf_channel(EVENT_LOG, Log)
 
 
-class AnnotatedEvaluation:
-    """Specifications evaluated over samples as they come, with the messages of an annotated log.
-
-    Cutting the samples into blocks changes neither numbers nor messages.
-
-    Attributes:
-        trees: every result, under the name it is reported by.
-        streams: their evaluation, in the same order.
-    """
-
-    def __init__(
-        self,
-        files: Sequence[Specification],
-        instances: Sequence[Sequence[Instance]],
-        semantics: Semantics = "ltlf",
-        compiled_before: Callable[[], Sequence[Attachment]] = list,
-        known: Sequence[SpecAutomaton] = (),
-        show: Callable[[SceneFrames], None] = lambda frames: None,
-    ) -> None:
-        """Start before the first sample.
-
-        Args:
-            instances: what to evaluate of each file.
-            compiled_before: returns the attachments of a log; automata among them are not compiled with MONA.
-            known: automata of specs of these files, which are not compiled again.
-            show: takes what the messages of the scene show.
-        """
-        self._files = files
-        self._semantics = semantics
-        self._compiled_before = compiled_before
-        self._known = known
-        self._show = show
-
-        self._evaluations = [
-            EvaluationStream(own, file.regions, semantics) for own, file in zip(instances, files, strict=True)
-        ]
-        self.streams = [stream for evaluation in self._evaluations for stream in evaluation.streams]
-        self.trees = reported_trees(files, instances)
-        self._extent: SceneBounds | None = None
-        self._has_samples = False
-
-    def extend(self, trace: Trace) -> list[SeriesBlock]:
-        """Take in the next samples; return one block for each of `trees`."""
-        return [block for evaluation in self._evaluations for block in evaluation.extend(trace)]
-
-    def messages(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
-        """Return what to write beside samples, from the blocks that `extend` returned for them."""
-        self._extent = SceneBounds.of(trace, self._extent)
-        self._has_samples |= len(trace) > 0
-        return self._annotator.messages(trace, blocks)
-
-    @property
-    def finals(self) -> list[Floats]:
-        """For each of `trees` (N, 2), lower and upper end of each node's value if the log ends here."""
-        return [stream.final for stream in self.streams]
-
-    def end(self, time_ns: int, vacuous: Sequence[Sequence[Vacuous]] = ()) -> Messages:
-        """Return what to write after everything else of a log.
-
-        Args:
-            time_ns: that of its last sample or message, whichever is later.
-            vacuous: for each of `trees`, the parts that decided nothing, if that is known.
-        """
-        return merge(self._annotator.end(time_ns, self.finals, vacuous))
-
-    @property
-    def channels(self) -> tuple[Channel, ...]:
-        """The channels of the messages that annotate a sample."""
-        specification = [_SPECIFICATION] if self.trees else []
-        return (*specification, _ROBUSTNESS, _AUTOMATON, _EVENTS, _EVENT_LOG, _SCENE)
-
-    def contents(self, extent: SceneBounds | None, topics: Collection[str] = ()) -> LayoutContents:
-        """Return what an annotated log of these results has for a viewer to show.
-
-        Args:
-            extent: of all footprints; None without any.
-            topics: those of messages that are not derived from samples.
-        """
-        has_states = [each.automaton is not None for each in self.automata]
-        # every result has events: a verdict is reported when it is reached, or else when the log ends
-        derived = {SCENE, *(DERIVED if self.trees else ())} - set(() if any(has_states) else (AUTOMATON,))
-        return LayoutContents(self.trees, has_states, extent, derived | set(topics))
-
-    def layout(self, topics: Collection[str] = ()) -> Attachment:
-        """Return the layout that opens the log in a viewer, once everything else is written.
-
-        Args:
-            topics: those of messages that are not derived from samples.
-        """
-        if not self._has_samples:
-            return layout_attachment(LayoutContents(self.trees, [False] * len(self.trees), None, topics))
-        return layout_attachment(self.contents(self._extent, topics))
-
-    def automata_metadata(self) -> Mapping[str, str]:
-        """Return the size of each spec's automaton, or the reason why it has none."""
-        return automata_metadata(self.automata)
-
-    def automata_attachments(self, prefix: str) -> list[Attachment]:
-        """Return the automata as attachments, beside those of `specification_attachments`."""
-        return automata_attachments(self.automata, prefix)
-
-    @cached_property
-    def automata(self) -> Sequence[SpecAutomaton]:
-        """Of each tree; compiled on first use, since not every evaluation is written to a log."""
-        return automata_of(self._files, self.trees, self._semantics, self._compiled_before(), self._known)
-
-    def annotator(self, scene: SceneState | None = None) -> Annotator:
-        """Return an annotator that starts before the first sample.
-
-        Args:
-            scene: what a viewer already shows, if it continues with these messages.
-        """
-        instances = [stream.instance for stream in self.streams]
-        return Annotator(
-            self._files, self.trees, instances, self.automata, self._semantics, scene, self._show
-        )
-
-    @cached_property
-    def _annotator(self) -> Annotator:
-        return self.annotator()
+def channels_of_results(trees: Sequence[ReportedTree]) -> tuple[Channel, ...]:
+    """Return the channels of the messages that annotate a sample with results."""
+    specification = [_SPECIFICATION] if trees else []
+    return (*specification, _ROBUSTNESS, _AUTOMATON, _EVENTS, _EVENT_LOG, _SCENE)

@@ -21,6 +21,7 @@ from spatial_replay.logs.topics import (
     CURVES_TOPIC,
     EVENT_LOG,
     GRADIENT_MAP,
+    LAYOUT,
     PLAN_DECISION,
     PLAN_PATH,
     ROBUSTNESS,
@@ -204,9 +205,6 @@ def _label(tree: ReportedTree) -> str:
 def _quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
-
-LAYOUT = "layout.json"
-"""Name of the attachment; a replay replaces it."""
 
 _MARGIN = 1.5
 """The height of the picture by the size of what is in it; a panel may be narrower than it is high."""

@@ -6,13 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from operator import attrgetter
 from pathlib import PurePath
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from spatial_replay.annotate.requirements import iter_subformulas
 from spatial_replay.errors import SpecificationError
 from spatial_replay.logs.messages import Attachment
-from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
-from spatial_replay.logs.schemas.Specification_pb2 import SpecificationResult
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.spec import format_specification, parse_specification
 from spatial_replay.spec.format import format_formula
@@ -33,6 +31,9 @@ from spatial_replay.spec.formula import (
     operator_of,
 )
 from spatial_replay.spec.relations import RELATION_NAMES
+
+if TYPE_CHECKING:
+    from spatial_replay.logs.schemas.Specification_pb2 import SpecificationResult
 
 DIMENSIONLESS = "1"
 MIXED = "mixed"
@@ -95,6 +96,9 @@ def encode_specification(
         signal_units: units of the log's signals, where known.
         propositions: of each tree, the nodes that are propositions of its automaton.
     """
+    # imported here since an evaluation without messages needs no message types
+    from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
+
     message = SpecificationMessage()
     for file in files:
         message.files.add(

@@ -118,7 +118,7 @@ def _print_decisions(log: Path, as_json: bool) -> int:
 
 def _print_layout(log: Path) -> int:
     """Print the layout stored in a log."""
-    from spatial_replay.annotate.foxglove_layout import LAYOUT
+    from spatial_replay.logs.topics import LAYOUT
     from spatial_replay.sources.open_log import open_source
 
     source = open_source(log)

@@ -66,6 +66,12 @@ class FootprintBatch:
     def __len__(self) -> int:
         return len(self.part_start) - 1
 
+    @property
+    def nbytes(self) -> int:
+        """The size of its arrays in bytes."""
+        numbers = (self.vertices, self.radius, self.bottom, self.top)
+        return self.part_start.nbytes + self.vertex_start.nbytes + sum(array.nbytes for array in numbers)
+
     @classmethod
     def from_footprints(
         cls, footprints: Sequence[Footprint], heights: Sequence[tuple[float, float] | None] | None = None

@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.compiled import inlined, long_kernel
+from spatial_replay.compiled import elementwise, inlined, long_kernel
 from spatial_replay.geometry.arrays import Floats, Integers
 
 SIGNED_DISTANCE, PROTRUSION = 0, 1
@@ -329,6 +329,7 @@ def _union_extreme(
     return -greatest if quantity % 2 == 0 else greatest
 
 
+@elementwise
 @long_kernel
 def measure_rows(
     part_start: Integers,
@@ -344,15 +345,15 @@ def measure_rows(
     quantity: Integers,
     first: Integers,
     second: Integers,
+    edges: Floats,
     values: Floats,
 ) -> None:
     """Fill `values` (K, T) with K quantities in T samples; see `measure`.
 
     In sample t, operand o has the `width[o]` rows from `members[member_start[o] + t * width[o]]` on;
-    `member_start` (O + 1,) ends with the total.
+    `member_start` (O + 1,) ends with the total. `edges` (V, 3), one for each vertex, is room to work in.
     """
     # edges only of rows that distances need: a log has many more that are projected or unused
-    edges = np.empty((len(vertices), 3))
     is_filled = np.zeros(len(part_start), dtype=np.bool_)
     for k in range(len(quantity)):
         if quantity[k] < MIN_X:

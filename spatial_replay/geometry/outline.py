@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.compiled import inlined, kernel
+from spatial_replay.compiled import elementwise, inlined, kernel
 from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.arrays import Floats, Integers
 
@@ -64,6 +64,7 @@ def normalise_polygons(vertex_start: Integers, vertices: Floats) -> Outlines:
     return Outlines(start, tidy[:used], fault)
 
 
+@elementwise
 @kernel
 def _normalise_all(start: Integers, vertices: Floats, counts: Integers, fault: NDArray[np.int8]) -> int:
     """Normalise every outline in place and close the gaps; return the number of vertices left."""

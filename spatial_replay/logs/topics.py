@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from google.protobuf.message import Message
-from mcap_protobuf.schema import build_file_descriptor_set
+from typing import TYPE_CHECKING
 
 from spatial_replay.logs.messages import Channel, Schema
+
+if TYPE_CHECKING:
+    from google.protobuf.message import Message
 
 OBJECTS = "/spatial/objects"
 SCENE = "/spatial/scene"
@@ -41,6 +43,9 @@ AUTOMATA = "spatial_replay_automata"
 AUTOMATA_PREFIX = "automata/"
 """Attachments with automata; the prefix of their specification comes next."""
 
+LAYOUT = "layout.json"
+"""The attachment that arranges a viewer's panels; a replay replaces it."""
+
 RECORDED_PREFIX = "recorded/"
 """Inputs of a recording as attachments; they stay in every copy."""
 
@@ -50,5 +55,8 @@ REPLAYED_PREFIX = "replayed/"
 
 def protobuf_channel(topic: str, message: type[Message]) -> Channel:
     """Return the channel of a topic with messages of one protobuf type, with all it takes to decode them."""
+    # imported here since it takes long, and readers need none of it
+    from mcap_protobuf.schema import build_file_descriptor_set
+
     descriptors = build_file_descriptor_set(message).SerializeToString(deterministic=True)
     return Channel(topic, "protobuf", Schema(message.DESCRIPTOR.full_name, "protobuf", descriptors))

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 
 from spatial_replay import __version__
-from spatial_replay.annotate.annotator import AnnotatedEvaluation
+from spatial_replay.annotate.annotated_evaluation import AnnotatedEvaluation
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.certificate import (
     Hashing,

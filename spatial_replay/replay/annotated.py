@@ -10,16 +10,14 @@ from pathlib import Path
 
 from spatial_replay import __version__
 from spatial_replay.annotate.certificate import specifications_json
-from spatial_replay.annotate.foxglove_layout import LAYOUT
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.mcap.writer import LogWriter
 from spatial_replay.logs.messages import Sink
-from spatial_replay.logs.output_file import replacing
 from spatial_replay.logs.source import Source, axes_of, reading_options
 from spatial_replay.logs.topics import (
     AUTOMATA,
     AUTOMATA_PREFIX,
     CERTIFICATE,
+    LAYOUT,
     METADATA,
     RECORDED_PREFIX,
     REPLAYED_PREFIX,
@@ -70,6 +68,10 @@ def run_replay(
     replay = Replay(source, files, options, keep_series=keep_series, keep_leaves=keep_leaves)
     if output is None:
         return replay.run(advance=advance)
+    # imported here since a replay without an annotated log needs no writer
+    from spatial_replay.logs.mcap.writer import LogWriter
+    from spatial_replay.logs.output_file import replacing
+
     with ExitStack() as stack:
         sink = stack.enter_context(LogWriter(stack.enter_context(replacing(output, inputs))))
         _begin(sink, source, replay, options, layer=layer)

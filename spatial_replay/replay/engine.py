@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from spatial_replay.annotate.annotator import AnnotatedEvaluation
-from spatial_replay.annotate.automaton_state import SpecAutomaton
+from spatial_replay.annotate.annotated_evaluation import AnnotatedEvaluation
 from spatial_replay.annotate.certificate import Hashing, MessageHash, ResultHash, SampleHash, certificate
-from spatial_replay.annotate.scene_update import SceneFrames
 from spatial_replay.annotate.specification import (
     ReportedTree,
     logged_specifications,
@@ -35,6 +34,13 @@ from spatial_replay.replay.selection import (
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.trace import Trace
+
+if TYPE_CHECKING:
+    from spatial_replay.annotate.automaton_state import SpecAutomaton
+    from spatial_replay.annotate.scene_update import SceneFrames
+
+_MOST_KEPT_BYTES: Final = 2**22
+"""Samples of up to so many bytes stay in memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +133,7 @@ class Replay:
         self._names = LogNames()
         self._samples = self._unreadable = self._encoded = self._end_ns = 0
         self._times: list[int] = []
+        self._traces = _KeptTraces(self._selection)
 
     def run(
         self,
@@ -149,6 +156,7 @@ class Replay:
         """
         for block, trace in self._selection.iter_blocks():
             stretches = self._evaluation.extend(trace)
+            self._traces.add(trace)
             inside = self._selection.inside(trace)
             own = self._selection.own_messages(block, self._encoded)
             self._encoded += len(self._selection.inside(block.trace))
@@ -224,7 +232,7 @@ class Replay:
                 self._evaluation,
                 self.files,
                 [join_blocks(kept) if kept else None for kept in self._kept],
-                self._selection,
+                self._traces.read,
                 has_series=self._keep_series,
                 has_leaves=self._keep_leaves,
             ),
@@ -234,6 +242,27 @@ class Replay:
             ),
             semantics=options.semantics,
         )
+
+
+class _KeptTraces:
+    """The samples of a short log, so that explaining a verdict does not read it again."""
+
+    def __init__(self, selection: Selection) -> None:
+        self._selection = selection
+        self._traces: list[Trace] | None = []
+        self._bytes = 0
+
+    def add(self, trace: Trace) -> None:
+        """Take in the next samples; too many are dropped, all of them."""
+        self._bytes += trace.nbytes
+        if self._bytes > _MOST_KEPT_BYTES:
+            self._traces = None
+        elif self._traces is not None:
+            self._traces.append(trace)
+
+    def read(self) -> Iterator[Trace]:
+        """Iterate over all samples."""
+        return self._selection.iter_traces() if self._traces is None else iter(self._traces)
 
 
 def idle_templates(files: Sequence[Specification], trees: Sequence[ReportedTree]) -> tuple[Vacuous, ...]:
@@ -255,7 +284,7 @@ def replayed_specs(
     evaluation: AnnotatedEvaluation,
     files: Sequence[Specification],
     kept: Sequence[SeriesBlock | None],
-    selection: Selection,
+    traces: Callable[[], Iterable[Trace]],
     *,
     has_series: bool = True,
     has_leaves: bool = True,
@@ -264,13 +293,14 @@ def replayed_specs(
 
     Args:
         kept: for each of its trees every sample, or None if nothing was kept.
+        traces: reads the samples again.
         has_series, has_leaves: whether the stretches hold the numbers, and the atoms.
     """
 
     return tuple(
         SpecResult.from_stream(
             stream,
-            Evidence(stream.instance, files[tree.file].regions, selection.iter_traces),
+            Evidence(stream.instance, files[tree.file].regions, traces),
             block,
             name=tree.name,
             has_series=has_series,

@@ -9,7 +9,6 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from spatial_replay.bags.open import open_messages
 from spatial_replay.bags.topic import ALL, MAPPED, is_kept
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.mcap.reader import McapSource
@@ -105,5 +104,8 @@ def _topics(source: Source) -> list[str]:
             return sorted({channel.topic for channel in walk.channels.values()})
     path = getattr(source, "path", None)
     if hasattr(source, "keep") and isinstance(path, Path):
+        # readers of external logs are loaded when there is one
+        from spatial_replay.bags.open import open_messages
+
         return [topic.name for topic in open_messages(path).topics()]
     return []

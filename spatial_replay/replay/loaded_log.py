@@ -13,7 +13,8 @@ from pathlib import PurePath
 from types import MappingProxyType
 from typing import Final
 
-from spatial_replay.annotate.annotator import AnnotatedEvaluation, Annotator
+from spatial_replay.annotate.annotated_evaluation import AnnotatedEvaluation
+from spatial_replay.annotate.annotator import Annotator
 from spatial_replay.annotate.curves import encode_curves
 from spatial_replay.annotate.foxglove_layout import SceneBounds, live_layout_attachment
 from spatial_replay.annotate.scene_update import SceneState
@@ -223,7 +224,9 @@ class Evaluated:
             remarks=loaded.remarks,
             missing=loaded.missing,
             unreadable=loaded.inside.unreadable_count,
-            results=replayed_specs(self.evaluation, self.edited.files, self.stretches, self.selection),
+            results=replayed_specs(
+                self.evaluation, self.edited.files, self.stretches, self.selection.iter_traces
+            ),
             vacuous=idle_templates(self.edited.files, self.evaluation.trees),
             certificate=MappingProxyType({}),
             semantics=loaded.options.semantics,

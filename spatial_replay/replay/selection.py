@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from types import MappingProxyType
 
 import numpy as np
 
 from spatial_replay.errors import LogError, SpecificationError, UsageError
-from spatial_replay.logs.messages import Block, Messages, merge, messages_of, select
+from spatial_replay.logs.messages import Block, Channel, Messages, merge, messages_of, select
 from spatial_replay.logs.objects.encode import encode_objects
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.source import Source, read_ahead, read_blocks, within
@@ -23,8 +24,6 @@ from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace, window_of
-
-_OBJECTS = protobuf_channel(OBJECTS, ObjectStates)
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +168,7 @@ class Selection:
             # in the source, messages of one time come in the order of its numbers of channels
             return merge([chosen])
         trace = self.inside(block.trace)
-        return merge([chosen, messages_of(_OBJECTS, trace.times_ns, encode_objects(trace), first)])
+        return merge([chosen, messages_of(_objects_channel(), trace.times_ns, encode_objects(trace), first)])
 
     def instances(self, file: Specification) -> list[Instance]:
         """Return what is to be evaluated of a specification; for templates, the source is read for objects.
@@ -226,6 +225,11 @@ class Selection:
     def _missing_names(self, names: LogNames) -> list[Diagnostic]:
         remarks = [remark for file in self.files for remark in names.check(file, self.options.each)]
         return [remark for remark in remarks if remark.severity == "error"]
+
+
+@cache
+def _objects_channel() -> Channel:
+    return protobuf_channel(OBJECTS, ObjectStates)
 
 
 def _check_parameters(files: Sequence[Specification], each: Mapping[str, str]) -> None:

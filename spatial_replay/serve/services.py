@@ -11,8 +11,8 @@ from typing import Any, Final, NamedTuple
 from jsonschema import Draft202012Validator
 from jsonschema.exceptions import best_match
 
-from spatial_replay.annotate.foxglove_layout import LAYOUT
 from spatial_replay.errors import UsageError
+from spatial_replay.logs.topics import LAYOUT
 from spatial_replay.replay.document import document_from_replay, explain_results
 from spatial_replay.replay.loaded_log import Evaluated, constant_values
 

@@ -7,7 +7,7 @@ import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -177,7 +177,7 @@ def made_from(grammar_text: str) -> str:
 
 
 def _resource(name: str) -> str:
-    return files("spatial_replay.spec").joinpath(name).read_text(encoding="utf-8")
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
 def _with_numbers(table: dict[str, Any]) -> dict[Any, Any]:

@@ -88,6 +88,19 @@ class Trace:
         return f"<Trace: {len(self)} samples{span}; objects {', '.join(self.names) or 'none'}>"
 
     @property
+    def nbytes(self) -> int:
+        """The size of its arrays in bytes, without the cache."""
+        arrays = [
+            self.times_ns,
+            self.rows,
+            self.yaw,
+            self.uncertainty,
+            self.class_code,
+            *self.signals.values(),
+        ]
+        return self.footprints.nbytes + sum(array.nbytes for array in arrays)
+
+    @property
     def unreadable_count(self) -> int:
         """Count the observations with a number that is not finite."""
         return int(np.count_nonzero(self.rows < ABSENT))

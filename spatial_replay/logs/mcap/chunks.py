@@ -25,7 +25,7 @@ from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from spatial_replay.compiled import kernel, piece
+from spatial_replay.compiled import elementwise, kernel, piece
 from spatial_replay.geometry.arrays import Integers
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -105,6 +105,7 @@ def _word(content: Bytes, begin: int, size: int) -> int:
     return word  # type: ignore[return-value]
 
 
+@elementwise
 @kernel
 def _walk(content: Bytes, places: Integers, fields: Words) -> tuple[int, int]:
     """Fill in the records that there is room for; return their number, and where the last whole one ends."""

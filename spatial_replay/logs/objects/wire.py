@@ -93,9 +93,7 @@ class WireTemplate:
         fixed[self.mark_offsets] = False
         for offset in self.word_offsets.tolist():
             fixed[offset : offset + 8] = False
-        result = np.empty(len(rows), np.bool_)
-        _compare(self.payload, np.flatnonzero(fixed), rows, result)
-        return result
+        return np.asarray(((rows == self.payload) | ~fixed).all(axis=1))
 
     def words(self, rows: Bytes) -> Words:
         """Return (n, W) the words of n messages (n, L) of this layout."""
@@ -120,18 +118,6 @@ def _scatter(payload: Bytes, contents: Bytes, offsets: NDArray[np.int64], rows: 
         for word in range(offsets.shape[0]):
             for k in range(8):
                 rows[i, offsets[word] + k] = contents[i, 8 * word + k]
-
-
-@kernel
-def _compare(payload: Bytes, places: NDArray[np.int64], rows: Bytes, result: NDArray[np.bool_]) -> None:
-    """Set result (n,) to which rows (n, L) agree with a payload (L,) in all the places given."""
-    for i in range(rows.shape[0]):
-        agrees = True
-        for k in places:
-            if rows[i, k] != payload[k]:
-                agrees = False
-                break
-        result[i] = agrees
 
 
 def rows_of(payloads: list[bytes]) -> Bytes:

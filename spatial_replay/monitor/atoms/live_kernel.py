@@ -198,10 +198,11 @@ def _measure(
         is_there = _is_there(classes, plan.operand_rows[k], plan.operand_classes[k])
         members[k] = plan.operand_rows[k] if is_there else ABSENT
     measured = np.empty((len(plan.geometric), 1))
+    joined = _joined(plan.region_vertices, vertices).reshape((-1, 2))
     measure_rows(
         _starts(plan.extent[0], plan.region_parts, counts),
         _starts(0, plan.region_sizes, sizes),
-        _joined(plan.region_vertices, vertices).reshape((-1, 2)),
+        joined,
         _joined(plan.region_radius, radius),
         bottom,
         top,
@@ -212,6 +213,7 @@ def _measure(
         plan.quantity,
         plan.first,
         plan.second,
+        np.empty((len(joined), 3)),
         measured,
     )
     of_operands = _spreads(plan.operand_start, members, places, here)
