@@ -228,7 +228,8 @@ def _elements(values: object) -> int:
 
 
 def _view(value: object) -> object:
-    return memoryview(value) if isinstance(value, np.ndarray) else value
+    # an array is a buffer, though its type does not say so
+    return memoryview(cast(bytes, value)) if isinstance(value, np.ndarray) else value
 
 
 class _Process:
