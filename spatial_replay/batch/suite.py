@@ -75,6 +75,12 @@ class Expectation:
     at_least: float | None = None
     allow_unknown: bool = False
 
+    @property
+    def text(self) -> str:
+        """What is expected, in words."""
+        least = "" if self.at_least is None else f" by at least {self.at_least:.6g}"
+        return f"{self.verdict}{least}{' or unknown' if self.allow_unknown else ''}"
+
     def failure(self, verdict: Verdict, robustness: float) -> str | None:
         """Return why a result does not pass, in a few words; None if it does.
 

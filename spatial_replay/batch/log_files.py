@@ -1,0 +1,212 @@
+"""The logs of a batch: found by patterns, and identified by what they hold."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from glob import glob, has_magic
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from spatial_replay.batch.suite import LogPattern
+from spatial_replay.errors import LogError, UsageError
+from spatial_replay.logs.mcap.chunks import MAGIC
+from spatial_replay.logs.mcap.reader import McapSource
+from spatial_replay.logs.output_file import replacing
+from spatial_replay.logs.topics import CERTIFICATE
+from spatial_replay.text import counted
+
+_ENDINGS: Final = (".mcap", ".bag", ".db3", ".jsonl", ".jsonl.gz", ".csv", ".xml")
+"""Of logs in a folder; any other file has to be named."""
+_BAG: Final = "metadata.yaml"
+"""What makes a folder one log: a ROS 2 bag."""
+_ADDRESS: Final = re.compile(r"[a-z][a-z0-9+.-]*://")
+_MOST_LOGS: Final = 2_000_000
+_MOST_FAULTS: Final = 100
+_HASHED_WHOLE: Final = 16 * 2**20
+"""Bytes up to which hashing a log takes no longer than reading its certificate."""
+
+
+class FoundLog(NamedTuple):
+    """A log of a batch.
+
+    Attributes:
+        name: as people know it: its path relative to the suite's folder, or its address.
+        path: what opens it.
+    """
+
+    name: str
+    path: str
+
+
+def find_logs(patterns: Sequence[LogPattern], folder: Path) -> list[FoundLog]:
+    """Return the logs that patterns stand for, in their order, sorted within each; each log once.
+
+    A folder stands for all logs in it and below, a ROS 2 bag for itself. Addresses are taken as they are.
+
+    Args:
+        folder: what relative paths are relative to.
+
+    Raises:
+        UsageError: patterns without a log; all are listed, with their places.
+    """
+    found: dict[str, FoundLog] = {}
+    faults = []
+    for pattern in patterns:
+        logs = list(_logs_of(pattern.text, folder))
+        if not logs:
+            place = f"{pattern.place}: " if pattern.place else ""
+            faults.append(f"{place}{_nothing(pattern.text, folder)}")
+        found.update((log.path, log) for log in logs if log.path not in found)
+        if len(found) > _MOST_LOGS:
+            raise UsageError(f"{pattern.text}: more than {counted(_MOST_LOGS, 'log')}; split the batch")
+    if faults:
+        more = [f"… and {len(faults) - _MOST_FAULTS} more"] if len(faults) > _MOST_FAULTS else []
+        raise UsageError("\n".join(faults[:_MOST_FAULTS] + more))
+    return list(found.values())
+
+
+def _logs_of(text: str, folder: Path) -> Iterator[FoundLog]:
+    if _ADDRESS.match(text):
+        yield FoundLog(text, text)
+        return
+    try:
+        path = folder / text
+        if path.is_dir():
+            yield from _logs_in(path, folder)
+        elif path.is_file():
+            yield _found(path, folder)
+        elif has_magic(text):
+            for name in sorted(glob(text, root_dir=folder, recursive=True)):  # noqa: PTH207 - absolute ones, too
+                if (folder / name).is_file() or (folder / name / _BAG).is_file():
+                    yield _found(folder / name, folder)
+    except (OSError, ValueError):
+        # a name that cannot be one, such as one with a null character
+        return
+
+
+def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
+    """Yield the logs in a folder: bags, and files with the ending of a log."""
+    if (path / _BAG).is_file():
+        yield _found(path, folder)
+        return
+    for parent, folders, names in os.walk(path):
+        if _BAG in names:
+            yield _found(Path(parent), folder)
+            folders.clear()
+            continue
+        # in the order of their names, and without hidden folders
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in sorted(names):
+            if name.lower().endswith(_ENDINGS) and not name.startswith("."):
+                yield _found(Path(parent, name), folder)
+
+
+def _found(path: Path, folder: Path) -> FoundLog:
+    name = path.relative_to(folder) if path.is_relative_to(folder) else path
+    return FoundLog(name.as_posix(), str(path))
+
+
+def _nothing(text: str, folder: Path) -> str:
+    if has_magic(text):
+        return f"{text}: no log matches this pattern; check it, and the folder it starts from"
+    if (folder / text).is_dir():
+        return f"{text}: no log in this folder; logs end in {', '.join(_ENDINGS)}"
+    return f"{text}: no such file; check the path"
+
+
+class Identities:
+    """What logs hold, as hashes: those of unchanged files are remembered.
+
+    A file is unchanged while its path, size and time of modification are. A log of ours that is large is
+    identified by its certificate and size, which its end says; any other by its bytes.
+
+    One object belongs to one batch; `save` keeps what it knows for the next one.
+    """
+
+    def __init__(self, file: Path) -> None:
+        """Read what an earlier batch has left; a file that is damaged is ignored."""
+        self._file = file
+        self._known: dict[str, str] = {}
+        self._used: dict[str, str] = {}
+        try:
+            for line in file.read_text("utf-8").splitlines():
+                state, identity = json.loads(line)
+                self._known[str(state)] = str(identity)
+        except (OSError, ValueError):
+            self._known.clear()
+
+    def of(self, paths: Iterable[str], threads: int = 1) -> list[str | None]:
+        """Return the identity of each log; None if it cannot be read."""
+        with ThreadPoolExecutor(threads, "identities") as pool:
+            return list(pool.map(self._of_one, paths))
+
+    def save(self) -> None:
+        """Write the identities that were asked for.
+
+        Raises:
+            OutputError: the machine cannot write them.
+        """
+        if self._used == self._known:
+            return
+        with replacing(self._file) as stream:
+            for item in sorted(self._used.items()):
+                stream.write(json.dumps(item).encode() + b"\n")
+
+    def _of_one(self, path: str) -> str | None:
+        try:
+            state = _state(path)
+            if state not in self._used:
+                self._used[state] = self._known.get(state) or _identity(path)
+            return self._used[state]
+        except (OSError, ValueError):
+            return None
+
+
+def _files_of(path: str) -> list[Path]:
+    """Return the files that a log consists of."""
+    whole = Path(path)
+    return sorted(each for each in whole.iterdir() if each.is_file()) if whole.is_dir() else [whole]
+
+
+def _state(path: str) -> str:
+    """Return a hash of the path, size and time of a log's files: equal while they are unchanged."""
+    states = [(str(each.resolve()), each.stat()) for each in _files_of(path)]
+    text = json.dumps([(name, state.st_size, state.st_mtime_ns) for name, state in states])
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def _identity(path: str) -> str:
+    files = _files_of(path)
+    if len(files) == 1 and Path(path).is_file():
+        return _certified(files[0]) or _hash_of(files[0])
+    total = hashlib.sha256()
+    for each in files:
+        total.update(f"{each.name}\0{_hash_of(each)}\0".encode("utf-8", "surrogatepass"))
+    return f"files:{total.hexdigest()}"
+
+
+def _hash_of(path: Path) -> str:
+    with path.open("rb") as stream:
+        return f"sha256:{hashlib.file_digest(stream, 'sha256').hexdigest()}"
+
+
+def _certified(path: Path) -> str | None:
+    """Return the identity of a large log of ours that has a certificate."""
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        is_ours = size >= _HASHED_WHOLE and stream.read(len(MAGIC)) == MAGIC
+    if not is_ours:
+        return None
+    try:
+        certificate = dict(McapSource(path).metadata()).get(CERTIFICATE)
+    except LogError:
+        return None
+    if certificate is None:
+        return None
+    hashes = [certificate.get(name, "") for name in ("samples_sha256", "messages_sha256")]
+    return f"certificate:{hashlib.sha256(json.dumps([size, *hashes]).encode()).hexdigest()}"

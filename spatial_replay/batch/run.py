@@ -1,0 +1,401 @@
+"""A batch: a suite in, the rows of all its logs out; only what no earlier run has evaluated is evaluated."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from spatial_replay import __version__
+from spatial_replay.batch.data_set import FORMAT, IDENTITIES, ResultsFolder, run_columns, table_of, write_rows
+from spatial_replay.batch.log_files import FoundLog, Identities, find_logs
+from spatial_replay.batch.rows import (
+    ResultRow,
+    Task,
+    error_rows,
+    parsed_specifications,
+    rows_from_task,
+    spec_lines,
+)
+from spatial_replay.batch.suite import Case, Conditions, Suite
+from spatial_replay.batch.workers import DaskCluster, LocalProcesses, ThisProcess, WorkerLost, Workers
+from spatial_replay.errors import SpecificationError, UsageError
+from spatial_replay.mapping.mapping_file import load_mapping
+from spatial_replay.monitor.instances import Choice
+from spatial_replay.monitor.verdict import Verdict
+from spatial_replay.spec.format import format_specification
+from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.overrides import SpecificationText
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+_HASH: Final = 32
+"""Digits of a hash in a name."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpecFile:
+    """A specification file of a case, parsed with the case's constants.
+
+    Attributes:
+        name: as it is written: relative to the suite's folder.
+        hash: of its meaning, with ids and titles: layout and comments do not count.
+        lines: the line of each spec.
+    """
+
+    name: str
+    text: SpecificationText
+    hash: str
+    lines: tuple[tuple[str, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """The rows that a case wants of one log and one specification file.
+
+    Attributes:
+        key: a hash of all that the rows depend on; None if the log cannot be read.
+    """
+
+    case: Case
+    log: FoundLog
+    file: SpecFile
+    key: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class StoredTask:
+    """A task, and where its rows go: for each specification the key, and the hash of the specification."""
+
+    task: Task
+    keys: tuple[str, ...]
+    hashes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class BatchResult:
+    """What a batch found.
+
+    Attributes:
+        table: one row for each case, log, spec and object of a template; see `data_set`.
+        logs: how many logs.
+        evaluated: on how many of them something was evaluated in this run; the rest was known.
+    """
+
+    table: pa.Table
+    logs: int
+    evaluated: int
+
+    @property
+    def failures(self) -> pa.Table:
+        """The rows that do not pass."""
+        import pyarrow.compute as pc
+
+        return self.table.filter(pc.is_valid(self.table.column("failure")))
+
+
+def workers_of(jobs: int, dask: str | None = None) -> Workers:
+    """Return what evaluates logs.
+
+    Args:
+        jobs: how many processes; with 1, this one.
+        dask: address of a scheduler, whose workers see the same files.
+    """
+    if dask is not None:
+        return DaskCluster(dask)
+    return LocalProcesses(jobs) if jobs > 1 else ThisProcess()
+
+
+def run_batch(
+    suite: Suite,
+    results: Path,
+    workers: Workers,
+    *,
+    fail_on: frozenset[str] = frozenset(),
+    threads: int = 1,
+    begin: Callable[[int], None] = lambda tasks: None,
+    advance: Callable[[int], None] = lambda tasks: None,
+) -> BatchResult:
+    """Evaluate what is new, and return and store the results of all logs of a suite.
+
+    Args:
+        results: the folder of results, made if need be.
+        fail_on: "vacuous" and "unknown": what fails although the case allows it.
+        threads: how many logs are hashed at once.
+        begin: called with the number of logs to evaluate.
+        advance: called with 1 for each log that is done.
+
+    Raises:
+        UsageError: patterns without a log, files that cannot be used, a folder that is not one of results.
+        SpecificationError: specifications with errors.
+        OutputError: rows cannot be written; those written so far stay.
+    """
+    files = _spec_files(suite)
+    logs = _found(suite)
+    folder = ResultsFolder.create(results)
+    with folder.locked():
+        identities = Identities(folder.path / IDENTITIES)
+        paths = list(dict.fromkeys(log.path for several in logs for log in several))
+        known = dict(zip(paths, identities.of(paths, threads), strict=True))
+        identities.save()
+        wanted = _wanted(suite, files, logs, known)
+        stored = folder.keys()
+        tasks = list(_tasks(wanted, stored))
+        begin(len(tasks))
+        errors: dict[str, tuple[ResultRow, ...]] = {}
+        work = partial(evaluate_and_store, folder.path.resolve())
+        for task, result in workers.results(work, tasks):
+            errors |= _errors(task, result)
+            advance(1)
+        _require_shared(folder, tasks, errors)
+        folder.join_files()
+        table = _table(wanted, folder, errors, fail_on)
+        folder.write_run(table)
+    return BatchResult(table, len(paths), len({task.task.log for task in tasks}))
+
+
+def evaluate_and_store(folder: Path, stored: StoredTask) -> dict[str, tuple[ResultRow, ...]]:
+    """Evaluate a task and store its rows; errors are returned by key, and not stored: they may pass."""
+    errors = {}
+    for rows, key, spec_hash in zip(rows_from_task(stored.task), stored.keys, stored.hashes, strict=True):
+        if any(row.error is not None for row in rows):
+            errors[key] = rows
+        else:
+            write_rows(folder, spec_hash, key, rows)
+    return errors
+
+
+def _errors(
+    stored: StoredTask, result: dict[str, tuple[ResultRow, ...]] | WorkerLost
+) -> dict[str, tuple[ResultRow, ...]]:
+    """Return the rows with errors, by key."""
+    if not isinstance(result, WorkerLost):
+        return result
+    return dict(zip(stored.keys, error_rows(stored.task, str(result), "machine"), strict=True))
+
+
+def _require_shared(folder: ResultsFolder, tasks: Sequence[StoredTask], errors: Collection[str]) -> None:
+    """Check that what workers on other machines have written is here."""
+    missing = {key for task in tasks for key in task.keys if key not in errors}
+    if missing and not missing <= folder.keys():
+        raise UsageError(
+            f"the workers' rows are not in {folder.path}: they see another disk; give a folder that all share"
+        )
+
+
+def _spec_files(suite: Suite) -> list[tuple[SpecFile, ...]]:
+    """Return the specification files of each case, checked; all errors are reported together."""
+    texts: dict[Path, SpecificationText] = {}
+    files: list[tuple[SpecFile, ...]] = []
+    diagnoses: dict[str, Any] = {}
+    faults: dict[str, None] = {}
+    for case in suite.cases:
+        try:
+            for path in case.specs:
+                if path not in texts:
+                    texts[path] = read_specification_text(path)
+            own = tuple(texts[path] for path in case.specs)
+            parsed = parsed_specifications(own, case.conditions)
+            _check_each(case, parsed)
+            if case.conditions.mapping is not None:
+                load_mapping(case.conditions.mapping)
+        except SpecificationError as error:
+            diagnoses.update((str(each), each) for each in error.diagnoses)
+            continue
+        except UsageError as error:
+            faults[f"case {case.name!r}: {error}"] = None
+            continue
+        names = [_shown(path, suite.folder) for path in case.specs]
+        files.append(tuple(map(_spec_file, names, own, parsed)))
+    if diagnoses:
+        raise SpecificationError(list(diagnoses.values()))
+    if faults:
+        raise UsageError("\n".join(faults))
+    return files
+
+
+def read_specification_text(path: Path) -> SpecificationText:
+    """Read the text of a specification, with its errors.
+
+    Raises:
+        MissingFileError, UsageError, SpecificationError: see `load_specification`.
+    """
+    from spatial_replay.spec.load import load_specification
+
+    return SpecificationText(load_specification(path).source, path.name)
+
+
+def _spec_file(name: str, text: SpecificationText, parsed: Specification) -> SpecFile:
+    meaning = f"{parsed.profile}\n{format_specification(parsed)}"
+    digest = hashlib.sha256(meaning.encode("utf-8", "surrogatepass")).hexdigest()[:_HASH]
+    return SpecFile(name, text, digest, tuple(spec_lines(parsed).items()))
+
+
+def _shown(path: Path, folder: Path) -> str:
+    return (path.relative_to(folder) if path.is_relative_to(folder) else path).as_posix()
+
+
+def _check_each(case: Case, files: Sequence[Specification]) -> None:
+    """Check the objects that a case chooses for the parameters of its templates."""
+    templates = [spec for file in files for spec in file.results if spec.parameter is not None]
+    parameters = {spec.parameter for spec in templates}
+    chosen = dict(case.conditions.each)
+    for parameter, objects in chosen.items():
+        Choice.parse(parameter, objects)
+        if parameter not in parameters:
+            known = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates) or "none"
+            raise UsageError(f"no template has a parameter {parameter!r}; templates here: {known}")
+    for spec in templates:
+        if spec.parameter not in chosen:
+            raise UsageError(
+                f"{spec.name} is a template; say which objects {spec.parameter} stands for: "
+                f"--each {spec.parameter}=class:NAME or each: {{{spec.parameter}: all}}"
+            )
+
+
+def _found(suite: Suite) -> list[list[FoundLog]]:
+    """Return the logs of each case; patterns without a log are reported together."""
+    logs, faults = [], []
+    for case in suite.cases:
+        try:
+            logs.append(find_logs(case.logs, suite.folder))
+        except UsageError as error:
+            faults.append(str(error))
+    if faults:
+        raise UsageError("\n".join(faults))
+    return logs
+
+
+def _wanted(
+    suite: Suite,
+    files: Sequence[Sequence[SpecFile]],
+    logs: Sequence[Sequence[FoundLog]],
+    identities: dict[str, str | None],
+) -> list[Wanted]:
+    wanted = []
+    for case, own, several in zip(suite.cases, files, logs, strict=True):
+        conditions = _key_of(case.conditions)
+        for log in several:
+            identity = identities[log.path]
+            for file in own:
+                parts = [FORMAT, __version__, identity, conditions, file.hash]
+                key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:_HASH]
+                wanted.append(Wanted(case, log, file, None if identity is None else key))
+    return wanted
+
+
+def _key_of(conditions: Conditions) -> list[Any]:
+    """Return what rows depend on besides the log and the specification, whose constants have their values."""
+    mapping = conditions.mapping
+    return [
+        None if mapping is None else load_mapping(mapping).sha256,
+        conditions.reading,
+        conditions.start,
+        conditions.end,
+        conditions.every,
+        conditions.each,
+        conditions.semantics,
+        conditions.strict_names,
+    ]
+
+
+def _tasks(wanted: Sequence[Wanted], stored: set[str]) -> Iterator[StoredTask]:
+    """Yield a task for each log and conditions under which something is missing, with all that is."""
+    groups: dict[tuple[str, Conditions], dict[str, SpecFile]] = defaultdict(dict)
+    taken = set(stored)
+    for each in wanted:
+        if each.key is not None and each.key not in taken:
+            taken.add(each.key)
+            groups[each.log.path, each.case.conditions][each.key] = each.file
+    for (path, conditions), files in groups.items():
+        task = Task(path, tuple(file.text for file in files.values()), conditions)
+        yield StoredTask(task, tuple(files), tuple(file.hash for file in files.values()))
+
+
+def _table(
+    wanted: Sequence[Wanted],
+    folder: ResultsFolder,
+    errors: dict[str, tuple[ResultRow, ...]],
+    fail_on: frozenset[str],
+) -> pa.Table:
+    """Return the table of a run: what was wanted, with the rows found for it."""
+    import pyarrow as pa
+
+    rows = folder.rows({each.key for each in wanted if each.key is not None})
+    unreadable = {
+        f"{each.log.path}\0{each.file.hash}": _unreadable(each) for each in wanted if each.key is None
+    }
+    rows = pa.concat_tables([rows, table_of({**errors, **unreadable})])
+    places: dict[str, list[int]] = defaultdict(list)
+    for place, key in enumerate(rows.column("key").to_pylist()):
+        places[key].append(place)
+    indices, asked = [], []
+    for each in wanted:
+        for place in places[each.key or f"{each.log.path}\0{each.file.hash}"]:
+            indices.append(place)
+            asked.append(each)
+    chosen = rows.take(pa.array(indices, pa.int64()))
+    return _judged(chosen, asked, fail_on)
+
+
+def _unreadable(wanted: Wanted) -> tuple[ResultRow, ...]:
+    """Return the rows of a log that cannot even be hashed."""
+    task = Task(wanted.log.path, (wanted.file.text,), wanted.case.conditions)
+    (rows,) = rows_from_task(task)
+    if all(row.error is None for row in rows):
+        # it came back while it was looked at
+        message = f"{wanted.log.name} could not be read at first; run the batch again"
+        (rows,) = error_rows(task, message, "machine")
+    return rows
+
+
+def _judged(rows: pa.Table, asked: Sequence[Wanted], fail_on: frozenset[str]) -> pa.Table:
+    """Return the table of a run: rows with what was asked for, and with why they fail."""
+    import pyarrow as pa
+
+    names = rows.column("spec").to_pylist()
+    columns = {name: rows.column(name) for name in rows.column_names}
+    judged = ("verdict", "robustness", "vacuous", "faults", "error")
+    values = zip(*(columns[name].to_pylist() for name in judged), asked, strict=True)
+    lines = {id(each.file): dict(each.file.lines) for each in asked}
+    requirements = zip(columns["requirement"].to_pylist(), asked, strict=True)
+    columns |= {
+        "case": [each.case.name for each in asked],
+        "log": [each.log.name for each in asked],
+        "file": [each.file.name for each in asked],
+        "expected": [each.case.expectation.text for each in asked],
+        "failure": [_failure(*each, fail_on=fail_on) for each in values],
+        "line": [lines[id(each.file)].get(name, 1) for each, name in zip(asked, names, strict=True)],
+        "requirement": [own or ", ".join(each.case.requirements) or None for own, each in requirements],
+    }
+    schema = run_columns()
+    return pa.table({field.name: columns[field.name] for field in schema}, schema=schema)
+
+
+def _failure(
+    verdict: str | None,
+    robustness: float,
+    vacuous: Sequence[str],
+    faults: Sequence[str],
+    error: str | None,
+    wanted: Wanted,
+    *,
+    fail_on: frozenset[str],
+) -> str | None:
+    """Return why a row does not pass, in a few words; None if it does."""
+    if error is not None or verdict is None:
+        return error
+    failure = wanted.case.expectation.failure(Verdict(verdict), robustness)
+    if failure is not None:
+        return failure
+    if "unknown" in fail_on and verdict == Verdict.UNKNOWN:
+        return "unknown"
+    if "vacuous" in fail_on and vacuous:
+        return f"vacuous: {vacuous[0]}"
+    return f"the log is damaged: {faults[0]}" if faults else None

@@ -1,0 +1,203 @@
+"""Processes that work on many tasks: on this machine, or on a Dask cluster.
+
+Both take a function and tasks and yield results as they come. A worker that dies takes no other task with it:
+its task runs again once, and then its result says so. There is no scheduler here: processes are those of
+`concurrent.futures`, clusters are Dask's.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from itertools import islice
+from multiprocessing.connection import Connection
+from typing import Any, Final, Protocol, TypeVar, cast
+
+from spatial_replay.errors import UsageError
+
+_Task = TypeVar("_Task")
+_Result = TypeVar("_Result")
+
+_AHEAD: Final = 2
+"""Tasks for each process that are handed out at once, so that none has to wait for its next."""
+_PRELOADED: Final = "spatial_replay.batch.run"
+"""Imported once, by the process that all workers are copies of."""
+_ANSWER_S: Final = 15
+"""How long the scheduler of a cluster has to answer."""
+
+
+class WorkerLost(Exception):  # noqa: N818 - a result, not raised by this module
+    """The result of a task whose worker died twice while it worked on it."""
+
+
+class Workers(Protocol):
+    """What works on tasks."""
+
+    def results(
+        self, work: Callable[[_Task], _Result], tasks: Iterable[_Task]
+    ) -> Iterator[tuple[_Task, _Result | WorkerLost]]:
+        """Yield each task with its result, in any order; what `work` raises is raised."""
+
+
+class ThisProcess:
+    """Works on one task after the other, in this process."""
+
+    def results(
+        self, work: Callable[[_Task], _Result], tasks: Iterable[_Task]
+    ) -> Iterator[tuple[_Task, _Result | WorkerLost]]:
+        """See `Workers.results`."""
+        for task in tasks:
+            yield task, work(task)
+
+
+class LocalProcesses:
+    """Works in several processes on this machine; they end with this one, however that ends."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+
+    def results(
+        self, work: Callable[[_Task], _Result], tasks: Iterable[_Task]
+    ) -> Iterator[tuple[_Task, _Result | WorkerLost]]:
+        """See `Workers.results`."""
+        rest = iter(tasks)
+        while True:
+            suspects: list[_Task] = []
+            with _pool(self._count) as pool:
+                yield from _results(pool, work, rest, self._count * _AHEAD, suspects)
+            if not suspects:
+                return
+            # one of them ended its process, so each gets one for itself
+            for task in suspects:
+                again: list[_Task] = []
+                with _pool(1) as pool:
+                    yield from _results(pool, work, iter([task]), 1, again)
+                if again:
+                    yield task, WorkerLost(f"its process ended twice while it was evaluated{_MEMORY}")
+
+
+_MEMORY: Final = "; is there memory enough for it?"
+
+
+def _results(
+    pool: Executor,
+    work: Callable[[_Task], _Result],
+    tasks: Iterator[_Task],
+    ahead: int,
+    suspects: list[_Task],
+) -> Iterator[tuple[_Task, _Result]]:
+    """Yield results until the tasks end, or the pool breaks: then `suspects` gets the tasks it had."""
+    waiting: dict[Future[_Result], _Task] = {}
+    is_whole = True
+    while True:
+        for task in islice(tasks, ahead - len(waiting) if is_whole else 0):
+            try:
+                waiting[pool.submit(work, task)] = task
+            except BrokenProcessPool:
+                is_whole = False
+                suspects.append(task)
+                break
+        if not waiting:
+            return
+        for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+            task = waiting.pop(future)
+            try:
+                result = future.result()
+            except BrokenProcessPool:
+                is_whole = False
+                suspects.append(task)
+                continue
+            yield task, result
+
+
+@contextmanager
+def _pool(count: int) -> Iterator[Executor]:
+    """Start processes; they are ended at once when the block ends early."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([_PRELOADED])
+    ours, theirs = multiprocessing.Pipe(duplex=False)
+    try:
+        with ProcessPoolExecutor(count, context, _begin_worker, (ours,)) as pool:
+            try:
+                yield pool
+            except BaseException:
+                theirs.close()
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+    finally:
+        theirs.close()
+        ours.close()
+
+
+def _begin_worker(connection: Connection) -> None:
+    """End this process when the other end of the connection is closed, or its process ends."""
+    # Ctrl-C goes to all processes of a terminal; the first one decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(connection,), daemon=True).start()
+
+
+def _end_with(connection: Connection) -> None:
+    try:
+        connection.recv_bytes()
+    except (EOFError, OSError):
+        os._exit(1)
+
+
+class DaskCluster:
+    """Works on a Dask cluster, through the executor of its client.
+
+    The cluster's scheduler decides how often the task of a worker that died runs again.
+    """
+
+    def __init__(self, address: str) -> None:
+        """Connect to a scheduler.
+
+        Args:
+            address: such as "tcp://scheduler:8786".
+
+        Raises:
+            UsageError: Dask is not installed, or no scheduler answers.
+        """
+        try:
+            import distributed
+        except ImportError:
+            remedy = "pip install 'spatial-replay[cluster]'"
+            raise UsageError(f"clusters need Dask, which is not installed: {remedy}") from None
+        try:
+            self._client: Any = cast(Any, distributed).Client(address, timeout=_ANSWER_S)
+        except (OSError, ValueError) as error:
+            raise UsageError(
+                f"--dask {address}: no scheduler answers ({str(error).splitlines()[0]:.200}); "
+                "start one with `dask scheduler`, and workers with `dask worker`"
+            ) from None
+
+    def results(
+        self, work: Callable[[_Task], _Result], tasks: Iterable[_Task]
+    ) -> Iterator[tuple[_Task, _Result | WorkerLost]]:
+        """See `Workers.results`."""
+        from distributed import KilledWorker
+
+        rest = iter(tasks)
+        waiting: dict[Future[_Result], _Task] = {}
+        with self._client, self._client.get_executor(pure=False) as pool:
+            try:
+                while True:
+                    ahead = _AHEAD * max(1, sum(self._client.nthreads().values())) - len(waiting)
+                    waiting |= {pool.submit(work, task): task for task in islice(rest, max(0, ahead))}
+                    if not waiting:
+                        return
+                    for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                        task = waiting.pop(future)
+                        try:
+                            yield task, future.result()
+                        except KilledWorker:
+                            yield task, WorkerLost(f"the workers that evaluated it died{_MEMORY}")
+            finally:
+                for future in waiting:
+                    future.cancel()
