@@ -10,6 +10,7 @@ treats them alike: equal footprints give equal bits, in either order and in any 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,18 @@ from spatial_replay.geometry.arrays import Floats, Integers
 SIGNED_DISTANCE, PROTRUSION = 0, 1
 MIN_X, MAX_X, MIN_Y, MAX_Y, MIN_Z, MAX_Z = 2, 3, 4, 5, 6, 7
 CENTROID_MIN_X, CENTROID_MAX_X, CENTROID_MIN_Y, CENTROID_MAX_Y = 8, 9, 10, 11
+
+
+class Rows(NamedTuple):
+    """The arrays of a `FootprintBatch`, with the `edges` (V, 3) of its parts: normal and length of each."""
+
+    part_start: Integers
+    vertex_start: Integers
+    vertices: Floats
+    edges: Floats
+    radius: Floats
+    bottom: Floats
+    top: Floats
 
 
 @inlined
@@ -38,20 +51,13 @@ def _fill_edges(vertices: Floats, edges: Floats, start: int, stop: int) -> None:
 
 
 @inlined
-def _fill_rows(
-    part_start: Integers,
-    vertex_start: Integers,
-    vertices: Floats,
-    edges: Floats,
-    members: Integers,
-    is_filled: NDArray[np.bool_],
-) -> None:
+def _fill_rows(rows: Rows, members: Integers, is_filled: NDArray[np.bool_]) -> None:
     """Compute the edges of the rows among `members` that have none yet."""
     for row in members:
         if row >= 0 and not is_filled[row]:
             is_filled[row] = True
-            for p in range(part_start[row], part_start[row + 1]):
-                _fill_edges(vertices, edges, vertex_start[p], vertex_start[p + 1])
+            for p in range(rows.part_start[row], rows.part_start[row + 1]):
+                _fill_edges(rows.vertices, rows.edges, rows.vertex_start[p], rows.vertex_start[p + 1])
 
 
 @inlined
@@ -155,105 +161,62 @@ def _centroid(vertices: Floats, start: int, stop: int) -> tuple[float, float]:
 
 
 @inlined
-def _rows_distance(
-    part_start: Integers,
-    vertex_start: Integers,
-    vertices: Floats,
-    edges: Floats,
-    radius: Floats,
-    bottom: Floats,
-    top: Floats,
-    a: int,
-    b: int,
-    enlargement: float,
-) -> float:
+def _rows_distance(rows: Rows, a: int, b: int, enlargement: float) -> float:
     """Return the signed distance of rows a and b, as upright prisms if both have heights."""
+    start = rows.vertex_start
     least = np.inf
-    for p in range(part_start[a], part_start[a + 1]):
-        for q in range(part_start[b], part_start[b + 1]):
+    for p in range(rows.part_start[a], rows.part_start[a + 1]):
+        for q in range(rows.part_start[b], rows.part_start[b + 1]):
             distance = _convex_distance(
-                vertices, edges, vertex_start[p], vertex_start[p + 1], vertex_start[q], vertex_start[q + 1]
+                rows.vertices, rows.edges, start[p], start[p + 1], start[q], start[q + 1]
             )
             # grouped so that swapping p and q cannot change a bit
-            least = min(least, distance - ((radius[p] + radius[q]) + enlargement))
-    if math.isnan(bottom[a]) or math.isnan(bottom[b]):
+            least = min(least, distance - ((rows.radius[p] + rows.radius[q]) + enlargement))
+    if math.isnan(rows.bottom[a]) or math.isnan(rows.bottom[b]):
         return least
-    gap = max(bottom[a] - top[b], bottom[b] - top[a])
+    gap = max(rows.bottom[a] - rows.top[b], rows.bottom[b] - rows.top[a])
     if least > 0.0 and gap > 0.0:
         return math.sqrt(least * least + gap * gap)
     return float(max(least, gap))
 
 
 @inlined
-def _part_protrusion(
-    part_start: Integers,
-    vertex_start: Integers,
-    vertices: Floats,
-    edges: Floats,
-    radius: Floats,
-    bottom: Floats,
-    top: Floats,
-    a: int,
-    p: int,
-    b: int,
-    enlargement: float,
-) -> float:
+def _part_protrusion(rows: Rows, a: int, p: int, b: int, enlargement: float) -> float:
     """Return how far part p of row a sticks out of row b: the least over b's parts."""
+    start, radius = rows.vertex_start, rows.radius
     least = np.inf
-    for q in range(part_start[b], part_start[b + 1]):
-        planar = _convex_protrusion(
-            vertices, edges, vertex_start[p], vertex_start[p + 1], vertex_start[q], vertex_start[q + 1]
-        )
+    for q in range(rows.part_start[b], rows.part_start[b + 1]):
+        planar = _convex_protrusion(rows.vertices, rows.edges, start[p], start[p + 1], start[q], start[q + 1])
         least = min(least, planar + (radius[p] - radius[q]) + enlargement)
-    if math.isnan(bottom[a]) or math.isnan(bottom[b]):
+    if math.isnan(rows.bottom[a]) or math.isnan(rows.bottom[b]):
         return least
-    return float(max(least, max(bottom[b] - bottom[a], top[a] - top[b])))
+    return float(max(least, max(rows.bottom[b] - rows.bottom[a], rows.top[a] - rows.top[b])))
 
 
 @inlined
-def _row_extreme(
-    part_start: Integers,
-    vertex_start: Integers,
-    vertices: Floats,
-    radius: Floats,
-    bottom: Floats,
-    top: Floats,
-    quantity: int,
-    row: int,
-    enlargement: float,
-) -> float:
+def _row_extreme(rows: Rows, quantity: int, row: int, enlargement: float) -> float:
     """Return a row's greatest coordinate for a MAX_ quantity; for a MIN_, the greatest of their negatives."""
     if quantity == MIN_Z:
-        return float(-bottom[row])
+        return float(-rows.bottom[row])
     if quantity == MAX_Z:
-        return float(top[row])
+        return float(rows.top[row])
     sign = -1.0 if quantity % 2 == 0 else 1.0
     greatest = -np.inf
-    for p in range(part_start[row], part_start[row + 1]):
-        start, stop = vertex_start[p], vertex_start[p + 1]
+    for p in range(rows.part_start[row], rows.part_start[row + 1]):
+        start, stop = rows.vertex_start[p], rows.vertex_start[p + 1]
         if quantity >= CENTROID_MIN_X:
-            x, y = _centroid(vertices, start, stop)
+            x, y = _centroid(rows.vertices, start, stop)
             greatest = max(greatest, sign * (x if quantity <= CENTROID_MAX_X else y))
         else:
             axis = 0 if quantity <= MAX_X else 1
             for i in range(start, stop):
-                greatest = max(greatest, sign * vertices[i, axis] + (radius[p] + enlargement))
+                greatest = max(greatest, sign * rows.vertices[i, axis] + (rows.radius[p] + enlargement))
     return greatest
 
 
 @inlined
 def _union_distance(
-    part_start: Integers,
-    vertex_start: Integers,
-    vertices: Floats,
-    edges: Floats,
-    radius: Floats,
-    bottom: Floats,
-    top: Floats,
-    members: Integers,
-    first: tuple[int, int],
-    second: tuple[int, int],
-    enlargement: float,
+    rows: Rows, members: Integers, first: tuple[int, int], second: tuple[int, int], enlargement: float
 ) -> float:
     """Return the signed distance of two unions of rows: the least over their pairs."""
     least = np.inf
@@ -261,26 +224,13 @@ def _union_distance(
         for j in range(second[0], second[1]):
             a, b = members[i], members[j]
             if a >= 0 and b >= 0:
-                distance = _rows_distance(
-                    part_start, vertex_start, vertices, edges, radius, bottom, top, a, b, enlargement
-                )
-                least = min(least, distance)
+                least = min(least, _rows_distance(rows, a, b, enlargement))
     return least
 
 
 @inlined
 def _union_protrusion(
-    part_start: Integers,
-    vertex_start: Integers,
-    vertices: Floats,
-    edges: Floats,
-    radius: Floats,
-    bottom: Floats,
-    top: Floats,
-    members: Integers,
-    first: tuple[int, int],
-    second: tuple[int, int],
-    enlargement: float,
+    rows: Rows, members: Integers, first: tuple[int, int], second: tuple[int, int], enlargement: float
 ) -> float:
     """Return how far a union of rows sticks out of another: greatest over parts of the least over parts."""
     greatest = -np.inf
@@ -288,41 +238,25 @@ def _union_protrusion(
         a = members[i]
         if a < 0:
             continue
-        for p in range(part_start[a], part_start[a + 1]):
+        for p in range(rows.part_start[a], rows.part_start[a + 1]):
             least = np.inf
             for j in range(second[0], second[1]):
-                b = members[j]
-                if b >= 0:
-                    protrusion = _part_protrusion(
-                        part_start, vertex_start, vertices, edges, radius, bottom, top, a, p, b, enlargement
-                    )
-                    least = min(least, protrusion)
+                if members[j] >= 0:
+                    least = min(least, _part_protrusion(rows, a, p, members[j], enlargement))
             greatest = max(greatest, least)
     return greatest
 
 
 @inlined
 def _union_extreme(
-    part_start: Integers,
-    vertex_start: Integers,
-    vertices: Floats,
-    radius: Floats,
-    bottom: Floats,
-    top: Floats,
-    members: Integers,
-    first: tuple[int, int],
-    quantity: int,
-    enlargement: float,
+    rows: Rows, members: Integers, first: tuple[int, int], quantity: int, enlargement: float
 ) -> float:
     """Return a projection of a union of rows; NaN along z if one of them has no height."""
     greatest = -np.inf
     for i in range(first[0], first[1]):
-        row = members[i]
-        if row < 0:
+        if members[i] < 0:
             continue
-        extreme = _row_extreme(
-            part_start, vertex_start, vertices, radius, bottom, top, quantity, row, enlargement
-        )
+        extreme = _row_extreme(rows, quantity, members[i], enlargement)
         if math.isnan(extreme):
             return np.nan
         greatest = max(greatest, extreme)
@@ -355,31 +289,25 @@ def measure_rows(
     """
     # edges only of rows that distances need: a log has many more that are projected or unused
     is_filled = np.zeros(len(part_start), dtype=np.bool_)
+    rows = Rows(part_start, vertex_start, vertices, edges, radius, bottom, top)
     for k in range(len(quantity)):
         if quantity[k] < MIN_X:
             for operand in (first[k], second[k]):
                 operand_members = members[member_start[operand] : member_start[operand + 1]]
-                _fill_rows(part_start, vertex_start, vertices, edges, operand_members, is_filled)
+                _fill_rows(rows, operand_members, is_filled)
     for t in range(values.shape[1]):
         for k in range(values.shape[0]):
             a, b = first[k], second[k]
             start = member_start[a] + t * width[a]
             a_members = (start, start + width[a])
             if quantity[k] >= MIN_X:
-                values[k, t] = _union_extreme(
-                    part_start, vertex_start, vertices, radius, bottom, top,
-                    members, a_members, quantity[k], enlargement[a],
-                )  # fmt: skip
+                values[k, t] = _union_extreme(rows, members, a_members, quantity[k], enlargement[a])
                 continue
             start = member_start[b] + t * width[b]
             b_members = (start, start + width[b])
             if quantity[k] == SIGNED_DISTANCE:
-                values[k, t] = _union_distance(
-                    part_start, vertex_start, vertices, edges, radius, bottom, top,
-                    members, a_members, b_members, enlargement[a] + enlargement[b],
-                )  # fmt: skip
+                grown = enlargement[a] + enlargement[b]
+                values[k, t] = _union_distance(rows, members, a_members, b_members, grown)
             else:
-                values[k, t] = _union_protrusion(
-                    part_start, vertex_start, vertices, edges, radius, bottom, top,
-                    members, a_members, b_members, enlargement[a] - enlargement[b],
-                )  # fmt: skip
+                grown = enlargement[a] - enlargement[b]
+                values[k, t] = _union_protrusion(rows, members, a_members, b_members, grown)

@@ -27,6 +27,7 @@ from spatial_replay.monitor.online.codes import (
     SINCE,
     WINDOW_MAX,
 )
+from spatial_replay.monitor.online.state import past_value
 
 
 class Steps(NamedTuple):
@@ -63,12 +64,7 @@ def _run_past(code: int, first: Floats, second: Floats, target: Floats, steps: S
     value = np.inf if code == HISTORICALLY else -np.inf
     for i in range(steps.length):
         k = _at(steps, i)
-        if code == ONCE:
-            value = max(first[k], value)
-        elif code == HISTORICALLY:
-            value = min(first[k], value)
-        else:
-            value = max(second[k], min(first[k], value))
+        value = past_value(code, first[k], second[k], value)
         target[k] = value
 
 

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spatial_replay.compiled import piece
+from spatial_replay.compiled import inlined, piece
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.online.codes import CHANNELS, SAMPLES
+from spatial_replay.monitor.online.codes import CHANNELS, HISTORICALLY, ONCE, SAMPLES
 from spatial_replay.monitor.online.program import Program
 
 TILE = 256
@@ -150,6 +150,16 @@ def doubled(memory: Memory) -> Memory:
         history=np.concatenate((memory.history, np.zeros_like(memory.history)), axis=2),
         wedges=wedges,
     )
+
+
+@inlined
+def past_value(code: int, first: float, second: float, before: float) -> float:
+    """Return an unbounded once, historically or since at a sample, from its value at the one before."""
+    if code == ONCE:
+        return max(first, before)
+    if code == HISTORICALLY:
+        return min(first, before)
+    return max(second, min(first, before))
 
 
 @piece

@@ -57,6 +57,7 @@ from spatial_replay.monitor.online.state import (
     first_behind,
     first_memory,
     forget,
+    past_value,
     scratch_for,
     widen,
 )
@@ -243,12 +244,7 @@ def _run_past(code: int, first: Floats, second: Floats, target: Floats, before: 
     if starts:
         value = np.inf if code == HISTORICALLY else -np.inf
     for k in range(len(target)):
-        if code == ONCE:
-            value = max(first[k], value)
-        elif code == HISTORICALLY:
-            value = min(first[k], value)
-        else:
-            value = max(second[k], min(first[k], value))
+        value = past_value(code, first[k], second[k], value)
         target[k] = value
 
 
