@@ -21,6 +21,7 @@ from spatial_replay.cli.options import (
 )
 from spatial_replay.cli.output import print_verdicts, write_document
 from spatial_replay.cli.progress import progress
+from spatial_replay.cli.watching import watch_log, watch_option
 from spatial_replay.errors import UsageError
 from spatial_replay.text import nearest_hint
 from spatial_replay.trace.time_points import duration_ns_from_text
@@ -71,6 +72,7 @@ def _read_kinds(context: click.Context, parameter: click.Parameter, text: str) -
     default="",
     help="Exit with 1 on these as well: vacuous, unknown, or both with a comma between.",
 )
+@watch_option
 @semantics_option
 def replay(
     request: EvaluationArguments,
@@ -82,6 +84,7 @@ def replay(
     signal: bool,
     width: str | None,
     fail_on: frozenset[str],
+    watch: bool,
     semantics: Semantics,
 ) -> int:
     """Evaluate specifications over a recorded log.
@@ -93,12 +96,16 @@ def replay(
     with 1 if a part of a specification decided nothing: an empty window, an antecedent that never held, a
     group without members, a template without objects.
 
+    With --watch the log stays in memory, and is evaluated again whenever a specification file is saved; the
+    key w writes the values given with --const into the files, and Ctrl-C ends it, with exit code 130.
+
     \b
     Examples:
       spatial-replay replay run.mcap --spec blocks.spatial -o annotated.mcap
       spatial-replay replay run.mcap --spec edited.spatial --json -
       spatial-replay replay run.mcap --spec blocks.spatial --const near=80 --fail-on vacuous,unknown
       spatial-replay replay run.mcap --spec blocks.spatial --window 10s
+      spatial-replay replay run.mcap --spec blocks.spatial --watch
       spatial-replay replay walk.jsonl --spec walk.spatial --each ego=class:person
       spatial-replay replay drive.bag --mapping drive.yaml --spec drive.spatial
       spatial-replay replay drive.bag --mapping drive.yaml -o annotated.mcap --keep mapped --keep '/camera/*'
@@ -119,6 +126,12 @@ def replay(
     if semantics != "ltlf" and (signal or window_ns is not None):
         option = "--signal" if signal else "--window"
         raise UsageError(f"{option} is not defined under --semantics {semantics}; remove one of them")
+    if watch:
+        others = {"-o": output, "--json": json_file, "--window": width, "--fail-on": fail_on}
+        for option, value in others.items():
+            if value:
+                raise UsageError(f"--watch prints verdicts only; remove {option}")
+        return watch_log(request, semantics)
     _check_outputs(output, json_file, request.inputs)
     inputs = open_inputs(request)
     with progress("samples") as advance:

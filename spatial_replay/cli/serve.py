@@ -17,11 +17,14 @@ from spatial_replay.cli.options import (
     warn_of_input,
 )
 from spatial_replay.cli.output import print_verdicts
-from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, show_file, warn
+from spatial_replay.cli.watching import files_to_watch, follow_saves, load_log, watch_option
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from spatial_replay.monitor.semantics import Semantics
+    from spatial_replay.replay import SpecificationFiles
     from spatial_replay.replay.loaded_log import Evaluated
 
 
@@ -44,6 +47,7 @@ if TYPE_CHECKING:
 )
 @click.option("--play", is_flag=True, help="Start playing at once instead of waiting for a viewer.")
 @click.option("--layout", is_flag=True, help="Print the layout to import in the viewer, and exit.")
+@watch_option
 @keep_option("Messages of the log to send")
 @semantics_option
 def serve(
@@ -52,6 +56,7 @@ def serve(
     host: str,
     play: bool,
     layout: bool,
+    watch: bool,
     keep: tuple[str, ...],
     semantics: Semantics,
 ) -> ExitCode | None:
@@ -59,7 +64,8 @@ def serve(
 
     Connect the viewer to the printed address, then play, pause, seek and change the speed. Every constant of
     the specifications is a parameter: change one, and the curves, colours, events and verdicts of the whole
-    log are updated.
+    log are updated. With --watch they follow the specification files, too, whenever these are saved; the key
+    w, and the service write_constants, write what viewers changed into the files.
 
     T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or 2026-01-31T12:00:00Z.
     Ctrl-C stops the server, with exit code 130.
@@ -67,22 +73,25 @@ def serve(
     \b
     Examples:
       spatial-replay serve run.mcap --spec blocks.spatial
+      spatial-replay serve run.mcap --spec blocks.spatial --watch
       spatial-replay serve run.mcap --spec blocks.spatial --layout > live.json
     """
-    evaluated = _evaluated(request, keep, semantics)
+    files = files_to_watch(request) if watch else None
+    inputs = open_inputs(request)
+    evaluated = load_log(inputs, inputs.options(semantics, keep), files).evaluate()
     if layout:
         show_file(evaluated.layout.data.decode())
         return None
     warn_of_input(evaluated.replayed)
     try:
-        _serve(evaluated, host, port, play)
+        _serve(evaluated, files, host, port, play)
     except KeyboardInterrupt:
         # the regular way to stop the server
         return ExitCode.INTERRUPTED
     return None
 
 
-def _serve(evaluated: Evaluated, host: str, port: int, play: bool) -> None:
+def _serve(evaluated: Evaluated, files: SpecificationFiles | None, host: str, port: int, play: bool) -> None:
     # imported here so that --help stays fast
     from spatial_replay.serve import open_server
 
@@ -93,21 +102,15 @@ def _serve(evaluated: Evaluated, host: str, port: int, play: bool) -> None:
         show(f"serving at {server.address}; stop with Ctrl-C")
         show(f"  in Foxglove or Lichtblick: Open connection, Foxglove WebSocket, {server.address}")
         show("  layout to import there: run the same command with --layout > live.json")
-        server.wait()
+        if files is None:
+            server.wait()
+            return
 
+        def write() -> Mapping[str, float | str]:
+            edited = server.edited
+            return edited.loaded.write_constants(edited.given)
 
-def _evaluated(request: EvaluationArguments, keep: tuple[str, ...], semantics: Semantics) -> Evaluated:
-    from spatial_replay.replay import LoadedLog
-
-    inputs = open_inputs(request)
-    with progress("samples") as advance:
-        loaded = LoadedLog(
-            inputs.source,
-            inputs.files,
-            inputs.options(semantics, keep),
-            advance=advance,
-        )
-    return loaded.evaluate()
+        follow_saves(files, server.show_saved, write, refuse=server.show_error, check=server.check)
 
 
 def _is_loopback(host: str) -> bool:

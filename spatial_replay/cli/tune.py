@@ -154,7 +154,7 @@ def tune(
     """
     # imported here so that --help stays fast
     from spatial_replay.logs.output_file import refuse_inputs
-    from spatial_replay.replay.specification_files import write_constants
+    from spatial_replay.replay.specification_files import plain_values, write_constants
     from spatial_replay.sources.open_log import read_trace
     from spatial_replay.tuning import load_runs, tune_runs
 
@@ -171,7 +171,7 @@ def tune(
         tuning = tune_runs(file, runs, ranges, each=objects_by_parameter(choices), seed=seed, advance=advance)
     changed: tuple[str, ...] = ()
     if write and tuning.is_found:
-        changed = write_constants(spec, tuning.plain_constants, profile=profile)
+        changed = write_constants(spec, plain_values(tuning.specification), profile=profile)
     if output is not None:
         _write_picture(tuning, output)
     if as_json:

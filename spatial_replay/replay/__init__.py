@@ -1,7 +1,8 @@
 """Replay: a log and specifications in, verdicts and an annotated log out.
 
 `selection` picks the samples, `engine` evaluates them, `annotated` writes the log, `document` the JSON.
-`loaded_log` evaluates a log in memory with other constants, `playback` plays what that gives.
+`loaded_log` evaluates a log in memory again, with what `specification_files` reads when it is saved;
+`playback` plays what that gives.
 
 Names are loaded when they are first used.
 """
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
         first_sample_ns,
         has_samples_from,
     )
+    from spatial_replay.replay.specification_files import SpecificationFiles, write_constants
     from spatial_replay.replay.table import QUANTITIES, export_table
     from spatial_replay.replay.verification import verify_certificate
 
@@ -38,6 +40,7 @@ __all__ = [
     "Replay",
     "ReplayOptions",
     "Replayed",
+    "SpecificationFiles",
     "Window",
     "constant_text",
     "constant_values",
@@ -50,6 +53,7 @@ __all__ = [
     "recorded_texts",
     "run_replay",
     "verify_certificate",
+    "write_constants",
 ]
 
 __getattr__, __dir__ = loaded_when_used(
@@ -60,6 +64,7 @@ __getattr__, __dir__ = loaded_when_used(
         "engine": ("Replay", "Replayed"),
         "playback": ("Playback",),
         "selection": ("LogNames", "ReplayOptions", "Window", "first_sample_ns", "has_samples_from"),
+        "specification_files": ("SpecificationFiles", "write_constants"),
         "table": ("QUANTITIES", "export_table"),
         "loaded_log": ("Evaluated", "LoadedLog", "constant_text", "constant_values"),
         "verification": ("verify_certificate",),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import PurePath
@@ -33,9 +34,11 @@ from spatial_replay.replay.selection import (
     ReplayOptions,
     Selection,
     first_sample_ns,
+    look_before,
 )
+from spatial_replay.replay.specification_files import SpecificationFiles
 from spatial_replay.spec import parse_specification
-from spatial_replay.spec.diagnostics import nearest_hint
+from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
 from spatial_replay.spec.format import format_duration, format_specification
 from spatial_replay.spec.formula import Constant, Specification, iter_nodes
 from spatial_replay.trace.trace import Trace
@@ -49,11 +52,15 @@ class EditedFiles:
     """The specifications with some values for their constants.
 
     Attributes:
+        loaded: the log that they are evaluated over.
         files: as a log stores them.
-        constants: the values, by the names of `LoadedLog.constants`.
+        given: the values that were given in place of those in the text.
+        constants: all values, by the names of `LoadedLog.constants`.
     """
 
+    loaded: LoadedLog
     files: tuple[Specification, ...]
+    given: Mapping[str, float | str]
     constants: Mapping[str, Constant]
 
 
@@ -79,11 +86,13 @@ class LoadedLog:
         files: Sequence[Specification],
         options: ReplayOptions = DEFAULT_OPTIONS,
         *,
+        saved: SpecificationFiles | None = None,
         advance: Callable[[int], None] = lambda samples: None,
     ) -> None:
         """Read the log.
 
         Args:
+            saved: the files that the specifications are from, if constants may be written into them.
             advance: called with the number of samples of each block that is read.
 
         Raises:
@@ -94,7 +103,9 @@ class LoadedLog:
         keep = KEEP_ALL if options.keep is None else options.keep
         selection = Selection(source, tuple(files), replace(options, keep=keep))
         # evaluations read the samples in memory, which have no messages
-        self.name, self.options = source.name, replace(options, keep=None)
+        self.name, self.options, self._keep = source.name, replace(options, keep=None), options.keep
+        self._source, self._saved = source, saved
+        self._looks_back = look_before(files)
         self._attachments = source.attachments
         self._files, self._kept = tuple(files), logged_specifications(files)
         self.own = OwnMessages(selection)
@@ -110,12 +121,57 @@ class LoadedLog:
         self.inside = selection.inside(self.trace)
         if not len(self.inside):
             raise selection.nothing_to_evaluate(self.faults)
-        names = LogNames()
-        names.add(self.trace)
-        self.missing = selection.missing_names(names)
+        self.missing = self._missing(selection)
         self.first_ns = first_sample_ns(source) if options.window.start_ns else int(self.trace.times_ns[0])
         self._places = _places(self._files)
         self.constants: Mapping[str, Constant] = self._constants(self._files)
+
+    def with_files(self, files: Sequence[Specification]) -> LoadedLog:
+        """Return the log with other specifications; samples and measurements are those in memory.
+
+        The log is read again only if these look back at samples before the window, and the former did not.
+
+        Raises:
+            UsageError: an option that does not fit these specifications.
+            SpecificationError: names that the log never has, if names are strict.
+        """
+        if self.options.window.start_ns and look_before(files) and not self._looks_back:
+            options = replace(self.options, keep=self._keep)
+            return LoadedLog(self._source, files, options, saved=self._saved)
+        other = copy(self)
+        other._files, other._kept = tuple(files), logged_specifications(files)
+        other.missing = other._missing(Selection(self._source, tuple(files), self.options))
+        other._places = _places(other._files)
+        other.constants = other._constants(other._files)
+        return other
+
+    def write_constants(self, values: Mapping[str, float | str]) -> Mapping[str, float | str]:
+        """Write values of constants into the files that the specifications are from; only numbers change.
+
+        Returns:
+            Those that changed.
+
+        Raises:
+            UsageError: the files may not be written; no such constant.
+            SpecificationError, MissingFileError, OutputError: see `write_constants`.
+        """
+        if self._saved is None:
+            raise UsageError(
+                "constants are written into files that are watched; give --spec FILE and --watch"
+            )
+        return self._saved.write(self._by_file(values))
+
+    def _missing(self, selection: Selection) -> tuple[Diagnostic, ...]:
+        names = LogNames()
+        names.add(self.trace)
+        return selection.missing_names(names)
+
+    def _by_file(self, values: Mapping[str, float | str]) -> list[dict[str, float | str]]:
+        edits = [dict[str, float | str]() for _ in self._files]
+        for name, value in values.items():
+            index, own = self._place(name, value)
+            edits[index][own] = value
+        return edits
 
     def edit(self, values: Mapping[str, float | str]) -> EditedFiles:
         """Return the specifications with other values for some constants; a file is parsed if it changes.
@@ -127,16 +183,13 @@ class LoadedLog:
             UsageError: no such constant, a value of another kind.
             SpecificationError: a specification that is invalid with these values.
         """
-        edits = [dict[str, float | str]() for _ in self._files]
-        for name, value in values.items():
-            index, own = self._place(name, value)
-            edits[index][own] = value
+        edits = self._by_file(values)
         edited = [_edited(file, own) for file, own in zip(self._files, edits, strict=True)]
         stored = [
             kept if file is written else _stored(file, written, kept)
             for file, written, kept in zip(edited, self._files, self._kept, strict=True)
         ]
-        return EditedFiles(tuple(stored), self._constants(edited))
+        return EditedFiles(self, tuple(stored), MappingProxyType(dict(values)), self._constants(edited))
 
     def evaluate(self, values: Mapping[str, float | str] | EditedFiles | None = None) -> Evaluated:
         """Evaluate the specifications over all samples, with other values for some constants.

@@ -69,6 +69,11 @@ class ReplayOptions:
 DEFAULT_OPTIONS = ReplayOptions()
 
 
+def look_before(files: Sequence[Specification]) -> bool:
+    """Say whether specifications look back at samples before a window."""
+    return any(look_back([spec.formula for spec in file.specs]) != (0, 0) for file in files)
+
+
 def first_sample_ns(source: Source) -> int:
     """Return the time of a log's first sample.
 
@@ -133,9 +138,8 @@ class Selection:
     def iter_blocks(self) -> Iterator[tuple[Block, Trace]]:
         """Read each block, with its samples in the window, and before it if a specification looks back."""
         window = self.window
-        looks_back = any(look_back([spec.formula for spec in file.specs]) != (0, 0) for file in self.files)
         # every Nth sample is counted from the log's first, wherever the window starts
-        from_start = looks_back or window.every > 1
+        from_start = look_before(self.files) or window.every > 1
         read = 0
         blocks = read_blocks(self.source, None if from_start else window.start_ns, window.end_ns)
         for block in read_ahead(blocks):

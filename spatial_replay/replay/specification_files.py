@@ -3,14 +3,148 @@
 from __future__ import annotations
 
 import stat
-from collections.abc import Mapping
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Final
 
-from spatial_replay.errors import MissingFileError, UsageError
+from spatial_replay.errors import MissingFileError, SpatialReplayError, UsageError
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.spec import parse_specification
+from spatial_replay.spec.format import format_duration
+from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.overrides import load_specifications
 
-_MARK = b"\xef\xbb\xbf"
+_MARK: Final = b"\xef\xbb\xbf"
+_SETTLE_S: Final = 0.1
+"""How long a file with errors, or one that is gone, is left to an editor that may be writing it."""
+_IDLE_MS: Final = 100
+_STEP_MS: Final = 10
+"""The longest wait for a change, and how long to wait for more after one."""
+
+
+class SpecificationFiles:
+    """Specification files, read again when they are saved.
+
+    Holds which state of the files was read last. For one thread.
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        *,
+        profile: str | None = None,
+        constants: Mapping[str, float | str] | None = None,
+    ) -> None:
+        """Name the files; nothing is read yet.
+
+        Args:
+            profile: relation profile of files without a `use` line.
+            constants: values in place of those that the files give their constants.
+
+        Raises:
+            UsageError: no file.
+        """
+        if not paths:
+            raise UsageError("watching needs a specification file to watch; give --spec FILE")
+        self.paths = tuple(dict.fromkeys(paths))
+        self._profile, self._constants = profile, dict(constants or {})
+        self._read: object = None
+        self._sources: list[str] = []
+
+    def load(self) -> list[Specification]:
+        """Parse the files.
+
+        Raises:
+            MissingFileError, SpecificationError, UsageError: as `load_specifications`.
+        """
+        # before the files are read: what is saved while they are is a change
+        self._read, self._sources = self._state(), []
+        files = load_specifications(self.paths, profile=self._profile, constants=self._constants)
+        self._sources = [file.source for file in files]
+        return files
+
+    def iter_saves(self) -> Iterator[list[Specification] | SpatialReplayError | None]:
+        """Yield the files whenever one is saved with another text, or why they cannot be read.
+
+        Between saves it yields None, about ten times a second. A file may be replaced by another of its name,
+        as many editors do, be gone for a while, and be caught in the middle of being written.
+
+        Raises:
+            UsageError: the library that watches files is not installed.
+        """
+        try:
+            from watchfiles import watch
+        except ImportError:
+            remedy = "pip install 'spatial-replay[live]'"
+            raise UsageError(f"--watch needs watchfiles, which is not installed: {remedy}") from None
+        places = {path.absolute() for path in self.paths} | {path.resolve() for path in self.paths}
+        names = {path.name for path in places}
+        for _ in watch(
+            *{path.parent for path in places},
+            watch_filter=lambda change, path: Path(path).name in names,
+            step=_STEP_MS,
+            debounce=_IDLE_MS,
+            rust_timeout=_IDLE_MS,
+            yield_on_timeout=True,
+            recursive=False,
+        ):
+            yield self._saved() if self._state() != self._read else None
+
+    def write(self, values: Sequence[Mapping[str, float | str]] = ()) -> dict[str, float | str]:
+        """Write values of constants into the files; they are no longer used in place of what is there.
+
+        Args:
+            values: for each of the files, by their names in it, besides those given at the start.
+
+        Returns:
+            Those that changed.
+
+        Raises:
+            MissingFileError, SpecificationError, UsageError, OutputError: see `write_constants`.
+        """
+        files = load_specifications(self.paths, profile=self._profile, constants=self._constants)
+        plain = load_specifications(self.paths, profile=self._profile)
+        changed: dict[str, float | str] = {}
+        for path, own, with_given, written in zip(
+            self.paths, values or [{}] * len(self.paths), files, plain, strict=True
+        ):
+            given = {
+                name: value
+                for name, value in plain_values(with_given).items()
+                if with_given.constants[name] != written.constants[name]
+            }
+            new = {**given, **own}
+            changed |= {name: new[name] for name in write_constants(path, new, profile=self._profile)}
+        self._constants = {}
+        return changed
+
+    def _saved(self) -> list[Specification] | SpatialReplayError | None:
+        """Return the files as saved; None if their text is the one before."""
+        before, failed = self._sources, False
+        while True:
+            try:
+                files = self.load()
+            except SpatialReplayError as error:
+                if failed:
+                    return error
+                state = self._read
+                time.sleep(_SETTLE_S)
+                failed = self._state() == state
+                continue
+            return files if self._sources != before else None
+
+    def _state(self) -> object:
+        """Return what differs when a file is saved."""
+        states: list[tuple[int, int, int] | None] = []
+        for path in self.paths:
+            try:
+                found = path.stat()
+            except (OSError, ValueError):
+                states.append(None)
+            else:
+                states.append((found.st_mtime_ns, found.st_size, found.st_ino))
+        return states
 
 
 def write_constants(
@@ -55,3 +189,12 @@ def write_constants(
         stream.write(mark + written.source.encode("utf-8"))
     path.chmod(mode)
     return tuple(changed)
+
+
+def plain_values(file: Specification) -> dict[str, float | str]:
+    """Return the constants of a specification that follow from no others, as they are given."""
+    return {
+        name: each.value if each.duration_ns is None else format_duration(each.duration_ns)
+        for name, each in file.constants.items()
+        if not each.is_computed
+    }

@@ -82,6 +82,7 @@ def thin(messages: Messages, most: int) -> Messages:
 VERDICT = "verdict"
 CONSTANTS = "constants"
 LOG = "log"
+SPECIFICATION = "specification"
 """The subjects of notes."""
 
 _MOST = 5
@@ -164,11 +165,14 @@ class Player:
         """Evaluate the whole log with other constants; after an error, restore the former values."""
         before = self._playback.evaluated
         try:
-            self._playback.evaluated = before.loaded.evaluate(edited)
+            self._playback.evaluated = edited.loaded.evaluate(edited)
         except SpatialReplayError as error:
             self._viewers.send_note(Note(CONSTANTS, Level.ERROR, str(error)))
-            self._viewers.send_values(self._session.restore_values(constant_values(before.edited.constants)))
+            self._viewers.send_values(self._session.restore(before.edited, error))
             return
+        if edited.loaded is not before.loaded:
+            # viewers know the constants that they set, not those of a file that was saved
+            self._viewers.send_values(constant_values(edited.constants))
         # viewers drop what they show of the log when the playback jumps, even to the same time
         self._viewers.send_state(self._session.state._replace(time_ns=time_ns, did_seek=True))
         self._viewers.send_note(verdict_note(self._playback.evaluated))

@@ -14,7 +14,7 @@ from jsonschema.exceptions import best_match
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.topics import LAYOUT
 from spatial_replay.replay.document import document_from_replay, explain_results
-from spatial_replay.replay.loaded_log import Evaluated, constant_values
+from spatial_replay.replay.loaded_log import Evaluated
 
 _MOST_BYTES: Final = 1 << 16
 
@@ -67,7 +67,7 @@ def _evaluate(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, 
     """Replay with other constants; what is shown stays as it is."""
     changed = request.get("constants", {})
     if changed:
-        evaluated = evaluated.loaded.evaluate({**constant_values(evaluated.edited.constants), **changed})
+        evaluated = evaluated.loaded.evaluate({**evaluated.edited.given, **changed})
     results = tuple(replace(result, has_series=False) for result in evaluated.replayed.results)
     return document_from_replay(replace(evaluated.replayed, results=results))
 
@@ -75,6 +75,12 @@ def _evaluate(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, 
 def _explain(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, Any]:
     explanations = explain_results(evaluated.replayed, node=request.get("node"), object=request.get("object"))
     return {"explanations": [each.document for each in explanations]}
+
+
+def _write_constants(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Write what viewers changed, and what the request gives, into the files of the specifications."""
+    values = {**evaluated.edited.given, **request.get("constants", {})}
+    return {"written": dict(evaluated.loaded.write_constants(values))}
 
 
 def _object(title: str, **properties: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -106,6 +112,15 @@ SERVICES: Final[Mapping[str, Service]] = MappingProxyType(
                 "properties": {"explanations": {"type": "array", "items": {"type": "object"}}},
             },
             _explain,
+        ),
+        "write_constants": Service(
+            _object("spatial_replay.WriteConstantsRequest", constants=_CONSTANTS),
+            {
+                "title": "spatial_replay.WriteConstantsResponse",
+                "type": "object",
+                "properties": {"written": _CONSTANTS},
+            },
+            _write_constants,
         ),
     }
 )

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from threading import Thread
+from typing import TYPE_CHECKING
 
 from spatial_replay.annotate.curves import CURVES_CHANNEL
-from spatial_replay.errors import UsageError
-from spatial_replay.replay.loaded_log import Evaluated
+from spatial_replay.errors import SpatialReplayError, UsageError
+from spatial_replay.replay.loaded_log import EditedFiles, Evaluated
 from spatial_replay.replay.playback import Playback
-from spatial_replay.serve.player import Player
+from spatial_replay.serve.player import SPECIFICATION, Level, Note, Player
 from spatial_replay.serve.requests import Questions
 from spatial_replay.serve.session import Session
+from spatial_replay.spec.formula import Specification
+
+if TYPE_CHECKING:
+    from spatial_replay.serve.server import LiveServer
 
 LOOPBACK = "127.0.0.1"
 PORT = 8765
@@ -34,10 +39,47 @@ class Serving:
 
     address: str
     _loop: Future[None]
+    _session: Session
+    _server: LiveServer
 
     def wait(self) -> None:
         """Wait until the server ends, which happens only through an error, and raise that."""
         self._loop.result()
+
+    def check(self) -> None:
+        """Raise the error that ended the server, if it ended."""
+        if self._loop.done():
+            self._loop.result()
+
+    @property
+    def edited(self) -> EditedFiles:
+        """The specifications with the constants as viewers set them."""
+        return self._session.edited
+
+    def show_saved(self, files: Sequence[Specification]) -> Evaluated:
+        """Evaluate specifications that were saved, show viewers what they give, and return it.
+
+        Constants that viewers changed keep their values, unless the text changed them, too. After an error
+        what was shown before stays, and viewers are shown the error.
+
+        Raises:
+            SpatialReplayError: it cannot be evaluated over this log.
+        """
+        try:
+            loaded = self.edited.loaded.with_files(files)
+            self._session.replace_log(loaded)
+            evaluated = self._session.wait_for_evaluation()
+            if evaluated.loaded is not loaded and self._session.failure is not None:
+                raise self._session.failure
+        except SpatialReplayError as error:
+            self.show_error(error)
+            raise
+        self._server.remove_note(SPECIFICATION)
+        return evaluated
+
+    def show_error(self, error: SpatialReplayError) -> None:
+        """Show viewers why a specification that was saved cannot be evaluated."""
+        self._server.send_note(Note(SPECIFICATION, Level.ERROR, str(error)))
 
 
 @contextmanager
@@ -72,7 +114,7 @@ def open_server(
     try:
         if play:
             session.control(is_playing=True, speed=1.0)
-        yield Serving(server.address, loop)
+        yield Serving(server.address, loop, session, server)
     finally:
         session.stop()
         questions.stop()

@@ -8,7 +8,8 @@ from concurrent.futures import Future
 from threading import Condition
 from typing import NamedTuple
 
-from spatial_replay.replay.loaded_log import Evaluated, LoadedLog, constant_values
+from spatial_replay.errors import SpatialReplayError
+from spatial_replay.replay.loaded_log import EditedFiles, Evaluated, LoadedLog, constant_values
 from spatial_replay.serve.pace import Pace, PlaybackState, Status, Transport
 from spatial_replay.serve.requests import PendingRequests, Values, session_over
 
@@ -25,6 +26,9 @@ class Session:
 
     No method but `wait_for_evaluation` waits for work. Of requests that come faster than they are done, the
     last one counts.
+
+    Attributes:
+        failure: why the last change that could not be evaluated could not, or None.
     """
 
     def __init__(
@@ -39,11 +43,12 @@ class Session:
         self._log = loaded
         self._pace = Pace(clock)
         self._transport = Transport(start_ns, end_ns)
-        self._values: Values = constant_values(loaded.constants)
+        self._edited = loaded.edit({})
         self._pending = PendingRequests()
         self._awaited: Future[Evaluated] | None = None
         self._requested = Condition()
         self._is_over = False
+        self.failure: SpatialReplayError | None = None
 
     @property
     def name(self) -> str:
@@ -58,7 +63,12 @@ class Session:
     @property
     def values(self) -> Values:
         """The constants as viewers set them."""
-        return self._values
+        return constant_values(self._edited.constants)
+
+    @property
+    def edited(self) -> EditedFiles:
+        """The specifications with these values."""
+        return self._edited
 
     @property
     def state(self) -> PlaybackState:
@@ -94,9 +104,28 @@ class Session:
             SpecificationError: the specification is invalid with these values.
         """
         with self._requested:
-            changed = {**self._values, **values}
-            self._pending.edited = self._log.edit(changed)
-            self._values = changed
+            edited = self._edited
+            self._pending.edited = self._edited = edited.loaded.edit({**edited.given, **values})
+            self._requested.notify()
+
+    def replace_log(self, loaded: LoadedLog) -> None:
+        """Evaluate other specifications over the same log.
+
+        Constants that viewers changed keep their values, unless the text changed them, too.
+        """
+        with self._requested:
+            before = self._edited
+            written = before.loaded.constants
+            kept = {
+                name: value
+                for name, value in before.given.items()
+                if name in loaded.constants and loaded.constants[name] == written[name]
+            }
+            try:
+                edited = loaded.edit(kept)
+            except SpatialReplayError:
+                edited = loaded.edit({})
+            self._pending.edited = self._edited = edited
             self._requested.notify()
 
     def resend(self, topic: str) -> None:
@@ -159,12 +188,17 @@ class Session:
             if self._pending.seek_ns is None:
                 self._transport.move_to(time_ns, self._pace.now())
 
-    def restore_values(self, values: Values) -> Values:
-        """Give the constants their former values, unless a change is pending; return the present ones."""
+    def restore(self, edited: EditedFiles, failure: SpatialReplayError) -> Values:
+        """Go back to former specifications, unless a change is pending; return the present constants.
+
+        Args:
+            failure: why the latest ones could not be evaluated.
+        """
         with self._requested:
+            self.failure = failure
             if self._pending.edited is None:
-                self._values = values
-            return self._values
+                self._edited = edited
+            return constant_values(self._edited.constants)
 
     def pause(self) -> PlaybackState:
         """Stay at the present time, unless a seek is pending."""

@@ -135,15 +135,6 @@ class Tuning(Displayed):
         """The values by name, as `parse_specification` takes them."""
         return {constant.name: constant.value for constant in self.constants}
 
-    @property
-    def plain_constants(self) -> dict[str, Value]:
-        """All constants of the specification that follow from no others, with the values found."""
-        return {
-            name: each.value if each.duration_ns is None else text_of_constant(each)
-            for name, each in self.specification.constants.items()
-            if not each.is_computed
-        }
-
     def surface(self, *names: str, points: int = 25) -> Surface:
         """Compute the margins over one or two constants; without names over the first two.
 

@@ -1,0 +1,165 @@
+"""`--watch`: evaluate again whenever a specification file is saved, and write constants with a key."""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from spatial_replay.cli.application import ExitCode, report_error
+from spatial_replay.cli.options import EvaluationArguments, EvaluationInputs, open_inputs, warn_of_input
+from spatial_replay.cli.output import print_verdicts
+from spatial_replay.cli.progress import progress
+from spatial_replay.cli.terminal import show, show_diagnostics
+from spatial_replay.errors import SpatialReplayError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from spatial_replay.monitor.semantics import Semantics
+    from spatial_replay.replay import Evaluated, LoadedLog, ReplayOptions, SpecificationFiles
+    from spatial_replay.spec.formula import Specification
+
+_MOST_KEYS: Final = 64
+
+watch_option = click.option(
+    "--watch", is_flag=True, help="Evaluate again whenever a specification file is saved."
+)
+
+
+def files_to_watch(request: EvaluationArguments) -> SpecificationFiles:
+    """Return the files to watch, from their present state on.
+
+    Raises:
+        UsageError: no file, or values of constants that none has.
+        SpecificationError, MissingFileError: a file cannot be evaluated.
+    """
+    # imported here so that --help stays fast
+    from spatial_replay.replay import SpecificationFiles
+
+    files = SpecificationFiles(request.specs, profile=request.profile, constants=request.constants)
+    files.load()
+    return files
+
+
+def load_log(
+    inputs: EvaluationInputs, options: ReplayOptions, files: SpecificationFiles | None = None
+) -> LoadedLog:
+    """Read a log into memory.
+
+    Args:
+        files: what is watched, or None.
+    """
+    from spatial_replay.replay import LoadedLog
+
+    with progress("samples") as advance:
+        return LoadedLog(inputs.source, inputs.files, options, saved=files, advance=advance)
+
+
+def watch_log(request: EvaluationArguments, semantics: Semantics) -> ExitCode:
+    """Evaluate a log, and again whenever a specification file is saved, until Ctrl-C."""
+    files = files_to_watch(request)
+    inputs = open_inputs(request)
+    # no messages of the log are needed
+    loaded = load_log(inputs, replace(inputs.options(semantics), keep=()), files)
+    evaluated = loaded.evaluate()
+    warn_of_input(evaluated.replayed)
+    print_verdicts(evaluated.replayed, None)
+
+    def evaluate(saved: Sequence[Specification]) -> Evaluated:
+        nonlocal loaded
+        other = loaded.with_files(saved)
+        evaluated = other.evaluate()
+        loaded = other
+        return evaluated
+
+    return follow_saves(files, evaluate, files.write)
+
+
+def follow_saves(
+    files: SpecificationFiles,
+    evaluate: Callable[[Sequence[Specification]], Evaluated],
+    write: Callable[[], Mapping[str, Any]],
+    *,
+    refuse: Callable[[SpatialReplayError], None] = lambda error: None,
+    check: Callable[[], None] = lambda: None,
+) -> ExitCode:
+    """Print what each save of the files gives, until Ctrl-C; after an error, what was shown before stays.
+
+    Args:
+        evaluate: evaluates the files as saved.
+        write: writes constants into the files, and returns those that changed; for the key w.
+        refuse: takes the error of a file that cannot be read.
+        check: called about ten times a second; raises an error that ends it.
+    """
+    names = ", ".join(path.name for path in files.paths)
+    try:
+        with pressed_keys() as keys:
+            hint = "; w writes constants into it" if sys.stdin.isatty() else ""
+            show(f"watching {names}{hint}; stop with Ctrl-C")
+            sys.stdout.flush()
+            for saved in files.iter_saves():
+                check()
+                try:
+                    if "w" in keys():
+                        _show_written(write(), names)
+                    if isinstance(saved, SpatialReplayError):
+                        refuse(saved)
+                        raise saved
+                    if saved is not None:
+                        _print_saved(saved, evaluate(saved), names)
+                except SpatialReplayError as error:
+                    report_error(error)
+                    show("the evaluation before stays", err=True)
+    except KeyboardInterrupt:
+        # the regular way to stop watching
+        return ExitCode.INTERRUPTED
+    return ExitCode.SATISFIED
+
+
+def _print_saved(saved: Sequence[Specification], evaluated: Evaluated, names: str) -> None:
+    if sys.stdout.isatty():
+        click.clear()
+    show_diagnostics(warning for file in saved for warning in file.warnings)
+    show_diagnostics(evaluated.replayed.missing)
+    show(f"{names} saved")
+    print_verdicts(evaluated.replayed, None)
+    sys.stdout.flush()
+
+
+def _show_written(written: Mapping[str, Any], names: str) -> None:
+    values = ", ".join(
+        f"{name} = {value:.12g}" if isinstance(value, float) else f"{name} = {value}"
+        for name, value in written.items()
+    )
+    show(f"{values} written into {names}" if written else f"{names} has all values already")
+
+
+@contextmanager
+def pressed_keys() -> Iterator[Callable[[], str]]:
+    """Give a function that returns the keys pressed since its last call; "" if there is no terminal."""
+    if not sys.stdin.isatty():
+        yield lambda: ""
+        return
+    import termios
+    import tty
+
+    terminal = sys.stdin.fileno()
+    before = termios.tcgetattr(terminal)
+
+    def keys() -> str:
+        # what is left in the terminal's own buffer, past that of Python
+        waiting = select.select([terminal], [], [], 0.0)[0]
+        return os.read(terminal, _MOST_KEYS).decode(errors="replace") if waiting else ""
+
+    try:
+        tty.setcbreak(terminal)
+        yield keys
+    finally:
+        termios.tcsetattr(terminal, termios.TCSADRAIN, before)
