@@ -15,7 +15,7 @@ from spatial_replay.monitor.result import no_such_node
 from spatial_replay.monitor.semantics import LIVE_ROOM, checked_semantics
 from spatial_replay.monitor.stream import LiveStream
 from spatial_replay.monitor.verdict import Verdict, online_verdict, worst_verdict
-from spatial_replay.monitor.violation import Settled, Violation, ViolationLog
+from spatial_replay.monitor.violation import Settled, Violation, ViolationLog, rehearse
 from spatial_replay.spec.formula import NamedSpec, Specification, iter_nodes
 from spatial_replay.spec.load import require_specification
 from spatial_replay.trace.sample import Sample, require_time
@@ -150,6 +150,8 @@ class Monitor:
         trial = LiveStream(specification, checked, 0)
         for time_ns in range(2 * LIVE_ROOM):
             trial.extend(Sample(time_ns))
+        if checked == "ltlf":
+            rehearse(specification)
         self._live = LiveStream(specification, checked, start_ns or 0)
         self._violations = ViolationLog(specification, start_ns or 0) if checked == "ltlf" else None
         self._last_ns: int | None = None

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from spatial_replay.geometry.arrays import Floats
+from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.causes import Conjunct, conjuncts_of
 from spatial_replay.monitor.instances import Instance
@@ -18,6 +19,7 @@ from spatial_replay.monitor.witness.atom import DecidingAtom
 from spatial_replay.monitor.witness.path import End, Evidence
 from spatial_replay.monitor.witness.threshold import Threshold
 from spatial_replay.monitor.witness.witness import Witness, find_witness
+from spatial_replay.spec.checks import object_names, signal_names
 from spatial_replay.spec.expressions import Scaled
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import NamedSpec, Number, Specification
@@ -168,6 +170,18 @@ class Settled:
         evidence = Evidence(instance, self.specification.regions, lambda: [trace])
         leaves = evidence.columns(self.program.leaves)
         return find_witness(evidence, leaves, evidence.times_ns(), self.conjunct.node, goes_on=True)
+
+
+def rehearse(specification: Specification) -> None:
+    """Explain trial violations, so that a real one waits for no code to be loaded or compiled."""
+    box = TrackedObject(Footprint.box(0.0, 0.0, 1.0, 1.0), height=(0.0, 1.0), yaw=0.0)
+    objects = dict.fromkeys(object_names(specification), box)
+    sample = Sample(0, objects, dict.fromkeys(signal_names(specification), 0.0))
+    for spec in specification.results:
+        program = compile_formula(spec.formula)
+        for conjunct in conjuncts_of(spec.formula, spec.name):
+            trial = Settled(spec, program, specification, conjunct, 0.0, (sample,), 0, True, 0)
+            _ = trial.violation.sentences
 
 
 class ViolationLog:

@@ -21,7 +21,7 @@ from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.offline import OfflineNodes
 from spatial_replay.monitor.online.codes import in_channels
-from spatial_replay.monitor.witness.unfinished import is_closed
+from spatial_replay.monitor.witness.unfinished import UnfinishedNodes, is_closed
 from spatial_replay.spec.formula import (
     Boolean,
     BooleanOperator,
@@ -157,7 +157,13 @@ class DecidingPath:
 
 
 def deciding_path(
-    formula: Formula, done: OfflineNodes, times_ns: Integers, node: int, end: End, *, goes_on: bool = False
+    formula: Formula,
+    done: OfflineNodes | UnfinishedNodes,
+    times_ns: Integers,
+    node: int,
+    end: End,
+    *,
+    goes_on: bool = False,
 ) -> DecidingPath:
     """Return the path to what decides a node at the first sample.
 
@@ -174,7 +180,9 @@ def deciding_path(
 class _Walk:
     """The tree of a formula with every node's numbers."""
 
-    def __init__(self, formula: Formula, done: OfflineNodes, times_ns: Integers, *, goes_on: bool) -> None:
+    def __init__(
+        self, formula: Formula, done: OfflineNodes | UnfinishedNodes, times_ns: Integers, *, goes_on: bool
+    ) -> None:
         self._done = done
         self._times = times_ns
         self._goes_on = goes_on

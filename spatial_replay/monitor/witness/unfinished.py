@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline
+from spatial_replay.monitor.offline import evaluate_offline
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
@@ -35,24 +35,31 @@ _Ends = tuple[Floats, Floats]
 _STAND_INS = tuple(Atom(name, "signal", Signal(name)) for name in ("first", "second"))
 
 
+class UnfinishedNodes:
+    """Every node at every sample, each computed when it is asked for."""
+
+    def __init__(self, formula: Formula, evaluator: _Evaluator) -> None:
+        self._nodes = [node for _, _, node in iter_nodes(formula)]
+        self._evaluator = evaluator
+
+    def ends(self, node: int) -> tuple[Floats, Floats]:
+        """Return the ends (T,) of a node's interval at each sample, with uncertainty."""
+        return self._evaluator.ends(self._nodes[node])
+
+
 def evaluate_unfinished(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
-) -> OfflineNodes:
-    """Evaluate every node over samples that others may follow.
+) -> UnfinishedNodes:
+    """Evaluate the nodes of a formula over samples that others may follow.
 
     Args:
         order: which leaf is which.
         leaves: (C, A, T), their intervals (see `leaf_values`).
         times_ns: (T,), increasing; T at least 1.
-
-    Returns:
-        Two channels: the ends of each node's interval, with uncertainty.
     """
     low, high = low_and_high(len(leaves), wide=True)
     columns = {_key(leaf): (leaves[low, index], leaves[high, index]) for index, leaf in enumerate(order)}
-    evaluator = _Evaluator(columns, times_ns)
-    ends = [evaluator.ends(node) for _, _, node in iter_nodes(formula)]
-    return OfflineNodes(np.stack([np.stack(column) for column in zip(*ends, strict=True)]))
+    return UnfinishedNodes(formula, _Evaluator(columns, times_ns))
 
 
 def is_closed(bound: Bound | None, times_ns: Integers) -> NDArray[np.bool_]:
