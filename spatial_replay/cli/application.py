@@ -28,7 +28,7 @@ from spatial_replay.errors import (
     TraceError,
     UsageError,
 )
-from spatial_replay.text import counted
+from spatial_replay.text import counted, nearest_hint
 
 COMPLETION_VARIABLE = "_SPATIAL_REPLAY_COMPLETE"
 DEBUG_VARIABLE = "SPATIAL_REPLAY_DEBUG"
@@ -64,6 +64,15 @@ class LazyCommands(click.Group):
         if not isinstance(command, click.Command):
             raise TypeError(f"spatial_replay.cli.{cmd_name}.{cmd_name} is not a command: {command!r}")
         return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        name = args[0]
+        if name not in COMMANDS and not name.startswith("-"):
+            hint = nearest_hint(name, COMMANDS) or f"the commands are {', '.join(COMMANDS)}"
+            ctx.fail(f"no command is named {name!r}; {hint}")
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
@@ -207,6 +216,10 @@ def report_error(error: BaseException) -> None:
     """Write an error to standard error; with its traceback if SPATIAL_REPLAY_DEBUG is set."""
     if os.environ.get(DEBUG_VARIABLE):
         show(*"".join(traceback.format_exception(error)).splitlines(), err=True)
+    if isinstance(error, click.exceptions.NoArgsIsHelpError):
+        # a command without arguments: what it takes is no error message
+        show(*error.format_message().splitlines(), err=True)
+        return
     if isinstance(error, SpecificationError):
         show_diagnostics(error.diagnoses)
     show_message("error", message_from_error(error), "red")

@@ -78,8 +78,8 @@ def check(
         raise UsageError("--of chooses an automaton; add --dfa FILE")
     if as_json and dfa == "-":
         raise UsageError("--json and --dfa - both write to standard output; give --dfa a file")
-    if log is None and reading["mapping"] is not None:
-        raise UsageError("--mapping applies to the log to compare with; add --log LOG")
+    if log is None:
+        _refuse_log_options(reading, strict_names)
     (parsed,) = load_spec_options([specification], profile, constants)
     inputs = [specification] if log is None else [specification, log]
     if dfa is not None:
@@ -112,6 +112,17 @@ class _Compared:
     windows: Sequence[str] = ()
     ranges: Sequence[ThresholdRange] = ()
     summary: str = ""
+
+
+def _refuse_log_options(reading: ReadArguments, strict_names: bool) -> None:
+    """Refuse options that say something about a log where there is none."""
+    defaults = {"on_time_jump": "error", "lost": "drop", "concave": "decompose"}
+    given = [name for name, value in reading.items() if value not in (None, defaults.get(name))]
+    for name in [*given, *(["strict_names"] if strict_names else [])]:
+        option = (
+            "--y-up" if reading["y_down"] is False and name == "y_down" else f"--{name.replace('_', '-')}"
+        )
+        raise UsageError(f"{option} applies to the log to compare with; add --log LOG")
 
 
 def _compare_with_log(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -28,6 +28,10 @@ if TYPE_CHECKING:
 
 _EPOCH_LIKELY_NS = 10**18
 """Later times are taken to count from 1970 (2001 or later), earlier ones from the start of the run."""
+
+
+_OF_MESSAGES = frozenset({"mapping", "on_time_jump"})
+"""Options of reading that say something about an external log."""
 
 
 @click.command()
@@ -77,6 +81,7 @@ def info(
     if decisions:
         return _print_decisions(log, as_json)
     # imported here so that --help stays fast
+    from spatial_replay.logs.read_options import ReadOptions
     from spatial_replay.sources.open_log import open_source
     from spatial_replay.sources.overview import messages_in, overview_of, overview_of_survey, survey
 
@@ -88,6 +93,7 @@ def info(
         with progress("messages") as advance:
             surveyed = survey(reader, advance)
     if surveyed is not None and reading["mapping"] is None:
+        ReadOptions(**reading).refuse_except(_OF_MESSAGES, surveyed.kind, surveyed.name)
         overview = overview_of_survey(log, surveyed)
     else:
         with progress("samples") as advance:
@@ -218,8 +224,14 @@ def _document(overview: Overview, survey: Survey | None, faults: tuple[str, ...]
         ]
     elif container is not None:
         document["topics"] = [
-            {"topic": topic, "schema": schema, "encoding": encoding, "messages": messages}
-            for topic, schema, encoding, messages in _topics(container)
+            {
+                "topic": topic,
+                "schema": schema,
+                "encoding": encoding,
+                "messages": sum(messages),
+                "publishers": len(messages),
+            }
+            for (topic, schema, encoding), messages in _topics(container).items()
         ]
     if container is not None:
         document["metadata"] = [{"name": name, "data": dict(data)} for name, data in container.metadata]
@@ -227,10 +239,13 @@ def _document(overview: Overview, survey: Survey | None, faults: tuple[str, ...]
     return document
 
 
-def _topics(container: LogSummary) -> Iterator[tuple[str, str, str, int]]:
+def _topics(container: LogSummary) -> Mapping[tuple[str, str, str], Sequence[int]]:
+    """Return how many messages each channel of a topic has: each publisher may have one of its own."""
+    found: dict[tuple[str, str, str], list[int]] = {}
     for each in container.channels:
         schema = each.channel.schema.name if each.channel.schema is not None else ""
-        yield each.channel.topic, schema, each.channel.encoding, each.messages
+        found.setdefault((each.channel.topic, schema, each.channel.encoding), []).append(each.messages)
+    return found
 
 
 def _lines(overview: Overview, survey: Survey | None, damaged: bool) -> Iterator[str]:
@@ -279,12 +294,21 @@ def _survey_lines(survey: Survey, *, mapped: bool) -> Iterator[str]:
 
 
 def _container_lines(container: LogSummary, *, topics: bool) -> Iterator[str]:
+    from spatial_replay.logs.topics import VERDICTS
+
+    for data in (data for name, data in container.metadata if name == VERDICTS):
+        yield "verdicts"
+        yield from _table(data.items())
     if topics:
         yield "topics"
-        yield from _table((*names, counted(messages, "message")) for *names, messages in _topics(container))
+        yield from _table(
+            (*names, counted(sum(each), "message"), counted(len(each), "publisher") if len(each) > 1 else "")
+            for names, each in _topics(container).items()
+        )
     for name, data in container.metadata:
-        yield f"metadata {name}"
-        yield from _table(data.items())
+        if name != VERDICTS:
+            yield f"metadata {name}"
+            yield from _table(data.items())
     if container.attachments:
         yield "attachments"
         yield from _table(

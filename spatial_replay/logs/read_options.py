@@ -77,20 +77,29 @@ class ReadOptions:
         for name, value in self.given().items():
             if name not in taken:
                 shown = fspath(cast("PathLike[str]", value)) if name == "mapping" else value
-                reason = f"{kind}, {_REASONS[name]}"
-                raise UsageError(f"{name} {shown!r} is not needed: {log} is {reason}; leave it out")
+                raise UsageError(
+                    f"{_option(name, shown)} does not apply to {log} ({kind}): {_REASONS[name]}; leave it out"
+                )
 
 
 _REASONS = {
-    "mapping": "which names its objects itself",
-    "on_time_jump": "whose times never go back",
-    "rate": "which has times, not numbers of frames",
-    "lost": "which has no rows marked as lost",
+    "mapping": "it names its objects itself",
+    "on_time_jump": "its times never go back",
+    "rate": "it has times, not numbers of frames",
+    "lost": "it has no rows marked as lost",
     "y_down": (
-        "whose samples have y up: recordings and scenarios always, and messages unless their mapping file"
-        " says `axes: {y: down}`"
+        "recordings and scenarios have y up, and so have messages unless their mapping file says"
+        " `axes: {y: down}`"
     ),
 }
+
+
+def _option(name: str, value: object) -> str:
+    """Return an option as given on the command line, and as an argument in Python."""
+    option = f"--{name.replace('_', '-')} {value}"
+    if name == "y_down":
+        option = "--y-down" if value else "--y-up"
+    return f"{option} ({name}={value!r})"
 
 
 def _check_rate(rate: object) -> None:

@@ -37,6 +37,9 @@ ENDING = "spatial_replay_ending"
 CERTIFICATE = "spatial_replay_certificate"
 """The metadata record that comes last: hashes of inputs and results."""
 
+VERDICTS = "spatial_replay_verdicts"
+"""The metadata record with the verdict and robustness of each result of a replay."""
+
 AUTOMATA = "spatial_replay_automata"
 """The metadata record with the sizes of automata, and why a specification has none."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -21,7 +22,9 @@ from spatial_replay.logs.topics import (
     METADATA,
     RECORDED_PREFIX,
     REPLAYED_PREFIX,
+    VERDICTS,
 )
+from spatial_replay.monitor.result import SpecResult
 from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.replay.kept_messages import KEEP_ALL
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Window
@@ -78,8 +81,14 @@ def run_replay(
         replayed = replay.run(sink.write_messages, layer=layer, advance=advance)
         layout = replay.layout()
         sink.add_attachment(layout.name, layout.media_type, layout.data)
+        sink.add_metadata(VERDICTS, {each.title: _verdict(each) for each in replayed.results})
         sink.add_metadata(CERTIFICATE, replayed.certificate)
     return replayed
+
+
+def _verdict(result: SpecResult) -> str:
+    robustness = "not determined" if math.isnan(result.robustness) else f"{result.robustness:.6g}"
+    return f"{result.verdict}, robustness {robustness}"
 
 
 def load_files(
@@ -151,7 +160,7 @@ def _begin(sink: Sink, source: Source, replay: Replay, options: ReplayOptions, *
 def _copy_attached(sink: Sink, source: Source) -> None:
     """Copy the source's metadata and attachments, except those that a replay replaces."""
     for name, data in source.metadata():
-        if name not in (METADATA, AUTOMATA, CERTIFICATE):
+        if name not in (METADATA, AUTOMATA, VERDICTS, CERTIFICATE):
             sink.add_metadata(name, data)
     for attachment in source.attachments():
         if not attachment.name.startswith(_REPLACED) and attachment.name != LAYOUT:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -179,7 +180,8 @@ def _open_messages(path: Path, kind: str, options: ReadOptions) -> Source:
     if options.mapping is None:
         raise UsageError(
             f"{path.name} is a {kind}, which does not say what its objects are; give a mapping file that"
-            " does, with --mapping FILE or mapping=FILE"
+            " does, with --mapping FILE or mapping=FILE; for a first one, see: spatial-replay info "
+            f"{shlex.quote(str(path))} --suggest-mapping"
         )
     # readers of external logs are loaded when there is one
     from spatial_replay.mapping import MappedSource, load_mapping

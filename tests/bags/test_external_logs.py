@@ -201,7 +201,7 @@ def test_logs_without_a_mapping_ask_for_one(tmp_path: Path, mapping: Path) -> No
             read_trace(log)
     with pytest.raises(UsageError, match="a mapping file says which of them carry objects"):
         read_trace(write_json_mcap(tmp_path / "a.mcap", [("/a", START_NS, {})]))
-    with pytest.raises(UsageError, match=r"mapping .* is not needed: ours\.mcap is MCAP"):
+    with pytest.raises(UsageError, match=r"--mapping .* does not apply to ours\.mcap \(MCAP\)"):
         read_trace(annotated(tmp_path, mapping), mapping=mapping)
 
 

@@ -41,10 +41,17 @@ def test_help_loads_no_command_and_no_numerical_library(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, b"")
 
 
+def test_a_group_without_a_command_prints_its_help_and_no_error(tmp_path: Path) -> None:
+    done = run_program("record", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("Usage: spatial-replay record")
+    assert "error" not in done.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("chekc",), "No such command 'chekc'"),
+        (("chekc",), "no command is named 'chekc'; did you mean 'check'?"),
         (("check",), "Missing argument 'SPEC'"),
         (("check", "a.spatial", "--loog", "x"), "No such option"),
         (("check", "missing.spatial"), "missing.spatial"),

@@ -90,7 +90,7 @@ def test_names_are_compared_with_those_of_the_mapping(
     bag = str(data_folder / "bags" / "two_turtles_lz4.bag")
     assert run(["check", "turtles.spatial", "--log", bag, "--mapping", "turtles.yaml"]) == 0
     (folder / "other.spatial").write_text("F (turtle1 ovlp turtle3)")
-    assert run(["check", "other.spatial", "--log", bag, "--mapping", "turtles.yaml"]) == 2
+    assert run(["check", "other.spatial", "--log", bag, "--mapping", "turtles.yaml", "--strict-names"]) == 2
     assert "turtle2" in capsys.readouterr().err
     assert run(["check", "turtles.spatial", "--mapping", "turtles.yaml"]) == 2
 
@@ -125,7 +125,7 @@ def test_drone_annotations_are_replayed(
     assert kept["log"]["samples"] == 120
     assert len(kept["specifications"]) > len(dropped["specifications"]) > 0
     assert run(["replay", str(log), "--spec", "turtles.spatial", "--mapping", "turtles.yaml"]) == 2
-    assert "mapping 'turtles.yaml' is not needed" in capsys.readouterr().err
+    assert "--mapping turtles.yaml (mapping='turtles.yaml') does not apply to" in capsys.readouterr().err
 
 
 def test_a_commonroad_scenario_is_replayed(

@@ -39,6 +39,42 @@ def test_samples_objects_and_signals_are_listed(log: Path, capsys: pytest.Captur
     assert "battery" in said
 
 
+def test_an_annotated_log_shows_its_verdicts(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    spec, annotated = log.with_name("s.spatial"), log.with_name("out.mcap")
+    spec.write_text("spec charged = G (battery >= 0.6)\nspec alone = G (hand dist hand <= 1)\n")
+    assert run(["replay", str(log), "--spec", str(spec), "-o", str(annotated)]) == 1
+    capsys.readouterr()
+    assert run(["info", str(annotated)]) == 0
+    said = capsys.readouterr().out
+    assert (
+        "verdicts\n  charged  violated, robustness not determined\n  alone    unknown, robustness not" in said
+    )
+    assert run(["info", str(annotated), "--json"]) == 0
+    metadata = {each["name"]: each["data"] for each in json.loads(capsys.readouterr().out)["metadata"]}
+    assert list(metadata["spatial_replay_verdicts"]) == ["charged", "alone"]
+
+
+def test_a_topic_of_several_publishers_is_listed_once(
+    data_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag, mapping, annotated = (
+        data_folder / "bags" / "two_turtles.bag",
+        tmp_path / "m.yaml",
+        tmp_path / "a.mcap",
+    )
+    assert run(["replay", str(bag), "--spec", str(tmp_path / "s.spatial")]) == 2
+    assert f"spatial-replay info {bag} --suggest-mapping" in capsys.readouterr().err
+    assert run(["info", str(bag), "--suggest-mapping"]) == 0
+    mapping.write_text(capsys.readouterr().out)
+    (tmp_path / "s.spatial").write_text("F (turtle1 dist turtle2 <= 1)")
+    options = ["--mapping", str(mapping), "--spec", str(tmp_path / "s.spatial"), "-o", str(annotated)]
+    assert run(["replay", str(bag), *options, "--to", "3s"]) in (0, 1)
+    capsys.readouterr()
+    assert run(["info", str(annotated)]) == 0
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.split()[:1] == ["/tf"])
+    assert line.endswith("messages  2 publishers")
+
+
 def test_json_counts_samples_and_observations(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["info", str(log), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)

@@ -137,12 +137,14 @@ def test_annotations_are_recognised_by_content(annotations: Write, tmp_path: Pat
 
 
 def test_options_of_other_formats_are_refused(annotations: Write, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"mapping 'a\.yaml' is not needed: .*leave it out"):
+    with pytest.raises(
+        UsageError, match=r"--mapping a\.yaml \(mapping='a\.yaml'\) does not apply to .*leave it out"
+    ):
         open_source(annotations(row(0, 0)), mapping="a.yaml")
     tracks = tmp_path / "run.jsonl"
     tracks.write_text('{"time_ns": 0}\n')
     for options in ({"rate": 25.0}, {"lost": "keep"}, {"on_time_jump": "split"}):
-        with pytest.raises(UsageError, match=r"is not needed: run\.jsonl is track JSONL"):
+        with pytest.raises(UsageError, match=r"does not apply to run\.jsonl \(track JSONL\)"):
             open_source(tracks, **options)  # type: ignore[arg-type]
 
 

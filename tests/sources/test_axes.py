@@ -135,7 +135,7 @@ def test_axes_that_mean_nothing_are_refused(tmp_path: Path, line: str, message: 
 def test_y_down_is_refused_where_something_else_says_it(tmp_path: Path, tracks: Path) -> None:
     log = tmp_path / "run.mcap"
     assert run(["record", "tracks", str(tracks), "-o", str(log)]) == 0
-    with pytest.raises(sr.UsageError, match=r"y_down True is not needed: run\.mcap is MCAP, whose samples"):
+    with pytest.raises(sr.UsageError, match=r"--y-down \(y_down=True\) does not apply to run\.mcap \(MCAP\)"):
         open_source(log, y_down=True)
     with pytest.raises(sr.UsageError, match="y_down is 'down'; give True, False or None"):
         open_source(tracks, y_down="down")  # type: ignore[arg-type]
