@@ -7,8 +7,7 @@ is open. Its rows are values, too. Nothing here knows where rows are stored or s
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final, Literal, TypeAlias
@@ -22,8 +21,7 @@ from spatial_replay.errors import (
     TraceError,
     UsageError,
 )
-from spatial_replay.logs.messages import Attachment, Block
-from spatial_replay.logs.source import Source, read_blocks, within
+from spatial_replay.logs.source import Source
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.sentences import reason_sentence
 from spatial_replay.monitor.vacuity import no_instances
@@ -150,8 +148,6 @@ def opened_task(task: Task, files: Sequence[Specification]) -> tuple[Source, Rep
     """
     conditions = task.conditions
     source = open_source(task.log, mapping=conditions.mapping, **dict(conditions.reading))
-    if conditions.start is None and conditions.end is None:
-        source = _in_memory(source)
     parameters = {spec.parameter for file in files for spec in file.results}
     each = {name: objects for name, objects in conditions.each if name in parameters}
     window = _window(source, conditions)
@@ -167,42 +163,6 @@ def _window(source: Source, conditions: Conditions) -> Window:
         for text, unbounded in ((conditions.start, whole.start_ns), (conditions.end, whole.end_ns))
     ]
     return Window(ends[0], ends[1], conditions.every)
-
-
-@dataclass(frozen=True, slots=True)
-class _OneBlock:
-    """A source whose only block is in memory: witnesses read the samples several times."""
-
-    source: Source
-    block: Block
-
-    @property
-    def name(self) -> str:
-        return self.source.name
-
-    @property
-    def kind(self) -> str:
-        return self.source.kind
-
-    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
-        """See `Source.iter_blocks`."""
-        yield replace(self.block, trace=within(self.block.trace, start_ns, end_ns))
-
-    def attachments(self) -> tuple[Attachment, ...]:
-        """See `Source.attachments`."""
-        return self.source.attachments()
-
-    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
-        """See `Source.metadata`."""
-        return self.source.metadata()
-
-
-def _in_memory(source: Source) -> Source:
-    """Return a source that reads a short log once; a longer one is never whole in memory."""
-    with closing(read_blocks(source)) as blocks:
-        first = next(blocks, None)
-        is_short = first is not None and next(blocks, None) is None
-    return _OneBlock(source, first) if first is not None and is_short else source
 
 
 @lru_cache(maxsize=64)

@@ -86,11 +86,13 @@ class BatchResult:
         table: one row for each case, log, spec and object of a template; see `data_set`.
         logs: how many logs.
         evaluated: on how many of them something was evaluated in this run; the rest was known.
+        wanted: what the suite asks for.
     """
 
     table: pa.Table
     logs: int
     evaluated: int
+    wanted: tuple[Wanted, ...]
 
     @property
     def failures(self) -> pa.Table:
@@ -157,7 +159,7 @@ def run_batch(
         folder.join_files()
         table = _table(wanted, folder, errors, fail_on)
         folder.write_run(table)
-    return BatchResult(table, len(paths), len({task.task.log for task in tasks}))
+    return BatchResult(table, len(paths), len({task.task.log for task in tasks}), tuple(wanted))
 
 
 def evaluate_and_store(folder: Path, stored: StoredTask) -> dict[str, tuple[ResultRow, ...]]:

@@ -34,6 +34,7 @@ COMPLETION_VARIABLE = "_SPATIAL_REPLAY_COMPLETE"
 DEBUG_VARIABLE = "SPATIAL_REPLAY_DEBUG"
 
 COMMANDS: dict[str, str] = {
+    "batch": "Evaluate many logs, and show what fails.",
     "check": "Check a specification and print its tree.",
     "completion": "Print a shell completion script.",
     "explain": "Explain a verdict.",
@@ -43,6 +44,7 @@ COMMANDS: dict[str, str] = {
     "record": "Record a run as a log.",
     "replay": "Evaluate specifications over a log.",
     "report": "Write an HTML report of a run.",
+    "results": "Show what a batch found.",
     "serve": "Replay live to a viewer, with tunable constants.",
     "tune": "Find the constants that fit recorded runs.",
     "verify": "Recompute a log's certificate and compare.",

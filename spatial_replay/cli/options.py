@@ -14,7 +14,7 @@ import click
 
 from spatial_replay.cli.terminal import show_diagnostics, warn
 from spatial_replay.errors import UsageError
-from spatial_replay.text import counted
+from spatial_replay.text import counted, nearest_hint
 from spatial_replay.trace.time_points import time_point_from_text
 
 if TYPE_CHECKING:
@@ -92,6 +92,25 @@ semantics_option = click.option(
     default="ltlf",
     show_default=True,
     help="Robustness over finite traces, or Def. 16 of the paper to the letter.",
+)
+
+_KINDS = ("vacuous", "unknown")
+
+
+def _read_kinds(context: click.Context, parameter: click.Parameter, text: str) -> frozenset[str]:
+    kinds = frozenset(kind.strip() for kind in text.split(",") if kind.strip())
+    for kind in kinds - {*_KINDS}:
+        hint = nearest_hint(kind, _KINDS) or f"the kinds are {' and '.join(_KINDS)}"
+        raise UsageError(f"--fail-on: {kind!r} is not a kind of failure; {hint}")
+    return kinds
+
+
+fail_on_option = click.option(
+    "--fail-on",
+    metavar="KINDS",
+    callback=_read_kinds,
+    default="",
+    help="Exit with 1 on these as well: vacuous, unknown, or both with a comma between.",
 )
 
 profile_option = click.option(

@@ -12,6 +12,7 @@ from spatial_replay.cli.application import exit_code_from_verdicts
 from spatial_replay.cli.options import (
     EvaluationArguments,
     evaluation_options,
+    fail_on_option,
     keep_option,
     naming_option,
     open_inputs,
@@ -23,23 +24,11 @@ from spatial_replay.cli.output import print_verdicts, write_document
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.watching import watch_log, watch_option
 from spatial_replay.errors import UsageError
-from spatial_replay.text import nearest_hint
 from spatial_replay.trace.time_points import duration_ns_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.semantics import Semantics
     from spatial_replay.replay import Replayed
-
-
-_KINDS = ("vacuous", "unknown")
-
-
-def _read_kinds(context: click.Context, parameter: click.Parameter, text: str) -> frozenset[str]:
-    kinds = frozenset(kind.strip() for kind in text.split(",") if kind.strip())
-    for kind in kinds - {*_KINDS}:
-        hint = nearest_hint(kind, _KINDS) or f"the kinds are {' and '.join(_KINDS)}"
-        raise UsageError(f"--fail-on: {kind!r} is not a kind of failure; {hint}")
-    return kinds
 
 
 @click.command()
@@ -65,13 +54,7 @@ def _read_kinds(context: click.Context, parameter: click.Parameter, text: str) -
     metavar="DURATION",
     help="Also evaluate a sliding window, such as 10s, at every sample.",
 )
-@click.option(
-    "--fail-on",
-    metavar="KINDS",
-    callback=_read_kinds,
-    default="",
-    help="Exit with 1 on these as well: vacuous, unknown, or both with a comma between.",
-)
+@fail_on_option
 @watch_option
 @semantics_option
 def replay(

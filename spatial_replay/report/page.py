@@ -290,7 +290,7 @@ def page(report: RunReport) -> bytes:
     library, script = _asset(_LIBRARY), _script()
     parts = [
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">',
-        f'<meta http-equiv="Content-Security-Policy" content="{_policy([library, script], style)}">',
+        f'<meta http-equiv="Content-Security-Policy" content="{policy([library, script], style)}">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         '<meta name="color-scheme" content="light dark">',
         element("title", text(f"{report.log}: {report.verdict}")),
@@ -317,7 +317,7 @@ def _script() -> str:
     return f'(() => {{\n"use strict";\n{scripts}\n}})();\n'
 
 
-def _policy(scripts: Sequence[str], style: str) -> str:
+def policy(scripts: Sequence[str], style: str) -> str:
     """Return the policy: the browser loads nothing, and runs only the scripts of the page."""
     allowed = " ".join(map(_digest, scripts))
     return (

@@ -1,0 +1,120 @@
+"""What GitHub shows of a run: annotations at lines of files, and the summary of a job."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal
+
+from spatial_replay.batch.summary import totals, worst_rows
+from spatial_replay.errors import OutputError
+from spatial_replay.text import counted, printable
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+_ANNOTATIONS: Final = 10
+"""GitHub shows no more of one kind for a step."""
+_WORST: Final = 10
+_ESCAPED: Final = {ord(sign): f"\\{sign}" for sign in "\\|["} | {ord("<"): "&lt;"}
+"""In a cell of a table: none ends another one, or becomes markup."""
+
+
+def is_github(environment: Mapping[str, str] = os.environ) -> bool:
+    """Return whether this process is a step of a GitHub job."""
+    return environment.get("GITHUB_ACTIONS") == "true"
+
+
+def annotation(
+    severity: Literal["error", "warning"],
+    file: str,
+    line: int,
+    message: str,
+    *,
+    column: int = 0,
+    title: str = "",
+) -> str:
+    """Return the workflow command that marks a line of a file."""
+    place = {"file": file, "line": str(line), "col": str(column) if column else "", "title": title}
+    properties = ",".join(f"{name}={_property(value)}" for name, value in place.items() if value)
+    return f"::{severity} {properties}::{_data(message)}"
+
+
+def worst_annotations(table: pa.Table, folder: Path = Path()) -> Iterator[str]:
+    """Yield an annotation for each of the worst rows that fail, at the line of its spec.
+
+    Args:
+        folder: what the paths of specifications are relative to.
+    """
+    for row in worst_rows(table, _ANNOTATIONS):
+        if row["failure"] is None:
+            return
+        name = f"{row['requirement']} {row['spec']}" if row["requirement"] else row["spec"]
+        message = f"{row['log']}: {row['failure']}. {row['reason']}"
+        yield annotation("error", str(folder / row["file"]), row["line"], message, title=name)
+
+
+def write_summary(table: pa.Table, environment: Mapping[str, str] = os.environ) -> None:
+    """Add the totals and the worst rows to the summary of the job, if there is one.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    file = environment.get("GITHUB_STEP_SUMMARY")
+    if not file:
+        return
+    try:
+        with Path(file).open("a", encoding="utf-8") as stream:
+            stream.write(markdown(table))
+    except OSError as error:
+        raise OutputError(f"{file}: the summary could not be written: {error.strerror}") from error
+
+
+def markdown(table: pa.Table) -> str:
+    """Return the totals and the worst rows as Markdown."""
+    lines = [
+        "### spatial-replay\n",
+        "| case | spec | requirement | satisfied | violated | unknown | errors | least robustness |",
+        "|---|---|---|--:|--:|--:|--:|--:|",
+    ]
+    for each in totals(table):
+        names = [
+            each.group["case"],
+            each.group["spec"] or each.group["file"],
+            each.group["requirement"] or "",
+        ]
+        numbers = [each.satisfied, each.violated, each.unknown, each.errors]
+        least = "" if each.least is None else f"{each.least:.6g}"
+        lines.append(_line([*names, *(f"{number:,}" for number in numbers), least]))
+    failing = [row for row in worst_rows(table, _WORST) if row["failure"] is not None]
+    if failing:
+        count = len(table) - table.column("failure").null_count
+        lines += [
+            "",
+            f"{counted(count, 'result')} failed; the worst:",
+            "",
+            "| log | spec | | |",
+            "|---|---|---|---|",
+        ]
+        lines += [_line([row["log"], row["spec"], row["failure"], row["reason"]]) for row in failing]
+    return "\n".join([*lines, "", ""])
+
+
+def _line(cells: list[str]) -> str:
+    shown = (printable(cell, 500) for cell in cells)
+    # no cell ends another one, or becomes markup
+    safe = (
+        cell.replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;").replace("[", "\\[")
+        for cell in shown
+    )
+    return f"| {' | '.join(safe)} |"
+
+
+def _data(text: str) -> str:
+    """Escape the message of a workflow command: a line break would begin another one."""
+    return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
+
+
+def _property(text: str) -> str:
+    return _data(text).replace(":", "%3A").replace(",", "%2C")

@@ -1,0 +1,114 @@
+"""Pages about the logs that fail, and the page over all logs that links to them."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from spatial_replay.batch.overview_page import overview_page
+from spatial_replay.batch.rows import Task, opened_task, parsed_specifications
+from spatial_replay.batch.run import BatchResult, Wanted
+from spatial_replay.batch.workers import Workers
+from spatial_replay.errors import OutputError, SpatialReplayError, UsageError
+from spatial_replay.logs.output_file import output_error, replacing
+from spatial_replay.report.write import write_report
+
+INDEX: Final = "index.html"
+_FOLDER: Final = "reports"
+_LONGEST: Final = 80
+_UNSAFE: Final = re.compile(r"[^A-Za-z0-9._-]+")
+
+
+@dataclass(frozen=True, slots=True)
+class _Page:
+    """A page to write about one log of one case."""
+
+    task: Task
+    path: Path
+
+
+def write_pages(
+    result: BatchResult,
+    folder: Path,
+    name: str,
+    workers: Workers,
+    *,
+    begin: Callable[[int], None] = lambda pages: None,
+    advance: Callable[[int], None] = lambda pages: None,
+) -> dict[tuple[str, str], Path]:
+    """Write the page over all logs, and one about each log with a verdict that fails.
+
+    A page that an earlier run has written of the same log and specifications stays.
+
+    Args:
+        folder: made if need be; the page over all is its `index.html`.
+        name: of the suite.
+        begin: called with the number of pages to write.
+        advance: called with 1 for each that is done.
+
+    Returns:
+        The pages, by case and log.
+
+    Raises:
+        UsageError: the folder is a file.
+        OutputError: a page cannot be written.
+    """
+    failing = _failing(result)
+    pages = {key: folder / _FOLDER / _file_name(key[1], wanted) for key, wanted in failing.items()}
+    try:
+        (folder / _FOLDER).mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise UsageError(f"{folder} is a file; give --html the name of a folder") from None
+    except OSError as error:
+        raise output_error(folder, error) from error
+    missing = {
+        path: _Page(_task(failing[key]), path.resolve()) for key, path in pages.items() if not path.exists()
+    }
+    begin(len(missing))
+    for _ in workers.results(_write_page, missing.values()):
+        advance(1)
+    pages = {key: path for key, path in pages.items() if path.exists()}
+    links = {key: path.relative_to(folder).as_posix() for key, path in pages.items()}
+    with replacing(folder / INDEX) as stream:
+        stream.write(overview_page(result.table, name, links))
+    return pages
+
+
+def _failing(result: BatchResult) -> dict[tuple[str, str], list[Wanted]]:
+    """Return what is wanted of each log with a failing verdict, by case and log."""
+    names = ("case", "log", "failure", "error")
+    rows = zip(*(result.table.column(name).to_pylist() for name in names), strict=True)
+    found: dict[tuple[str, str], list[Wanted]] = {
+        (case, log): [] for case, log, failure, error in rows if failure and not error
+    }
+    for each in result.wanted:
+        if (each.case.name, each.log.name) in found:
+            found[each.case.name, each.log.name].append(each)
+    return found
+
+
+def _task(wanted: list[Wanted]) -> Task:
+    first = wanted[0]
+    return Task(first.log.path, tuple(each.file.text for each in wanted), first.case.conditions)
+
+
+def _file_name(log: str, wanted: list[Wanted]) -> str:
+    """Return a name that says which log it is, and changes with what the page shows."""
+    digest = hashlib.sha256("".join(each.key or "" for each in wanted).encode()).hexdigest()[:12]
+    return f"{_UNSAFE.sub('-', log).strip('-.')[-_LONGEST:]}-{digest}.html"
+
+
+def _write_page(page: _Page) -> None:
+    """Write one page; a log that cannot be read any more has none."""
+    try:
+        files = parsed_specifications(page.task.specs, page.task.conditions)
+        source, options = opened_task(page.task, files)
+        write_report(source, files, page.path, options)
+    except OutputError:
+        raise
+    except (SpatialReplayError, OSError):
+        return

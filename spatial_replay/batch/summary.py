@@ -1,0 +1,195 @@
+"""The table of a run in short: totals by spec or by log, the worst rows, rows that fit a condition."""
+
+from __future__ import annotations
+
+import ast
+import operator
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, cast
+
+from spatial_replay.errors import UsageError
+from spatial_replay.text import nearest_hint
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+By: TypeAlias = Literal["spec", "log"]
+Values: TypeAlias = dict[str, Any]
+"""A row of a table: values by column."""
+
+VERDICTS: Final = ("satisfied", "violated", "unknown")
+_GROUPS: Final[Mapping[By, tuple[str, ...]]] = MappingProxyType(
+    {"spec": ("case", "file", "spec", "requirement"), "log": ("case", "log")}
+)
+_RANKS: Final[Mapping[str | None, int]] = MappingProxyType(
+    {"violated": 0, None: 1, "unknown": 2, "satisfied": 3}
+)
+_LONGEST_CONDITION: Final = 1_000
+
+
+@dataclass(frozen=True, slots=True)
+class Total:
+    """The results of one spec over its logs, or of one log under its specs.
+
+    Attributes:
+        group: what they have in common, by column.
+        satisfied, violated, unknown: how many results.
+        errors: how many have an error in place of a verdict.
+        failures: how many do not pass.
+        least: the least robustness among them; None if none is determined.
+    """
+
+    group: Values
+    satisfied: int
+    violated: int
+    unknown: int
+    errors: int
+    failures: int
+    least: float | None
+
+
+def totals(table: pa.Table, by: By = "spec") -> list[Total]:
+    """Return the totals of a table, in the order in which it names specs or logs."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    verdict, number = table.column("verdict"), table.column("robustness")
+    columns = {name: table.column(name) for name in _GROUPS[by]}
+    counted = {name: pc.equal(verdict, name) for name in VERDICTS}
+    counted |= {
+        "errors": pc.is_valid(table.column("error")),
+        "failures": pc.is_valid(table.column("failure")),
+    }
+    columns |= {f"n_{name}": pc.cast(pc.fill_null(flag, False), pa.int64()) for name, flag in counted.items()}
+    columns["least"] = pc.if_else(pc.is_nan(number), None, number)
+    sums = [(f"n_{name}", "sum") for name in counted]
+    # one thread: groups come in the order of their first rows
+    grouped = pa.table(columns).group_by(list(_GROUPS[by]), use_threads=False)
+    return [
+        Total(
+            {name: row[name] for name in _GROUPS[by]},
+            **{name: row[f"n_{name}_sum"] for name in counted},
+            least=row["least_min"],
+        )
+        for row in grouped.aggregate([*sums, ("least", "min")]).to_pylist()
+    ]
+
+
+def worst_rows(table: pa.Table, count: int) -> list[Values]:
+    """Return the worst rows: what fails first, then violations, errors and unknown ones, by robustness."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    verdict = table.column("verdict")
+    rank = pc.index_in(verdict, pa.array(list(_RANKS), pa.string()))
+    passes = pc.cast(pc.is_null(table.column("failure")), pa.int8())
+    # rows of equal robustness keep their order
+    order = pa.table(
+        {"passes": passes, "rank": rank, "number": table.column("robustness"), "place": range(len(table))}
+    )
+    keys = [(name, "ascending") for name in order.column_names]
+    chosen = table.take(pc.sort_indices(order, sort_keys=keys).slice(0, count))
+    return cast("list[Values]", chosen.to_pylist())
+
+
+def rows_where(table: pa.Table, condition: str) -> pa.Table:
+    """Return the rows that fit a condition such as `verdict == "violated" and robustness < -0.1`.
+
+    It compares columns with texts and numbers (`==`, `!=`, `<`, `<=`, `>`, `>=`), looks for a text
+    (`"door" in log`), and joins such parts by `and`, `or`, `not` and parentheses. `none` is an absent value.
+
+    Raises:
+        UsageError: anything else, or a column that the table lacks.
+    """
+    import pyarrow as pa
+    import pyarrow.dataset as ds
+
+    if len(condition) > _LONGEST_CONDITION:
+        raise UsageError(f"--where is longer than {_LONGEST_CONDITION:,} characters")
+    try:
+        parsed = ast.parse(condition.strip(), mode="eval").body
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        raise UsageError(_no_condition(condition)) from None
+    try:
+        return table.filter(_Condition(table.column_names, condition, ds.field).of(parsed))
+    except pa.ArrowException as error:
+        reason = str(error).splitlines()[0]
+        raise UsageError(f"--where {condition!r} compares different kinds of values: {reason}") from None
+
+
+_COMPARISONS: Final[Mapping[type[ast.cmpop], Callable[[Any, Any], Any]]] = MappingProxyType(
+    {
+        ast.Eq: operator.eq,
+        ast.NotEq: operator.ne,
+        ast.Lt: operator.lt,
+        ast.LtE: operator.le,
+        ast.Gt: operator.gt,
+        ast.GtE: operator.ge,
+    }
+)
+
+
+@dataclass(frozen=True, slots=True)
+class _Condition:
+    """Turns the syntax tree of a condition into an expression of Arrow; nothing is executed."""
+
+    names: list[str]
+    text: str
+    field: Callable[[str], Any]
+
+    def of(self, node: ast.expr) -> Any:
+        """Return the expression of a truth value."""
+        match node:
+            case ast.BoolOp(op=op, values=[first, *rest]):
+                joined = self.of(first)
+                for each in rest:
+                    joined = joined & self.of(each) if isinstance(op, ast.And) else joined | self.of(each)
+                return joined
+            case ast.UnaryOp(op=ast.Not(), operand=operand):
+                return ~self.of(operand)
+            case ast.Compare(
+                left=ast.Constant(value=str(part)), ops=[ast.In()], comparators=[ast.Name() as name]
+            ):
+                import pyarrow.compute as pc
+
+                return pc.match_substring(self._column(name), part)
+            case ast.Compare(left=ast.Name() as name, ops=[op], comparators=[value]) if (
+                type(op) in _COMPARISONS
+            ):
+                return self._compared(self._column(name), op, self._value(value))
+        raise UsageError(_no_condition(self.text))
+
+    def _compared(self, column: Any, op: ast.cmpop, value: Any) -> Any:
+        if value is None:
+            if isinstance(op, ast.Eq | ast.NotEq):
+                return column.is_null() if isinstance(op, ast.Eq) else ~column.is_null()
+            raise UsageError(_no_condition(self.text))
+        return _COMPARISONS[type(op)](column, value)
+
+    def _column(self, name: ast.Name) -> Any:
+        if name.id not in self.names:
+            hint = nearest_hint(name.id, self.names) or f"columns are {', '.join(self.names)}"
+            raise UsageError(f"--where: there is no column {name.id!r}; {hint}")
+        return self.field(name.id)
+
+    def _value(self, node: ast.expr) -> Any:
+        match node:
+            case ast.Constant(value=str() | int() | float() as value):
+                return value
+            case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() | float() as value)):
+                return -value
+            case ast.Name(id="none"):
+                return None
+            case ast.Name(id=word) if word not in self.names:
+                # `verdict == violated`, as people type it where a shell takes the quotes
+                return word
+        raise UsageError(_no_condition(self.text))
+
+
+def _no_condition(text: str) -> str:
+    return (
+        f"--where {text[:200]!r} is not a condition; compare columns, as in "
+        "'verdict == \"violated\" and robustness < -0.1' or '\"door\" in log'"
+    )

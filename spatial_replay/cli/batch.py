@@ -1,0 +1,375 @@
+"""`spatial-replay batch`: evaluate many logs, as a suite or from the command line."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from spatial_replay.cli.application import ExitCode, most_severe
+from spatial_replay.cli.batch_output import (
+    exit_code_from_table,
+    headline,
+    print_totals,
+    print_worst,
+    write_json_lines,
+)
+from spatial_replay.cli.options import (
+    ReadArguments,
+    add_options,
+    choices_option,
+    constants_option,
+    fail_on_option,
+    gather,
+    naming_option,
+    objects_by_parameter,
+    profile_option,
+    reading_options,
+    semantics_option,
+    specs_option,
+    strict_names_option,
+)
+from spatial_replay.cli.progress import progress
+from spatial_replay.cli.terminal import show, warn
+from spatial_replay.errors import UsageError
+from spatial_replay.text import counted
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from spatial_replay.batch.baseline import Tolerance
+    from spatial_replay.batch.run import BatchResult
+    from spatial_replay.batch.suite import Suite
+    from spatial_replay.batch.workers import Workers
+    from spatial_replay.monitor.semantics import Semantics
+
+_WORST = 10
+_MOST_WARNINGS = 5
+_MOST_DIFFERENCES = 20
+
+
+@dataclass(frozen=True, slots=True)
+class BatchConditions:
+    """What a suite says, given on the command line."""
+
+    specs: tuple[Path, ...]
+    start: str | None
+    end: str | None
+    every: int
+    choices: tuple[str, ...]
+    constants: Mapping[str, float | str]
+    semantics: Semantics
+    strict_names: bool
+    profile: str | None
+
+
+_CONDITIONS = (
+    specs_option("Specification file; repeat for several."),
+    click.option("--from", "start", metavar="T", help="Start at the first sample at or after T."),
+    click.option("--to", "end", metavar="T", help="End with the last sample before T."),
+    click.option("--every", metavar="N", type=click.IntRange(min=1), default=1, help="Use every Nth sample."),
+    choices_option,
+    constants_option,
+    semantics_option,
+    strict_names_option,
+    profile_option,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class BatchOutputs:
+    """Where results go, and what they are compared with."""
+
+    output: Path | None
+    junit: Path | None
+    html: Path | None
+    json_file: str | None
+    baseline: Path | None
+    tolerance: str | None
+    update_baseline: bool
+
+
+_OUTPUTS = (
+    click.option(
+        "-o",
+        "--output",
+        metavar="RESULTS",
+        type=click.Path(path_type=Path),
+        help="Folder of results, which another run goes on with.  [default: results, or SUITE.results]",
+    ),
+    click.option("--junit", metavar="FILE", type=click.Path(path_type=Path), help="JUnit report to write."),
+    click.option(
+        "--html",
+        metavar="DIR",
+        type=click.Path(path_type=Path),
+        help="Folder to write a page over all logs to, and a report of each that fails.",
+    ),
+    click.option("--json", "json_file", metavar="FILE|-", help="Results to write as JSON, one a line."),
+    click.option(
+        "--baseline",
+        metavar="RESULTS",
+        type=click.Path(path_type=Path),
+        help="Results of an earlier run: what got worse than there, or is gone, fails.",
+    ),
+    click.option("--tolerance", metavar="T", help="With --baseline: how much worse passes, as 5% or 0.02."),
+    click.option("--update-baseline", is_flag=True, help="Write this run's results to --baseline."),
+)
+
+
+@click.command()
+@click.argument("logs", metavar="SUITE.yaml|LOG...", nargs=-1, required=True)
+@lambda command: add_options(_CONDITIONS, reading_options(gather("conditions", BatchConditions, command)))
+@lambda command: add_options(_OUTPUTS, gather("outputs", BatchOutputs, command))
+@click.option(
+    "--jobs", metavar="N", type=click.IntRange(min=1), help="Processes.  [default: one for each core]"
+)
+@click.option("--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster that evaluates the logs.")
+@fail_on_option
+def batch(
+    logs: tuple[str, ...],
+    conditions: BatchConditions,
+    reading: ReadArguments,
+    outputs: BatchOutputs,
+    jobs: int | None,
+    dask: str | None,
+    fail_on: frozenset[str],
+) -> int:
+    """Evaluate many logs and show what fails: a suite file, or logs with specifications.
+
+    LOG is a file, a folder, a pattern such as 'nightly/**/*.mcap', or an address. Results are kept in a
+    folder; another run evaluates only what is new. A log that cannot be read is a result, too: its error.
+
+    Exits as replay does over all logs: 0 if everything is as expected, 1 if anything fails, 4 if results are
+    unknown, 3 if logs are damaged, 2 if some do not fit, 70 if the machine failed.
+
+    \b
+    Examples:
+      spatial-replay batch 'nightly/**/*.mcap' --spec safety.spatial -o results
+      spatial-replay batch suite.yaml --junit report.xml --html pages
+      spatial-replay batch suite.yaml --baseline main.results --tolerance 5%
+      spatial-replay batch logs --spec safety.spatial --dask tcp://scheduler:8786
+    """
+    # imported here so that --help stays fast
+    from spatial_replay.batch.github import is_github, worst_annotations, write_summary
+    from spatial_replay.batch.junit import write_junit
+    from spatial_replay.batch.run import workers_of
+
+    if dask is not None and jobs is not None:
+        raise UsageError("--jobs is for this machine, and a cluster has its own; remove --jobs or --dask")
+    suite = _suite(logs, conditions, reading)
+    folder = outputs.output or (
+        Path("results") if suite.path is None else suite.folder / f"{suite.name}.results"
+    )
+    tolerance, before = _baseline(outputs)
+    _check_outputs(outputs, suite)
+    threads = jobs or os.cpu_count() or 1
+    workers = workers_of(threads, dask)
+    result = _run(suite, folder, workers, fail_on, threads)
+    inputs = _inputs(suite)
+    pages = {} if outputs.html is None else _write_pages(result, outputs.html, suite, workers)
+    if outputs.junit is not None:
+        attached = {key: path.as_posix() for key, path in pages.items()}
+        write_junit(outputs.junit, result.table, suite.name, attached, inputs=inputs)
+    if outputs.json_file is not None:
+        write_json_lines(result.table, outputs.json_file, inputs)
+    if outputs.json_file != "-":
+        _print(result, folder)
+    _warn_of_names(result.table)
+    if is_github():
+        for line in worst_annotations(result.table, suite.folder):
+            show(line, err=True)
+        write_summary(result.table)
+    code = exit_code_from_table(result.table, fail_on)
+    if before is not None and _print_differences(result.table, before, tolerance, outputs.json_file == "-"):
+        code = most_severe([code, ExitCode.VIOLATED])
+    if outputs.update_baseline and outputs.baseline is not None:
+        from spatial_replay.batch.data_set import ResultsFolder
+
+        ResultsFolder.create(outputs.baseline).write_run(result.table)
+        show(f"wrote {outputs.baseline}", err=outputs.json_file == "-")
+    return code
+
+
+def _suite(logs: tuple[str, ...], given: BatchConditions, reading: ReadArguments) -> Suite:
+    """Return the suite that is named, or that the logs and options make up.
+
+    Raises:
+        UsageError: both, no specification, or a suite that is not valid.
+    """
+    from spatial_replay.batch.suite import Conditions, Suite, load_suite
+
+    own = {name: value for name, value in reading.items() if name != "mapping"}
+    changed = {name: value for name, value in own.items() if value != _READING_DEFAULTS[name]}
+    conditions = Conditions(
+        mapping=reading["mapping"],
+        reading=tuple(sorted(changed.items())),
+        start=given.start,
+        end=given.end,
+        every=given.every,
+        each=tuple(sorted(objects_by_parameter(given.choices).items())),
+        semantics=given.semantics,
+        strict_names=given.strict_names,
+        constants=tuple(sorted(given.constants.items())),
+        profile=given.profile,
+    )
+    suites = [log for log in logs if log.endswith((".yaml", ".yml")) and Path(log).name != "metadata.yaml"]
+    if not suites:
+        if not given.specs:
+            raise UsageError(
+                "there is nothing to evaluate; give a specification with --spec FILE, or a suite"
+            )
+        for option, text in (("--from", given.start), ("--to", given.end)):
+            if text is not None:
+                _check_time(option, text)
+        return Suite.of_logs(logs, tuple(dict.fromkeys(given.specs)), conditions)
+    if len(logs) > 1:
+        raise UsageError(f"{suites[0]} is a suite, which names its logs; give it alone")
+    if given.specs or conditions != Conditions():
+        raise UsageError(
+            f"{suites[0]} says how its logs are evaluated; change it there, or give logs and options"
+        )
+    return load_suite(suites[0])
+
+
+_READING_DEFAULTS: Mapping[str, Any] = {
+    "on_time_jump": "error",
+    "rate": None,
+    "lost": "drop",
+    "y_down": None,
+    "concave": "decompose",
+}
+
+
+def _check_time(option: str, text: str) -> None:
+    from spatial_replay.trace.time_points import time_point_from_text
+
+    with naming_option(option):
+        time_point_from_text(text)
+
+
+def _inputs(suite: Suite) -> list[Path]:
+    """Return the files that are read, but for the logs, of which there may be very many."""
+    mappings = [case.conditions.mapping for case in suite.cases]
+    specs = [spec for case in suite.cases for spec in case.specs]
+    own = [] if suite.path is None else [suite.path]
+    return [*own, *dict.fromkeys([*specs, *(each for each in mappings if each is not None)])]
+
+
+def _check_outputs(outputs: BatchOutputs, suite: Suite) -> None:
+    """Refuse outputs that could not be written, before the work is done."""
+    from spatial_replay.logs.output_file import refuse_inputs
+
+    files = [outputs.junit, None if outputs.json_file in (None, "-") else Path(outputs.json_file or "")]
+    named = [file for file in files if file is not None]
+    for file in named:
+        refuse_inputs(file, _inputs(suite))
+    if len({file.resolve() for file in named}) < len(named):
+        raise UsageError(f"--junit and --json both name {named[0]}; give them different names")
+
+
+def _baseline(outputs: BatchOutputs) -> tuple[Tolerance, pa.Table | None]:
+    """Return the tolerance, and the table of the baseline if there is one."""
+    from spatial_replay.batch.baseline import Tolerance
+    from spatial_replay.batch.data_set import ResultsFolder
+
+    if outputs.baseline is None:
+        if outputs.tolerance is not None or outputs.update_baseline:
+            option = "--update-baseline" if outputs.update_baseline else "--tolerance"
+            raise UsageError(f"{option} applies to a baseline; add --baseline RESULTS")
+        return Tolerance(), None
+    with naming_option("--tolerance"):
+        tolerance = Tolerance.parse(outputs.tolerance or "0")
+    if outputs.update_baseline and not outputs.baseline.exists():
+        return tolerance, None
+    return tolerance, ResultsFolder.open(outputs.baseline).read_run()
+
+
+def _run(suite: Suite, folder: Path, workers: Workers, fail_on: frozenset[str], threads: int) -> BatchResult:
+    from spatial_replay.batch.run import run_batch
+
+    with ExitStack() as stack:
+        steps: list[Any] = []
+        try:
+            return run_batch(
+                suite,
+                folder,
+                workers,
+                fail_on=fail_on,
+                threads=threads,
+                begin=lambda tasks: steps.append(stack.enter_context(progress("logs", tasks))),
+                advance=lambda tasks: steps[0](tasks),
+            )
+        except KeyboardInterrupt as error:
+            error.add_note(f"what was evaluated so far is in {folder}; the same command goes on from there")
+            raise
+
+
+def _write_pages(
+    result: BatchResult, folder: Path, suite: Suite, workers: Workers
+) -> dict[tuple[str, str], Path]:
+    from spatial_replay.batch.reports import write_pages
+
+    with ExitStack() as stack:
+        steps: list[Any] = []
+        return write_pages(
+            result,
+            folder,
+            suite.name,
+            workers,
+            begin=lambda pages: steps.append(stack.enter_context(progress("reports", pages))),
+            advance=lambda pages: steps[0](pages),
+        )
+
+
+def _print(result: BatchResult, folder: Path) -> None:
+    known = result.logs - result.evaluated
+    news = f"{result.evaluated:,} evaluated now, {known:,} known" if known else "all evaluated now"
+    show(f"{counted(result.logs, 'log')}, {headline(result.table)} ({news})")
+    print_totals(result.table, "spec")
+    failures = len(result.failures)
+    if failures:
+        shown = f"{failures:,} failed" if failures <= _WORST else f"{failures:,} failed, the worst {_WORST}"
+        show(f"{shown}:")
+        print_worst(result.table, _WORST, failing=True)
+    show(f"wrote {folder}")
+
+
+def _warn_of_names(table: pa.Table) -> None:
+    """Warn of names that logs lack; the same name is reported once."""
+    logs: dict[str, int] = {}
+    for missing in dict(_columns(table, "log", "missing")).values():
+        for message in missing:
+            logs[message] = logs.get(message, 0) + 1
+    found = [f"{message} (in {counted(count, 'log')})" for message, count in logs.items()]
+    more = [f"… and {len(found) - _MOST_WARNINGS} more"] if len(found) > _MOST_WARNINGS else []
+    warn(*found[:_MOST_WARNINGS], *more)
+
+
+def _columns(table: pa.Table, *names: str) -> list[tuple[Any, ...]]:
+    return list(zip(*(table.column(name).to_pylist() for name in names), strict=True))
+
+
+def _print_differences(table: pa.Table, before: pa.Table, tolerance: Tolerance, to_errors: bool) -> bool:
+    """Print what differs from the baseline, and return whether any of it fails."""
+    from spatial_replay.batch.baseline import compare
+
+    differences = compare(table, before, tolerance)
+    worse = [each for each in differences if each.fails]
+    better = len(differences) - len(worse)
+    heads = (
+        [f"{len(worse):,} worse than the baseline, or gone"]
+        if worse
+        else ["nothing is worse than the baseline"]
+    )
+    heads += [f"{better:,} better: --update-baseline keeps that"] if better else []
+    show("; ".join(heads) + (":" if worse else ""), err=to_errors)
+    for each in worse[:_MOST_DIFFERENCES]:
+        show(f"  {each.text}", err=to_errors)
+    if len(worse) > _MOST_DIFFERENCES:
+        show(f"  … and {len(worse) - _MOST_DIFFERENCES:,} more", err=to_errors)
+    return bool(worse)

@@ -1,0 +1,123 @@
+"""Tables of batches as text and as JSON lines."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from spatial_replay.cli.application import ExitCode, most_severe
+from spatial_replay.cli.terminal import Coloured, show, show_file
+from spatial_replay.text import counted, json_number
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from spatial_replay.batch.summary import By, Total
+
+_COLOURS: Final = {"satisfied": "blue", "violated": "red", "unknown": "yellow", "errors": "red"}
+_KIND_CODES: Final = {"usage": ExitCode.USAGE, "log": ExitCode.DAMAGED, "machine": ExitCode.INTERNAL}
+_BATCH: Final = 10_000
+"""Rows that are turned into JSON at once."""
+
+
+def print_totals(table: pa.Table, by: By) -> None:
+    """Print how many results there are of each verdict, for each spec or for each log."""
+    # imported here so that --help stays fast
+    from spatial_replay.batch.summary import totals
+
+    rows = totals(table, by)
+    titles = [_title(each, by, len({each.group["case"] for each in rows}) > 1) for each in rows]
+    names = ["satisfied", "violated", "unknown", "errors"]
+    width = max([len(by), *map(len, titles)])
+    show(f"  {by:<{width}}  {'  '.join(f'{name:>9}' for name in names)}  least robustness")
+    for title, each in zip(titles, rows, strict=True):
+        line: list[str | Coloured] = [f"  {title:<{width}}"]
+        for name in names:
+            count = getattr(each, name)
+            line += ["  ", Coloured(f"{count:>9,}", _COLOURS[name]) if count else f"{'-':>9}"]
+        least = "not determined" if each.least is None else f"{each.least:.6g}"
+        show((*line, f"  {least:>16}"))
+
+
+def print_worst(table: pa.Table, count: int, *, failing: bool) -> None:
+    """Print the worst rows, each with the sentence that explains it.
+
+    Args:
+        failing: only those that fail.
+    """
+    from spatial_replay.batch.summary import worst_rows
+
+    for row in worst_rows(table, count):
+        if failing and row["failure"] is None:
+            return
+        name = row["spec"] or row["file"]
+        name = name if row["object"] is None else f"{name}({row['object']})"
+        name = f"{name} [{row['requirement']}]" if row["requirement"] else name
+        kind = "errors" if row["verdict"] is None else row["verdict"]
+        verdict = Coloured("error" if kind == "errors" else kind, _COLOURS[kind])
+        number = "" if math.isnan(row["robustness"]) else f", robustness {row['robustness']:.6g}"
+        show((f"  {row['log']}: {name}: ", verdict, number))
+        usual = f"{row['verdict']}, expected satisfied"
+        for line in (None if row["failure"] == usual else row["failure"], row["reason"]):
+            if line:
+                show(*(f"      {each}" for each in line.split("\n")))
+
+
+def headline(table: pa.Table) -> str:
+    """Return how many results a table has, and how many of each verdict."""
+    verdicts = table.column("verdict").to_pylist()
+    counts = {name: verdicts.count(name) for name in ("satisfied", "violated", "unknown")}
+    parts = [f"{count:,} {name}" for name, count in counts.items() if count]
+    if errors := verdicts.count(None):
+        parts.append(counted(errors, "error"))
+    return f"{counted(len(table), 'result')}: {', '.join(parts) or 'none'}"
+
+
+def write_json_lines(table: pa.Table, file: str, inputs: Sequence[Path]) -> None:
+    """Write each row as a JSON object on a line, to a file, or to standard output for "-"."""
+    from spatial_replay.logs.output_file import replacing
+
+    def lines(rows: pa.Table) -> str:
+        return "".join(f"{json.dumps(_json_row(row), ensure_ascii=False)}\n" for row in rows.to_pylist())
+
+    batches = (table.slice(begin, _BATCH) for begin in range(0, len(table), _BATCH))
+    if file == "-":
+        for rows in batches:
+            show_file(lines(rows))
+        return
+    with replacing(Path(file), inputs) as stream:
+        for rows in batches:
+            stream.write(lines(rows).encode())
+
+
+def exit_code_from_table(table: pa.Table, fail_on: frozenset[str]) -> ExitCode:
+    """Return the exit code of a run: that of a replay of all its logs, but for what was expected."""
+    names = ("failure", "error_kind", "verdict", "faults")
+    codes = set()
+    for failure, kind, verdict, faults in zip(*(table.column(n).to_pylist() for n in names), strict=True):
+        if faults:
+            codes.add(ExitCode.DAMAGED)
+        if failure is None or (faults and failure.startswith("the log is damaged")):
+            continue
+        if kind is not None:
+            codes.add(_KIND_CODES[kind])
+        elif verdict == "unknown" and "unknown" not in fail_on:
+            codes.add(ExitCode.UNKNOWN)
+        else:
+            codes.add(ExitCode.VIOLATED)
+    return most_severe(codes)
+
+
+def _title(total: Total, by: By, with_case: bool) -> str:
+    group = total.group
+    title = group["log"] if by == "log" else group["spec"] or group["file"]
+    if by == "spec" and group["requirement"]:
+        title = f"{title} [{group['requirement']}]"
+    return f"{group['case']}: {title}" if with_case else title
+
+
+def _json_row(row: dict[str, Any]) -> dict[str, Any]:
+    return {name: json_number(value) if isinstance(value, float) else value for name, value in row.items()}
