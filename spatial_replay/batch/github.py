@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
-from spatial_replay.batch.summary import totals, worst_rows
+from spatial_replay.batch.run_table import totals, worst_rows
 from spatial_replay.errors import OutputError
 from spatial_replay.text import counted, printable
 

@@ -17,7 +17,7 @@ from spatial_replay.text import counted, printable
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from spatial_replay.batch.summary import Values
+    from spatial_replay.batch.run_table import Values
 
 LARGEST: Final = 30_000_000
 """Bytes: GitLab refuses larger reports."""

@@ -11,7 +11,7 @@ from urllib.parse import quote
 import numpy as np
 
 from spatial_replay import __version__
-from spatial_replay.batch.summary import Total, Values, totals, worst_rows
+from spatial_replay.batch.run_table import Total, Values, totals, worst_rows
 from spatial_replay.notebook.figures import Html, element
 from spatial_replay.report.page import policy, text, theme
 from spatial_replay.text import counted
@@ -43,7 +43,7 @@ def overview_page(table: pa.Table, name: str, reports: Mapping[tuple[str, str], 
     style = "\n".join([theme(), *map(_asset, _STYLES)])
     script = _asset("batch:overview.js")
     parts = [
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">',
+        '<!doctype html>\n<html lang="en" data-read><head><meta charset="utf-8">',
         f'<meta http-equiv="Content-Security-Policy" content="{policy([script], style)}">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         '<meta name="color-scheme" content="light dark">',

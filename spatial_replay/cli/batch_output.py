@@ -15,7 +15,7 @@ from spatial_replay.text import counted, json_number
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from spatial_replay.batch.summary import By, Total
+    from spatial_replay.batch.run_table import By, Total
 
 _COLOURS: Final = {"satisfied": "blue", "violated": "red", "unknown": "yellow", "errors": "red"}
 _KIND_CODES: Final = {"usage": ExitCode.USAGE, "log": ExitCode.DAMAGED, "machine": ExitCode.INTERNAL}
@@ -26,7 +26,7 @@ _BATCH: Final = 10_000
 def print_totals(table: pa.Table, by: By) -> None:
     """Print how many results there are of each verdict, for each spec or for each log."""
     # imported here so that --help stays fast
-    from spatial_replay.batch.summary import totals
+    from spatial_replay.batch.run_table import totals
 
     rows = totals(table, by)
     titles = [_title(each, by, len({each.group["case"] for each in rows}) > 1) for each in rows]
@@ -48,7 +48,7 @@ def print_worst(table: pa.Table, count: int, *, failing: bool) -> None:
     Args:
         failing: only those that fail.
     """
-    from spatial_replay.batch.summary import worst_rows
+    from spatial_replay.batch.run_table import worst_rows
 
     for row in worst_rows(table, count):
         if failing and row["failure"] is None:

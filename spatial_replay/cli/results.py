@@ -11,7 +11,7 @@ from spatial_replay.cli.batch_output import headline, print_totals, print_worst,
 from spatial_replay.cli.terminal import show
 
 if TYPE_CHECKING:
-    from spatial_replay.batch.summary import By
+    from spatial_replay.batch.run_table import By
 
 
 @click.command()
@@ -37,7 +37,7 @@ def results(folder: Path, worst: int, where: str | None, by: By, json_file: str 
     """
     # imported here so that --help stays fast
     from spatial_replay.batch.data_set import ResultsFolder
-    from spatial_replay.batch.summary import rows_where
+    from spatial_replay.batch.run_table import rows_where
 
     table = ResultsFolder.open(folder).read_run()
     if where is not None:
