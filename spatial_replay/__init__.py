@@ -21,10 +21,11 @@ from spatial_replay.errors import (
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.api import info, replay_log, tune, verify, write_report
+    from spatial_replay.api import evaluate_logs, info, read_results, replay_log, tune, verify, write_report
     from spatial_replay.automata.automaton import Automaton
     from spatial_replay.automata.compile import automaton
     from spatial_replay.automata.guards import Transition
+    from spatial_replay.batch.run import BatchResult
     from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
     from spatial_replay.monitor.causes import Cause, LeastPart
     from spatial_replay.monitor.evaluate import Evaluation, evaluate
@@ -56,6 +57,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Automaton",
+    "BatchResult",
     "Candidate",
     "Cause",
     "Consideration",
@@ -107,9 +109,11 @@ __all__ = [
     "__version__",
     "automaton",
     "evaluate",
+    "evaluate_logs",
     "info",
     "load_specification",
     "parse_specification",
+    "read_results",
     "read_trace",
     "replay_log",
     "tune",
@@ -120,7 +124,8 @@ __all__ = [
 __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
-        "api": ("info", "replay_log", "tune", "verify", "write_report"),
+        "api": ("evaluate_logs", "info", "read_results", "replay_log", "tune", "verify", "write_report"),
+        "batch.run": ("BatchResult",),
         "automata.automaton": ("Automaton",),
         "automata.compile": ("automaton",),
         "automata.guards": ("Transition",),

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from os import PathLike
+from os import PathLike, fspath
 from pathlib import Path
 from reprlib import repr as shortened
-from typing import Literal, TypeAlias, TypedDict, Unpack
+from typing import TYPE_CHECKING, Literal, TypeAlias, TypedDict, Unpack
 
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.source import MemorySource, Source
@@ -26,6 +26,11 @@ from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
 from spatial_replay.tuning.margins import load_runs
 from spatial_replay.tuning.tuned import Tuning, tune_runs
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from spatial_replay.batch.run import BatchResult
 
 PathName: TypeAlias = str | PathLike[str]
 Log: TypeAlias = PathName | Trace
@@ -183,6 +188,79 @@ def tune(
 def _logs(logs: Log | Sequence[Log]) -> list[Path | Trace]:
     listed = [logs] if isinstance(logs, Trace | str | PathLike) else list(logs)
     return [each if isinstance(each, Trace) else Path(each) for each in listed]
+
+
+def evaluate_logs(
+    logs: PathName | Sequence[PathName],
+    specifications: PathName | Sequence[PathName] | None = None,
+    *,
+    output: PathName,
+    jobs: int = 1,
+    dask: str | None = None,
+    fail_on: Sequence[str] = (),
+    constants: Mapping[str, float | str] | None = None,
+    each: Mapping[str, str] | None = None,
+    semantics: Semantics = "ltlf",
+    strict_names: bool = False,
+    **reading: Unpack[Reading],
+) -> BatchResult:
+    """Evaluate many logs, but for what an earlier batch has evaluated already, and store their results.
+
+    Args:
+        logs: a suite file (.yaml), which says all the rest; or logs: files, folders, patterns such as
+            "nightly/**/*.mcap", addresses.
+        specifications: the specification files, unless `logs` is a suite.
+        output: the folder of results, made if need be.
+        jobs: how many processes evaluate; a program that gives more than 1 needs the guard
+            `if __name__ == "__main__":`, as for every process pool.
+        dask: the address of a Dask scheduler, whose workers evaluate instead.
+        fail_on: "vacuous", "unknown": results that fail as well.
+        constants, each, semantics, strict_names, reading: as for `replay_log`.
+
+    Returns:
+        `table`, a `pyarrow.Table` with one row for each log, spec and object of a template, and `failures`,
+        the rows that do not pass. A log that cannot be read is a row with its `error`.
+
+    Raises:
+        UsageError: a pattern without a log, options that do not work, pyarrow is not installed.
+        SpecificationError: specifications with errors.
+        OutputError: results cannot be written; those written so far stay.
+    """
+    from spatial_replay.batch.run import run_batch, workers_of
+    from spatial_replay.batch.suite import Conditions, Suite, load_suite
+
+    named = [logs] if isinstance(logs, str | PathLike) else list(logs)
+    mapping = reading.get("mapping")
+    conditions = Conditions(
+        mapping=None if mapping is None else Path(mapping),
+        reading=tuple(sorted((name, value) for name, value in reading.items() if name != "mapping")),
+        each=tuple(sorted((each or {}).items())),
+        semantics=semantics,
+        strict_names=strict_names,
+        constants=tuple(sorted((constants or {}).items())),
+    )
+    if specifications is None:
+        if len(named) != 1 or conditions != Conditions():
+            raise UsageError(
+                "without specifications, give the path of a suite file, and nothing that it says"
+            )
+        suite = load_suite(named[0])
+    else:
+        files = [specifications] if isinstance(specifications, str | PathLike) else specifications
+        suite = Suite.of_logs([fspath(log) for log in named], [Path(file) for file in files], conditions)
+    return run_batch(suite, Path(output), workers_of(jobs, dask), fail_on=frozenset(fail_on))
+
+
+def read_results(folder: PathName) -> pa.Table:
+    """Return the table of the last run of a batch, a `pyarrow.Table`.
+
+    Raises:
+        UsageError: no such folder, no results in it, or those of another version; pyarrow is not installed.
+        LogError: the table is damaged.
+    """
+    from spatial_replay.batch.data_set import ResultsFolder
+
+    return ResultsFolder.open(Path(folder)).read_run()
 
 
 def verify(log: PathName, source: PathName | None = None, **reading: Unpack[Reading]) -> Verified:

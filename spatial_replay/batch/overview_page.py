@@ -110,14 +110,13 @@ def _totals(by_spec: Sequence[Total]) -> Html:
 
 
 def _worst(rows: Sequence[Values], reports: Mapping[tuple[str, str], str]) -> Html:
-    head = element("tr", *(element("th", each) for each in ("log", "spec", "failed by", "reason")))
+    head = element("tr", *(element("th", each) for each in ("log", "spec", "reason")))
     body = [
         element(
             "tr",
             element("td", _linked((row["case"], row["log"]), reports)),
             element("td", text(_title(row["spec"], row["object"]))),
-            element("td", text(row["failure"])),
-            element("td", text(row["reason"])),
+            element("td", text(row["reason"] or row["failure"])),
         )
         for row in rows
     ]
