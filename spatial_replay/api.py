@@ -10,7 +10,9 @@ from reprlib import repr as shortened
 from typing import TYPE_CHECKING, Literal, TypeAlias, TypedDict, Unpack
 
 from spatial_replay.errors import UsageError
+from spatial_replay.logs.remote import local_files
 from spatial_replay.logs.source import MemorySource, Source
+from spatial_replay.logs.topics import MAPPED
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.replay.annotated import load_files, run_replay
 from spatial_replay.replay.engine import Replayed
@@ -80,7 +82,7 @@ def replay_log(
     """Evaluate specifications over a log, and write the annotated log if a file is named.
 
     Args:
-        log: a file in any format, or a trace.
+        log: a file in any format, an address of one (s3://, gs://, az://, https://), or a trace.
         specifications: one or several, parsed or as files; None takes those that the log was written with.
         output: the annotated log to write (MCAP).
         layer: write the derived messages only, without the log's own.
@@ -106,7 +108,7 @@ def replay_log(
     return run_replay(
         source,
         _files(specifications, source, constants),
-        replace(how, keep=None if keep is None else tuple(keep)),
+        replace(how, keep=_kept(keep, output)),
         keep_series=True,
         keep_leaves=True,
         output=None if output is None else Path(output),
@@ -337,9 +339,16 @@ def _distinct(named: Sequence[Specification | PathName]) -> list[Specification |
     return chosen
 
 
+def _kept(keep: Sequence[str] | None, output: PathName | None) -> tuple[str, ...] | None:
+    """Return which messages a replay reads: without an output, only those that samples are made of."""
+    if keep is not None:
+        return tuple(keep)
+    return (MAPPED,) if output is None else None
+
+
 def _inputs(log: Log, specifications: Specifications | None, reading: Reading) -> list[Path]:
     """Return the files that are read."""
     files = [each for each in _listed(specifications) if not isinstance(each, Specification)]
     mapping = reading.get("mapping")
     logs = [] if isinstance(log, Trace) else [log]
-    return [Path(each) for each in (*logs, *files, *([] if mapping is None else [mapping]))]
+    return local_files([*logs, *files, *([] if mapping is None else [mapping])])

@@ -8,6 +8,7 @@
     ├── GeometryError           invalid footprint coordinates
     ├── TraceError              samples that do not form a trace
     ├── LogError                a log that is damaged or breaks its format
+    │   └── RemoteError         an address that does not answer, or whose file changes
     └── OutputError             an output could not be written
 
 Every message names the wrong value, its place and the remedy.
@@ -88,6 +89,10 @@ class TraceError(SpatialReplayError, ValueError):
 
 class LogError(SpatialReplayError):
     """A log that is damaged or breaks its format."""
+
+
+class RemoteError(LogError):
+    """A log at an address that does not answer, breaks off, or is replaced while it is read."""
 
 
 class OutputError(SpatialReplayError):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from functools import cached_property
-from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
@@ -21,11 +20,12 @@ from spatial_replay.bags.reader import MessageReader
 from spatial_replay.bags.ros_definitions import full_type_name
 from spatial_replay.bags.topic import Topic, is_latched
 from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.mcap.chunks import ChunkPlace, DamageError, read_records, walk_records
+from spatial_replay.logs.mcap.chunks import ChunkPlace, DamageError, plan_places, read_records, walk_records
 from spatial_replay.logs.mcap.index import Directory, iter_attachments, iter_metadata, read_directory
 from spatial_replay.logs.mcap.reader import ChunkWalk
 from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList
+from spatial_replay.logs.remote import LogFile, open_file
 from spatial_replay.trace.sample import LATEST_NS
 
 _MESSAGE_FIELDS = 22
@@ -36,13 +36,14 @@ class McapLog(MessageReader):
 
     kind = "MCAP"
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: LogFile) -> None:
         super().__init__(path)
+        self._file = path
         self._walked, self._walked_all = 0, False
 
     @cached_property
     def _contents(self) -> tuple[Directory, dict[int, Channel]]:
-        with self._path.open("rb") as stream:
+        with open_file(self._file) as stream:
             directory = read_directory(stream, self._faults, self.name)
             return directory, ChunkWalk(stream, directory, FaultList(), self.name).channels
 
@@ -87,7 +88,8 @@ class McapLog(MessageReader):
         if not as_recorded:
             places.sort(key=lambda ranked: ranked[1].start_ns)
         self._walked, self._walked_all = 0, len(places) == len(directory.chunks)
-        with self._path.open("rb") as stream:
+        with open_file(self._file) as stream:
+            plan_places(stream, (place for _, place in places))
             contents = (self._messages(stream, *ranked, wanted, first, last) for ranked in places)
             yield from (
                 contents if as_recorded else in_order([place.start_ns for _, place in places], contents)
@@ -113,11 +115,11 @@ class McapLog(MessageReader):
         }
 
     def attachments(self) -> tuple[Attachment, ...]:
-        with self._path.open("rb") as stream:
+        with open_file(self._file) as stream:
             return tuple(iter_attachments(stream, self._contents[0], FaultList(), self.name))
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
-        with self._path.open("rb") as stream:
+        with open_file(self._file) as stream:
             return tuple(iter_metadata(stream, self._contents[0], FaultList(), self.name))
 
     @property

@@ -12,12 +12,13 @@ from spatial_replay.bags.ros1_index import BAG_MAGIC
 from spatial_replay.bags.sqlite import SQLITE_MAGIC, SqliteBag
 from spatial_replay.errors import LogError, MissingFileError
 from spatial_replay.logs.mcap.chunks import MAGIC
+from spatial_replay.logs.remote import LogFile, open_file
 
 READERS: dict[bytes, type[MessageReader]] = {BAG_MAGIC: Ros1Bag, SQLITE_MAGIC: SqliteBag, MAGIC: McapLog}
 """The reader of a file, by its first bytes."""
 
 
-def open_messages(path: Path) -> MessageReader:
+def open_messages(path: LogFile) -> MessageReader:
     """Return a reader of the log in a file or a folder; the content decides, not the name.
 
     Raises:
@@ -25,9 +26,9 @@ def open_messages(path: Path) -> MessageReader:
         LogError: it is not a log of messages.
     """
     try:
-        if path.is_dir():
+        if isinstance(path, Path) and path.is_dir():
             return BagFolder(path)
-        with path.open("rb") as stream:
+        with open_file(path) as stream:
             head = stream.read(len(SQLITE_MAGIC))
     except (OSError, ValueError) as error:
         raise MissingFileError.of(path, error) from None

@@ -12,6 +12,7 @@ from spatial_replay.bags.topic import Decoder, Topic
 from spatial_replay.errors import LogError
 from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList
+from spatial_replay.logs.remote import LogFile
 from spatial_replay.trace.sample import LATEST_NS
 
 
@@ -24,8 +25,9 @@ class MessageReader(ABC):
 
     kind: str
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: LogFile) -> None:
+        # readers that open paths get none of a remote file
+        self._path = path if isinstance(path, Path) else Path(path.name)
         self._faults = FaultList()
 
     @property

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 from types import MappingProxyType
 
 from spatial_replay.logs.messages import Schema
 
 Decoder = Callable[[bytes], object]
 """A payload to an object with fields: attributes of ROS and protobuf messages, keys of a JSON object."""
-
-ALL, MAPPED = "all", "mapped"
-"""What `is_kept` takes beside patterns: every topic, or those that a mapping reads."""
 
 _LATCHED = re.compile(r"durability: *(1|transient_local)\b")
 
@@ -42,18 +38,6 @@ class Topic:
     latched: bool = False
     unreadable: str | None = None
     metadata: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}), hash=False)
-
-
-def is_kept(topic: str, keep: Collection[str], mapped: Collection[str]) -> bool:
-    """Return whether a copy of a log keeps the messages of a topic.
-
-    Args:
-        keep: "all", "mapped", or patterns of topics such as "/camera/*"; one that says so is enough.
-        mapped: the topics that a mapping reads.
-    """
-    return any(
-        each == ALL or (each == MAPPED and topic in mapped) or fnmatchcase(topic, each) for each in keep
-    )
 
 
 def is_latched(qos: str) -> bool:

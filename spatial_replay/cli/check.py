@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from spatial_replay.cli.options import (
+    LogPath,
     ReadArguments,
     constants_option,
     load_spec_options,
@@ -21,6 +22,7 @@ from spatial_replay.cli.options import (
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, show_diagnostics, show_json, warn
 from spatial_replay.errors import NoAutomatonError, SpecificationError, UsageError
+from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.spec import format_formula
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import iter_branches, label_of, title_text
@@ -39,7 +41,7 @@ _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
 @click.argument("specification", metavar="SPEC", type=click.Path(path_type=Path))
 @click.option(
     "--log",
-    type=click.Path(path_type=Path),
+    type=LogPath(),
     help="Log to compare names, thresholds and windows with.",
 )
 @constants_option
@@ -55,7 +57,7 @@ _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
 @click.option("--of", metavar="NAME", help="With --dfa: which result, if SPEC has several.")
 def check(
     specification: Path,
-    log: Path | None,
+    log: LogFile | None,
     constants: Mapping[str, float | str],
     strict_names: bool,
     profile: str | None,
@@ -81,7 +83,7 @@ def check(
     if log is None:
         _refuse_log_options(reading, strict_names)
     (parsed,) = load_spec_options([specification], profile, constants)
-    inputs = [specification] if log is None else [specification, log]
+    inputs = local_files([specification] if log is None else [specification, log])
     if dfa is not None:
         _check_automaton_options(parsed, of, dfa, inputs)
     compared = _compare_with_log(parsed, log, reading, strict_names) if log is not None else _Compared()
@@ -126,10 +128,11 @@ def _refuse_log_options(reading: ReadArguments, strict_names: bool) -> None:
 
 
 def _compare_with_log(
-    specification: Specification, log: Path, reading: ReadArguments, strict_names: bool
+    specification: Specification, log: LogFile, reading: ReadArguments, strict_names: bool
 ) -> _Compared:
     """Compare names, thresholds, regions and windows with what a log has."""
     # only needed with --log: log readers load the numerical libraries
+    from spatial_replay.logs.source import reading_only
     from spatial_replay.monitor.plausibility import LogNumbers, plausibility_warnings, window_lines
     from spatial_replay.replay import LogNames
     from spatial_replay.sources.open_log import open_source
@@ -137,7 +140,7 @@ def _compare_with_log(
     numbers, names = LogNumbers(specification), LogNames()
     source = open_source(log, **reading)
     with progress("samples") as advance:
-        for block in source.iter_blocks():
+        for block in reading_only(source).iter_blocks():
             names.add(block.trace)
             numbers.add(block.trace)
             warn(*block.trace.faults)

@@ -49,6 +49,7 @@ def explain(
       spatial-replay explain run.mcap --spec blocks.spatial --node reach --at 12.3s
     """
     # imported here so that --help stays fast
+    from spatial_replay.logs.topics import MAPPED
     from spatial_replay.replay import explain_results, has_samples_from, run_replay
 
     if at is not None and request.end is not None:
@@ -58,7 +59,7 @@ def explain(
         replayed = run_replay(
             inputs.source,
             inputs.files,
-            inputs.options(),
+            inputs.options(keep=(MAPPED,)),
             keep_series=True,
             keep_leaves=True,
             advance=advance,

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import click
 
 from spatial_replay.cli.application import ExitCode
-from spatial_replay.cli.options import output_option
+from spatial_replay.cli.options import LogPath, output_option
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, warn
+from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.text import counted
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("annotated", type=click.Path(path_type=Path))
+@click.argument("annotated", type=LogPath())
 @output_option("Output: FILE.csv or FILE.parquet.", required=True)
 @click.option(
     "--quantity",
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Which number of each node to export.",
 )
-def export(annotated: Path, output: Path, quantity: Quantity) -> int:
+def export(annotated: LogFile, output: Path, quantity: Quantity) -> int:
     """Export the robustness in an annotated log as a table: one row per sample, one column per node.
 
     A column is named after the named specs on the way to its node, task/deliver, and the text of an unnamed
@@ -48,7 +49,7 @@ def export(annotated: Path, output: Path, quantity: Quantity) -> int:
             source,
             output,
             quantity=quantity,
-            inputs=(annotated,),
+            inputs=local_files([annotated]),
             advance=advance,
         )
     warn(*faults)

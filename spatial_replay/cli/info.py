@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING
 import click
 
 from spatial_replay.cli.application import ExitCode
-from spatial_replay.cli.options import ReadArguments, reading_options
+from spatial_replay.cli.options import LogPath, ReadArguments, reading_options
 from spatial_replay.cli.output import decision_lines, decision_rows
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, show_file, show_json, warn
 from spatial_replay.errors import UsageError
+from spatial_replay.logs.remote import LogFile
 from spatial_replay.text import counted, escaped
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump"})
 
 
 @click.command()
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("log", type=LogPath())
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 @click.option("--suggest-mapping", is_flag=True, help="Print a first mapping file (YAML) instead.")
 @click.option("--decisions", is_flag=True, help="Print the decisions of a planned run instead.")
@@ -49,7 +50,7 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump"})
 @click.option("--layout", is_flag=True, help="Print the layout to import in a viewer instead.")
 @reading_options
 def info(
-    log: Path,
+    log: LogFile,
     as_json: bool,
     suggest_mapping: bool,
     decisions: bool,
@@ -107,7 +108,7 @@ def info(
     return ExitCode.DAMAGED if faults else ExitCode.SATISFIED
 
 
-def _print_decisions(log: Path, as_json: bool) -> int:
+def _print_decisions(log: LogFile, as_json: bool) -> int:
     """Print the decisions of a planned run."""
     from spatial_replay.planning.read import read_decisions
 
@@ -122,7 +123,7 @@ def _print_decisions(log: Path, as_json: bool) -> int:
     return ExitCode.DAMAGED if recorded.faults else ExitCode.SATISFIED
 
 
-def _print_layout(log: Path) -> int:
+def _print_layout(log: LogFile) -> int:
     """Print the layout stored in a log."""
     from spatial_replay.logs.topics import LAYOUT
     from spatial_replay.sources.open_log import open_source
@@ -137,7 +138,7 @@ def _print_layout(log: Path) -> int:
     )
 
 
-def _print_specification(log: Path, name: str) -> int:
+def _print_specification(log: LogFile, name: str) -> int:
     """Print the texts of the specifications that a log was written with, or the one of a name."""
     from spatial_replay.replay import recorded_texts
     from spatial_replay.sources.open_log import open_source
@@ -174,7 +175,7 @@ def _names_of(text: SpecificationText) -> list[str]:
         return []
 
 
-def _print_mapping(log: Path, reader: MessageReader | None, as_json: bool) -> int:
+def _print_mapping(log: LogFile, reader: MessageReader | None, as_json: bool) -> int:
     """Print a first version of a mapping file for an external log."""
     from spatial_replay.sources.open_log import open_source
     from spatial_replay.sources.overview import survey

@@ -14,6 +14,7 @@ import click
 
 from spatial_replay.cli.terminal import show_diagnostics, warn
 from spatial_replay.errors import UsageError
+from spatial_replay.logs.remote import LogFile, is_address, local_files, log_file
 from spatial_replay.text import counted, nearest_hint
 from spatial_replay.trace.time_points import time_point_from_text
 
@@ -39,6 +40,18 @@ class _OutputFile(click.Path):
         if value == "-":
             self.fail("'-' is not a file; only --json - writes to standard output", param, ctx)
         return super().convert(value, param, ctx)
+
+
+class LogPath(click.Path):
+    """A path or an address of a log."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(
+        self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
+    ) -> Any:
+        return log_file(value) if is_address(value) else super().convert(value, param, ctx)
 
 
 def output_option(text: str, *, required: bool = False) -> Callable[[_Command], _Command]:
@@ -200,7 +213,7 @@ def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
 class EvaluationArguments:
     """What to evaluate, as given on the command line."""
 
-    log: Path
+    log: LogFile
     specs: tuple[Path, ...]
     start: str | None
     end: str | None
@@ -217,10 +230,10 @@ class EvaluationArguments:
         return input_files(self.log, *self.specs, reading=self.reading)
 
 
-def input_files(*files: Path, reading: ReadArguments) -> tuple[Path, ...]:
-    """Return the files that a command reads, the mapping among them."""
+def input_files(*files: LogFile, reading: ReadArguments) -> tuple[Path, ...]:
+    """Return the files on this machine that a command reads, the mapping among them."""
     mapping = reading["mapping"]
-    return files if mapping is None else (*files, mapping)
+    return tuple(local_files(files if mapping is None else (*files, mapping)))
 
 
 strict_names_option = click.option(
@@ -238,7 +251,7 @@ choices_option = click.option(
 )
 
 _EVALUATION = (
-    click.argument("log", type=click.Path(path_type=Path)),
+    click.argument("log", type=LogPath()),
     specs_option("Specification file; repeat for several.  [default: those in the log]"),
     click.option("--from", "start", metavar="T", help="Start at the first sample at or after T."),
     click.option("--to", "end", metavar="T", help="End with the last sample before T."),

@@ -17,6 +17,7 @@ from spatial_replay.trace.time_points import text_from_duration_ns
 if TYPE_CHECKING:
     from google.protobuf.message import Message
 
+    from spatial_replay.logs.remote import LogFile
     from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanCandidate, PlanDecision, PlanEdge, PlanTarget
     from spatial_replay.monitor.result import SpecResult
     from spatial_replay.replay import Replayed
@@ -126,7 +127,7 @@ _LONGEST: Final = 400
 """Characters of alternatives that are printed; JSON has all."""
 
 
-def decision_lines(log: Path, decisions: Sequence[PlanDecision], width: int) -> Iterator[str]:
+def decision_lines(log: LogFile, decisions: Sequence[PlanDecision], width: int) -> Iterator[str]:
     """Yield lines about each decision: its aim, the candidates, the choice and the outcome.
 
     Args:
@@ -169,7 +170,7 @@ def _write_numbers(row: dict[str, Any], message: Message) -> None:
                 _write_numbers(part, of_part)
 
 
-def _whole_lines(log: Path, decisions: Sequence[PlanDecision]) -> Iterator[str]:
+def _whole_lines(log: LogFile, decisions: Sequence[PlanDecision]) -> Iterator[str]:
     *before, last = decisions
     motions = sum(decision.HasField("target") and decision.HasField("outcome") for decision in decisions)
     is_cut = last.HasField("target") and not last.HasField("outcome")

@@ -94,6 +94,7 @@ def replay(
       spatial-replay replay drive.bag --mapping drive.yaml -o annotated.mcap --keep mapped --keep '/camera/*'
     """
     # imported here so that --help stays fast
+    from spatial_replay.logs.topics import MAPPED
     from spatial_replay.replay import run_replay
 
     if (series or signal) and json_file is None:
@@ -121,7 +122,7 @@ def replay(
         replayed = run_replay(
             inputs.source,
             inputs.files,
-            inputs.options(semantics, keep),
+            inputs.options(semantics, keep or (() if output else (MAPPED,))),
             keep_series=json_file is not None and (series or signal or window_ns is not None),
             keep_leaves=True,
             output=output,

@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import click
 
 from spatial_replay.cli.application import ExitCode
-from spatial_replay.cli.options import ReadArguments, reading_options
+from spatial_replay.cli.options import LogPath, ReadArguments, reading_options
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, warn
 from spatial_replay.errors import UsageError
+from spatial_replay.logs.remote import LogFile
 from spatial_replay.text import counted
 
 
 @click.command()
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("log", type=LogPath())
 @click.option(
     "--source",
     metavar="SOURCE",
-    type=click.Path(path_type=Path),
+    type=LogPath(),
     help="Evaluate the log that LOG was made from instead of LOG.",
 )
 @click.option("--decisions", is_flag=True, help="Also recompute the decisions of a planned run.")
 @reading_options
-def verify(log: Path, source: Path | None, decisions: bool, reading: ReadArguments) -> int:
+def verify(log: LogFile, source: LogFile | None, decisions: bool, reading: ReadArguments) -> int:
     """Recompute a log's certificate and compare it with the recorded one.
 
     The log is evaluated with its own specifications and options. With --decisions, every planner decision is

@@ -13,6 +13,8 @@ from typing import Any, BinaryIO
 
 from spatial_replay.errors import OutputError, UsageError
 
+_SCHEMES = ("s3:", "gs:", "az:", "http:", "https:")
+
 
 @contextmanager
 def replacing(output: Path, inputs: Iterable[Path] = ()) -> Iterator[BinaryIO]:
@@ -93,6 +95,9 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
     Raises:
         UsageError: it is one of the inputs or in one, a folder, or in none.
     """
+    if output.parts and output.parts[0] in _SCHEMES:
+        shown = str(output).replace(":/", "://", 1)
+        raise UsageError(f"{shown} is an address; write to a file on this machine, and copy that")
     if output.is_dir():
         raise UsageError(f"{output} is a folder; give the name of a file in it")
     if not output.parent.is_dir():

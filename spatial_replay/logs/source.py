@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Protocol
+from typing import Any, Protocol, cast
 
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.footprint import Concave
@@ -161,6 +161,15 @@ def read_ahead(blocks: Generator[Block, None, None]) -> Iterator[Block]:
             # starts, or the end of the interpreter, may prevent that; then garbage collection closes it
             with suppress(ValueError, RuntimeError):
                 thread.submit(blocks.close).result()
+
+
+def reading_only(source: Source, keep: tuple[str, ...] = ()) -> Source:
+    """Return a source that reads its samples and, beside them, only messages of some topics.
+
+    Args:
+        keep: as `is_kept` takes them.
+    """
+    return cast(Source, replace(cast(Any, source), keep=keep)) if hasattr(source, "keep") else source
 
 
 def axes_of(source: Source) -> Axes:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
 from spatial_replay.logs.messages import Channel, Schema
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
+
+OWN_PREFIX = "/spatial/"
+"""Topics of ours; a log has them in chunks of their own."""
 
 OBJECTS = "/spatial/objects"
 SCENE = "/spatial/scene"
@@ -54,6 +59,22 @@ RECORDED_PREFIX = "recorded/"
 
 REPLAYED_PREFIX = "replayed/"
 """Inputs of a replay as attachments; the next replay replaces them."""
+
+
+ALL, MAPPED = "all", "mapped"
+"""What `is_kept` takes beside patterns: every topic, or those that the samples are made of."""
+
+
+def is_kept(topic: str, keep: Collection[str], mapped: Collection[str]) -> bool:
+    """Return whether a copy of a log keeps the messages of a topic.
+
+    Args:
+        keep: "all", "mapped", or patterns of topics such as "/camera/*"; one that says so is enough.
+        mapped: the topics that the samples are made of.
+    """
+    return any(
+        each == ALL or (each == MAPPED and topic in mapped) or fnmatchcase(topic, each) for each in keep
+    )
 
 
 def protobuf_channel(topic: str, message: type[Message]) -> Channel:

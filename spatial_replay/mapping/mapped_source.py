@@ -18,12 +18,13 @@ import numpy as np
 from spatial_replay.bags.columns import Columns, MessageColumns, in_pieces, joined, without_jumps
 from spatial_replay.bags.open import open_messages
 from spatial_replay.bags.reader import MessageReader
-from spatial_replay.bags.topic import MAPPED, Topic, is_kept
+from spatial_replay.bags.topic import Topic
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import Attachment, Block, Channel, Messages
 from spatial_replay.logs.read_options import FaultList, OnTimeJump
-from spatial_replay.logs.topics import DERIVED, OBJECTS
+from spatial_replay.logs.remote import LogFile, RemoteFile
+from spatial_replay.logs.topics import DERIVED, MAPPED, OBJECTS, is_kept
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.model import LogMapping
 from spatial_replay.mapping.reading_plan import ReadingPlan
@@ -47,7 +48,7 @@ class MappedSource:
             the mapping reads, "all", or patterns of topics such as "/camera/*"; several add up.
     """
 
-    path: Path
+    path: LogFile
     mapping: LogMapping
     kind: str
     concave: Concave = "decompose"
@@ -56,7 +57,7 @@ class MappedSource:
 
     @property
     def name(self) -> str:
-        return self.path.name or self.path.absolute().name
+        return self.path.name or Path(self.path).absolute().name
 
     @property
     def axes(self) -> Axes:
@@ -68,6 +69,11 @@ class MappedSource:
         """The options of reading, for the metadata of a copy."""
         mapping = {"mapping": self.mapping.name, "mapping_sha256": self.mapping.sha256}
         return mapping | ({} if self.on_time_jump == "error" else {"on_time_jump": self.on_time_jump})
+
+    @property
+    def begin_ns(self) -> int | None:
+        """When the first message was logged, if a log elsewhere says so."""
+        return open_messages(self.path).start_ns if isinstance(self.path, RemoteFile) else None
 
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         """See `Source.iter_blocks`; of an indexed log, only what the window needs is read.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from os import PathLike
-from pathlib import Path
 from typing import Final, NamedTuple
 
 from spatial_replay.errors import LogError, UsageError
@@ -43,7 +42,7 @@ class LoggedDecisions(NamedTuple):
     faults: tuple[str, ...]
 
 
-def read_decisions(log: Path) -> LoggedDecisions:
+def read_decisions(log: str | PathLike[str]) -> LoggedDecisions:
     """Read the messages of all decisions in a log.
 
     Raises:

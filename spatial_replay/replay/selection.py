@@ -13,7 +13,7 @@ from spatial_replay.errors import LogError, SpecificationError, UsageError
 from spatial_replay.logs.messages import Block, Channel, Messages, merge, messages_of, select
 from spatial_replay.logs.objects.encode import encode_objects
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.source import Source, read_ahead, read_blocks, within
+from spatial_replay.logs.source import Source, read_ahead, read_blocks, reading_only, within
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
 from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.instances import Instance, find_instances
@@ -68,6 +68,9 @@ class ReplayOptions:
 
 DEFAULT_OPTIONS = ReplayOptions()
 
+_FIRST_NS = 10**8
+"""Where the first sample is looked for, after a log's first message."""
+
 
 def look_before(files: Sequence[Specification]) -> bool:
     """Say whether specifications look back at samples before a window."""
@@ -80,15 +83,19 @@ def first_sample_ns(source: Source) -> int:
     Raises:
         LogError: it has none.
     """
-    for block in read_blocks(source):
-        if len(block.trace):
-            return int(block.trace.times_ns[0])
+    source = reading_only(source)
+    begin_ns = getattr(source, "begin_ns", None)
+    # its first chunks, if the log says when they are; else, or if nothing is in them, all of it
+    for end_ns in (None,) if begin_ns is None else (begin_ns + _FIRST_NS, None):
+        for block in read_blocks(source, None, end_ns):
+            if len(block.trace):
+                return int(block.trace.times_ns[0])
     raise LogError(f"{source.name} has no sample")
 
 
 def has_samples_from(source: Source, time_ns: int) -> bool:
     """Say whether a log has samples at or after a time."""
-    return any(len(block.trace) for block in read_blocks(source, time_ns))
+    return any(len(block.trace) for block in read_blocks(reading_only(source), time_ns))
 
 
 @dataclass(slots=True)

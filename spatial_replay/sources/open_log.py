@@ -15,14 +15,17 @@ from typing import NamedTuple
 
 from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.geometry.footprint import Concave
+from spatial_replay.logs.downloads import downloaded
 from spatial_replay.logs.formats.commonroad import is_scenario, iter_scenario
 from spatial_replay.logs.formats.csv_tracks import COLUMNS, iter_csv
 from spatial_replay.logs.formats.drone import FRAMES_A_SECOND, is_annotations, iter_annotations
 from spatial_replay.logs.formats.tracks import iter_jsonl, open_text
 from spatial_replay.logs.mcap.chunks import MAGIC
+from spatial_replay.logs.mcap.index import has_summary
 from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.read_options import Lost, OnTimeJump, ReadOptions, count_of
-from spatial_replay.logs.source import IterTraces, Source, TrackSource
+from spatial_replay.logs.remote import LogFile, RemoteFile, log_file
+from spatial_replay.logs.source import IterTraces, Source, TrackSource, reading_only
 from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.trace import Trace
 
@@ -44,7 +47,10 @@ def open_source(
 ) -> Source:
     """Open the log in a file of any format; the content decides, not the name.
 
+    Of an MCAP log at an address only what is needed is read; a log of another format is downloaded once.
+
     Args:
+        path: on this machine, or an address: s3://bucket/run.mcap, gs://…, az://container/…, https://….
         concave: how polygons that are not convex are handled.
         mapping: a mapping file, which says which topics of an external log carry which objects.
         on_time_jump: whether a clock of an external log that jumps back is an error or ends the log.
@@ -57,11 +63,12 @@ def open_source(
         UsageError: no path was given, or an option that means nothing to this format.
         MissingFileError: there is no such file, or it cannot be opened.
         LogError: the file is in none of the known formats.
+        RemoteError: an address does not answer.
     """
     _require_path(path)
     options = ReadOptions(concave, mapping, on_time_jump, rate, lost, y_down)
-    path = Path(path)
-    if is_bag_folder(path):
+    path = readable_file(path)
+    if isinstance(path, Path) and is_bag_folder(path):
         options.refuse_except(_MESSAGES, "ROS 2 bag", path.name)
         return _open_messages(path, "ROS 2 bag", options)
     head = _head(path)
@@ -100,7 +107,8 @@ def read_trace(
     source = open_source(
         path, concave=concave, mapping=mapping, on_time_jump=on_time_jump, rate=rate, lost=lost, y_down=y_down
     )
-    traces = [replace(block.trace, remarks=block.remarks) for block in source.iter_blocks()]
+    blocks = reading_only(source).iter_blocks()
+    traces = [replace(block.trace, remarks=block.remarks) for block in blocks]
     trace = Trace.concatenate(traces)
     if trace.faults and not allow_damage:
         others = count_of(trace.faults) - 1
@@ -115,6 +123,27 @@ def _require_path(value: object) -> None:
         raise UsageError(f"path is {shortened(value)}; {remedy}")
 
 
+def readable_file(path: str | PathLike[str]) -> LogFile:
+    """Return the file of a log; a remote one that cannot be read in parts is downloaded.
+
+    Raises:
+        UsageError: an address that names no file, or obstore is not installed.
+        MissingFileError, RemoteError: the address cannot be read.
+        LogError: the file is too large to be downloaded.
+    """
+    file = log_file(path)
+    if not isinstance(file, RemoteFile):
+        return file
+    if not file.version.has_ranges:
+        return downloaded(file, "its server does not give parts of files")
+    with file.open() as stream:
+        if stream.read(len(MAGIC)) != MAGIC:
+            return downloaded(file, "only MCAP logs are read in parts")
+        if not has_summary(stream):
+            return downloaded(file, "it has no index, so all of it is read")
+    return file
+
+
 def is_bag_folder(path: Path) -> bool:
     """Return whether a folder holds what a ROS 2 bag is made of."""
     try:
@@ -123,10 +152,10 @@ def is_bag_folder(path: Path) -> bool:
         return False
 
 
-def _head(path: Path) -> bytes:
+def _head(path: LogFile) -> bytes:
     """Read the first bytes of a file, decompressed; what is missing from a broken one is left out."""
     try:
-        with open_text(path) as stream:
+        with open_text(path) if isinstance(path, Path) else path.open() as stream:
             return stream.read(_HEAD)
     except (EOFError, ValueError):
         return b"{"
@@ -153,29 +182,31 @@ class Format(NamedTuple):
     """
 
     recognise: Callable[[bytes], bool]
-    open: Callable[[Path, str, ReadOptions], Source]
+    open: Callable[[LogFile, str, ReadOptions], Source]
     options: frozenset[str] = frozenset()
 
 
-def _tracks(iter_traces: IterTraces) -> Callable[[Path, str, ReadOptions], Source]:
+def _tracks(iter_traces: IterTraces) -> Callable[[LogFile, str, ReadOptions], Source]:
     return lambda path, kind, options: _track_source(path, kind, options, iter_traces, y_down=False)
 
 
 def _track_source(
-    path: Path, kind: str, options: ReadOptions, iter_traces: IterTraces, *, y_down: bool
+    path: LogFile, kind: str, options: ReadOptions, iter_traces: IterTraces, *, y_down: bool
 ) -> Source:
     """Return the source of a file; `y_down` says what is usual in its format."""
     axes = Axes("down" if (y_down if options.y_down is None else options.y_down) else "up")
-    return TrackSource(path, kind, options.concave, iter_traces, MappingProxyType(options.given()), axes)
+    return TrackSource(
+        Path(path), kind, options.concave, iter_traces, MappingProxyType(options.given()), axes
+    )
 
 
-def _open_annotations(path: Path, kind: str, options: ReadOptions) -> Source:
+def _open_annotations(path: LogFile, kind: str, options: ReadOptions) -> Source:
     rate = FRAMES_A_SECOND if options.rate is None else options.rate
     reader = partial(iter_annotations, rate=rate, lost=options.lost)
     return _track_source(path, kind, options, reader, y_down=True)
 
 
-def _open_messages(path: Path, kind: str, options: ReadOptions) -> Source:
+def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
     """Open an external log of messages."""
     if options.mapping is None:
         raise UsageError(
@@ -189,7 +220,7 @@ def _open_messages(path: Path, kind: str, options: ReadOptions) -> Source:
     return MappedSource(path, load_mapping(options.mapping), kind, options.concave, options.on_time_jump)
 
 
-def _open_mcap(path: Path, kind: str, options: ReadOptions) -> Source:
+def _open_mcap(path: LogFile, kind: str, options: ReadOptions) -> Source:
     """Open our own log, which names its objects, or an external one, given a mapping."""
     source = McapSource(path, kind, options.concave)
     if not options.given():

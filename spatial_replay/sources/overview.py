@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +19,11 @@ from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.mcap.summary import LogSummary, summarise_mcap
 from spatial_replay.logs.read_options import FaultList
-from spatial_replay.logs.source import Source, TrackSource, axes_of
+from spatial_replay.logs.remote import RemoteFile
+from spatial_replay.logs.source import Source, TrackSource, axes_of, reading_only
 from spatial_replay.logs.topics import OBJECTS
 from spatial_replay.mapping.suggest import EXAMPLES, suggest_mapping, suggest_topics
-from spatial_replay.sources.open_log import is_bag_folder
+from spatial_replay.sources.open_log import is_bag_folder, readable_file
 from spatial_replay.trace.axes import OUR_AXES, Axes
 from spatial_replay.trace.trace import Trace
 
@@ -74,16 +76,17 @@ class Survey:
         return sum(each.messages for each in self.topics)
 
 
-def messages_in(path: Path) -> MessageReader | None:
+def messages_in(path: str | PathLike[str]) -> MessageReader | None:
     """Return a reader of a log of messages that needs a mapping; None for logs that name their objects.
 
     Raises:
         MissingFileError: there is no such file.
     """
-    if path.is_dir() and not is_bag_folder(path):
+    file = readable_file(path)
+    if isinstance(file, Path) and file.is_dir() and not is_bag_folder(file):
         return None
     try:
-        reader = open_messages(path)
+        reader = open_messages(file)
         if isinstance(reader, McapLog) and (OBJECTS in reader.channel_topics or not reader.channel_topics):
             return None
     except MissingFileError:
@@ -243,7 +246,9 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
     # an external log has no samples, and yet a container to list
     if container is None or container.has_objects:
         try:
-            for block in source.iter_blocks():
+            # the whole log, with all its damage, unless it lies elsewhere
+            read = reading_only(source) if isinstance(getattr(source, "path", None), RemoteFile) else source
+            for block in read.iter_blocks():
                 tally.add(block.trace)
                 remarks += block.remarks
                 advance(len(block.trace))
@@ -269,9 +274,9 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
     )
 
 
-def overview_of_survey(path: Path, survey: Survey) -> Overview:
+def overview_of_survey(path: str | PathLike[str], survey: Survey) -> Overview:
     """Return what an external log holds, of which nothing says yet what its samples are."""
-    container = summarise_mcap(McapSource(path)) if survey.kind == McapSource.kind else None
+    container = summarise_mcap(McapSource(readable_file(path))) if survey.kind == McapSource.kind else None
     faults = container.faults if container is not None else ()
     return Overview(survey.name, survey.kind, 0, None, None, (), (), faults, container)
 

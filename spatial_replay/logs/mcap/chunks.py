@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from io import BytesIO
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from spatial_replay.compiled import elementwise, kernel, piece
 from spatial_replay.geometry.arrays import Integers
+from spatial_replay.logs.remote import plan_reads
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")
@@ -224,16 +225,26 @@ def iter_contents(
     A second thread reads and decompresses the next places while the caller processes one, so the caller must
     not use the stream in between.
     """
+    plan_places(stream, places)
     groups = [places[begin : begin + _TOGETHER] for begin in range(0, len(places), _TOGETHER)]
     waiting: deque[tuple[Sequence[ChunkPlace], Future[list[bytes | DamageError]]]] = deque()
     with ThreadPoolExecutor(1, "chunk-reading") as reader:
-        for group in groups:
-            waiting.append((group, reader.submit(_read_group, stream, group)))
-            if len(waiting) > _AHEAD:
-                ready, contents = waiting.popleft()
+        try:
+            for group in groups:
+                waiting.append((group, reader.submit(_read_group, stream, group)))
+                if len(waiting) > _AHEAD:
+                    ready, contents = waiting.popleft()
+                    yield from zip(ready, contents.result(), strict=True)
+            for ready, contents in waiting:
                 yield from zip(ready, contents.result(), strict=True)
-        for ready, contents in waiting:
-            yield from zip(ready, contents.result(), strict=True)
+        finally:
+            # whoever has seen enough does not wait for the rest
+            reader.shutdown(cancel_futures=True)
+
+
+def plan_places(stream: BinaryIO, places: Iterable[ChunkPlace]) -> None:
+    """Announce the places that are going to be read from a stream, in this order."""
+    plan_reads(stream, ((place.offset, place.offset + place.length) for place in places))
 
 
 def _read_group(stream: BinaryIO, places: Sequence[ChunkPlace]) -> list[bytes | DamageError]:

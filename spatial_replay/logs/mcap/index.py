@@ -71,6 +71,15 @@ def read_directory(stream: BinaryIO, faults: FaultList, name: str) -> Directory:
         return directory
 
 
+def has_summary(stream: BinaryIO) -> bool:
+    """Return whether a file ends with a footer that points to a summary; without one, it is scanned."""
+    size = stream.seek(0, os.SEEK_END)
+    stream.seek(max(0, size - _FOOTER_BYTES - len(MAGIC)))
+    tail = stream.read(_FOOTER_BYTES + len(MAGIC))
+    footer = RECORD_HEAD.pack(Opcode.FOOTER, 20)
+    return tail.endswith(MAGIC) and tail.startswith(footer) and any(tail[len(footer) : len(footer) + 8])
+
+
 class _NoSummaryError(Exception):
     """A file without a summary, or with an incomplete one, as other writers may make it."""
 

@@ -12,7 +12,6 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import itemgetter
-from pathlib import Path
 from types import MappingProxyType
 from typing import BinaryIO
 
@@ -40,7 +39,8 @@ from spatial_replay.logs.mcap.index import (
 from spatial_replay.logs.messages import BLOCK_SAMPLES, Attachment, Block, Channel, Messages, Schema
 from spatial_replay.logs.objects.decode import decode_objects
 from spatial_replay.logs.read_options import FaultList
-from spatial_replay.logs.topics import DERIVED, METADATA, OBJECTS
+from spatial_replay.logs.remote import LogFile, RemoteFile, open_file, plan_reads
+from spatial_replay.logs.topics import ALL, DERIVED, METADATA, OBJECTS, is_kept
 from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
@@ -56,27 +56,35 @@ _ORDER = itemgetter(0, 1, 2)
 
 @dataclass(frozen=True)
 class McapSource:
-    """An MCAP log with the topic /spatial/objects; its index is read once for all uses of the source."""
+    """An MCAP log with the topic /spatial/objects; its index is read once for all uses of the source.
 
-    path: Path
+    Attributes:
+        keep: which of its other messages its blocks hold, as `is_kept` takes them. What they do not hold is
+            not read, where chunks say what they hold.
+    """
+
+    path: LogFile
     kind: str = "MCAP"
     concave: Concave = "decompose"
+    keep: tuple[str, ...] = (ALL,)
 
     @property
     def name(self) -> str:
         return self.path.name
 
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
-        """See `Source.iter_blocks`; messages of derived topics are left out.
+        """See `Source.iter_blocks`; derived topics, and those that `keep` does not name, are left out.
 
         Only chunks that reach into the window are read, if the log has an index.
         """
         with self.open_walk() as walk:
             window = (0 if start_ns is None else start_ns, AFTER_ALL_NS if end_ns is None else end_ns)
             decoder = _BlockDecoder(self, walk)
-            for messages in _blocks(walk, window, lambda topic: topic not in DERIVED):
+            for messages in _blocks(walk, window, self.is_wanted):
                 yield decoder.block(messages)
-            check_attachments(walk.stream, walk.directory, walk.faults, self.name)
+            if not isinstance(self.path, RemoteFile) or window == (0, AFTER_ALL_NS):
+                # some seconds of a log elsewhere are not worth all its attachments
+                check_attachments(walk.stream, walk.directory, walk.faults, self.name)
             rest = walk.faults.take(last=True)
             fault = decoder.first_fault or next(iter(rest), None)
             if not decoder.any_sample and not walk.sees_objects:
@@ -107,6 +115,13 @@ class McapSource:
         return Axes.from_metadata(dict(self.metadata()).get(METADATA, {}))
 
     @property
+    def begin_ns(self) -> int | None:
+        """When the first chunk with samples begins, if the index says so."""
+        with self.open_walk() as walk:
+            numbers = {number for number, channel in walk.channels.items() if channel.topic == OBJECTS}
+            return next((p.start_ns for p in walk.places if p.channels and p.channels & numbers), None)
+
+    @property
     def has_samples(self) -> bool:
         """Whether the log has the topic of our samples."""
         with self.open_walk() as walk:
@@ -115,24 +130,30 @@ class McapSource:
                 for channel in walk.channels.values()
             )
 
+    def is_wanted(self, topic: str) -> bool:
+        """Return whether the blocks hold messages of a topic."""
+        return topic == OBJECTS or (topic not in DERIVED and is_kept(topic, self.keep, ()))
+
     @contextmanager
     def open_walk(self) -> Iterator[ChunkWalk]:
         """Open the file for a walk over its chunks, whose faults begin with those of the index."""
         directory, faults = self._index
-        with self.path.open("rb") as stream:
+        with open_file(self.path) as stream:
             yield ChunkWalk(stream, directory, deepcopy(faults), self.name)
 
     @cached_property
     def _index(self) -> tuple[Directory, FaultList]:
         """The directory and its faults, read once: without a summary, it takes a scan of the whole file."""
         faults = FaultList()
-        with self.path.open("rb") as stream:
+        with open_file(self.path) as stream:
             return read_directory(stream, faults, self.name), faults
 
     @cached_property
     def _beside(self) -> tuple[tuple[Attachment, ...], tuple[tuple[str, Mapping[str, str]], ...]]:
         directory, _ = self._index
-        with self.path.open("rb") as stream:
+        with open_file(self.path) as stream:
+            beside = [*directory.attachments, *directory.metadata]
+            plan_reads(stream, ((offset, offset + length) for offset, length in beside))
             attachments = tuple(iter_attachments(stream, directory, FaultList(), self.name))
             return attachments, tuple(iter_metadata(stream, directory, FaultList(), self.name))
 
@@ -231,7 +252,14 @@ def _blocks(
 ) -> Iterator[list[RawMessage]]:
     """Yield the messages of the topics wanted, in order, in lists of bounded size."""
     start_ns, end_ns = window
-    places = [place for place in walk.places if place.start_ns < end_ns and place.end_ns >= start_ns]
+    numbers = {number for number, channel in walk.channels.items() if is_wanted(channel.topic)}
+    places = [
+        place
+        for place in walk.places
+        if place.start_ns < end_ns
+        and place.end_ns >= start_ns
+        and (place.channels is None or not place.channels.isdisjoint(numbers))
+    ]
     waiting: list[RawMessage] = []
     size = samples = 0
     for number, (place, messages) in enumerate(walk.iter_messages(places, is_wanted), 1):
@@ -305,7 +333,8 @@ class _BlockDecoder:
 
     def _columns(self, messages: list[RawMessage]) -> Messages:
         declared = self._walk.channels.items()
-        copied = MappingProxyType({n: each for n, each in declared if each.topic not in DERIVED})
+        is_wanted = self._source.is_wanted
+        copied = MappingProxyType({n: each for n, each in declared if is_wanted(each.topic)})
         if not messages:
             return Messages(copied)
         log_time_ns, channel, sequence, publish_time_ns, payloads = zip(*messages, strict=True)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from spatial_replay.logs.mcap.index import iter_attachments, iter_metadata
 from spatial_replay.logs.mcap.reader import ChunkWalk, McapSource
 from spatial_replay.logs.messages import Channel
+from spatial_replay.logs.remote import file_size
 from spatial_replay.logs.topics import OBJECTS
 
 
@@ -76,7 +77,7 @@ def summarise_mcap(source: McapSource) -> LogSummary:
         channels = [ChannelSummary(channel, counts[number]) for number, channel in walk.channels.items()]
         return LogSummary(
             name=source.name,
-            size=source.path.stat().st_size,
+            size=file_size(source.path),
             library=directory.header.library if directory.header else "",
             messages=counts.total(),
             chunks=sum(place.compressed for place in directory.chunks),

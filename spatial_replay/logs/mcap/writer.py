@@ -1,14 +1,16 @@
 """Write MCAP logs.
 
-The bounds of chunks depend on bytes and log time alone, so that equal messages make equal files.
+The bounds of chunks depend on topics, bytes and log time alone, so that equal messages make equal files.
+Messages of /spatial/* have chunks of their own: who wants them need not read the camera images between them.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
@@ -21,8 +23,9 @@ from spatial_replay.errors import OutputError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.chunks import MAGIC, encoded
 from spatial_replay.logs.mcap.packing import Batch, McapSummary, MessageRange, PackedChunk, pack
-from spatial_replay.logs.messages import Channel, Messages, Schema, messages_of
+from spatial_replay.logs.messages import Channel, Messages, Schema, messages_of, select
 from spatial_replay.logs.output_file import output_error
+from spatial_replay.logs.topics import OWN_PREFIX
 
 CHUNK_BYTES = 128 * 2**10
 """A chunk is closed when it holds this much, uncompressed."""
@@ -34,6 +37,21 @@ WAITING_CHUNKS = 1024
 """Chunks that may wait for their compression."""
 WAITING_BYTES = 256 * 2**20
 """Bytes of chunks that may wait for their compression: pictures and clouds of points make large ones."""
+
+
+@dataclass(slots=True)
+class _Lane:
+    """The open chunk of some topics, and the schemas that were declared in chunks of these topics.
+
+    Chunks of two lanes may be written in another order than their messages came, and a schema has to come
+    before its channels: so each lane declares the schemas that it uses.
+    """
+
+    schemas: set[Schema] = field(default_factory=set)
+    open: list[MessageRange] = field(default_factory=list)
+    open_bytes: int = 0
+    began_ns: int = 0
+    began_s: float = 0.0
 
 
 class LogWriter:
@@ -67,10 +85,7 @@ class LogWriter:
         self._summary = McapSummary()
         self._channels: dict[Channel, int] = {}
         self._schemas: dict[Schema, int] = {}
-        self._open: list[MessageRange] = []
-        self._open_bytes = 0
-        self._began_ns = 0
-        self._began_s = 0.0
+        self._lanes = (_Lane(), _Lane())
         self._worker = ThreadPoolExecutor(1, "chunk-compression")
         self._compressor = zstandard.ZstdCompressor(level=COMPRESSION_LEVEL)
         self._packing: deque[Future[PackedChunk]] = deque()
@@ -98,7 +113,21 @@ class LogWriter:
         """Add messages in the order given; a channel is declared before its first one."""
         if not len(messages):
             return
-        self._divide(Batch.of(messages, *self._numbers(messages)), messages.log_time_ns)
+        numbers, lanes, declared = self._numbers(messages)
+        closings: list[tuple[int, int, list[MessageRange], int]] = []
+        for number, lane in enumerate(self._lanes):
+            places = np.flatnonzero(lanes == number)
+            if not lane.open and not len(places):
+                continue
+            own = messages if len(places) == len(messages) else select(messages, places)
+            before = {
+                int(np.searchsorted(places, at)): each for at, each in declared.items() if lanes[at] == number
+            }
+            batch = Batch.of(own, numbers[places], before)
+            closings += self._divide(lane, batch, places, messages.log_time_ns)
+        # in the order of the messages at which they close, however these were divided among calls
+        for _, _, ranges, size in sorted(closings, key=lambda closing: closing[:2]):
+            self._pack(ranges, size)
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
         """Add a metadata record, its keys in the order given, after closing the chunk."""
@@ -120,8 +149,10 @@ class LogWriter:
         self._summary.attachments.append(index)
 
     def flush(self) -> None:
-        """Close the chunk and hand everything written so far to the operating system."""
-        self._close_chunk()
+        """Close the chunks and hand everything written so far to the operating system."""
+        for lane in self._lanes:
+            if lane.open:
+                self._pack(*_closed(lane))
         self._write_packed(0)
 
     def close(self) -> None:
@@ -137,28 +168,33 @@ class LogWriter:
         finally:
             self._worker.shutdown(cancel_futures=True)
 
-    def _numbers(self, messages: Messages) -> tuple[Integers, dict[int, bytes]]:
-        """Return (M,) channel numbers, and declarations of channels by the message that they precede."""
+    def _numbers(self, messages: Messages) -> tuple[Integers, Integers, dict[int, bytes]]:
+        """Return (M,) channel numbers, (M,) lanes, and declarations by the message that they precede."""
         known, first = np.unique(messages.channel, return_index=True)
         number = np.zeros(int(known.max()) + 1, np.int64)
+        lane = np.zeros(len(number), np.int64)
         declared: dict[int, bytes] = {}
         for index in sorted(first.tolist()):
             local = int(messages.channel[index])
             channel = messages.channels[local]
+            lane[local] = not channel.topic.startswith(OWN_PREFIX)
             if channel not in self._channels:
-                declared[index] = self._declare(channel)
+                declared[index] = self._declare(channel, self._lanes[int(lane[local])])
             number[local] = self._channels[channel]
-        return number[messages.channel], declared
+        return number[messages.channel], lane[messages.channel], declared
 
-    def _declare(self, channel: Channel) -> bytes:
+    def _declare(self, channel: Channel, lane: _Lane) -> bytes:
         declaration = b""
         schema = channel.schema
-        if schema is not None and schema not in self._schemas:
-            number = self._schemas[schema] = len(self._schemas) + 1
+        if schema is not None and schema not in lane.schemas:
+            lane.schemas.add(schema)
+            is_new = schema not in self._schemas
+            number = self._schemas.setdefault(schema, len(self._schemas) + 1)
             described = records.Schema(
                 id=number, data=schema.data, encoding=schema.encoding, name=schema.name
             )
-            self._summary.schemas.append(described)
+            if is_new:
+                self._summary.schemas.append(described)
             declaration += encoded(described)
         self._channels[channel] = len(self._channels) + 1
         record = records.Channel(
@@ -171,38 +207,52 @@ class LogWriter:
         self._summary.channels.append(record)
         return declaration + encoded(record)
 
-    def _divide(self, batch: Batch, times_ns: Integers) -> None:
-        """Cut a batch where chunks end, and pack those that do."""
+    def _divide(
+        self, lane: _Lane, batch: Batch, places: Integers, times_ns: Integers
+    ) -> Iterator[tuple[int, int, list[MessageRange], int]]:
+        """Cut the messages of a lane where chunks end.
+
+        A late message of the other lane closes a chunk, too, so that none waits for long.
+
+        Args:
+            places: (m,) which of the M messages of the call are of this lane.
+            times_ns: (M,) of all of them.
+
+        Yields:
+            For each chunk that ends: at which message of the call, 0 for before it or 1 for after it; its
+            messages, and their bytes.
+        """
         ends = np.cumsum(batch.sizes)
         latest = np.maximum.accumulate(times_ns)
-        begin = 0
-        while begin < len(times_ns):
-            if self._open and self._is_over(int(times_ns[begin])):
-                self._close_chunk()
-            if not self._open:
-                self._began_ns = int(times_ns[begin])
-                self._began_s = self._clock() if self._clock else 0.0
+        begin = at = 0
+        if lane.open and self._clock and (self._clock() - lane.began_s) * 1e9 >= CHUNK_NS:
+            yield 0, 0, *_closed(lane)
+        while lane.open or begin < len(places):
+            if not lane.open:
+                at = int(places[begin])
+                lane.began_ns = int(times_ns[at])
+                lane.began_s = self._clock() if self._clock else 0.0
+            late = _first_from(times_ns, latest, lane.began_ns + CHUNK_NS, at if lane.open else at + 1)
             written = int(ends[begin - 1]) if begin else 0
-            full = int(np.searchsorted(ends, written + CHUNK_BYTES - self._open_bytes)) + 1
-            late = bisect_left(latest, self._began_ns + CHUNK_NS, begin)
-            stop = max(begin + 1, min(full, late, len(times_ns)))
-            self._open.append(MessageRange(batch, begin, stop))
-            self._open_bytes += int(ends[stop - 1]) - written
-            if self._open_bytes >= CHUNK_BYTES:
-                self._close_chunk()
-            begin = stop
+            full = int(np.searchsorted(ends, written + CHUNK_BYTES - lane.open_bytes)) + 1
+            stop = min(full, int(np.searchsorted(places, late)), len(places))
+            if stop > begin:
+                lane.open.append(MessageRange(batch, begin, stop))
+                lane.open_bytes += int(ends[stop - 1]) - written
+                begin, at = stop, int(places[stop - 1]) + 1
+            if lane.open_bytes >= CHUNK_BYTES:
+                yield at - 1, 1, *_closed(lane)
+            elif late < len(times_ns):
+                at = late
+                yield late, 0, *_closed(lane)
+            else:
+                return
 
-    def _is_over(self, time_ns: int) -> bool:
-        if time_ns - self._began_ns >= CHUNK_NS:
-            return True
-        return self._clock is not None and (self._clock() - self._began_s) * 1e9 >= CHUNK_NS
-
-    def _close_chunk(self) -> None:
-        if self._open:
-            self._packing.append(self._worker.submit(pack, self._open, self._compressor))
-            self._packing_bytes.append(self._open_bytes)
-            self._open, self._open_bytes = [], 0
-            self._write_packed(WAITING_CHUNKS)
+    def _pack(self, ranges: list[MessageRange], size: int) -> None:
+        """Compress a chunk on the other thread, and write those that are ready."""
+        self._packing.append(self._worker.submit(pack, ranges, self._compressor))
+        self._packing_bytes.append(size)
+        self._write_packed(WAITING_CHUNKS)
 
     def _write_packed(self, waiting: int) -> None:
         """Write chunks in their order until no more than `waiting` are left, and those that are ready."""
@@ -248,3 +298,23 @@ class LogWriter:
             self._stream.flush()
         except OSError as error:
             raise output_error(self._path, error) from error
+
+
+def _first_from(times_ns: Integers, latest: Integers, limit_ns: int, begin: int) -> int:
+    """Return the first message from `begin` on that is not before a time; their number if there is none.
+
+    Args:
+        latest: (M,) the latest time so far, by which it is found at once where times do not go back.
+    """
+    first = bisect_left(latest, limit_ns, begin)
+    if first < len(times_ns) and times_ns[first] < limit_ns:
+        found = np.flatnonzero(times_ns[first:] >= limit_ns)
+        return first + int(found[0]) if len(found) else len(times_ns)
+    return first
+
+
+def _closed(lane: _Lane) -> tuple[list[MessageRange], int]:
+    """Return the messages of an open chunk and their bytes, and begin an empty one."""
+    closed = lane.open, lane.open_bytes
+    lane.open, lane.open_bytes = [], 0
+    return closed

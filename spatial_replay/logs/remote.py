@@ -1,0 +1,502 @@
+"""Files at addresses: s3://, gs://, az://, https://. Only the ranges of bytes that are needed are moved.
+
+The only importer of obstore, which knows the services, and takes credentials from the environment as their
+own tools do (AWS_ACCESS_KEY_ID, GOOGLE_SERVICE_ACCOUNT, AZURE_STORAGE_ACCOUNT_NAME and so on).
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from datetime import timedelta
+from fnmatch import fnmatchcase
+from itertools import pairwise
+from os import PathLike, fspath
+from pathlib import Path
+from threading import Lock
+from typing import Any, BinaryIO, Final, TypeAlias, cast
+from urllib.parse import unquote, urlsplit
+
+from spatial_replay.errors import MissingFileError, RemoteError, SpatialReplayError, UsageError
+
+Range: TypeAlias = tuple[int, int]
+"""Bytes from the first up to, not including, the second."""
+
+_CREDENTIALS: Final = {
+    "s3": "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for a public bucket",
+    "gs": "set GOOGLE_SERVICE_ACCOUNT, or GOOGLE_SKIP_SIGNATURE=true for a public bucket",
+    "az": "set AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY",
+    "https": "give an address that may be read without a password",
+    "http": "give an address that may be read without a password",
+}
+"""What helps where access is denied, by the scheme of an address."""
+
+_WEB: Final = ("http", "https")
+
+_TAIL_BYTES: Final = 2**19
+"""Bytes at the end of a file that are read first: the index of a log of a gigabyte mostly fits."""
+_HEAD_BYTES: Final = 2**16
+"""Bytes at its beginning that are read at the same time: the format, and what was written first."""
+_LEAST_BYTES: Final = 2**16
+_PIECE_BYTES: Final = 2**23
+_AT_ONCE: Final = 32
+_BATCH_BYTES: Final = 2**26
+"""What is read at once if that is all; of more, the first batches are smaller, and one is read ahead."""
+_HELD_BYTES: Final = 2**28
+_WASTE: Final = 0.08
+"""The share of bytes that may be read in vain, between ranges, to save requests."""
+_ATTEMPTS: Final = 3
+_RETRIES: Final[Any] = {
+    "max_retries": 6,
+    "retry_timeout": timedelta(seconds=60),
+    "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=5), "base": 2},
+}
+_CLIENT: Final[Any] = {"allow_http": True, "connect_timeout": "10s", "timeout": "120s"}
+
+
+def is_address(path: object) -> bool:
+    """Return whether a path is an address of another machine."""
+    return isinstance(path, RemoteFile) or (
+        isinstance(path, str) and path.partition("://")[0] in _CREDENTIALS
+    )
+
+
+def log_file(path: str | PathLike[str]) -> LogFile:
+    """Return the file of a path or an address.
+
+    Raises:
+        UsageError: an address without a name, or obstore is not installed.
+    """
+    if isinstance(path, RemoteFile):
+        return path
+    return RemoteFile(str(path)) if is_address(path) else Path(path)
+
+
+def local_files(paths: Iterable[str | PathLike[str]]) -> list[Path]:
+    """Return the paths among some that are on this machine."""
+    return [Path(each) for each in paths if not is_address(each)]
+
+
+def matching_addresses(pattern: str) -> list[str]:
+    """Return the addresses of a bucket or container that fit a pattern, in order.
+
+    Args:
+        pattern: such as "s3://fleet/2026-11/*.mcap"; an end in "/" stands for everything below.
+
+    Raises:
+        UsageError: a web server cannot list its files.
+        MissingFileError, RemoteError: the bucket cannot be read.
+    """
+    scheme, _, rest = pattern.partition("://")
+    if scheme in _WEB:
+        raise UsageError(f"{pattern}: web servers do not list their files; give each address")
+    bucket, _, key = rest.partition("/")
+    begin = min((key.find(sign) for sign in "*?[" if sign in key), default=len(key))
+    fixed, wanted = key[:begin].rpartition("/")[0], key + "*" if key.endswith("/") or not key else key
+    obstore = _obstore()
+    try:
+        listed = obstore.list(_store(scheme, bucket), fixed or None)
+        keys = sorted(each["path"] for some in listed for each in some)
+    except (OSError, ValueError, obstore.exceptions.BaseError) as error:
+        raise _failure(f"{scheme}://{bucket}", scheme, error) from None
+    return [f"{scheme}://{bucket}/{key}" for key in keys if fnmatchcase(key, wanted)]
+
+
+@dataclass(frozen=True, slots=True)
+class FileVersion:
+    """What identifies the content of a remote file.
+
+    Attributes:
+        size: in bytes.
+        tag: changes with the content; None if the server gives none.
+        has_ranges: whether the server gives parts of it.
+    """
+
+    size: int
+    tag: str | None
+    has_ranges: bool = True
+
+
+class RemoteFile(PathLike[str]):
+    """A file at an address. Holds its version and, up to 256 MiB, what was read of it lately.
+
+    A change after the first read is an error, never a mixture of two versions. Several threads may use it.
+    """
+
+    def __init__(self, address: str) -> None:
+        """Take an address; nothing is read yet.
+
+        Raises:
+            UsageError: it has no name, or obstore is not installed.
+        """
+        parts = urlsplit(address)
+        self._scheme = parts.scheme
+        self._address = address
+        if self._scheme in _WEB:
+            # what follows the path may be a signature, which nobody else should see
+            self._shown = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
+            self._key, bucket, name = "", address, unquote(parts.path).rpartition("/")[2]
+        else:
+            self._shown = address
+            bucket, _, self._key = address.partition("://")[2].partition("/")
+            name = self._key.rpartition("/")[2]
+        if not name or not parts.netloc:
+            raise UsageError(
+                f"{self._shown} names no file; give the address of one log, such as s3://bucket/run.mcap"
+            )
+        self.name = name
+        self._obstore = _obstore()
+        self._store = _store(self._scheme, bucket)
+        self._held = _HeldBytes()
+        self._lock, self._opening = Lock(), Lock()
+        self._version: FileVersion | None = None
+
+    def __fspath__(self) -> str:
+        return self._address
+
+    def __str__(self) -> str:
+        return self._shown
+
+    def __repr__(self) -> str:
+        return f"RemoteFile({self._shown!r})"
+
+    @property
+    def version(self) -> FileVersion:
+        """Its version, known from the first read on: one of its end, and of its beginning at the same time.
+
+        Raises:
+            MissingFileError: there is no such file, or access is denied.
+            RemoteError: it cannot be read.
+        """
+        with self._opening:
+            if self._version is None:
+                self._version = self._opened()
+            return self._version
+
+    def open(self) -> BinaryIO:
+        """Open it for reading, from any number of streams."""
+        return cast(BinaryIO, RemoteStream(self))
+
+    def read(self, begin: int, end: int) -> bytes:
+        """Return a range of its bytes, less where it ends before that.
+
+        Raises:
+            MissingFileError, RemoteError: it cannot be read, or has changed.
+        """
+        end = min(end, self.version.size)
+        if end - begin > _HELD_BYTES // 2:
+            bounds = range(begin, end, _PIECE_BYTES)
+            return b"".join(self.iter_pieces([(each, min(each + _PIECE_BYTES, end)) for each in bounds]))
+        while True:
+            with self._lock:
+                missing = self._held.missing(begin, end)
+                if not missing:
+                    return self._held.read(begin, end)
+            first, last = missing[0][0], missing[-1][1]
+            self.fetch([(first, min(max(last, first + _LEAST_BYTES), self.version.size))])
+
+    def fetch(self, ranges: Iterable[Range]) -> None:
+        """Read ranges that are not held yet: joined where they are near, all at the same time."""
+        with self._lock:
+            missing = [gap for begin, end in ranges for gap in self._held.missing(begin, end)]
+        pieces = [
+            (begin, min(begin + _PIECE_BYTES, end))
+            for first, end in joined_ranges(missing)
+            for begin in range(first, end, _PIECE_BYTES)
+        ]
+        for (begin, _), data in zip(pieces, self.iter_pieces(pieces), strict=True):
+            with self._lock:
+                self._held.add(begin, data)
+
+    def iter_pieces(self, pieces: Sequence[Range], at_once: int = _AT_ONCE) -> Iterator[bytes]:
+        """Read ranges at the same time, and yield the bytes of each in their order; none of them is held."""
+        with ThreadPoolExecutor(max(1, min(at_once, len(pieces))), "remote-reading") as threads:
+            waiting: deque[Future[bytes]] = deque()
+            try:
+                for piece in pieces:
+                    waiting.append(threads.submit(self._range, piece))
+                    if len(waiting) >= at_once:
+                        yield waiting.popleft().result()
+                while waiting:
+                    yield waiting.popleft().result()
+            finally:
+                threads.shutdown(wait=False, cancel_futures=True)
+
+    def iter_whole(self) -> Iterator[bytes]:
+        """Read the file from its beginning to its end, in parts."""
+        version = self.version
+        if version.has_ranges:
+            bounds = range(0, version.size, _PIECE_BYTES)
+            pieces = [(begin, min(begin + _PIECE_BYTES, version.size)) for begin in bounds]
+            yield from self.iter_pieces(pieces, at_once=8)
+            return
+        try:
+            yield from map(bytes, self._get({}).stream(min_chunk_size=2**20))
+        except self._obstore.exceptions.BaseError as error:
+            raise _failure(self._shown, self._scheme, error) from None
+
+    def _opened(self) -> FileVersion:
+        """Read the end and the beginning."""
+        with ThreadPoolExecutor(1, "remote-reading") as thread:
+            head = thread.submit(self._part, {"range": (0, _HEAD_BYTES)})
+            try:
+                version, begin, tail = self._part({"range": {"suffix": _TAIL_BYTES}})
+                first, _, beginning = head.result()
+            except self._obstore.exceptions.NotSupportedError:
+                return self._without_suffix(head)
+        if first != version:
+            raise self._changed()
+        for place, data in ((begin, tail), (0, beginning)):
+            for gap_begin, gap_end in self._held.missing(place, place + len(data)):
+                self._held.add(gap_begin, data[gap_begin - place : gap_end - place])
+        return version
+
+    def _without_suffix(self, head: Future[tuple[FileVersion, int, bytes]]) -> FileVersion:
+        """Return the version where the end cannot be asked for (Azure), or no range at all."""
+        try:
+            version, _, beginning = head.result()
+        except self._obstore.exceptions.NotSupportedError:
+            return self._versioned(self._get({"head": True}).meta, has_ranges=False)
+        self._held.add(0, beginning)
+        self._version = version
+        self.fetch([(max(0, version.size - _TAIL_BYTES), version.size)])
+        return version
+
+    def _range(self, wanted: Range) -> bytes:
+        """Read a range of the version that is known."""
+        known = self._version
+        # a weak tag never fits; then the answer's own tag is compared
+        strong = {"if_match": known.tag} if known and known.tag and known.tag.startswith('"') else {}
+        version, _, data = self._part({"range": wanted, **strong})
+        if version != known or len(data) != wanted[1] - wanted[0]:
+            raise self._changed()
+        return data
+
+    def _part(self, options: dict[str, Any]) -> tuple[FileVersion, int, bytes]:
+        """Return the version of an answer, where its bytes begin, and these."""
+        for attempt in range(1, _ATTEMPTS + 1):
+            answer = self._get(options)
+            try:
+                data = bytes(answer.bytes())
+                if len(data) == answer.range[1] - answer.range[0]:
+                    return self._versioned(answer.meta), answer.range[0], data
+                error: Exception = EOFError("the connection breaks off")
+            except self._obstore.exceptions.BaseError as failure:
+                error = failure
+            # requests are repeated by the library, answers that break off here
+            if attempt == _ATTEMPTS:
+                raise _failure(self._shown, self._scheme, error) from None
+        raise AssertionError
+
+    def _get(self, options: dict[str, Any]) -> Any:
+        exceptions = self._obstore.exceptions
+        try:
+            return self._obstore.get(self._store, self._key, options=cast(Any, options))
+        except exceptions.NotSupportedError:
+            raise
+        except exceptions.PreconditionError:
+            raise self._changed() from None
+        except (OSError, ValueError, exceptions.BaseError) as error:
+            raise _failure(self._shown, self._scheme, error) from None
+
+    @staticmethod
+    def _versioned(meta: Any, *, has_ranges: bool = True) -> FileVersion:
+        modified = meta["last_modified"]
+        # without a date, the library gives the epoch
+        dated = modified.isoformat() if modified and modified.timestamp() > 0 else None
+        return FileVersion(meta["size"], meta["e_tag"] or dated, has_ranges)
+
+    def _changed(self) -> RemoteError:
+        return RemoteError(f"{self._shown} was replaced while it was read; run the command again")
+
+
+LogFile: TypeAlias = Path | RemoteFile
+"""The file of a log, on this machine or at an address."""
+
+
+def open_file(file: LogFile) -> BinaryIO:
+    """Open the file of a log for reading."""
+    return file.open() if isinstance(file, RemoteFile) else file.open("rb")
+
+
+def file_size(file: LogFile) -> int:
+    """Return its size in bytes."""
+    return file.version.size if isinstance(file, RemoteFile) else file.stat().st_size
+
+
+class RemoteStream(io.RawIOBase):
+    """A position in a remote file, and the ranges that are going to be read from it, in batches."""
+
+    def __init__(self, file: RemoteFile) -> None:
+        super().__init__()
+        self._file = file
+        self._position = 0
+        self._batches: list[list[Range]] = []
+        self._batch_of: dict[int, int] = {}
+        self._fetching: dict[int, Future[None]] = {}
+        self._thread: ThreadPoolExecutor | None = None
+
+    def plan(self, ranges: Iterable[Range]) -> None:
+        """Announce which ranges are going to be read, in this order.
+
+        They are fetched in batches when the first of them is read, and one batch ahead.
+        """
+        batch, size, most = list[Range](), 0, _BATCH_BYTES
+        wanted = list(ranges)
+        if sum(end - begin for begin, end in wanted) > _BATCH_BYTES:
+            # the reader may stop after the first messages
+            most = _BATCH_BYTES // 32
+        for begin, end in wanted:
+            batch.append((begin, end))
+            self._batch_of.setdefault(begin, len(self._batches))
+            size += end - begin
+            if size >= most:
+                self._batches.append(batch)
+                batch, size, most = [], 0, min(4 * most, _BATCH_BYTES // 2)
+        if batch:
+            self._batches.append(batch)
+
+    def seekable(self) -> bool:
+        return True
+
+    def readable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position}.get(whence)
+        self._position = (self._file.version.size if base is None else base) + offset
+        return self._position
+
+    def tell(self) -> int:
+        return self._position
+
+    def read(self, size: int = -1) -> bytes:
+        end = self._file.version.size if size < 0 else self._position + size
+        if (batch := self._batch_of.get(self._position)) is not None:
+            self._fetch(batch)
+        data = self._file.read(self._position, end)
+        self._position += len(data)
+        return data
+
+    def close(self) -> None:
+        if self._thread is not None:
+            self._thread.shutdown(wait=False, cancel_futures=True)
+        super().close()
+
+    def _fetch(self, batch: int) -> None:
+        if self._thread is None:
+            self._thread = ThreadPoolExecutor(1, "remote-batches")
+        # not ahead of the first one: whoever looks for the first sample needs no other
+        for each in range(batch, min(batch + 1 + bool(batch), len(self._batches))):
+            if each not in self._fetching:
+                self._fetching[each] = self._thread.submit(self._file.fetch, self._batches[each])
+        self._fetching[batch].result()
+
+
+def plan_reads(stream: BinaryIO, ranges: Iterable[Range]) -> None:
+    """Announce the ranges that are going to be read from a stream, if it is of a remote file."""
+    if isinstance(stream, RemoteStream):
+        stream.plan(ranges)
+
+
+def joined_ranges(ranges: Sequence[Range]) -> list[Range]:
+    """Return ranges in order, joined over the smallest gaps as long as these add up to little."""
+    ordered = sorted(each for each in ranges if each[1] > each[0])
+    wanted = sum(end - begin for begin, end in ordered)
+    gaps = sorted((after[0] - before[1], i) for i, (before, after) in enumerate(pairwise(ordered)))
+    bridged, wasted = set[int](), 0
+    for gap, index in gaps:
+        wasted += max(gap, 0)
+        if wasted > _WASTE * wanted:
+            break
+        bridged.add(index)
+    result: list[Range] = []
+    for index, (begin, end) in enumerate(ordered):
+        if index - 1 in bridged:
+            result[-1] = (result[-1][0], max(result[-1][1], end))
+        else:
+            result.append((begin, end))
+    return result
+
+
+class _HeldBytes:
+    """Parts of a file that do not overlap; the oldest are dropped when there are too many."""
+
+    def __init__(self) -> None:
+        self._begins: list[int] = []
+        self._parts: dict[int, bytes] = {}
+        self._size = 0
+
+    def missing(self, begin: int, end: int) -> list[Range]:
+        """Return the parts of a range that are not held."""
+        gaps = []
+        for start, data in self._overlapping(begin, end):
+            if start > begin:
+                gaps.append((begin, start))
+            begin = max(begin, start + len(data))
+        return [*gaps, (begin, end)] if begin < end else gaps
+
+    def read(self, begin: int, end: int) -> bytes:
+        """Return a range that is held."""
+        return b"".join(
+            data[max(begin - start, 0) : end - start] for start, data in self._overlapping(begin, end)
+        )
+
+    def add(self, begin: int, data: bytes) -> None:
+        """Take in what is not held of a part."""
+        for start, end in self.missing(begin, begin + len(data)):
+            self._begins.insert(bisect_right(self._begins, start), start)
+            self._parts[start] = data if end - start == len(data) else data[start - begin : end - begin]
+            self._size += end - start
+        while self._size > _HELD_BYTES and len(self._parts) > 1:
+            oldest = next(iter(self._parts))
+            self._size -= len(self._parts.pop(oldest))
+            self._begins.remove(oldest)
+
+    def _overlapping(self, begin: int, end: int) -> Iterator[tuple[int, bytes]]:
+        index = max(bisect_right(self._begins, begin) - 1, 0)
+        while index < len(self._begins) and self._begins[index] < end:
+            start = self._begins[index]
+            if start + len(self._parts[start]) > begin:
+                yield start, self._parts[start]
+            index += 1
+
+
+def _obstore() -> Any:
+    try:
+        import obstore
+        import obstore.exceptions
+        import obstore.store
+    except ImportError:
+        raise UsageError("addresses need obstore; pip install 'spatial-replay[remote]'") from None
+    return obstore
+
+
+def _store(scheme: str, bucket: str) -> Any:
+    stores = _obstore().store
+    options: dict[str, Any] = {"client_options": _CLIENT, "retry_config": _RETRIES}
+    made = {"s3": stores.S3Store, "gs": stores.GCSStore, "az": stores.AzureStore}.get(scheme)
+    try:
+        return made(bucket, **options) if made else stores.HTTPStore.from_url(bucket, **options)
+    except (ValueError, _obstore().exceptions.BaseError) as error:
+        raise _failure(f"{scheme}://{bucket.partition('?')[0].rpartition('/')[2]}", scheme, error) from None
+
+
+def _failure(shown: str, scheme: str, error: Exception) -> SpatialReplayError:
+    """Return the error for an address that cannot be read, with what helps."""
+    exceptions = _obstore().exceptions
+    if isinstance(error, FileNotFoundError):
+        return MissingFileError(f"{shown}: there is no such file; check the address")
+    if isinstance(error, (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError)):
+        return MissingFileError(f"{shown}: access denied; {_CREDENTIALS[scheme]}")
+    text = str(error).partition("\n")[0].strip()
+    if "416 " in text:
+        return RemoteError(f"{shown} is empty; give a log with at least one sample")
+    reason = fspath(text).rpartition(" - ")[2].partition(": <")[0].rstrip(":")
+    remedy = "the address" if scheme in _WEB else f"the credentials: {_CREDENTIALS[scheme]}"
+    return RemoteError(f"{shown} cannot be read: {reason}; check the network and {remedy}")
