@@ -49,7 +49,7 @@ _BATCH_BYTES: Final = 2**26
 """What is read at once if that is all; of more, the first batches are smaller, and one is read ahead."""
 _HELD_BYTES: Final = 2**28
 _WASTE: Final = 0.08
-"""The share of bytes that may be read in vain, between ranges, to save requests."""
+"""The share of bytes that may be read between ranges, unused, to save requests."""
 _ATTEMPTS: Final = 3
 _RETRIES: Final[Any] = {
     "max_retries": 6,
@@ -138,7 +138,7 @@ class RemoteFile(PathLike[str]):
         self._scheme = parts.scheme
         self._address = address
         if self._scheme in _WEB:
-            # what follows the path may be a signature, which nobody else should see
+            # what follows the path may be a signature, which is a secret
             self._shown = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
             self._key, bucket, name = "", address, unquote(parts.path).rpartition("/")[2]
         else:
@@ -372,9 +372,6 @@ class RemoteStream(io.RawIOBase):
         self._position = (self._file.version.size if base is None else base) + offset
         return self._position
 
-    def tell(self) -> int:
-        return self._position
-
     def read(self, size: int = -1) -> bytes:
         end = self._file.version.size if size < 0 else self._position + size
         if (batch := self._batch_of.get(self._position)) is not None:
@@ -391,7 +388,7 @@ class RemoteStream(io.RawIOBase):
     def _fetch(self, batch: int) -> None:
         if self._thread is None:
             self._thread = ThreadPoolExecutor(1, "remote-batches")
-        # not ahead of the first one: whoever looks for the first sample needs no other
+        # not ahead of the first one: a search for the first sample needs no other
         for each in range(batch, min(batch + 1 + bool(batch), len(self._batches))):
             if each not in self._fetching:
                 self._fetching[each] = self._thread.submit(self._file.fetch, self._batches[each])

@@ -1,4 +1,4 @@
-"""A web server that gives ranges of files, notes what it is asked, and can be told to misbehave."""
+"""A web server that gives ranges of files, notes what it is asked, and misbehaves on request."""
 
 from __future__ import annotations
 

@@ -238,7 +238,7 @@ def iter_contents(
             for ready, contents in waiting:
                 yield from zip(ready, contents.result(), strict=True)
         finally:
-            # whoever has seen enough does not wait for the rest
+            # a caller that has seen enough does not wait for the rest
             reader.shutdown(cancel_futures=True)
 
 
