@@ -22,6 +22,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cached_property
 from pathlib import Path
 from types import FunctionType
 from typing import Any, Final, Generic, Literal, ParamSpec, TypeVar, cast
@@ -176,7 +177,7 @@ class _Kernel(Generic[_Arguments, _Result]):
         if not _process.has_compiler:
             cost -= _COMPILER_S
         # asked last, since looking for the cache takes its time, too
-        return cost <= _WARM_S or (cost <= _COLD_S and not _process.is_warm)
+        return cost <= _WARM_S or (cost <= _COLD_S and not _process.holds(self))
 
     def interpreted(self) -> Callable[_Arguments, _Result]:
         """Return the function as it stands, calling others as they stand."""
@@ -239,17 +240,21 @@ class _Process:
         self.only = _required_form()
         self.interprets = True
         self.listeners: list[Callable[[], None]] = []
-        self._folder: Path | None = None
-        self._is_warm: bool | None = None
-        self._compile: Callable[..., Any] | None = None
 
-    @property
-    def is_warm(self) -> bool:
-        """Whether an earlier process has left machine code in the cache."""
-        if self._is_warm is None:
-            self._folder = cache_folder()
-            self._is_warm = self._folder is not None and _holds_code(self._folder)
-        return self._is_warm
+    @cached_property
+    def _folder(self) -> Path | None:
+        return cache_folder()
+
+    @cached_property
+    def _cached(self) -> frozenset[str]:
+        """The kernels whose machine code earlier processes have left in the cache."""
+        # a file is named after module, function and line: kernels.measure_rows-335.py311.nbi
+        files = () if self._folder is None else self._folder.rglob("*.nbi")
+        return frozenset(path.name.partition("-")[0] for path in files)
+
+    def holds(self, kernel: _Kernel[..., Any]) -> bool:
+        """Say whether the cache has machine code of a kernel."""
+        return f"{kernel.__module__.rpartition('.')[2]}.{kernel.__name__}" in self._cached
 
     @property
     def has_compiler(self) -> bool:
@@ -258,7 +263,6 @@ class _Process:
 
     def compile(self, function: Callable[..., Any], options: dict[str, Any]) -> Any:
         """Return a function that is compiled for the types of its arguments when it is called."""
-        _ = self.is_warm
         numba = sys.modules.get("numba") or self._load()
         if self._folder is None:
             return numba.njit(error_model="numpy", **options)(function)

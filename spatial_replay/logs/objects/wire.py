@@ -17,7 +17,6 @@ from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 from numpy.typing import NDArray
 
-from spatial_replay.compiled import kernel
 from spatial_replay.geometry.arrays import Integers
 
 Bytes = NDArray[np.uint8]
@@ -81,8 +80,11 @@ class WireTemplate:
     def fill(self, words: Words, marks: Bytes | None = None) -> Bytes:
         """Encode n messages: words (n, W) and marks (n, M) → (n, L) uint8."""
         rows = np.empty((len(words), len(self)), np.uint8)
-        contents = np.ascontiguousarray(words, "<u8").view(np.uint8)
-        _scatter(self.payload, contents, self.word_offsets, rows)
+        rows[:] = self.payload
+        if words.size:
+            # any 8 bytes of a row, as a word
+            anywhere = np.ndarray((len(words), len(self) - 7), "<u8", rows, 0, (len(self), 1))
+            anywhere[:, self.word_offsets] = words
         if marks is not None:
             rows[:, self.mark_offsets] = marks
         return rows
@@ -107,17 +109,6 @@ class WireTemplate:
         breaks = np.flatnonzero(np.diff(self.word_offsets, prepend=-9) != 8).tolist()
         for word, after in pairwise([*breaks, len(self.word_offsets)]):
             yield int(self.word_offsets[word]), word, after - word
-
-
-@kernel
-def _scatter(payload: Bytes, contents: Bytes, offsets: NDArray[np.int64], rows: Bytes) -> None:
-    """Copy a payload (L,) to rows (n, L), with the words of contents (n, 8 W) at the offsets (W,)."""
-    for i in range(rows.shape[0]):
-        for k in range(rows.shape[1]):
-            rows[i, k] = payload[k]
-        for word in range(offsets.shape[0]):
-            for k in range(8):
-                rows[i, offsets[word] + k] = contents[i, 8 * word + k]
 
 
 def rows_of(payloads: list[bytes]) -> Bytes:
