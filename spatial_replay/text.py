@@ -10,6 +10,7 @@ from typing import Final
 
 _LONGEST: Final = 300
 """Characters of a printable text."""
+_LONGEST_FORMULA: Final = 60
 _LONGEST_NAME: Final = 100
 _MOST_NAMES: Final = 2_000
 """Bounds of the comparison, which takes quadratic time: names come from logs and may be hostile."""
@@ -38,7 +39,10 @@ class Sentence(str):
 
     def __new__(cls, *parts: str | Instant) -> Sentence:
         made = super().__new__(cls, "".join(map(str, parts)))
-        made.parts = parts
+        # a part may be a clause with times of its own
+        made.parts = tuple(
+            own for part in parts for own in (part.parts if isinstance(part, Sentence) else (part,))
+        )
         return made
 
 
@@ -70,6 +74,21 @@ def escaped(text: str, kept: str = "") -> str:
         each if each.isprintable() or each in kept else each.encode("unicode_escape").decode()
         for each in text
     )
+
+
+def shortened_formula(text: str) -> str:
+    """Return the text of a formula that a sentence only mentions."""
+    return printable(text, _LONGEST_FORMULA)
+
+
+def time_text(time_ns: int, first_ns: int = 0) -> str:
+    """Return a time in seconds since another, or a duration: "5.533 s", the form of all times in texts."""
+    return str(Instant(time_ns, first_ns))
+
+
+def requirement_text(identifier: str | None, title: str | None) -> str:
+    """Return the id of a requirement and its words, as far as it has them: "REQ-12: no one is hit"."""
+    return ": ".join(each for each in (identifier, title) if each)
 
 
 def nearest_hint(name: str, known: Iterable[str]) -> str:

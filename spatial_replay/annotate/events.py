@@ -38,29 +38,34 @@ from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.online.operators import looks_ahead
 from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.monitor.sentences import number_text
+from spatial_replay.monitor.sentences import amount_text, number_text
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.vacuity import Vacuous
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import Formula, Specification, iter_nodes
+from spatial_replay.spec.formula import Formula, Specification, iter_nodes, operator_of
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.walks import substitute
+from spatial_replay.text import requirement_text, time_text
 
 _NOW: Final[Mapping[int, str]] = {
     HOLDING: "holds so far",
-    FAILING: "fails so far",
+    FAILING: "is pending",
     SATISFIED: "is satisfied, whatever comes",
     VIOLATED: "is violated, whatever comes",
 }
 
 
-def leaf_words(text: str, number: float, *, past: bool = False) -> str:
-    """Return a leaf and its number in words, as in "`a closeto[1] b` fails by 3.2"."""
+def leaf_words(text: str, number: float, amount: str, *, past: bool = False) -> str:
+    """Return a leaf and its number in words, as in "`a closeto[1] b` fails by 3.2".
+
+    Args:
+        amount: the number without its sign, in words.
+    """
     if number == 0.0:
         return f"`{text}` just {'held' if past else 'holds'}"
     holds, fails = ("held", "failed") if past else ("holds", "fails")
-    return f"`{text}` {holds if number > 0.0 else fails} by {number_text(abs(number))}"
+    return f"`{text}` {holds if number > 0.0 else fails} by {amount}"
 
 
 def change_sentence(title: str, after: Period, witness: str) -> str:
@@ -70,7 +75,11 @@ def change_sentence(title: str, after: Period, witness: str) -> str:
         title: what the node is called.
         witness: the leaf that its number is that of, in words; "" for none.
     """
-    because = f", by {number_text(abs(after.worst))}" if math.isfinite(after.worst) else ""
+    is_short = after.code == FAILING
+    because = ""
+    if math.isfinite(after.worst):
+        number = number_text(abs(after.worst))
+        because = f", {number} short of holding" if is_short else f", by {number}"
     if witness:
         because = f": {witness}"
     return f"{title} {_NOW[after.code]}{because}."
@@ -94,15 +103,15 @@ def end_sentence(title: str, verdict: Verdict, ends: tuple[float, float], witnes
 
 def past_sentence(before: Period, until_ns: int, witness: str) -> str:
     """Return a sentence on the period before, until another began."""
-    did = "held" if before.code == HOLDING else "failed"
-    seconds = f"{(until_ns - before.start_ns) / 1e9:.3f} s"
+    seconds = time_text(until_ns, before.start_ns)
+    if before.code == FAILING:
+        return f"Before, it was pending for {seconds}."
     worst = ""
     if witness:
         worst = f"; its worst was that {witness}"
     elif math.isfinite(before.worst):
-        number = number_text(abs(before.worst))
-        worst = f", by {number} or more" if before.code == HOLDING else f", by up to {number}"
-    return f"Before, it {did} for {seconds}{worst}."
+        worst = f", by {number_text(abs(before.worst))} or more"
+    return f"Before, it held for {seconds}{worst}."
 
 
 class ReportedNode(NamedTuple):
@@ -115,6 +124,7 @@ class ReportedNode(NamedTuple):
         line: where the spec stands in its file, from 1; 0 if nowhere.
         below: its leaves.
         requirement, sentence: the id of the requirement that the spec stands for, and its words, or None.
+        is_needed: whether the root needs it to hold; not within `not`, or as one of several that may hold.
     """
 
     node: int
@@ -124,6 +134,7 @@ class ReportedNode(NamedTuple):
     below: LeavesBelow
     requirement: str | None = None
     sentence: str | None = None
+    is_needed: bool = True
 
 
 class PeriodText(NamedTuple):
@@ -168,7 +179,7 @@ class EventReporter:
         self._reported = _reported_nodes(tree, below, file)
         self._nodes = np.array([each.node for each in self._reported], np.int64)
         self._leaf_finder = DecidingLeaves(tree.formula, below, self._nodes.tolist())
-        self._history = LeafHistory(tree.formula, self._leaves) if self._settles else None
+        self._history = LeafHistory(tree.formula, self._leaves, instance.bindings) if self._settles else None
         self._values = np.empty(0)
         self._bindings = instance.bindings
         self._relations = RELATION_NAMES | file.relations
@@ -294,7 +305,8 @@ class EventReporter:
             facts |= self._facts_of(before, past.witness, "_before")
             facts |= {"start_ns_before": str(before.start_ns), "end_ns_before": str(before.end_ns)}
         span = period.start_ns, period.end_ns
-        return self._message(reported, time_ns, span, _LEVELS[period.code], facts, sentence)
+        level = _LEVELS[period.code] if reported.is_needed else Log.INFO
+        return self._message(reported, time_ns, span, level, facts, sentence)
 
     def _message(
         self,
@@ -322,17 +334,19 @@ class EventReporter:
         """Return what decided in words, the same with how long ago, and its time; nothing for None."""
         if found is None:
             return "", "", None
-        before_ns = now_ns - found.time_ns
+        missed, before_ns = found.missed, now_ns - found.time_ns
         words = self._words(LeafValue(found.leaf, found.number), past=before_ns > 0)
-        ago = f" ({before_ns / 1e9:.3f} s earlier)" if before_ns else ""
-        return words, f"{words}{ago}", found.time_ns
+        ago = f" ({time_text(before_ns)} earlier)" if before_ns else ""
+        response = f"`{missed.condition}` held, but `{missed.response}` did not: " if missed else ""
+        return words, f"{response}{words}{ago}", found.time_ns
 
     def _words(self, found: LeafValue | None, *, past: bool = False) -> str:
         """Return a leaf and its number in words; "" for none."""
         if found is None:
             return ""
         leaf: Formula = substitute(self._leaves[found.leaf], self._bindings)
-        return leaf_words(format_formula(leaf, relations=self._relations), found.number, past=past)
+        amount = amount_text(abs(found.number), leaf)
+        return leaf_words(format_formula(leaf, relations=self._relations), found.number, amount, past=past)
 
     def _facts(self, reported: ReportedNode) -> dict[str, str]:
         of = {} if self._tree.object is None else {"object": self._tree.object}
@@ -370,7 +384,11 @@ def _reported_nodes(
     found: list[ReportedNode] = []
     root = f"`{tree.name}`" + (f" for {tree.object}" if tree.object is not None else "")
     names: set[str] = set()
+    needed = {0}
+    operators = {identifier: operator_of(node) for identifier, _, node in iter_nodes(tree.formula)}
     for identifier, parent, node in iter_nodes(tree.formula):
+        if parent in needed and operators[parent] in ("and", "spec"):
+            needed.add(identifier)
         if parent is None:
             title = root
         elif node.name and node.name not in names and looks_ahead(node):
@@ -383,8 +401,9 @@ def _reported_nodes(
         line = 0 if spec is None else _line(file.source, spec.span.start, spec.span.end)
         about = (None, None) if spec is None else (spec.id, spec.title)
         if any(about):
-            title = f"{title} ({': '.join(filter(None, about))})"
-        found.append(ReportedNode(identifier, title, name, line, below[identifier], *about))
+            title = f"{title} ({requirement_text(*about)})"
+        own = ReportedNode(identifier, title, name, line, below[identifier], *about, identifier in needed)
+        found.append(own)
     return found
 
 
@@ -408,7 +427,7 @@ _VERDICTS: Final = {SATISFIED: Verdict.SATISFIED, VIOLATED: Verdict.VIOLATED}
 _LEVELS: Final[Mapping[int, Log.Level.ValueType]] = {
     START: Log.WARNING,
     HOLDING: Log.INFO,
-    FAILING: Log.WARNING,
+    FAILING: Log.INFO,
     SATISFIED: Log.INFO,
     VIOLATED: Log.ERROR,
 }

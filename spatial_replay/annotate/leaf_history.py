@@ -14,14 +14,22 @@ import numpy as np
 
 from spatial_replay.annotate.deciding_leaf import leaf_key
 from spatial_replay.geometry.arrays import Floats
+from spatial_replay.monitor.atoms.terms import Bindings
 from spatial_replay.monitor.causes import conjuncts_of, find_causes
-from spatial_replay.monitor.offline import evaluate_offline
+from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.stream import NEVER, SeriesBlock, join_blocks
 from spatial_replay.monitor.verdict import Verdict, final_verdict
-from spatial_replay.monitor.witness.path import DecidingPath, End, deciding_path
-from spatial_replay.monitor.witness.unfinished import evaluate_unfinished
+from spatial_replay.monitor.witness.path import (
+    DecidingPath,
+    End,
+    MissedResponse,
+    deciding_path,
+    missed_response,
+)
+from spatial_replay.monitor.witness.unfinished import UnfinishedNodes, evaluate_unfinished
 from spatial_replay.spec.formula import Atom, Formula, Quantified, iter_nodes
+from spatial_replay.spec.walks import substitute
 
 MOST_NUMBERS: Final = 1 << 22
 """Numbers of leaves that are kept of one result, at most: 32 MiB of them."""
@@ -36,12 +44,14 @@ class DecidingLeaf(NamedTuple):
         leaf: index among the program's leaves.
         number: its own number there, its sign not turned.
         time_ns: of the sample.
+        missed: the implication above it that failed, if a violation is due to one.
     """
 
     node: int
     leaf: int
     number: float
     time_ns: int
+    missed: MissedResponse | None = None
 
 
 class SettledViolation(NamedTuple):
@@ -59,12 +69,16 @@ class SettledViolation(NamedTuple):
 class LeafHistory:
     """The leaves of one result in the samples so far; cutting the samples into blocks changes nothing."""
 
-    def __init__(self, formula: Formula, order: Sequence[Atom | Quantified]) -> None:
+    def __init__(
+        self, formula: Formula, order: Sequence[Atom | Quantified], bindings: Bindings | None = None
+    ) -> None:
         """Start before the first sample.
 
         Args:
             order: which leaf is which.
+            bindings: what the parameter of a template stands for.
         """
+        self._bindings = bindings or {}
         self._formula = formula
         self._order = order
         self._nodes = [node for _, _, node in iter_nodes(formula)]
@@ -107,7 +121,7 @@ class LeafHistory:
             node = next(each for each in conjuncts if series[each, 3] < 0.0)
         done = evaluate_unfinished(self._formula, self._order, samples.leaves, samples.times_ns)
         path = deciding_path(self._formula, done, samples.times_ns, node, _END_OF[verdict], goes_on=True)
-        return self._leaf(path, samples)
+        return self._leaf(path, samples, done, verdict)
 
     def finished(self, node: int, values: Floats, final: Floats) -> DecidingLeaf | None:
         """Return what decides a node that was pending up to the end of the log; None beyond the bound.
@@ -128,9 +142,8 @@ class LeafHistory:
             first, *_ = find_causes(conjuncts, values[node:], final[node:], pending, lambda *_: None)
             node += first.node
         done = evaluate_offline(self._formula, self._order, samples.leaves, samples.times_ns)
-        return self._leaf(
-            deciding_path(self._formula, done, samples.times_ns, node, _END_OF[verdict]), samples
-        )
+        path = deciding_path(self._formula, done, samples.times_ns, node, _END_OF[verdict])
+        return self._leaf(path, samples, done, verdict)
 
     def _until(self, time_ns: int | None) -> SeriesBlock | None:
         """Return the samples up to a time, or all."""
@@ -139,7 +152,9 @@ class LeafHistory:
         self._blocks = [join_blocks(self._blocks)]
         return self._blocks[0] if time_ns is None else self._blocks[0].between(0, time_ns + 1)
 
-    def _leaf(self, path: DecidingPath, samples: SeriesBlock) -> DecidingLeaf | None:
+    def _leaf(
+        self, path: DecidingPath, samples: SeriesBlock, done: OfflineNodes | UnfinishedNodes, verdict: Verdict
+    ) -> DecidingLeaf | None:
         """Return the leaf at the end of a path; None if it has no finite number."""
         node, sample = path.steps[-1].node, path.steps[-1].sample
         index = self._leaf_of[node]
@@ -149,4 +164,8 @@ class LeafHistory:
         number = float(samples.leaves[high if path.end is End.HIGH else low, index, sample])
         if not math.isfinite(number):
             return None
-        return DecidingLeaf(node, index, number + 0.0, int(samples.times_ns[sample]))
+        missed = None
+        if verdict is Verdict.VIOLATED:
+            nodes = [substitute(each, self._bindings) for each in self._nodes]
+            missed = missed_response(path, nodes, done, samples.times_ns)
+        return DecidingLeaf(node, index, number + 0.0, int(samples.times_ns[sample]), missed)

@@ -146,7 +146,12 @@ class ExitCode(IntEnum):
     """The reader of standard output closed it; the code that a shell gives for SIGPIPE."""
 
 
-_VERDICTS = {"satisfied": ExitCode.SATISFIED, "violated": ExitCode.VIOLATED, "unknown": ExitCode.UNKNOWN}
+_VERDICTS = {
+    "satisfied": ExitCode.SATISFIED,
+    "violated": ExitCode.VIOLATED,
+    "unknown": ExitCode.UNKNOWN,
+    "pending": ExitCode.UNKNOWN,
+}
 _MOST_SEVERE_FIRST = (
     ExitCode.BROKEN_PIPE,
     ExitCode.INTERRUPTED,
@@ -165,7 +170,7 @@ def most_severe(codes: Iterable[ExitCode]) -> ExitCode:
 
 
 def exit_code_from_verdicts(verdicts: Iterable[str], damaged: bool = False) -> ExitCode:
-    """Return the code for the verdicts "satisfied", "violated" and "unknown" of an evaluation.
+    """Return the code for the verdicts of an evaluation; "pending" counts as "unknown".
 
     Args:
         damaged: whether parts of the log were lost, so that the verdicts cover only the rest.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -20,7 +20,8 @@ from spatial_replay.cli.options import (
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, show_json, warn
 from spatial_replay.errors import UsageError
-from spatial_replay.trace.time_points import text_from_duration_ns, time_point_from_text
+from spatial_replay.text import requirement_text, time_text
+from spatial_replay.trace.time_points import time_point_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.replay import Explanation
@@ -41,7 +42,7 @@ def explain(
     change of a constant would flip it; for an unknown verdict, what was not known.
 
     T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or 2026-01-31T12:00:00Z.
-    Exits with the code of the explained verdicts, as `replay` does.
+    Exits with the code of the explained verdicts, as `replay` does, and with 4 if samples after T decide.
 
     \b
     Examples:
@@ -67,22 +68,25 @@ def explain(
     warn_of_input(replayed)
     goes_on = at is not None and has_samples_from(inputs.source, inputs.window.end_ns)
     if at is not None and not goes_on and replayed.end_ns < inputs.window.end_ns - 1:
-        last = text_from_duration_ns(replayed.end_ns - replayed.first_ns)
-        warn(f"--at {at} is after the last sample, at {last}")
+        warn(f"--at {at} is after the last sample, at {time_text(replayed.end_ns, replayed.first_ns)}")
     results = explain_results(replayed, node=node, object=object_name, goes_on=goes_on)
     if as_json:
         show_json([each.document for each in results])
     else:
-        for number, each in enumerate(results):
-            show(*([""] if number else []), *_requirement(each), *each.sentences)
+        for number, each in enumerate(_texts(results)):
+            show(*([""] if number else []), *each)
     return exit_code_from_verdicts((each.verdict for each in results), bool(replayed.faults))
 
 
-def _requirement(explanation: Explanation) -> Iterator[str]:
-    """Yield the id and the title of what is explained, if it has any."""
-    parts = [explanation.document[key] for key in ("requirement", "title") if explanation.document[key]]
-    if parts:
-        yield ": ".join(parts)
+def _texts(explanations: Sequence[Explanation]) -> Iterator[list[str]]:
+    """Yield each explanation below the requirement that it is about, which several in a row share."""
+    before = None
+    for each in explanations:
+        spec = each.document["specification"], each.document["node"]
+        requirement = requirement_text(each.document["requirement"], each.document["title"])
+        heading = [requirement] if requirement and spec != before else []
+        yield [*heading, *each.sentences]
+        before = spec
 
 
 def _until(inputs: EvaluationInputs, at: str | None) -> EvaluationInputs:

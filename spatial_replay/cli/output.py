@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -11,8 +12,7 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Final
 
 from spatial_replay.cli.terminal import Coloured, show, show_json
-from spatial_replay.text import counted, escaped, json_number
-from spatial_replay.trace.time_points import text_from_duration_ns
+from spatial_replay.text import counted, escaped, json_number, requirement_text, time_text
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
@@ -22,20 +22,31 @@ if TYPE_CHECKING:
     from spatial_replay.monitor.result import SpecResult
     from spatial_replay.replay import Replayed
 
+_WORST_FIRST: Final = ("violated", "unknown", "satisfied")
+_MANY: Final = 6
+"""Results that are printed in the order of the file; more are counted and sorted."""
 _COLOURS = {"satisfied": "blue", "violated": "red", "unknown": "yellow"}
 
 
 def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | None = None) -> None:
     """Print one line for each result, and another one for a sliding window."""
-    seconds = (replayed.end_ns - replayed.start_ns) / 1e9
+    span = time_text(replayed.end_ns, replayed.start_ns)
     damaged = ", damaged: verdicts are over what could be read" if replayed.faults else ""
-    show(f"{replayed.log}: {counted(replayed.samples, 'sample')} over {seconds:.3f} s{damaged}")
+    are_many = len(replayed.results) > _MANY
+    counts = f": {_counts(replayed.results)}" if are_many else ""
+    show(f"{replayed.log}: {counted(replayed.samples, 'sample')} over {span}{damaged}{counts}")
+    results = sorted(replayed.results, key=_severity) if are_many else replayed.results
     # escaped here, so that what is printed is as wide as what is measured
-    titles = [escaped(_titled(result)) for result in replayed.results]
+    titles = [escaped(_titled(result)) for result in results]
     width = max(map(len, titles), default=0)
-    for title, result in zip(titles, replayed.results, strict=True):
+    titled: set[str] = set()
+    for title, result in zip(titles, results, strict=True):
         verdict = Coloured(f"{result.verdict:<9}", _COLOURS[result.verdict])
         show((f"  {title:<{width}}  ", verdict, f"  {_numbers(result, replayed.first_ns)}"))
+        # results of one template share its words
+        if result.spec.title and result.name not in titled:
+            show(f"  {'':<{width}}  {result.spec.title}")
+            titled.add(result.name)
         for line in _below(result, replayed.first_ns):
             show(f"  {'':<{width}}  {line}")
         if window_ns is not None:
@@ -62,6 +73,18 @@ def write_document(
         stream.write(text.encode() + b"\n")
 
 
+def _counts(results: Sequence[SpecResult]) -> str:
+    """Return how many results have each verdict, the worst first."""
+    counts = Counter(str(result.verdict) for result in results)
+    return ", ".join(f"{counts[verdict]:,} {verdict}" for verdict in _WORST_FIRST if counts[verdict])
+
+
+def _severity(result: SpecResult) -> tuple[int, float]:
+    """Return what to sort results by: the worst verdict first, and then the least robustness."""
+    number = result.upper if math.isnan(result.robustness) else result.robustness
+    return _WORST_FIRST.index(str(result.verdict)), number
+
+
 def _titled(result: SpecResult) -> str:
     """Return the name of a result with the id of its requirement."""
     return f"{result.title} [{result.spec.id}]" if result.spec.id else result.title
@@ -74,27 +97,27 @@ def _numbers(result: SpecResult, first_ns: int) -> str:
         parts.append(f"between {_shown(lower)} and {_shown(upper)}")
     if robustness == 0.0:
         parts.append("marginal")
-    if result.verdict == "violated":
-        if result.violated_at_ns is not None:
-            parts.append(f"certain since {text_from_duration_ns(result.violated_at_ns - first_ns)}")
-        if result.least is not None:
-            parts.append(f"the least robustness is that of {result.least.name}")
-    elif result.first_satisfied_ns is not None:
-        parts.append(f"first satisfied at {text_from_duration_ns(result.first_satisfied_ns - first_ns)}")
+    certain_ns = result.certain_ns()
+    if result.verdict != "violated" and result.first_satisfied_ns not in (None, certain_ns):
+        parts.append(f"first satisfied at {time_text(result.first_satisfied_ns or 0, first_ns)}")
+    if certain_ns is not None:
+        parts.append(f"certain since {time_text(certain_ns, first_ns)}")
+    if result.least is not None and result.verdict == "violated":
+        parts.append(f"the least robustness is that of `{result.least.name}`")
     return ", ".join(parts)
 
 
 def _below(result: SpecResult, first_ns: int) -> Iterator[str]:
-    """Yield the requirement, a line for each cause of the verdict, and for each part that decided nothing."""
+    """Yield a line for each cause of the verdict, and for each part that decided nothing."""
     # imported here so that --help stays fast
     from spatial_replay.monitor.sentences import reason_sentence
 
-    if result.spec.title:
-        yield result.spec.title
     for cause in result.causes:
-        settled_ns = cause.settled_ns
-        when = "" if settled_ns is None else f" at {text_from_duration_ns(settled_ns - first_ns)}"
-        label = f"{cause.spec}{when}: " if len(result.causes) > 1 or cause.spec != result.name else ""
+        is_own = cause.spec == result.name
+        when = "" if cause.settled_ns is None else f" at {time_text(cause.settled_ns, first_ns)}"
+        about = "" if is_own else requirement_text(cause.requirement, cause.title)
+        about = f" [{about}]" if about else ""
+        label = f"{cause.spec}{about}{when}: " if len(result.causes) > 1 or not is_own else ""
         if cause.witness is not None:
             yield f"{label}{reason_sentence(cause.witness, first_ns=first_ns)}"
         elif label:
@@ -108,11 +131,11 @@ def _over_window(result: SpecResult, first_ns: int, window_ns: int) -> str:
     if result.leaves is None:
         return ""
     values, times_ns = result.window_signal(window_ns)[0], result.times_ns
-    over = f"over the last {text_from_duration_ns(window_ns)}"
+    over = f"over the last {time_text(window_ns)}"
     failing = (values < 0.0).nonzero()[0]
     if not len(failing):
         return f"{over} never violated; robustness at the end {_shown(float(values[-1]))}"
-    first = text_from_duration_ns(int(times_ns[failing[0]]) - first_ns)
+    first = time_text(int(times_ns[failing[0]]), first_ns)
     count = f"{len(failing):,} of {counted(len(values), 'sample')}"
     return f"{over} violated at {count}, first at {first}; robustness at the end {_shown(float(values[-1]))}"
 
@@ -188,7 +211,7 @@ def _whole_lines(log: LogFile, decisions: Sequence[PlanDecision]) -> Iterator[st
 
 def _lines(decision: PlanDecision) -> Iterator[str]:
     states = ", ".join(map(str, decision.states))
-    yield f"step {decision.number} at {_seconds(decision.time_ns)}, state {states}"
+    yield f"step {decision.number} at {time_text(decision.time_ns)}, state {states}"
     for edge in decision.considered:
         yield from _edge_lines(edge, is_aim=edge is decision.considered[-1] and not edge.pruned)
     if not decision.HasField("target"):
@@ -202,7 +225,7 @@ def _lines(decision: PlanDecision) -> Iterator[str]:
         outcome = decision.outcome
         how = "done" if outcome.succeeded else "failed"
         after = ", ".join(map(str, outcome.states))
-        yield f"  {how} at {_seconds(outcome.end_ns)}: {outcome.reason}; state {after}"
+        yield f"  {how} at {time_text(outcome.end_ns)}: {outcome.reason}; state {after}"
 
 
 def _edge_lines(edge: PlanEdge, *, is_aim: bool) -> Iterator[str]:
@@ -255,7 +278,3 @@ def _some(texts: Sequence[str]) -> str:
     count = max(1, sum(end <= _LONGEST for end in ends))
     more = f" or {len(texts) - count} more" if count < len(texts) else ""
     return (f"({texts[0]})" if more and count == 1 else _either(texts[:count])) + more
-
-
-def _seconds(time_ns: int) -> str:
-    return f"{time_ns / 1e9:.3f} s"

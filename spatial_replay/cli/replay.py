@@ -22,6 +22,7 @@ from spatial_replay.cli.options import (
 )
 from spatial_replay.cli.output import print_verdicts, write_document
 from spatial_replay.cli.progress import progress
+from spatial_replay.cli.terminal import show_message
 from spatial_replay.cli.watching import watch_log, watch_option
 from spatial_replay.errors import UsageError
 from spatial_replay.trace.time_points import duration_ns_from_text
@@ -136,6 +137,9 @@ def replay(
     if json_file != "-":
         print_verdicts(replayed, output, window_ns)
     verdicts = [str(result.verdict) for result in replayed.results]
+    if json_file != "-" and semantics == "ltlf" and "violated" in verdicts:
+        hint = "`spatial-replay explain` with the same log and specifications says what would have helped"
+        show_message("note", hint, "cyan")
     return exit_code_from_verdicts([*verdicts, *_failures(replayed, fail_on)], damaged=bool(replayed.faults))
 
 

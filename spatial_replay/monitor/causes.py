@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.stream import NEVER
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import Boolean, Formula, iter_nodes
+from spatial_replay.spec.formula import Boolean, Formula, NamedSpec, iter_nodes
+from spatial_replay.text import shortened_formula
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +30,7 @@ class Cause:
             decided.
         witness: the atom that decides it: at `settled_ns`, on the samples up to there, or else on the
             whole log. None if the leaves were not stored, and under the paper's semantics.
+        requirement, title: of the spec ("REQ-12" and its words), or None.
     """
 
     spec: str
@@ -37,6 +40,8 @@ class Cause:
     robustness: float
     settled_ns: int | None
     witness: Witness | None
+    requirement: str | None = None
+    title: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +50,7 @@ class LeastPart:
 
     Attributes:
         spec: the innermost named spec that it belongs to.
-        name: what to call it: the spec's name, or its own text if the first cause is of the same spec.
+        name: what to call it: the spec's name or, if that is the first cause's too, its own text, shortened.
         node: its id.
     """
 
@@ -95,6 +100,7 @@ def find_causes(
     final: Floats,
     settled_ns: Integers,
     witness: Callable[[int, int | None], Witness | None],
+    named: Mapping[str, NamedSpec] = MappingProxyType({}),
 ) -> tuple[Cause, ...]:
     """Return one cause for each named spec with a conjunct that is not satisfied.
 
@@ -106,6 +112,7 @@ def find_causes(
         final: (N, 2), the ends of each node's interval for the finished log.
         settled_ns: (N, 2), see `InstanceStream`.
         witness: returns the witness of a node: what settled it at a time, or on the whole log.
+        named: specs by name.
     """
     failing = [each for each in conjuncts if _verdict(final, each.node) is not Verdict.SATISFIED]
     first: dict[str, Conjunct] = {}
@@ -114,6 +121,7 @@ def find_causes(
     causes = []
     for each in first.values():
         at = settled_time(settled_ns, each.node)
+        about = named.get(each.spec)
         causes.append(
             Cause(
                 each.spec,
@@ -123,20 +131,27 @@ def find_causes(
                 float(values[each.node]),
                 at,
                 witness(each.node, at),
+                None if about is None else about.id,
+                None if about is None else about.title,
             )
         )
     return tuple(causes)
 
 
 def find_least(
-    conjuncts: Sequence[Conjunct], values: Floats, final: Floats, first: Cause
+    conjuncts: Sequence[Conjunct], values: Floats, final: Floats, first: Cause, whole: str
 ) -> LeastPart | None:
-    """Return the conjunct that has the least robustness; None if that is the first cause."""
+    """Return the conjunct that has the least robustness; None if that is the first cause.
+
+    Args:
+        whole: what the formula itself is called.
+    """
     least = min(conjuncts, key=lambda each: _number(each.node, values, final))
     robustness = _number(least.node, values, final)
     if least.node == first.node or not robustness < _number(first.node, values, final):
         return None
-    name = format_formula(least.formula) if least.spec == first.spec else least.spec
+    has_own_name = least.spec not in (first.spec, whole)
+    name = least.spec if has_own_name else shortened_formula(format_formula(least.formula))
     return LeastPart(least.spec, name, least.node, robustness)
 
 

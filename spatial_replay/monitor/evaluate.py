@@ -15,7 +15,7 @@ from spatial_replay.monitor.semantics import Semantics, checked_semantics
 from spatial_replay.monitor.stream import EvaluationStream
 from spatial_replay.monitor.vacuity import Vacuous, no_instances
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
-from spatial_replay.monitor.witness.path import Evidence
+from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.spec.checks import check_names
 from spatial_replay.spec.diagnostics import Diagnostic

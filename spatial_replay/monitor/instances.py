@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -23,6 +23,7 @@ class Instance:
         object: the object that the template's parameter stands for, or None.
         bindings: that object by the parameter's name.
         start_ns, end_ns: it is evaluated over the samples from start to before end.
+        named: the specs of its file by name, of which some are parts of the formula.
     """
 
     spec: NamedSpec
@@ -31,6 +32,7 @@ class Instance:
     bindings: Bindings
     start_ns: int
     end_ns: int
+    named: Mapping[str, NamedSpec] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -92,14 +94,15 @@ def find_instances(
     }
     chosen = _appearances(choices, traces, start_ns, end_ns) if choices else {}
     instances: list[Instance] = []
+    named = {spec.name: spec for spec in specification.specs}
     for spec in specification.results:
         program = compile_formula(spec.formula)
         if spec.parameter is None:
-            instances.append(Instance(spec, None, program, {}, start_ns, end_ns))
+            instances.append(Instance(spec, None, program, {}, start_ns, end_ns, named))
             continue
         for name, (first_ns, last_ns) in sorted(chosen[spec.parameter].items()):
             bindings = {spec.parameter: TrackedName(name)}
-            instances.append(Instance(spec, name, program, bindings, first_ns, last_ns + 1))
+            instances.append(Instance(spec, name, program, bindings, first_ns, last_ns + 1, named))
     return instances
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,19 +11,19 @@ import numpy as np
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
 from spatial_replay.lazy import Displayed
-from spatial_replay.monitor.causes import Cause, LeastPart, conjuncts_of, find_causes, find_least
+from spatial_replay.monitor.causes import Cause, Conjunct, LeastPart, conjuncts_of, find_causes, find_least
 from spatial_replay.monitor.offline import full_signal, window_signal
 from spatial_replay.monitor.semantics import Semantics, require_ltlf
 from spatial_replay.monitor.sentences import cause_sentences, sentences_of, verdict_sentence
 from spatial_replay.monitor.stream import NEVER, InstanceStream, SeriesBlock
 from spatial_replay.monitor.vacuity import Vacuous, find_vacuous
 from spatial_replay.monitor.verdict import Verdict, final_verdict
-from spatial_replay.monitor.witness.path import Evidence
+from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.monitor.witness.witness import Witness, find_witness
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, NamedSpec, iter_nodes, operator_of
-from spatial_replay.text import Instant, Sentence
+from spatial_replay.text import Instant, Sentence, shortened_formula
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +36,7 @@ class NodeResult:
         operator: "and", "F", a relation's name, …
         name: the name of the spec whose root it is, or None.
         text: its canonical text.
+        requirement, title: of the spec whose root it is ("REQ-12" and its words), or None.
         value: (T,), its robustness at the first sample, given the samples up to each (NaN: not determined).
         now: (T,), its robustness at each sample, given the samples up to that one.
         lower, upper: (T,), the ends of `value` over every continuation and everything unknown.
@@ -48,6 +49,8 @@ class NodeResult:
     operator: str
     name: str | None
     text: str
+    requirement: str | None
+    title: str | None
     value: Floats
     now: Floats
     lower: Floats
@@ -143,18 +146,23 @@ class SpecResult(Displayed):
     def nodes(self) -> tuple[NodeResult, ...]:
         """All nodes, by id."""
         series = self.series if self.has_series else np.empty((len(self.final), 4, 0))
-        return tuple(
-            NodeResult(
-                identifier,
-                parent,
-                operator_of(node),
-                node.name,
-                format_formula(node),
-                *series[identifier],
-                *map(float, (self.values[identifier], *self.final[identifier])),
+        found = []
+        for identifier, parent, node in iter_nodes(self.formula):
+            spec = self.spec if parent is None else self.evidence.instance.named.get(node.name or "")
+            found.append(
+                NodeResult(
+                    identifier,
+                    parent,
+                    operator_of(node),
+                    node.name,
+                    format_formula(node),
+                    None if spec is None else spec.id,
+                    None if spec is None else spec.title,
+                    *series[identifier],
+                    *map(float, (self.values[identifier], *self.final[identifier])),
+                )
             )
-            for identifier, parent, node in iter_nodes(self.formula)
-        )
+        return tuple(found)
 
     def node(self, name: str) -> NodeResult:
         """Return the node of the spec with the given name, within this result's tree.
@@ -190,14 +198,18 @@ class SpecResult(Displayed):
     @property
     def satisfied_at_ns(self) -> int | None:
         """When it became certain that it is satisfied, whatever came after; None if only the end decided."""
-        at = int(self.settled_ns[0, 0])
-        return at if at != NEVER and self.verdict is Verdict.SATISFIED else None
+        return self.certain_ns() if self.verdict is Verdict.SATISFIED else None
 
     @property
     def violated_at_ns(self) -> int | None:
         """When it became certain that it is violated, whatever came after; None if only the end decided."""
-        at = int(self.settled_ns[0, 1])
-        return at if at != NEVER and self.verdict is Verdict.VIOLATED else None
+        return self.certain_ns() if self.verdict is Verdict.VIOLATED else None
+
+    def certain_ns(self, node: int = 0) -> int | None:
+        """Return when a node's verdict became certain; None if only the end decided, or it is unknown."""
+        verdict = final_verdict(*self.final[node].tolist())
+        at = NEVER if verdict is Verdict.UNKNOWN else self.settled_ns[node, int(verdict is Verdict.VIOLATED)]
+        return None if at == NEVER else int(at)
 
     @cached_property
     def causes(self) -> tuple[Cause, ...]:
@@ -206,17 +218,33 @@ class SpecResult(Displayed):
         Those that settled it come first, by time; then those that only the end of the log decided, the least
         robustness first; then unknown ones.
         """
-        if self.verdict is Verdict.SATISFIED:
-            return ()
-        conjuncts = conjuncts_of(self.formula, self.name)
-        return find_causes(conjuncts, self.values, self.final, self.settled_ns, self._cause_witness)
+        return self.causes_of(0)
 
-    @cached_property
+    def causes_of(self, node: int) -> tuple[Cause, ...]:
+        """Return why a node is violated or unknown, as `causes` does for the root."""
+        if final_verdict(*self.final[node].tolist()) is Verdict.SATISFIED:
+            return ()
+        named = {**self.evidence.instance.named, self.name: self.spec}
+        return find_causes(
+            self._conjuncts(node), self.values, self.final, self.settled_ns, self._settled_witness, named
+        )
+
+    @property
     def least(self) -> LeastPart | None:
         """The part with the least robustness, if that is another than the first cause."""
-        if not self.causes:
-            return None
-        return find_least(conjuncts_of(self.formula, self.name), self.values, self.final, self.causes[0])
+        return self._least(0, self.causes)
+
+    @cached_property
+    def worst(self) -> Witness | None:
+        """What decided the verdict: the first cause's witness or, of a satisfied result, what settled it.
+
+        None if the leaves were not stored, and under the paper's semantics.
+        """
+        return self.worst_of(0, self.causes)
+
+    def worst_of(self, node: int, causes: Sequence[Cause]) -> Witness | None:
+        """Return what decided the verdict of a node, given why it failed, if it did (see `worst`)."""
+        return causes[0].witness if causes else self._settled_witness(node, self.certain_ns(node))
 
     @cached_property
     def vacuous(self) -> tuple[Vacuous, ...]:
@@ -269,20 +297,6 @@ class SpecResult(Displayed):
             raise UsageError(f"no node has the id {identifier}; they go from 0 to {len(self.final) - 1}")
         return find_witness(self.evidence, leaves, self.times_ns, identifier)
 
-    def since_ns(self, node: int = 0) -> int | None:
-        """Return since when a node has had the sign of its verdict; None if that is not known."""
-        if not self.has_series or final_verdict(*self.final[node].tolist()) is Verdict.UNKNOWN:
-            return None
-        value, _, lower, upper = self.series[node]
-        holds = (value >= 0.0) | (lower >= 0.0)
-        fails = (value < 0.0) | (upper < 0.0)
-        others = np.flatnonzero(~(holds if holds[-1] else fails))
-        if not len(others):
-            return int(self.times_ns[0])
-        last = int(others[-1])
-        is_known = holds[last] or fails[last]
-        return int(self.times_ns[last + 1]) if is_known and last + 1 < len(value) else None
-
     def explain(self, *, first_ns: int | None = None) -> str:
         """Explain the verdict in sentences, one a line, as the command `explain` prints them.
 
@@ -297,36 +311,59 @@ class SpecResult(Displayed):
 
     def sentences(self, first_ns: int) -> tuple[Sentence, ...]:
         """Return the sentences of `explain`, which count time from `first_ns`."""
-        found: list[Sentence] = []
-        if self.can_explain and not self.causes:
-            found += sentences_of(self.witness(), first_ns=first_ns, since_ns=self.since_ns())
-        else:
-            found.append(self._headline(first_ns))
-        for cause in self.causes:
-            about = cause_sentences(cause, first_ns=first_ns, object=self.object)
-            # of the whole formula, the headline has said the first of them
-            found += about if cause.node else about[1:]
+        found = self.sentences_about(0, self.causes, first_ns)
         return (*found, *(each.message for each in self.vacuous))
 
-    def _headline(self, first_ns: int) -> Sentence:
+    def sentences_about(self, node: int, causes: Sequence[Cause], first_ns: int) -> tuple[Sentence, ...]:
+        """Return the sentences on the verdict of a node, given why it failed, if it did."""
+        found = [self._headline(node, causes, first_ns)]
+        for cause in causes:
+            about = cause_sentences(cause, first_ns=first_ns, object=self.object)
+            # of the whole formula, the headline has said the first of them
+            found += about if cause.node != node else about[1:]
+        if not causes and self.can_explain:
+            witness = self.worst_of(node, causes)
+            found += () if witness is None else sentences_of(witness, first_ns=first_ns)[1:]
+        return tuple(found)
+
+    def _headline(self, node: int, causes: Sequence[Cause], first_ns: int) -> Sentence:
         instance = f" for {self.object}" if self.object is not None else ""
-        settled_ns = self.satisfied_at_ns if self.violated_at_ns is None else self.violated_at_ns
+        lower, upper = self.final[node].tolist()
+        settled_ns = self.certain_ns(node)
         return verdict_sentence(
-            f"`{self.name}`{instance}",
-            self.verdict,
-            (self.lower, self.upper),
+            f"`{self._name_of(node)}`{instance}",
+            final_verdict(lower, upper),
+            (lower, upper),
             certain_since=None if settled_ns is None else Instant(settled_ns, first_ns),
-            least=self.least,
+            least=self._least(node, causes),
         )
 
-    def _cause_witness(self, node: int, settled_ns: int | None) -> Witness | None:
+    def _least(self, node: int, causes: Sequence[Cause]) -> LeastPart | None:
+        if not causes:
+            return None
+        name = self._name_of(node)
+        return find_least(self._conjuncts(node), self.values, self.final, causes[0], name)
+
+    def _name_of(self, node: int) -> str:
+        return self.name if node == 0 else self.nodes[node].name or shortened_formula(self.nodes[node].text)
+
+    def _conjuncts(self, node: int) -> list[Conjunct]:
+        formula = next(each for identifier, _, each in iter_nodes(self.formula) if identifier == node)
+        own = conjuncts_of(formula, self._name_of(node))
+        return [replace(each, node=node + each.node) for each in own]
+
+    def _settled_witness(self, node: int, settled_ns: int | None) -> Witness | None:
+        """Return what settled the verdict of a node at a time, or decides it on the whole log."""
         if self.leaves is None or not self.can_explain:
             return None
         if settled_ns is None:
             return self.witness(node)
         count = int(np.searchsorted(self.times_ns, settled_ns, side="right"))
         leaves, times_ns = self.leaves[:, :, :count], self.times_ns[:count]
-        return find_witness(self.evidence, leaves, times_ns, node, goes_on=True)
+        # where a satisfied result would flip is a matter of the whole log
+        is_satisfied = final_verdict(*self.final[node].tolist()) is Verdict.SATISFIED
+        whole = (self.leaves, self.times_ns) if is_satisfied else None
+        return find_witness(self.evidence, leaves, times_ns, node, goes_on=True, whole=whole)
 
     def _leaves(self, what: str) -> Floats:
         require_ltlf(self.semantics, what)

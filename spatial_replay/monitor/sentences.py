@@ -8,40 +8,52 @@ from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from spatial_replay.monitor.causes import Cause, LeastPart
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom, Measured
+from spatial_replay.monitor.witness.evidence import Gap
+from spatial_replay.monitor.witness.path import End, MissedResponse
 from spatial_replay.monitor.witness.threshold import Threshold
 from spatial_replay.monitor.witness.witness import Witness, WitnessStep
-from spatial_replay.text import Instant, Sentence
+from spatial_replay.spec.expressions import Scaled
+from spatial_replay.spec.formula import Atom, Formula
+from spatial_replay.text import Instant, Sentence, counted, requirement_text, shortened_formula
 
 _DIGITS = 6
-_LONGEST = 60
-"""Characters of a formula that is only mentioned, at most."""
 _EDGES = {"min_x": "left", "max_x": "right", "min_y": "lower", "max_y": "upper"}
 
 
 def sentences_of(
-    witness: Witness, *, first_ns: int, since_ns: int | None = None, is_open: bool = False
+    witness: Witness, *, first_ns: int, requirement: str = "", is_open: bool = False
 ) -> tuple[Sentence, ...]:
     """Return sentences on why a node has its verdict: what decided it, and what would flip it.
 
     Args:
         first_ns: the time that others are counted from.
-        since_ns: since when it has had its verdict, if that is known.
-        is_open: whether samples after those evaluated may change it.
+        requirement: what its spec stands for, see `requirement_text`.
+        is_open: whether it is pending: samples after those evaluated decide it.
     """
-    if witness.is_settled:
-        since = Instant(witness.settled_ns or 0, first_ns)
-        sentences = [_settled(_title(witness), witness.verdict, since)]
+    title = f"`{witness.path[0].name or shortened_formula(witness.path[0].text)}`"
+    title += f" for {witness.object}" if witness.object is not None else ""
+    title += f" ({requirement})" if requirement else ""
+    numbers = _robustness(witness.lower, witness.upper)
+    if witness.settled_ns is not None:
+        sentences = [_settled(title, witness.verdict, Instant(witness.settled_ns, first_ns))]
+    elif is_open:
+        sentences = [Sentence(f"{title} is pending: {numbers} so far, and later samples decide.")]
     else:
-        sentences = [_verdict(witness, first_ns, since_ns, is_open)]
+        sentences = [Sentence(f"{title} is {witness.verdict}: {numbers}.")]
+    if witness.missed is not None and not is_open:
+        sentences.append(Sentence(missed_text(witness.missed, first_ns), "."))
     if witness.deciding is None:
         sentences.append(_dead_end(witness.path[-1], first_ns))
     elif witness.deciding.unknown:
         sentences.append(_unknown(witness, witness.deciding, first_ns))
+        sentences += [_gap(each, first_ns) for each in witness.gaps]
     elif witness.verdict is Verdict.UNKNOWN:
         sentences.append(_uncertain(witness, witness.deciding, first_ns))
     else:
-        sentences.append(_decision(witness, witness.deciding, first_ns))
-        sentences.append(Sentence(_flip(witness, witness.deciding, witness.threshold)))
+        what = "What counts so far" if is_open else "What decides"
+        how = _how_it_decides(witness, witness.deciding, first_ns, is_open=is_open)
+        sentences.append(Sentence(f"{what} is `{witness.deciding.text}`, which ", how))
+        sentences.append(Sentence(_flip(witness, witness.deciding, witness.threshold, is_open=is_open)))
     if witness.open_end is not None:
         sentences.append(_open_end(*witness.open_end, first_ns))
     return tuple(sentences)
@@ -49,9 +61,11 @@ def sentences_of(
 
 def cause_sentences(cause: Cause, *, first_ns: int, object: str | None = None) -> tuple[Sentence, ...]:
     """Return sentences on one cause of a verdict: since when, what decided it, and what would flip it."""
+    requirement = requirement_text(cause.requirement, cause.title)
     if cause.witness is not None:
-        return sentences_of(cause.witness, first_ns=first_ns)
+        return sentences_of(cause.witness, first_ns=first_ns, requirement=requirement)
     instance = f" for {object}" if object is not None else ""
+    instance += f" ({requirement})" if requirement else ""
     if cause.settled_ns is not None:
         return (_settled(f"`{cause.spec}`{instance}", cause.verdict, Instant(cause.settled_ns, first_ns)),)
     robustness = number_text(cause.robustness)
@@ -84,16 +98,12 @@ def number_text(number: float) -> str:
     return f"{number:.{_DIGITS}g}"
 
 
-def _verdict(witness: Witness, first_ns: int, since_ns: int | None, is_open: bool) -> Sentence:
-    numbers = _robustness(witness.lower, witness.upper)
-    since = (", since ", Instant(since_ns, first_ns)) if since_ns is not None else ()
-    so_far, later = (" so far", "; later samples may change that") if is_open else ("", "")
-    return Sentence(f"{_title(witness)} is {witness.verdict}{so_far}: {numbers}", *since, f"{later}.")
-
-
-def _title(witness: Witness) -> str:
-    instance = f" for {witness.object}" if witness.object is not None else ""
-    return f"`{witness.path[0].name or witness.path[0].text}`{instance}"
+def amount_text(number: float, atom: Formula) -> str:
+    """Return a number of an atom in the unit of the log: what `scale` divided it by is said beside it."""
+    if not isinstance(atom, Atom) or not isinstance(atom.expression, Scaled):
+        return number_text(number)
+    divisor = atom.expression.divisor
+    return f"{number_text(number * divisor)} ({number_text(number)} on its scale of {number_text(divisor)})"
 
 
 def _robustness(lower: float, upper: float) -> str:
@@ -110,30 +120,43 @@ def _settled(title: str, verdict: Verdict, since: Instant) -> Sentence:
 def reason_sentence(witness: Witness, *, first_ns: int) -> Sentence:
     """Return one sentence on what decided a verdict or, for an unknown one, on what was not known."""
     deciding = witness.deciding
+    missed = Sentence("") if witness.missed is None else missed_text(witness.missed, first_ns)
     if deciding is None or deciding.unknown or witness.verdict is Verdict.UNKNOWN:
-        _, reason, *_ = sentences_of(witness, first_ns=first_ns)
-        return reason
-    return Sentence(f"`{deciding.text}` ", *_how_it_decides(witness, deciding, first_ns).parts)
+        reason = sentences_of(witness, first_ns=first_ns)[2 if missed else 1]
+        return Sentence(missed, ". ", reason) if missed else reason
+    if witness.missed is not None and witness.missed.is_condition:
+        # how well the condition held is not what went wrong
+        return Sentence(missed, f": {_what_was_measured(deciding)}.")
+    how = Sentence(f"`{deciding.text}` ", _how_it_decides(witness, deciding, first_ns))
+    return Sentence(missed, ": ", how) if missed else how
 
 
-def _decision(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentence:
-    how = _how_it_decides(witness, deciding, first_ns)
-    return Sentence(f"What decides is `{deciding.text}`, which ", *how.parts)
+def missed_text(missed: MissedResponse, first_ns: int) -> Sentence:
+    """Return a clause on an implication that failed: its condition held, and its response did not."""
+    when = Instant(missed.time_ns, first_ns)
+    return Sentence(f"`{missed.condition}` held at ", when, f", but `{missed.response}` did not")
 
 
-def _how_it_decides(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentence:
-    amount = deciding.value if deciding.lower == deciding.upper else _end(witness, deciding)
-    how = f"holds by {number_text(amount)}" if amount >= 0.0 else f"fails by {number_text(-amount)}"
+def _how_it_decides(
+    witness: Witness, deciding: DecidingAtom, first_ns: int, *, is_open: bool = False
+) -> Sentence:
+    amount = deciding.value if deciding.lower == deciding.upper else _end(deciding)
+    size = amount_text(abs(amount), deciding.atom)
+    how = f"holds by {size}" if amount >= 0.0 else f"fails by {size}"
     if amount == 0.0:
         how = "just holds"
-    what = " and ".join(map(_measured, deciding.measured))
-    where = (
-        _in_time_of_all(witness) if witness.path[-1].operator == deciding.atom.relation else _in_time(witness)
-    )
+    where = _in_time(witness)
+    if witness.path[-1].operator == deciding.atom.relation:
+        where = _in_time_of_all(witness, deciding, "so far " if is_open else "")
+    what = _what_was_measured(deciding)
     return Sentence(f"{how} at ", Instant(witness.time_ns, first_ns), f"{where}: {what}.")
 
 
-def _end(witness: Witness, deciding: DecidingAtom) -> float:
+def _what_was_measured(deciding: DecidingAtom) -> str:
+    return " and ".join(map(_measured, deciding.measured))
+
+
+def _end(deciding: DecidingAtom) -> float:
     return deciding.lower if deciding.end.value == "low" else deciding.upper
 
 
@@ -141,27 +164,27 @@ def _in_time(witness: Witness) -> str:
     """Name the temporal operator that chose the sample."""
     for step in reversed(witness.path[:-1]):
         if step.operator in ("F", "G", "U", "R", "W", "X", "WX", "O", "H", "S", "Y"):
-            return f" (within `{_shortened(step)}`)"
+            return f" (within `{step.name or shortened_formula(step.text)}`)"
     return ""
 
 
-def _in_time_of_all(witness: Witness) -> str:
+def _in_time_of_all(witness: Witness, deciding: DecidingAtom, so_far: str) -> str:
     """Name it, and say that the atom is greatest or least within it, where that is so."""
     passed: set[str] = set()
+    # one sample may settle a G that fails or an F that holds, and later ones be worse or better
+    unsure = {End.HIGH: "G", End.LOW: "F"}.get(deciding.end) if witness.is_settled else None
     for step in reversed(witness.path[:-1]):
+        if step.operator == unsure:
+            break
+        where = f"{so_far}within `{step.name or shortened_formula(step.text)}`"
         if step.operator in ("F", "O") and passed <= {"or", "spec"}:
-            return f" (its greatest within `{_shortened(step)}`)"
+            return f" (its greatest {where})"
         if step.operator in ("G", "H") and passed <= {"and", "spec"}:
-            return f" (its least within `{_shortened(step)}`)"
+            return f" (its least {where})"
         if step.operator not in ("and", "or", "spec"):
             break
         passed.add(step.operator)
     return _in_time(witness)
-
-
-def _shortened(step: WitnessStep) -> str:
-    text = step.name or step.text
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1].rstrip()}…"
 
 
 def _measured(measured: Measured) -> str:
@@ -194,7 +217,9 @@ def _measured(measured: Measured) -> str:
     return f"the {edge} edge of {names[0]} is at {axis} = {number_text(value)}"
 
 
-def _flip(witness: Witness, deciding: DecidingAtom, threshold: Threshold | None) -> str:
+def _flip(
+    witness: Witness, deciding: DecidingAtom, threshold: Threshold | None, *, is_open: bool = False
+) -> str:
     if threshold is None:
         opposite = "violated" if witness.verdict is Verdict.SATISFIED else "satisfied"
         match witness.obstacle:
@@ -205,12 +230,16 @@ def _flip(witness: Witness, deciding: DecidingAtom, threshold: Threshold | None)
         return f"No number of this atom alone makes it {opposite}: other atoms decide it, too."
     change = _change(threshold)
     would = f"It would be {threshold.verdict}"
-    if witness.is_settled:
-        would = f"It would not have been {witness.verdict} then"
+    if is_open:
+        would = f"So far it would {'fail' if witness.verdict is Verdict.SATISFIED else 'hold'}"
+    elif witness.is_settled and witness.verdict is Verdict.VIOLATED:
+        would = "It would not have been violated then"
     if threshold.is_written:
         limit = f"{change} in place of {number_text(threshold.value)}"
         return f"{would} with {limit} in `{deciding.text}`."
     margin = change.removeprefix("-").removesuffix(" or less").removesuffix(" or more")
+    if isinstance(deciding.atom.expression, Scaled):
+        margin = amount_text(abs(threshold.flips_at), deciding.atom)
     how = "were allowed to fail by" if threshold.flips_at < 0.0 else "had to hold by"
     return f"{would} if `{deciding.text}` {how} {margin}."
 
@@ -246,8 +275,23 @@ def _unknown(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentenc
     )
 
 
+def _gap(gap: Gap, first_ns: int) -> Sentence:
+    """Return in how many samples an object or a signal is missing, and which samples leave that out."""
+    if gap.missing == gap.samples:
+        return Sentence(f"{gap.name} is missing in every sample.")
+    many = f"{gap.name} is missing in {gap.missing:,} of {counted(gap.samples, 'sample')}"
+    if gap.is_at_start and gap.next_ns is not None:
+        # whole milliseconds, not past the sample
+        start = f"--from {(gap.next_ns - first_ns) // 10**6 / 1e3:.3f}s"
+        return Sentence(f"{many}, all before ", Instant(gap.next_ns, first_ns), f": {start} leaves them out.")
+    first, last = Instant(gap.first_ns, first_ns), Instant(gap.last_ns, first_ns)
+    if first == last:
+        return Sentence(f"{many}, at ", first, ".")
+    return Sentence(f"{many}, the first at ", first, ", the last at ", last, ".")
+
+
 def _uncertain(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentence:
-    low, high = number_text(deciding.lower), number_text(deciding.upper)
+    low, high = (amount_text(each, deciding.atom) for each in (deciding.lower, deciding.upper))
     return Sentence(
         f"`{deciding.text}` lies between {low} and {high} at ",
         Instant(witness.time_ns, first_ns),
@@ -261,7 +305,7 @@ def _open_end(deciding: DecidingAtom, time_ns: int, first_ns: int) -> Sentence:
     if deciding.unknown:
         reasons = " and ".join(deciding.unknown)
         return Sentence(f"By how much is open: `{deciding.text}` is unknown at ", when, f", {reasons}.")
-    low, high = number_text(deciding.lower), number_text(deciding.upper)
+    low, high = (amount_text(each, deciding.atom) for each in (deciding.lower, deciding.upper))
     what = f"By how much is uncertain: `{deciding.text}` lies between {low} and {high} at "
     return Sentence(what, when, ".")
 
@@ -276,7 +320,8 @@ _DEAD_ENDS = {
 
 
 def _dead_end(step: WitnessStep, first_ns: int) -> Sentence:
+    text = shortened_formula(step.text)
     if step.operator in ("true", "false"):
-        return Sentence(f"What decides is the constant `{step.text}`.")
+        return Sentence(f"What decides is the constant `{text}`.")
     why = _DEAD_ENDS.get(step.operator, "no sample lies in its window")
-    return Sentence(f"What decides is `{step.text}` at ", Instant(step.time_ns, first_ns), f": {why}.")
+    return Sentence(f"What decides is `{text}` at ", Instant(step.time_ns, first_ns), f": {why}.")

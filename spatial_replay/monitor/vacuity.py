@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline
 from spatial_replay.monitor.online.codes import low_and_high
-from spatial_replay.monitor.witness.path import End, Evidence, deciding_path
+from spatial_replay.monitor.witness.evidence import Evidence
+from spatial_replay.monitor.witness.path import End, deciding_path
 from spatial_replay.spec.format import format_formula, format_term
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,

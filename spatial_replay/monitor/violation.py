@@ -13,10 +13,11 @@ from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.causes import Conjunct, conjuncts_of
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.program import Program, compile_formula
-from spatial_replay.monitor.sentences import number_text, sentences_of
+from spatial_replay.monitor.sentences import amount_text, missed_text, number_text, sentences_of
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom
-from spatial_replay.monitor.witness.path import End, Evidence
+from spatial_replay.monitor.witness.evidence import Evidence
+from spatial_replay.monitor.witness.path import End
 from spatial_replay.monitor.witness.threshold import Threshold
 from spatial_replay.monitor.witness.witness import Witness, find_witness
 from spatial_replay.spec.checks import object_names, signal_names
@@ -85,9 +86,13 @@ class Violation:
         if self.atom is None or self.witness is None:
             since = Instant(self.time_ns, self.first_ns)
             return f"`{self.spec}` is violated since {since}, by {number_text(-self.robustness)}"
+        missed = self.witness.missed
+        if missed is not None and missed.is_condition:
+            return missed_text(missed, self.first_ns)
         when = Instant(self.witness.time_ns, self.first_ns)
         number = self.atom.upper if self.atom.end is End.HIGH else self.atom.lower
-        how = f"{'holds' if number >= 0.0 else 'fails'} by {number_text(abs(number))}"
+        size = amount_text(abs(number), self.atom.atom)
+        how = f"{'holds' if number >= 0.0 else 'fails'} by {size}"
         short = _short(self.atom, self.spec, abs(number) * _divisor(self.atom))
         return f"{short}: `{self.atom.text}` {how} at {when}"
 

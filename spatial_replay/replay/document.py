@@ -10,7 +10,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.causes import Cause
 from spatial_replay.monitor.result import SpecResult, no_such_node
-from spatial_replay.monitor.sentences import cause_sentences, sentences_of
+from spatial_replay.monitor.sentences import sentences_of
 from spatial_replay.monitor.vacuity import Vacuous
 from spatial_replay.monitor.verdict import Verdict, online_verdict
 from spatial_replay.monitor.witness.atom import Measured
@@ -75,6 +75,8 @@ def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | No
                 "parent": node.parent,
                 "operator": node.operator,
                 "name": node.name,
+                "requirement": node.requirement,
+                "title": node.title,
                 "text": node.text,
                 "verdict": str(node.verdict),
                 "robustness": json_number(node.robustness),
@@ -84,11 +86,9 @@ def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | No
             for node in result.nodes
         ],
     }
-    if result.causes:
-        # the atom of the first cause: what headline, arrow and event name
-        value["worst"] = value["causes"][0]["witness"]
-    elif result.can_explain:
-        value["worst"] = witness_document(result.witness(), first_ns)
+    if result.worst is not None:
+        # what headline, arrow and event name
+        value["worst"] = witness_document(result.worst, first_ns)
     if result.has_series:
         value["series"] = {
             "time_ns": result.times_ns.tolist(),
@@ -106,6 +106,8 @@ def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | No
 def _cause(cause: Cause, first_ns: int) -> dict[str, Any]:
     return {
         "spec": cause.spec,
+        "requirement": cause.requirement,
+        "title": cause.title,
         "node": cause.node,
         "verdict": str(cause.verdict),
         "robustness": json_number(cause.robustness),
@@ -132,8 +134,26 @@ def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
         "atom": None,
         "threshold": None,
         "obstacle": witness.obstacle,
+        "missed": None,
+        "missing": [
+            {
+                "name": gap.name,
+                "samples": gap.missing,
+                "of": gap.samples,
+                "first_ns": gap.first_ns,
+                "last_ns": gap.last_ns,
+            }
+            for gap in witness.gaps
+        ],
         "explanation": list(sentences_of(witness, first_ns=first_ns)),
     }
+    if witness.missed is not None:
+        missed = witness.missed
+        value["missed"] = {
+            "condition": missed.condition,
+            "response": missed.response,
+            "time_ns": missed.time_ns,
+        }
     if deciding is not None:
         value["atom"] = {
             "text": deciding.text,
@@ -235,41 +255,38 @@ def explain_node(result: SpecResult, node: int = 0, *, first_ns: int, goes_on: b
     if not result.has_series:
         raise ValueError("the replay did not keep series and leaves")
     _, _, lower, upper = result.series[node]
-    causes = _causes_below(result, node)
-    settled = next((cause.witness for cause in causes if cause.settled_ns is not None), None)
-    witness = settled or (causes[0].witness if causes and node == 0 else None) or result.witness(node)
-    since_ns = result.since_ns(node)
+    about = result.nodes[node]
     is_open = goes_on and online_verdict(float(lower[-1]), float(upper[-1])) is Verdict.PENDING
-    if node == 0 and not is_open:
-        sentences = result.sentences(first_ns)
-    elif settled is not None:
-        sentences = tuple(
-            sentence
-            for cause in causes
-            for sentence in cause_sentences(cause, first_ns=first_ns, object=result.object)
-        )
-    else:
+    # a goal that later samples may still reach is no cause
+    causes = [each for each in result.causes_of(node) if not goes_on or each.settled_ns is not None]
+    if is_open:
         witness = result.witness(node)
-        sentences = sentences_of(witness, first_ns=first_ns, since_ns=since_ns, is_open=is_open)
+        sentences = sentences_of(witness, first_ns=first_ns, is_open=True)
+    else:
+        worst = result.worst_of(node, causes)
+        witness = result.witness(node) if worst is None else worst
+        sentences = result.sentences_about(node, causes, first_ns)
+    vacuous = result.vacuous if node == 0 and not is_open else ()
+    sentences += tuple(each.message for each in vacuous)
+    verdict = Verdict.PENDING if is_open else about.verdict
+    decided = witness_document(witness, first_ns)
     document = {
-        **witness_document(witness, first_ns),
         "specification": result.name,
         "object": result.object,
-        "requirement": result.spec.id if node == 0 else None,
-        "title": result.spec.title if node == 0 else None,
-        "since_ns": since_ns,
-        "causes": [_cause(each, first_ns) for each in causes],
-        "vacuous": [_vacuous(each) for each in result.vacuous] if node == 0 else [],
+        "requirement": about.requirement,
+        "title": about.title,
+        "node": node,
+        "name": about.name,
+        "verdict": str(verdict),
+        "robustness": json_number(about.robustness),
+        "lower": json_number(about.final_lower),
+        "upper": json_number(about.final_upper),
+        "since_ns": None if is_open else result.certain_ns(node),
         "may_change": is_open,
+        **{key: decided[key] for key in ("time_ns", "atom", "threshold", "obstacle", "missed", "missing")},
+        "worst": decided,
+        "causes": [] if is_open else [_cause(each, first_ns) for each in causes],
+        "vacuous": [_vacuous(each) for each in vacuous],
         "explanation": list(sentences),
     }
-    return Explanation(witness.verdict, witness.time_ns, sentences, document)
-
-
-def _causes_below(result: SpecResult, node: int) -> list[Cause]:
-    """Return the causes of a result that lie within one of its nodes."""
-    below = {node}
-    for identifier, parent, _ in iter_nodes(result.formula):
-        if parent in below:
-            below.add(identifier)
-    return [cause for cause in result.causes if cause.node in below]
+    return Explanation(verdict, witness.time_ns, sentences, document)

@@ -23,7 +23,7 @@ from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import SeriesBlock, join_blocks
 from spatial_replay.monitor.vacuity import Vacuous, no_instances
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
-from spatial_replay.monitor.witness.path import Evidence
+from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.replay.selection import (
     DEFAULT_OPTIONS,
     LogNames,

@@ -52,4 +52,4 @@ def _status(facts: Mapping[str, str]) -> str:
         return "vacuous"
     if facts.get("verdict") != "pending":
         return facts.get("verdict", "")
-    return "holding" if facts.get("sign") == "positive" else "failing"
+    return "holding" if facts.get("sign") == "positive" else "pending"

@@ -18,7 +18,6 @@ from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.output_file import refuse_inputs, replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.source import Source, axes_of
-from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions
@@ -134,7 +133,7 @@ def _results(replay: Replay, replayed: Replayed, collector: Collector) -> Iterat
         tree, compiled = replay.trees[index], replay.automata[index]
 
         is_explained = index in explained
-        witness = _deciding(result) if is_explained else None
+        witness = result.worst if is_explained else None
         yield ReportedResult(
             result=result,
             relations=RELATION_NAMES | replay.files[tree.file].relations,
@@ -147,11 +146,6 @@ def _results(replay: Replay, replayed: Replayed, collector: Collector) -> Iterat
             no_automaton=compiled.reason,
             path=collector.path(tree.name, tree.object),
         )
-
-
-def _deciding(result: SpecResult) -> Witness | None:
-    """Return the witness of the first cause or, of a satisfied result, that of its verdict."""
-    return result.causes[0].witness if result.causes else result.witness()
 
 
 def _pointer(witness: Witness) -> Pointer | None:

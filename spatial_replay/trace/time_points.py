@@ -82,12 +82,6 @@ def duration_ns_from_text(text: str) -> int:
     return _checked_ns(int(min(nanoseconds, Decimal(LATEST_NS + 1)).to_integral_value()), text)
 
 
-def text_from_duration_ns(nanoseconds: int) -> str:
-    """Return a duration as `duration_ns_from_text` reads it, to the nanosecond: "2s", "0.25s"."""
-    seconds, fraction_ns = divmod(nanoseconds, 10**9)
-    return f"{seconds}.{fraction_ns:09d}".rstrip("0").rstrip(".") + "s"
-
-
 def _ns_from_calendar(match: re.Match[str], text: str) -> int:
     offset = "+00:00" if match["offset"] in "Zz" else match["offset"]
     try:

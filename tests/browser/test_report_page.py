@@ -157,10 +157,10 @@ def test_the_tree_shows_how_things_stand_at_the_cursor(open_page: Open) -> None:
     satisfied = colour_of(page, mark)
     page.keyboard.press("Home")
     expect(readout(page)).to_have_text("0.000 s / 9.967 s")
-    expect(mark).to_have_class("mark is-failing")
+    expect(mark).to_have_class("mark is-pending")
     assert colour_of(page, mark) != satisfied
     expect(row(page, "plate_first").locator(".number").first).to_have_text(f"{MINUS}0.2802")
-    expect(row(page, "plate_first").locator(".what")).to_contain_text("fails so far")
+    expect(row(page, "plate_first").locator(".what")).to_contain_text("pending")
 
 
 def test_choosing_an_event_goes_there(open_page: Open) -> None:

@@ -50,7 +50,7 @@ def test_every_result_is_explained_in_a_few_sentences(
     done, met, apart = text.strip().split("\n\n")
     assert code == 1
     assert done.splitlines() == [
-        "`done` is satisfied: robustness 0.1, since 1.500 s.",
+        "`done` is satisfied: robustness 0.1.",
         "What decides is `battery >= 0.3`, which holds by 0.1 at 0.500 s "
         "(its least within `charged`): battery is 0.4.",
         "It would be violated with 0.400001 or more in place of 0.3 in `battery >= 0.3`.",
@@ -62,16 +62,19 @@ def test_every_result_is_explained_in_a_few_sentences(
         "`apart` is unknown: robustness between -inf and 0.5.",
         "`cube dist cup >= 0.5` is unknown at 0.000 s, where it could decide (within `apart`): "
         "cup is not in the sample.",
+        "cup is missing in 2 of 4 samples, all before 1.000 s: --from 1.000s leaves them out.",
     ]
+    assert run_in_process([*EXPLAIN, "--from", "1.000s", "--node", "apart"]) == 0
 
 
 def test_a_named_spec_is_explained_at_a_time(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, text = said(capsys, *EXPLAIN, "--node", "reach", "--at", "1.2s")
-    assert code == 1
-    assert text.startswith("`reach` is violated so far: robustness -0.5, since 0.000 s; later samples may")
-    assert "cube sticks out of goal by 0.5" in text
+    assert code == 4
+    assert text.startswith("`reach` is pending: robustness -0.5 so far, and later samples decide.")
+    assert "(its greatest so far within `reach`): cube sticks out of goal by 0.5" in text
+    assert "violated" not in text
     _, at_the_end = said(capsys, *EXPLAIN, "--node", "reach", "--at", "1500ms")
-    assert at_the_end.startswith("`reach` is satisfied: robustness 0.5, since 1.500 s.")
+    assert at_the_end.startswith("`reach` is satisfied: robustness 0.5, certain since 1.500 s.")
 
 
 def test_options_that_cannot_be_explained_are_refused_by_name(
@@ -125,7 +128,10 @@ def test_signals_and_windows_are_written_as_series(folder: Path, capsys: pytest.
 
 def test_a_sliding_window_is_summarised_in_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, text = said(capsys, *REPLAY, "--window", "600ms")
-    assert "over the last 0.6s violated at 3 of 4 samples, first at 0s; robustness at the end 0.2" in text
+    assert (
+        "over the last 0.600 s violated at 3 of 4 samples, first at 0.000 s; robustness at the end 0.2"
+        in text
+    )
 
 
 def test_an_unknown_verdict_names_what_was_unknown(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

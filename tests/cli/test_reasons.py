@@ -58,16 +58,92 @@ def test_the_text_says_when_a_violation_became_certain_and_why(
     printed = capsys.readouterr().out
     _, first, title, safe, goal = printed.splitlines()
     assert "mission [REQ-7]  violated" in first
-    assert "certain since 5.533333333s" in first
+    assert "certain since 5.533 s" in first
     assert title.strip() == "done and safe"
-    assert safe.strip().startswith("safe at 5.533333333s: `cup dist plate >= 0.2` fails by ")
+    assert safe.strip().startswith("safe at 5.533 s: `cup dist plate >= 0.2` fails by ")
     assert goal.strip().startswith("goal: `fork ovlp plate` fails by ")
     assert "first satisfied" not in printed
 
 
-def test_the_requirement_is_in_the_document(folder: Path) -> None:
+def test_the_requirements_of_a_result_its_parts_and_causes_are_in_every_output(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = MISSION.replace("spec safe =", 'spec safe "REQ-3: keeps its distance" =')
+    (folder / "mission.spatial").write_text(text)
     (mission,) = _document(folder, "mission.spatial")[1]["specifications"]
     assert (mission["requirement"], mission["title"]) == ("REQ-7", "done and safe")
+    named = {node["name"]: (node["requirement"], node["title"]) for node in mission["nodes"] if node["name"]}
+    about = ("REQ-3", "keeps its distance")
+    assert named == {"mission": ("REQ-7", "done and safe"), "safe": about, "goal": (None, None)}
+    assert (mission["causes"][0]["requirement"], mission["causes"][0]["title"]) == about
+    assert "safe [REQ-3: keeps its distance] at 5.533 s: " in capsys.readouterr().out
+    run(["explain", str(LOG), "--spec", "mission.spatial"])
+    said = capsys.readouterr().out
+    assert "`safe` (REQ-3: keeps its distance) is violated since 5.533 s" in said
+
+
+def test_many_results_are_counted_and_the_worst_come_first(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "apart.spatial").write_text(
+        'spec apart(t) "REQ-8: nothing is on the fork" = G (t dist fork >= 0.05)\n'
+        "spec distant(t) = G (t dist fork >= 0.02)\n"
+    )
+    assert run(["replay", str(LOG), "--spec", "apart.spatial", "--each", "t=all"]) == 1
+    head, *lines = capsys.readouterr().out.splitlines()
+    verdicts = [line.split()[1:3] for line in lines if "  robustness " in line]
+    found = ["violated" if "violated" in each else "satisfied" for each in verdicts]
+    violated = found.count("violated")
+    assert found == sorted(found, reverse=True)
+    assert head.endswith(f"over 9.967 s: {violated} violated, {len(found) - violated} satisfied")
+    assert sum("nothing is on the fork" in line for line in lines) == 1
+
+
+def test_explain_has_one_object_of_facts_for_each_result(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(["explain", str(LOG), "--spec", "mission.spatial", "--json"])
+    (found,) = json.loads(capsys.readouterr().out)
+    (mission,) = _document(folder, "mission.spatial")[1]["specifications"]
+    for key in (
+        "verdict",
+        "robustness",
+        "lower",
+        "upper",
+        "requirement",
+        "title",
+        "causes",
+        "vacuous",
+        "worst",
+    ):
+        assert found[key] == mission[key]
+    assert (found["specification"], found["name"], found["node"]) == ("mission", "mission", 0)
+    assert found["since_ns"] == mission["violated_at_ns"] == found["time_ns"]
+    assert found["atom"] == mission["worst"]["atom"]
+    assert found["explanation"][0].startswith("`mission` is violated: robustness -0.144867, certain since")
+
+
+def test_a_failed_implication_names_the_response_that_was_missing(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    formula = "G (cup dist plate <= 0.3 -> F[0s, 1s] (fork dist plate <= 0.02))"
+    (folder / "respond.spatial").write_text(f"spec respond = {formula}\n")
+    missed = "`cup dist plate <= 0.3` held at 5.267 s, but `F[0s, 1s] (fork dist plate <= 0.02)` did not"
+    run(["replay", str(LOG), "--spec", "respond.spatial", "-o", "out.mcap"])
+    assert f"{missed}: cup and plate are 0.290207 apart." in capsys.readouterr().out
+    run(["explain", str(LOG), "--spec", "respond.spatial"])
+    assert f"{missed}." in capsys.readouterr().out.splitlines()
+    (respond,) = _document(folder, "respond.spatial")[1]["specifications"]
+    assert respond["worst"]["missed"]["response"] == "F[0s, 1s] (fork dist plate <= 0.02)"
+
+
+def test_amounts_are_said_in_the_unit_of_the_log_where_scale_divides_them(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "scaled.spatial").write_text("scale lengths = 0.5\nspec safe = G (cup dist plate >= 0.2)\n")
+    run(["replay", str(LOG), "--spec", "scaled.spatial"])
+    said = capsys.readouterr().out
+    assert "`cup dist plate >= 0.2` fails by 0.00128379 (0.00256758 on its scale of 0.5) at 5.533 s" in said
 
 
 def test_explain_lists_every_failing_spec_the_settled_one_first(
@@ -97,7 +173,9 @@ def test_a_named_part_is_explained_by_what_settled_it(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["explain", str(LOG), "--spec", "mission.spatial", "--node", "safe"]) == 1
-    assert capsys.readouterr().out.startswith("`safe` is violated since 5.533 s, whatever came after.")
+    assert capsys.readouterr().out.startswith(
+        "`safe` is violated: robustness -0.144867, certain since 5.533 s."
+    )
 
 
 def test_parts_that_decided_nothing_are_marked_and_can_fail_a_gate(

@@ -93,12 +93,12 @@ def test_explanations_name_every_cause_and_what_would_have_prevented_it() -> Non
         "`task` is violated: robustness -7.76, certain since 3.000 s (the least robustness is that of "
         "`deliver`).",
         "`safe` is violated since 3.000 s, whatever came after.",
-        "What decides is `red dist vase >= 0.1`, which fails by 0.03 at 3.000 s (its least within `safe`): "
+        "What decides is `red dist vase >= 0.1`, which fails by 0.03 at 3.000 s (within `safe`): "
         "red and vase are 0.07 apart.",
         "It would not have been violated then with 0.0699999 or less in place of 0.1 in "
         "`red dist vase >= 0.1`.",
         "`charged` is violated since 4.000 s, whatever came after.",
-        "What decides is `battery >= 0.2`, which fails by 0.06 at 4.000 s (its least within `charged`): "
+        "What decides is `battery >= 0.2`, which fails by 0.06 at 4.000 s (within `charged`): "
         "battery is 0.14.",
         "It would not have been violated then with 0.139999 or less in place of 0.2 in `battery >= 0.2`.",
         "`deliver` is violated: robustness -7.76.",
@@ -113,7 +113,7 @@ def test_a_result_is_explained_alone_and_a_satisfied_one_by_what_holds() -> None
     texts = [result.explain() for result in evaluation]
     assert evaluation.explain() == "\n\n".join(texts)
     assert texts[0].startswith("`safe` is violated: robustness -0.34, certain since 3.000 s.\nWhat decides")
-    assert texts[1].startswith("`far` is satisfied: robustness 6.66, since 0.000 s.\nWhat decides is `red")
+    assert texts[1].startswith("`far` is satisfied: robustness 6.66.\nWhat decides is `red")
 
 
 def test_the_semantics_of_the_paper_has_causes_without_witnesses_and_no_vacuous_parts() -> None:

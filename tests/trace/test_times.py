@@ -13,7 +13,6 @@ from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.time_points import (
     TimePoint,
     duration_ns_from_text,
-    text_from_duration_ns,
     time_point_from_text,
 )
 
@@ -106,15 +105,6 @@ def test_no_text_raises_anything_but_a_usage_error(text: str) -> None:
     except UsageError:
         return
     assert 0 <= point.nanoseconds <= LATEST_NS
-
-
-@given(st.integers(0, LATEST_NS))
-def test_a_written_duration_reads_back_as_the_same_number(nanoseconds: int) -> None:
-    assert duration_ns_from_text(text_from_duration_ns(nanoseconds)) == nanoseconds
-
-
-def test_a_duration_is_written_without_trailing_zeros() -> None:
-    assert [text_from_duration_ns(ns) for ns in (0, 10 * 10**9, 250_000_000)] == ["0s", "10s", "0.25s"]
 
 
 def test_a_duration_requires_a_unit() -> None:

@@ -7,36 +7,29 @@ negated. The path to it follows one end of the interval (see `End`).
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.atoms.delays import look_back, tail
-from spatial_replay.monitor.atoms.measurements import leaf_values
-from spatial_replay.monitor.atoms.terms import TraceScene
-from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.offline import OfflineNodes
-from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.witness.unfinished import UnfinishedNodes, is_closed
+from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import (
     Boolean,
     BooleanOperator,
-    Earlier,
     Formula,
-    Group,
-    Outline,
     Temporal,
     Truth,
     iter_nodes,
     operands_of,
     operator_of,
 )
-from spatial_replay.spec.walks import substitute
-from spatial_replay.trace.trace import Trace, window_of
+from spatial_replay.text import shortened_formula
 
 _Number = TypeVar("_Number")
 
@@ -338,81 +331,40 @@ def _least_between(column: Floats, *, is_ahead: bool) -> Floats:
     return least if is_ahead else least[::-1]
 
 
-class Evidence:
-    """The samples of one instance, read again on each request: a log need not fit into memory."""
+@dataclass(frozen=True, slots=True)
+class MissedResponse:
+    """An implication on the path to the deciding atom that failed: its condition held, its response did not.
 
-    def __init__(
-        self, instance: Instance, regions: Mapping[str, Outline], traces: Callable[[], Iterable[Trace]]
-    ) -> None:
-        """Store how to read the samples.
+    Attributes:
+        condition, response: their names, or their texts, shortened.
+        time_ns: of the sample at which the condition held.
+        is_condition: whether the deciding atom is in the condition.
+    """
 
-        Args:
-            traces: iterates over the samples, with those looked back at, in blocks of any length.
-        """
-        self.instance = instance
-        self._regions = regions
-        self._traces = traces
-        self._reach = look_back([instance.formula])
+    condition: str
+    response: str
+    time_ns: int
+    is_condition: bool
 
-    def bound(self, formula: Formula) -> Formula:
-        """Bind a formula of the instance to the object that it is about."""
-        return substitute(formula, self.instance.bindings)
 
-    def scene(self, time_ns: int) -> TraceScene:
-        """Return the one sample of that time, with the earlier ones that it may look back at.
+def missed_response(
+    path: DecidingPath,
+    nodes: Sequence[Formula],
+    done: OfflineNodes | UnfinishedNodes,
+    times_ns: Integers,
+) -> MissedResponse | None:
+    """Return the outermost implication on the path to what violates a formula that failed, if there is one.
 
-        Raises:
-            LookupError: there is none; the log changed since it was evaluated.
-        """
-        for scene in self._scenes():
-            trace = scene.trace
-            at, end = window_of(trace.times_ns, time_ns, time_ns + 1)
-            if at < end:
-                past = tail(trace.slice(0, at), *self._reach) if at else trace.slice(0, 0)
-                return TraceScene(Trace.concatenate([past, trace.slice(at, end)]), self._regions, len(past))
-        raise LookupError(f"there is no sample at {time_ns} ns any more")
-
-    def columns(self, formulas: Sequence[Formula]) -> Floats:
-        """Compute K formulas without temporal operators in each sample, (C, K, T) (see `leaf_values`)."""
-        parts: list[Floats] = []
-        for scene in self._scenes():
-            times_ns = scene.trace.times_ns[scene.skip :]
-            begin, end = window_of(times_ns, self.instance.start_ns, self.instance.end_ns)
-            parts.append(leaf_values(scene, formulas, self.instance.bindings)[:, :, begin:end])
-        channels = max(map(len, parts))
-        return np.concatenate([in_channels(part, channels) for part in parts], axis=2)
-
-    def first_ns(self) -> int:
-        """Return the time of the first sample, those looked back at included."""
-        return next(int(trace.times_ns[0]) for trace in self._traces() if len(trace))
-
-    def times_ns(self) -> Integers:
-        """Return the times of the samples, (T,)."""
-        parts = [scene.trace.times_ns[scene.skip :] for scene in self._scenes()]
-        times_ns = np.concatenate(parts)
-        begin, end = window_of(times_ns, self.instance.start_ns, self.instance.end_ns)
-        return times_ns[begin:end]
-
-    def have_members(self, groups: Sequence[Group | Earlier]) -> list[bool]:
-        """Return for each open group whether any of the samples has a member of it, or may have had one."""
-        found = [False] * len(groups)
-        for scene in self._scenes() if groups else ():
-            times_ns = scene.trace.times_ns[scene.skip :]
-            begin, end = window_of(times_ns, self.instance.start_ns, self.instance.end_ns)
-            for index, group in enumerate(groups):
-                if not found[index]:
-                    _, members, unknown = scene.members(group)
-                    found[index] = bool(members[begin:end].any() or unknown[begin:end].any())
-        return found
-
-    def _scenes(self) -> Iterator[TraceScene]:
-        """Iterate over the samples in blocks, each with the earlier ones that it may look back at."""
-        past: Trace | None = None
-        for trace in self._traces():
-            skip = 0
-            if past is not None and self._reach != (0, 0):
-                recent = tail(past, *self._reach)
-                skip = len(recent)
-                trace = Trace.concatenate([recent, trace])
-            past = trace if len(trace) else past
-            yield TraceScene(trace, self._regions, skip)
+    Args:
+        nodes: every node of the formula, by id.
+    """
+    for step, below in pairwise(path.steps):
+        node = nodes[step.node]
+        if operator_of(node) == "->" and done.ends(step.node)[1][step.sample] < 0.0:
+            condition, response = (
+                each.name or shortened_formula(format_formula(each)) for each in operands_of(node)
+            )
+            # nodes are numbered in the order of the text
+            is_condition = below.node == step.node + 1
+            return MissedResponse(condition, response, int(times_ns[step.sample]), is_condition)
+    return None

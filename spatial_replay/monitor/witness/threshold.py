@@ -16,7 +16,8 @@ from spatial_replay.monitor.offline import evaluate_offline, new_leaves
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom
-from spatial_replay.monitor.witness.path import End, Evidence
+from spatial_replay.monitor.witness.evidence import Evidence
+from spatial_replay.monitor.witness.path import End
 from spatial_replay.monitor.witness.unfinished import evaluate_unfinished
 from spatial_replay.spec.formula import (
     Atom,

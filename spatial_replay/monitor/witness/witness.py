@@ -8,7 +8,14 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.offline import evaluate_offline
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom, deciding_atom
-from spatial_replay.monitor.witness.path import End, Evidence, deciding_path
+from spatial_replay.monitor.witness.evidence import Evidence, Gap
+from spatial_replay.monitor.witness.path import (
+    DecidingPath,
+    End,
+    MissedResponse,
+    deciding_path,
+    missed_response,
+)
 from spatial_replay.monitor.witness.threshold import Obstacle, Threshold, threshold_of
 from spatial_replay.monitor.witness.unfinished import evaluate_unfinished
 from spatial_replay.spec.format import format_formula
@@ -54,6 +61,8 @@ class Witness:
             time of its sample.
         settled_ns: the time of the sample that made the verdict certain, whatever came after; interval and
             threshold are then those of that moment. None if it is about the whole log.
+        missed: the outermost implication on the path that failed, or None.
+        gaps: of an unknown atom, when what it is about is missing.
     """
 
     name: str
@@ -67,6 +76,8 @@ class Witness:
     obstacle: Obstacle | None
     open_end: tuple[DecidingAtom, int] | None
     settled_ns: int | None = None
+    missed: MissedResponse | None = None
+    gaps: tuple[Gap, ...] = ()
 
     @property
     def node(self) -> int:
@@ -85,7 +96,13 @@ class Witness:
 
 
 def find_witness(
-    evidence: Evidence, leaves: Floats, times_ns: Integers, node: int = 0, *, goes_on: bool = False
+    evidence: Evidence,
+    leaves: Floats,
+    times_ns: Integers,
+    node: int = 0,
+    *,
+    goes_on: bool = False,
+    whole: tuple[Floats, Integers] | None = None,
 ) -> Witness:
     """Return the witness of a node.
 
@@ -97,6 +114,7 @@ def find_witness(
         times_ns: (T,), T at least 1.
         node: its id.
         goes_on: whether samples may follow these, which settle the node's verdict whatever comes.
+        whole: leaves and times of the whole log, if the number that flips the verdict is sought over it.
     """
     instance = evidence.instance
     evaluate, verdict_of = (
@@ -108,21 +126,22 @@ def find_witness(
     end = {Verdict.SATISFIED: End.LOW, Verdict.VIOLATED: End.HIGH}.get(verdict, End.OPEN)
     nodes = [evidence.bound(formula) for _, _, formula in iter_nodes(instance.formula)]
 
-    def follow(end: End) -> tuple[tuple[WitnessStep, ...], DecidingAtom | None]:
+    def follow(end: End) -> tuple[DecidingPath, tuple[WitnessStep, ...], DecidingAtom | None]:
         found = deciding_path(instance.formula, done, times_ns, node, end, goes_on=goes_on)
         path = tuple(_step(step.node, nodes[step.node], int(times_ns[step.sample])) for step in found.steps)
         leaf = nodes[path[-1].node]
         if not isinstance(leaf, Atom | Quantified):
-            return path, None
-        return path, deciding_atom(evidence.scene(path[-1].time_ns), leaf, found.end)
+            return found, path, None
+        return found, path, deciding_atom(evidence.scene(path[-1].time_ns), leaf, found.end)
 
-    path, deciding = follow(end)
+    found, path, deciding = follow(end)
     threshold = None
     if deciding is not None:
-        threshold = threshold_of(evidence, leaves, times_ns, node, verdict, deciding, goes_on=goes_on)
+        over, open_ended = (whole, False) if whole is not None else ((leaves, times_ns), goes_on)
+        threshold = threshold_of(evidence, *over, node, verdict, deciding, goes_on=open_ended)
     open_end = None
     if end is not End.OPEN and lower < upper and not goes_on:
-        other_path, other = follow(end.turned)
+        _, other_path, other = follow(end.turned)
         if other is not None and other.lower < other.upper:
             open_end = other, other_path[-1].time_ns
     return Witness(
@@ -137,6 +156,8 @@ def find_witness(
         None if isinstance(threshold, Threshold) else threshold,
         open_end,
         int(times_ns[-1]) if goes_on else None,
+        missed_response(found, nodes, done, times_ns) if verdict is Verdict.VIOLATED else None,
+        evidence.gaps(deciding.atom) if deciding is not None and deciding.unknown else (),
     )
 
 

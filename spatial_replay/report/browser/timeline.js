@@ -78,8 +78,8 @@ function makeLane(clock, result, node, number) {
 }
 
 // What fails is drawn higher than what holds, and that higher than what is unknown; what is final is full.
-const HEIGHTS = {violated: 1, failing: 1, holding: 0.6, satisfied: 0.6, unknown: 0.3};
-const OPACITIES = {violated: 1, failing: 0.5, holding: 0.4, satisfied: 1, unknown: 0.6};
+const HEIGHTS = {violated: 1, failing: 1, pending: 0.6, holding: 0.6, satisfied: 0.6, unknown: 0.3};
+const OPACITIES = {violated: 1, failing: 0.5, pending: 0.4, holding: 0.4, satisfied: 1, unknown: 0.6};
 
 function drawStretch(context, clock, [from, to, status], fills, width, height) {
   const left = shareOf(clock, from) * width, right = shareOf(clock, to) * width;

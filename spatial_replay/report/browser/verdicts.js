@@ -4,7 +4,8 @@ const STATUSES = {
   satisfied: {sign: "✓", words: "satisfied", colour: "positive"},
   holding: {sign: "+", words: "holds so far", colour: "positive"},
   violated: {sign: "✕", words: "violated", colour: "negative"},
-  failing: {sign: "−", words: "fails so far", colour: "negative"},
+  failing: {sign: "−", words: "fails now", colour: "negative"},
+  pending: {sign: "−", words: "pending", colour: "neutral"},
   unknown: {sign: "?", words: "unknown", colour: "neutral"},
   vacuous: {sign: "∅", words: "decided nothing", colour: "neutral"},
   absent: {sign: "·", words: "not evaluated here", colour: "neutral"},
@@ -20,7 +21,8 @@ function statusOf(run, result, node, place) {
   if (place >= last) return node.verdict;
   if (run.settles && lower[place] >= 0) return "satisfied";
   if (run.settles && upper[place] < 0) return "violated";
-  return signOf(value[place]);
+  // later samples may still fulfil it: no violation
+  return run.settles && value[place] < 0 ? "pending" : signOf(value[place]);
 }
 
 function signOf(number) {

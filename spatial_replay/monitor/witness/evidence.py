@@ -1,0 +1,168 @@
+"""The samples of one instance, read again on each request, and what is missing in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.atoms.delays import look_back, tail
+from spatial_replay.monitor.atoms.measurements import leaf_values
+from spatial_replay.monitor.atoms.terms import TraceScene
+from spatial_replay.monitor.instances import Instance
+from spatial_replay.monitor.online.codes import in_channels
+from spatial_replay.spec.formula import Atom, Earlier, Formula, Group, Outline, Signal, Term, TrackedName
+from spatial_replay.spec.walks import base_of, iter_expressions, substitute
+from spatial_replay.trace.trace import Trace, window_of
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """An object or a signal that some samples lack.
+
+    Attributes:
+        name: of the object, or the signal in quotes.
+        missing, samples: in how many of how many samples it is missing.
+        first_ns, last_ns: the first and the last of these.
+        next_ns: the sample after the last of these; None if there is none.
+        is_at_start: whether they are the first samples, without another one between.
+    """
+
+    name: str
+    missing: int
+    samples: int
+    first_ns: int
+    last_ns: int
+    next_ns: int | None
+    is_at_start: bool
+
+
+class Evidence:
+    """The samples of one instance, read again on each request: a log need not fit into memory."""
+
+    def __init__(
+        self, instance: Instance, regions: Mapping[str, Outline], traces: Callable[[], Iterable[Trace]]
+    ) -> None:
+        """Store how to read the samples.
+
+        Args:
+            traces: iterates over the samples, with those looked back at, in blocks of any length.
+        """
+        self.instance = instance
+        self._regions = regions
+        self._traces = traces
+        self._reach = look_back([instance.formula])
+
+    def bound(self, formula: Formula) -> Formula:
+        """Bind a formula of the instance to the object that it is about."""
+        return substitute(formula, self.instance.bindings)
+
+    def scene(self, time_ns: int) -> TraceScene:
+        """Return the one sample of that time, with the earlier ones that it may look back at.
+
+        Raises:
+            LookupError: there is none; the log changed since it was evaluated.
+        """
+        for scene in self._scenes():
+            trace = scene.trace
+            at, end = window_of(trace.times_ns, time_ns, time_ns + 1)
+            if at < end:
+                past = tail(trace.slice(0, at), *self._reach) if at else trace.slice(0, 0)
+                return TraceScene(Trace.concatenate([past, trace.slice(at, end)]), self._regions, len(past))
+        raise LookupError(f"there is no sample at {time_ns} ns any more")
+
+    def columns(self, formulas: Sequence[Formula]) -> Floats:
+        """Compute K formulas without temporal operators in each sample, (C, K, T) (see `leaf_values`)."""
+        parts: list[Floats] = []
+        for scene in self._scenes():
+            times_ns = scene.trace.times_ns[scene.skip :]
+            begin, end = window_of(times_ns, self.instance.start_ns, self.instance.end_ns)
+            parts.append(leaf_values(scene, formulas, self.instance.bindings)[:, :, begin:end])
+        channels = max(map(len, parts))
+        return np.concatenate([in_channels(part, channels) for part in parts], axis=2)
+
+    def first_ns(self) -> int:
+        """Return the time of the first sample, those looked back at included."""
+        return next(int(trace.times_ns[0]) for trace in self._traces() if len(trace))
+
+    def times_ns(self) -> Integers:
+        """Return the times of the samples, (T,)."""
+        parts = [scene.trace.times_ns[scene.skip :] for scene in self._scenes()]
+        times_ns = np.concatenate(parts)
+        begin, end = window_of(times_ns, self.instance.start_ns, self.instance.end_ns)
+        return times_ns[begin:end]
+
+    def gaps(self, atom: Atom) -> tuple[Gap, ...]:
+        """Return when each object and signal that an atom names is missing, for those that ever are."""
+        signals = [each.name for each in iter_expressions(atom.expression) if isinstance(each, Signal)]
+        objects = dict.fromkeys(name for term in atom.terms for name in _object_names(base_of(term)))
+        kinds = [(f"signal {name!r}", name, True) for name in dict.fromkeys(signals)]
+        kinds += [(name, name, False) for name in objects]
+        parts: list[NDArray[np.bool_]] = []
+        for scene in self._scenes():
+            trace = scene.trace.slice(scene.skip, len(scene.trace))
+            inside = slice(*window_of(trace.times_ns, self.instance.start_ns, self.instance.end_ns))
+            columns = [_is_missing(trace, name, is_signal=is_signal)[inside] for _, name, is_signal in kinds]
+            parts.append(np.stack(columns) if columns else np.empty((0, 0), np.bool_))
+        times_ns = self.times_ns()
+        found = zip(kinds, np.concatenate(parts, axis=1), strict=True)
+        return tuple(_gap(shown, missing, times_ns) for (shown, _, _), missing in found if missing.any())
+
+    def have_members(self, groups: Sequence[Group | Earlier]) -> list[bool]:
+        """Return for each open group whether any of the samples has a member of it, or may have had one."""
+        found = [False] * len(groups)
+        for scene in self._scenes() if groups else ():
+            times_ns = scene.trace.times_ns[scene.skip :]
+            begin, end = window_of(times_ns, self.instance.start_ns, self.instance.end_ns)
+            for index, group in enumerate(groups):
+                if not found[index]:
+                    _, members, unknown = scene.members(group)
+                    found[index] = bool(members[begin:end].any() or unknown[begin:end].any())
+        return found
+
+    def _scenes(self) -> Iterator[TraceScene]:
+        """Iterate over the samples in blocks, each with the earlier ones that it may look back at."""
+        past: Trace | None = None
+        for trace in self._traces():
+            skip = 0
+            if past is not None and self._reach != (0, 0):
+                recent = tail(past, *self._reach)
+                skip = len(recent)
+                trace = Trace.concatenate([recent, trace])
+            past = trace if len(trace) else past
+            yield TraceScene(trace, self._regions, skip)
+
+
+def _object_names(base: Term) -> tuple[str, ...]:
+    """Return the objects that a term names, itself or as the members of a group."""
+    if isinstance(base, Group):
+        left_out = {each.name for each in base.excluded}
+        return tuple(name for name in base.members or () if name not in left_out)
+    return (base.name,) if isinstance(base, TrackedName) else ()
+
+
+def _is_missing(trace: Trace, name: str, *, is_signal: bool) -> NDArray[np.bool_]:
+    """Return (T,), in which samples an object is not seen, or a signal has no finite value."""
+    if is_signal:
+        values = trace.signals.get(name)
+        return np.ones(len(trace), np.bool_) if values is None else ~np.isfinite(values)
+    if name not in trace.names:
+        return np.ones(len(trace), np.bool_)
+    return np.asarray(trace.rows[:, trace.names.index(name)] < 0)
+
+
+def _gap(name: str, missing: NDArray[np.bool_], times_ns: Integers) -> Gap:
+    at = np.flatnonzero(missing)
+    first, last = int(at[0]), int(at[-1])
+    return Gap(
+        name,
+        len(at),
+        len(missing),
+        int(times_ns[first]),
+        int(times_ns[last]),
+        int(times_ns[last + 1]) if last + 1 < len(missing) else None,
+        last + 1 == len(at),
+    )
