@@ -18,6 +18,7 @@ from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
 from spatial_replay.monitor.vacuity import Vacuous
 from spatial_replay.spec.formula import Specification
+from spatial_replay.trace.axes import OUR_AXES, Axes
 from spatial_replay.trace.trace import Trace
 
 if TYPE_CHECKING:
@@ -101,31 +102,37 @@ class AnnotatedEvaluation:
 
         return channels_of_results(self.trees)
 
-    def contents(self, extent: SceneBounds | None, topics: Collection[str] = ()) -> LayoutContents:
+    def contents(
+        self, extent: SceneBounds | None, topics: Collection[str] = (), axes: Axes = OUR_AXES
+    ) -> LayoutContents:
         """Return what an annotated log of these results has for a viewer to show.
 
         Args:
             extent: of all footprints; None without any.
             topics: those of messages that are not derived from samples.
+            axes: those of the source.
         """
         from spatial_replay.annotate.foxglove_layout import LayoutContents
 
         has_states = [each.automaton is not None for each in self.automata]
         # every result has events: a verdict is reported when it is reached, or else when the log ends
         derived = {SCENE, *(DERIVED if self.trees else ())} - set(() if any(has_states) else (AUTOMATON,))
-        return LayoutContents(self.trees, has_states, extent, derived | set(topics))
+        return LayoutContents(self.trees, has_states, extent, derived | set(topics), axes)
 
-    def layout(self, topics: Collection[str] = ()) -> Attachment:
+    def layout(self, topics: Collection[str] = (), axes: Axes = OUR_AXES) -> Attachment:
         """Return the layout that opens the log in a viewer, once everything else is written.
 
         Args:
             topics: those of messages that are not derived from samples.
+            axes: those of the source.
         """
         from spatial_replay.annotate.foxglove_layout import LayoutContents, layout_attachment
 
         if not self._has_samples:
-            return layout_attachment(LayoutContents(self.trees, [False] * len(self.trees), None, topics))
-        return layout_attachment(self.contents(self._extent, topics))
+            return layout_attachment(
+                LayoutContents(self.trees, [False] * len(self.trees), None, topics, axes)
+            )
+        return layout_attachment(self.contents(self._extent, topics, axes))
 
     def automata_metadata(self) -> Mapping[str, str]:
         """Return the size of each spec's automaton, or the reason why it has none."""

@@ -31,6 +31,7 @@ from spatial_replay.logs.topics import (
 from spatial_replay.monitor.online.operators import looks_ahead
 from spatial_replay.palette import CURVES, lighter
 from spatial_replay.spec.formula import Formula, iter_nodes
+from spatial_replay.trace.axes import OUR_AXES, Axes
 from spatial_replay.trace.trace import Trace
 
 _MOST_CURVES: Final = 12
@@ -50,7 +51,7 @@ class Panel(NamedTuple):
     config: Config
 
 
-def scene_panel(camera: Mapping[str, Any], topics: Collection[str]) -> Panel:
+def scene_panel(camera: Mapping[str, Any], topics: Collection[str], axes: Axes = OUR_AXES) -> Panel:
     """Return the scene from above, with the planner's map below it and its path above."""
     shown: dict[str, Config] = {SCENE: {}, GRADIENT_MAP: {"colorMode": "rgba-fields"}, PLAN_PATH: {}}
     config = {
@@ -62,6 +63,10 @@ def scene_panel(camera: Mapping[str, Any], topics: Collection[str]) -> Panel:
         # its axes are a metre long, whatever the scene's size
         "transforms": {f"frame:{FRAME}": {"visible": False}},
     }
+    if axes != OUR_AXES:
+        # each of the two viewers reads a key of its own
+        title = f"Scene, {axes}"
+        config |= {"foxglovePanelTitle": title, "lichtblickPanelTitle": title}
     return Panel("3D!scene", config)
 
 
@@ -242,12 +247,14 @@ class LayoutContents(NamedTuple):
         has_states: of each, whether the log has the states of its automaton.
         extent: where its footprints are; None if it has none.
         topics: all that have messages.
+        axes: those of the source, which the title of the scene says where they are not ours.
     """
 
     trees: Sequence[ReportedTree]
     has_states: Sequence[bool]
     extent: SceneBounds | None
     topics: Collection[str]
+    axes: Axes = OUR_AXES
 
 
 def layout_attachment(contents: LayoutContents) -> Attachment:
@@ -284,7 +291,7 @@ _Weighted = tuple[Panel, float]
 
 def _scene_panels(contents: LayoutContents) -> list[_Weighted]:
     """Return the scene and, of a planner, its reasons."""
-    scene = scene_panel(_camera(contents.extent), contents.topics)
+    scene = scene_panel(_camera(contents.extent), contents.topics, contents.axes)
     return [(scene, 4.0), *([(decision_reason(), 1.0)] if PLAN_DECISION in contents.topics else [])]
 
 

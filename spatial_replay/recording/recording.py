@@ -33,6 +33,7 @@ from spatial_replay.logs.topics import (
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.spec.formula import Specification
+from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
 
@@ -60,6 +61,7 @@ class Recording:
         refuse_templates(files)
         self._files = files = logged_specifications(files)
         self._sink = sink
+        self._axes = Axes.from_metadata(about or {})
         self._evaluation = AnnotatedEvaluation(
             files, [find_instances(file, {}, (), 0, FOREVER) for file in files], known=known
         )
@@ -137,7 +139,7 @@ class Recording:
             ending |= {"messages": str(self._messages), "messages_dropped": str(messages_dropped)}
         if self._samples:
             self._sink.write_messages(self._evaluation.end(self._end_ns))
-        layout = self._evaluation.layout(self._topics)
+        layout = self._evaluation.layout(self._topics, self._axes)
         self._sink.add_attachment(layout.name, layout.media_type, layout.data)
         self._sink.add_metadata(ENDING, ending)
         hashes = certificate(self._sample_hash, self._message_hash, self._files, self._result_hash)

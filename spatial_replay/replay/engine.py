@@ -16,7 +16,7 @@ from spatial_replay.annotate.specification import (
     specification_attachments,
 )
 from spatial_replay.logs.messages import Attachment, Messages, merge
-from spatial_replay.logs.source import Source
+from spatial_replay.logs.source import Source, axes_of
 from spatial_replay.logs.topics import REPLAYED_PREFIX
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
@@ -189,7 +189,7 @@ class Replay:
 
     def layout(self) -> Attachment:
         """Return the viewer layout of the annotated log; call it after `run`."""
-        return self._evaluation.layout(self._topics)
+        return self._evaluation.layout(self._topics, axes_of(self._source))
 
     def _add(self, trace: Trace, own: Messages, stretches: Sequence[SeriesBlock]) -> None:
         self._faults += trace.faults

@@ -96,6 +96,9 @@ def test_a_recording_of_an_image_is_not_turned_over_again(
     for log in (recorded, annotated):
         assert run(["info", str(log)]) == 0
         assert "axes     y up (down in the source)\n" in capsys.readouterr().out
+        assert run(["info", str(log), "--layout"]) == 0
+        scene = json.loads(capsys.readouterr().out)["configById"]["3D!scene"]
+        assert scene["foxglovePanelTitle"] == "Scene, y up (down in the source)"
     assert run(["info", str(tracks), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["axes"] == {"y": "up", "source": {"y": "up", "scale": 1.0}}
 
