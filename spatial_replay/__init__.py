@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from spatial_replay.spec.diagnostics import Diagnostic
     from spatial_replay.spec.formula import NamedSpec, Specification
     from spatial_replay.spec.load import load_specification, parse_specification
+    from spatial_replay.text import Instant, Sentence
     from spatial_replay.trace.sample import Sample
     from spatial_replay.trace.trace import Trace
     from spatial_replay.tuning.tuned import Tuning
@@ -68,6 +69,7 @@ __all__ = [
     "Footprint",
     "GeometryError",
     "Guards",
+    "Instant",
     "LeastPart",
     "LogError",
     "Measured",
@@ -85,6 +87,7 @@ __all__ = [
     "Recorder",
     "Replayed",
     "Sample",
+    "Sentence",
     "Settings",
     "SpatialReplayError",
     "SpecResult",
@@ -152,6 +155,7 @@ __getattr__, __dir__ = loaded_when_used(
         "spec.diagnostics": ("Diagnostic",),
         "spec.formula": ("NamedSpec", "Specification"),
         "spec.load": ("load_specification", "parse_specification"),
+        "text": ("Instant", "Sentence"),
         "trace.sample": ("Sample",),
         "trace.trace": ("Trace",),
         "tuning.tuned": ("Tuning",),

@@ -24,7 +24,7 @@ from spatial_replay.spec.checks import object_names, signal_names
 from spatial_replay.spec.expressions import Scaled
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import NamedSpec, Number, Specification
-from spatial_replay.text import Instant
+from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.sample import FOREVER, Sample
 from spatial_replay.trace.trace import Trace
 
@@ -78,7 +78,7 @@ class Violation:
         return None if self.witness is None else self.witness.threshold
 
     @property
-    def sentences(self) -> tuple[str, ...]:
+    def sentences(self) -> tuple[Sentence, ...]:
         """What decided it and what would flip it, as `SpecResult.explain` says it."""
         return () if self.witness is None else sentences_of(self.witness, first_ns=self.first_ns)
 
