@@ -89,9 +89,8 @@ class Difference:
         was = f"{self.before or 'an error'} with robustness {_shown(self.before_robustness)} in the baseline"
         if self.change == "gone":
             return f"{self.log}: {name} is gone; it was {was}"
-        return (
-            f"{self.log}: {name} is {self.now or 'an error'} with robustness {_shown(self.robustness)}, {was}"
-        )
+        now = f"{self.now or 'an error'} with robustness {_shown(self.robustness)}"
+        return f"{self.log}: {name} is {now}; it was {was}"
 
 
 def compare(table: pa.Table, baseline: pa.Table, tolerance: Tolerance) -> list[Difference]:

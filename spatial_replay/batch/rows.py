@@ -79,7 +79,7 @@ class ResultRow:
         first_satisfied_ns, violated_at_ns, satisfied_at_ns: as in `SpecResult`.
         atom, atom_time_ns, atom_objects: what decides the verdict: the first cause of a violation.
         reason: one sentence on what decided; "" under the paper's semantics.
-        explanation: what `explain` says, in sentences.
+        explanation: what `explain` says, in sentences, but for since when a satisfied spec has held.
         vacuous: sentences on the parts that decided nothing.
         samples: how many were evaluated.
         start_ns: time of the first of them.

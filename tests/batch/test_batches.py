@@ -1,0 +1,282 @@
+"""Batches: what is evaluated, what is kept, what fails, and what bad input gets."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+import spatial_replay as sr
+from batch.fleet import GATE, batch, command, write_fleet, write_log
+
+DISTANCES = [0.5, 0.4, 0.2, 0.1]
+
+
+@pytest.fixture
+def fleet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with four logs, of which two come too close."""
+    write_fleet(tmp_path, DISTANCES)
+    monkeypatch.chdir(tmp_path)
+    for name in ("GITHUB_ACTIONS", "GITHUB_STEP_SUMMARY"):
+        monkeypatch.delenv(name, raising=False)
+    return tmp_path
+
+
+def test_a_row_says_what_a_replay_of_the_log_says(fleet: Path) -> None:
+    result = sr.evaluate_logs("logs", "gate.spatial", output="results")
+    rows = result.table.to_pylist()
+    assert [row["log"] for row in rows[::2]] == [f"logs/run-{number}.jsonl" for number in range(4)]
+    for row in rows:
+        replayed = sr.replay_log(row["log"], "gate.spatial")
+        (own,) = (each for each in replayed.results if each.name == row["spec"])
+        assert (row["verdict"], row["robustness"]) == (str(own.verdict), own.robustness)
+        assert (row["requirement"], row["violated_at_ns"]) == (own.spec.id, own.violated_at_ns)
+        if row["verdict"] == "violated":
+            assert "\n".join(row["explanation"]) == own.explain()
+            assert row["reason"] in row["explanation"][1].replace("What decides is ", "").replace(
+                ", which", ""
+            )
+    assert [row["failure"] for row in result.failures.to_pylist()] == ["violated, expected satisfied"] * 2
+    assert sr.read_results("results").equals(result.table)
+
+
+def test_only_what_is_new_is_evaluated(fleet: Path) -> None:
+    Path("other.spatial").write_text("spec near = F (cart dist person <= 0.3)")
+    specs = ["gate.spatial", "other.spatial"]
+    assert sr.evaluate_logs("logs", specs, output="results").evaluated == 4
+    assert sr.evaluate_logs("logs", specs, output="results").evaluated == 0
+    # another layout of the text, and other names of the same logs
+    Path("gate.spatial").write_text(f"\n\n{GATE}")
+    shutil.move("logs", "moved")
+    again = sr.evaluate_logs("moved", specs, output="results")
+    assert again.evaluated == 0
+    assert again.table.column("log")[0].as_py() == "moved/run-0.jsonl"
+    assert again.table.column("line")[0].as_py() == 4
+    write_log(Path("moved/new.jsonl"), 0.7)
+    assert sr.evaluate_logs("moved", specs, output="results").evaluated == 1
+    Path("other.spatial").write_text("spec near = F (cart dist person <= 0.15)")
+    changed = sr.evaluate_logs("moved", specs, output="results")
+    assert changed.evaluated == 5
+    assert [row["verdict"] for row in changed.table.to_pylist() if row["spec"] == "near"] == [
+        "violated", "violated", "violated", "violated", "satisfied",
+    ]  # fmt: skip
+
+
+def test_a_log_that_cannot_be_read_is_a_row_until_it_can(fleet: Path) -> None:
+    log = Path("logs/run-1.jsonl")
+    whole = log.read_text()
+    log.write_text("{")
+    done = batch("logs", "--spec", "gate.spatial")
+    assert done.code == 3
+    assert "8 results: 4 satisfied, 2 violated, 2 errors" in done.out
+    assert "run-1.jsonl:1: the line is not JSON" in done.out
+    rows = sr.read_results("results").to_pylist()
+    assert [row["spec"] for row in rows if row["error"]] == ["apart", "arrives"]
+    log.write_text(whole)
+    done = batch("logs", "--spec", "gate.spatial")
+    assert done.code == 1
+    assert "(1 evaluated now, 3 known)" in done.out
+
+
+def test_a_damaged_log_fails_whatever_its_verdict(fleet: Path) -> None:
+    log = Path("logs/run-0.jsonl")
+    log.write_text(log.read_text() + '{"time_ns": 9')
+    done = batch("logs/run-0.jsonl", "--spec", "gate.spatial")
+    assert done.code == 3
+    assert "the log is damaged: run-0.jsonl:5" in done.out
+
+
+def test_a_suite_says_what_passes(fleet: Path) -> None:
+    Path("suite.yaml").write_text(
+        "specs: gate.spatial\n"
+        "cases:\n"
+        "  - {name: good, logs: 'logs/run-[01].jsonl', at_least: 0.05, requirements: SYS-1}\n"
+        "  - {name: bad, logs: [logs/run-2.jsonl, logs/run-3.jsonl], specs: bad.spatial, expect: violated}\n"
+        "  - {name: blind, logs: logs, specs: ghost.spatial, allow_unknown: true}\n"
+    )
+    Path("bad.spatial").write_text("spec apart = G (cart dist person >= 0.3)")
+    Path("ghost.spatial").write_text("spec seen = F (ghost dist cart <= 1)")
+    done = batch("suite.yaml")
+    assert (done.code, done.err.count("warning")) == (0, 1), done.out
+    assert "ghost" in done.err
+    assert Path("suite.results/last_run.parquet").exists()
+    assert batch("suite.yaml", "--fail-on", "unknown").code == 1
+    text = Path("suite.yaml").read_text()
+    Path("suite.yaml").write_text(text.replace("0.05", "0.15"))
+    done = batch("suite.yaml")
+    assert done.code == 1
+    assert "robustness 0.1, expected at least 0.15" in done.out
+    Path("suite.yaml").write_text(text.replace(", allow_unknown: true", ""))
+    assert batch("suite.yaml").code == 4
+    table = sr.read_results("suite.results")
+    assert {row["requirement"] for row in table.to_pylist() if row["case"] == "good"} == {"REQ-3", "REQ-4"}
+
+
+def test_templates_windows_and_constants_apply_to_every_log(fleet: Path) -> None:
+    Path("each.spatial").write_text("const near = 0.3\nspec calm(who) = G (who dist cart >= near)")
+    log = Path("logs/run-0.jsonl")
+    log.write_text(log.read_text().replace('"name": "person"', '"name": "person", "class": "human"'))
+    arguments = ("logs/run-0.jsonl", "--spec", "each.spatial", "--each", "who=class:human")
+    done = batch(*arguments, "--const", "near=0.6", "--from", "0.1s", "--json", "-")
+    assert done.code == 1
+    row = json.loads(done.out)
+    assert (row["spec"], row["object"], row["samples"]) == ("calm", "person", 3)
+    assert row["robustness"] == pytest.approx(-0.1)
+    assert batch(*arguments).code == 0
+    assert batch("logs/run-0.jsonl", "--spec", "each.spatial").code == 2
+
+
+def test_all_errors_of_a_suite_are_reported_at_once_with_their_lines(fleet: Path) -> None:
+    Path("suite.yaml").write_text(
+        "cases:\n"
+        "  - name: one\n"
+        "    logs: []\n"
+        "    specs: nowhere.spatial\n"
+        "  - name: one\n"
+        "    logs: logs\n"
+        "    semantics: mtl\n"
+        "    from: soon\n"
+        "    every: 0\n"
+        "  - logs: logs\n"
+        "    specs: gate.spatial\n"
+        "    expect: violated\n"
+        "    at_least: 1\n"
+        "    mapping: none.yaml\n"
+        "    colour: red\n"
+    )
+    done = batch("suite.yaml")
+    assert done.code == 2
+    for line, what in [
+        (3, "expected a log, a folder"),
+        (4, "no file 'nowhere.spatial'"),
+        (5, "there is a case 'one' already"),
+        (5, "it has no specs"),
+        (7, "expected ltlf or paper"),
+        (8, "'soon' is not a time"),
+        (9, "expected a whole number of at least 1"),
+        (10, "the key 'name' is missing"),
+        (13, "at_least applies to satisfied"),
+        (14, "no file 'none.yaml'"),
+        (15, "unknown key"),
+    ]:
+        assert any(f"suite.yaml:{line}: " in each and what in each for each in done.err.split("\n")), what
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nightly/*.mcap", "missing.mcap", "--spec", "gate.spatial"], "no log matches this pattern"),
+        (["empty", "--spec", "gate.spatial"], "no log in this folder"),
+        (["logs"], "give a specification with --spec FILE"),
+        (["logs", "--spec", "gate.spatial", "-o", "gate.spatial"], "is a file; results are a folder"),
+        (["logs", "--spec", "gate.spatial", "-o", "logs"], "does not hold the results of a batch"),
+        (["logs", "--spec", "gate.spatial", "-o", "old"], "results of format 0"),
+        (["logs", "--spec", "gate.spatial", "--tolerance", "5%"], "add --baseline"),
+        (["logs", "--spec", "gate.spatial", "--baseline", "gone"], "no such folder"),
+        (["logs", "--spec", "gate.spatial", "--junit", "gate.spatial"], "is an input too"),
+        (["logs", "--spec", "gate.spatial", "--from", "soon"], "--from: 'soon' is not a time"),
+        (["s.yaml", "logs"], "is a suite, which names its logs"),
+        (["s.yaml", "--spec", "gate.spatial"], "says how its logs are evaluated"),
+        (["logs", "--spec", "broken.spatial"], "broken.spatial:1:"),
+    ],
+)  # fmt: skip
+def test_what_cannot_work_is_refused_with_the_remedy(fleet: Path, arguments: list[str], message: str) -> None:
+    Path("empty").mkdir()
+    Path("old").mkdir()
+    Path("old/format.json").write_text('{"spatial_replay_results": 0}')
+    Path("broken.spatial").write_text("spec a = G (cart dist")
+    done = batch(*arguments)
+    assert (done.code, message in done.err) == (2, True), done.err
+    assert not Path("results").exists()
+    if "missing.mcap" in arguments:
+        assert "missing.mcap: no such file" in done.err
+
+
+def test_two_batches_do_not_write_to_one_folder(fleet: Path) -> None:
+    import fcntl
+
+    assert batch("logs", "--spec", "gate.spatial").code == 1
+    with Path("results/format.json").open() as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        done = batch("logs", "--spec", "gate.spatial")
+    assert done.code == 2
+    assert "another batch is writing to results" in done.err
+
+
+def test_a_baseline_fails_what_is_worse_or_gone(fleet: Path) -> None:
+    first = ["logs", "--spec", "gate.spatial"]
+    assert batch(*first, "--baseline", "main", "--update-baseline").code == 1
+    assert "nothing is worse than the baseline" in batch(*first, "--baseline", "main").out
+    # 0.2 of robustness becomes 0.19, 0.1 becomes -0.05; one is gone, one is better
+    write_log(Path("logs/run-0.jsonl"), 0.49)
+    write_log(Path("logs/run-1.jsonl"), 0.25)
+    write_log(Path("logs/run-2.jsonl"), 0.6)
+    Path("logs/run-3.jsonl").unlink()
+    done = batch(*first, "--baseline", "main", "--tolerance", "6%")
+    assert done.code == 1
+    assert "run-0" not in done.out.partition("worse than the baseline")[2]
+    assert (
+        "logs/run-1.jsonl: apart is violated with robustness -0.05; "
+        "it was satisfied with robustness 0.1 in the baseline" in done.out
+    )
+    assert "logs/run-3.jsonl: arrives is gone; it was satisfied" in done.out
+    assert "better: --update-baseline" in done.out
+    done = batch(*first, "--baseline", "main", "--tolerance", "1%")
+    assert "logs/run-0.jsonl: apart is satisfied with robustness 0.19; it was" in done.out
+    assert batch(*first, "--baseline", "main", "--update-baseline").code == 1
+    assert "nothing is worse" in batch(*first, "--baseline", "main").out
+
+
+def test_results_are_summed_up_and_searched(fleet: Path) -> None:
+    batch("logs", "--spec", "gate.spatial")
+    done = command("results", "results", "--worst", "1")
+    assert done.out.startswith("8 results: 6 satisfied, 2 violated\n")
+    assert "apart [REQ-3]" in done.out
+    assert "logs/run-3.jsonl: apart [REQ-3]: violated, robustness -0.2\n" in done.out
+    assert "cart and person are 0.1 apart" in done.out
+    chosen = command("results", "results", "--by", "log", "--where", "spec == apart and robustness < -0.15")
+    assert chosen.out.startswith("1 result: 1 violated\n  log ")
+    both = '("run-0" in log or not robustness > 0) and object == none'
+    assert command("results", "results", "--where", both).out.startswith("4 results")
+    for wrong, message in [
+        ("colour == red", "there is no column 'colour'"),
+        ("__import__('os').system('true')", "is not a condition"),
+        ("robustness < 'a'", "compares different kinds"),
+        ("verdict ==", "is not a condition"),
+    ]:
+        done = command("results", "results", "--where", wrong)
+        assert (done.code, message in done.err) == (2, True), done.err
+    assert command("results", "logs").code == 2
+
+
+def test_a_page_over_all_logs_links_to_those_that_fail(fleet: Path) -> None:
+    Path("logs/<b>&.jsonl").write_text(Path("logs/run-3.jsonl").read_text())
+    assert batch("logs", "--spec", "gate.spatial", "--html", "pages", "--junit", "junit.xml").code == 1
+    page = Path("pages/index.html").read_text()
+    reports = sorted(path.name for path in Path("pages/reports").iterdir())
+    assert len(reports) == 3
+    assert all(f'href="reports/{name}"' in page for name in reports)
+    assert "<b>&.jsonl" not in page
+    assert "&lt;b&gt;&amp;.jsonl" in page
+    assert f"[[ATTACHMENT|pages/reports/{reports[-1]}]]" in Path("junit.xml").read_text()
+    before = {path: path.stat().st_mtime_ns for path in Path("pages/reports").iterdir()}
+    batch("logs", "--spec", "gate.spatial", "--html", "pages")
+    assert {path: path.stat().st_mtime_ns for path in Path("pages/reports").iterdir()} == before
+    assert Path("pages/index.html").read_text() == page
+
+
+def test_github_gets_annotations_at_the_lines_of_specs_and_a_summary(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", "summary.md")
+    done = batch("logs", "--spec", "gate.spatial")
+    lines = [line for line in done.err.splitlines() if line.startswith("::")]
+    assert len(lines) == 2
+    assert lines[0].startswith(
+        "::error file=gate.spatial,line=2,title=REQ-3 apart::logs/run-3.jsonl: violated"
+    )
+    summary = Path("summary.md").read_text()
+    assert "| logs | apart | REQ-3 | 2 | 2 | 0 | 0 | -0.2 |" in summary

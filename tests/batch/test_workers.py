@@ -1,0 +1,177 @@
+"""Workers that die, batches that are killed, and clusters."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+import spatial_replay as sr
+from batch.dying import work
+from batch.fleet import command, write_fleet
+from cli.program import PROGRAM, environment
+from spatial_replay.batch.workers import LocalProcesses, WorkerLost
+
+LOGS = 16
+
+
+def test_the_task_of_a_worker_that_dies_runs_once_more_and_no_other_is_lost(tmp_path: Path) -> None:
+    kinds = ["fine"] * 6 + ["dies once"] + ["fine"] * 3 + ["dies"] + ["fine"] * 6
+    tasks = [(kind, str(tmp_path / str(number))) for number, kind in enumerate(kinds)]
+    results = list(LocalProcesses(2).results(work, tasks))
+    assert sorted(task for task, _ in results) == sorted(tasks)
+    for (kind, file), result in results:
+        if kind == "dies":
+            assert isinstance(result, WorkerLost)
+            # in the pool with others, and by itself
+            assert Path(file).read_text() == "begun\n" * 2
+        else:
+            assert result == kind
+
+
+@pytest.fixture
+def fleet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    write_fleet(tmp_path, [0.2 + 0.01 * number for number in range(LOGS)])
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SPATIAL_REPLAY_KERNELS", "interpreted")
+    return tmp_path
+
+
+def keys_of(folder: Path) -> Counter[tuple[str, str]]:
+    """How often each key and spec is stored."""
+    from pyarrow import parquet
+
+    tables = [parquet.read_table(file, partitioning=None) for file in folder.glob("rows/*/*.parquet")]
+    columns = [(table.column("key").to_pylist(), table.column("spec").to_pylist()) for table in tables]
+    return Counter(pair for keys, specs in columns for pair in zip(keys, specs, strict=True))
+
+
+def processes_in(folder: Path) -> list[int]:
+    """The processes that work in a folder."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        try:
+            if entry.name.isdigit() and (entry / "cwd").readlink() == folder:
+                found.append(int(entry.name))
+        except OSError:
+            continue
+    return [pid for pid in found if pid != os.getpid()]
+
+
+def start() -> subprocess.Popen[str]:
+    # no forkserver of an earlier run is there, so a kill may meet it at any stage
+    arguments = ["batch", "logs", "--spec", "gate.spatial", "--jobs", "2"]
+    return subprocess.Popen(
+        [*PROGRAM, *arguments],
+        env=environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_a_batch_that_is_killed_loses_no_row_and_has_none_twice(fleet: Path) -> None:
+    chance = random.Random(7)
+    stored = 0
+    for number in (signal.SIGINT, signal.SIGKILL):
+        with start() as process:
+            # at work: beyond the rows that were there before
+            until = stored + chance.randrange(1, 6)
+            while sum(keys_of_files(fleet)) < until and process.poll() is None:
+                time.sleep(0.005)
+            process.send_signal(number)
+            _, said = process.communicate(timeout=60)
+        assert process.returncode in (130, -signal.SIGKILL, 1), said
+        if process.returncode == 130:
+            assert "the same command goes on from there" in said
+        stored = sum(keys_of_files(fleet))
+        assert stored >= 1
+    deadline = time.monotonic() + 30
+    while processes_in(fleet) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert processes_in(fleet) == []
+    result = sr.evaluate_logs("logs", "gate.spatial", output="results")
+    assert result.evaluated <= LOGS - 1
+    pairs = Counter(zip(result.table["log"].to_pylist(), result.table["spec"].to_pylist(), strict=True))
+    assert len(pairs) == 2 * LOGS
+    assert set(pairs.values()) == {1}
+    assert not result.table["error"].drop_null()
+    stored_pairs = keys_of(fleet / "results")
+    assert len(stored_pairs) == 2 * LOGS
+    assert set(stored_pairs.values()) == {1}
+    assert not list(fleet.glob("results/**/*.partial"))
+
+
+def keys_of_files(folder: Path) -> list[int]:
+    """One for each file with rows."""
+    return [1 for _ in folder.glob("results/rows/*/*.parquet")]
+
+
+def test_rows_that_a_kill_left_in_two_files_count_once(fleet: Path) -> None:
+    first = sr.evaluate_logs("logs", "gate.spatial", output="results")
+    (joined,) = (fleet / "results").glob("rows/*/joined-*")
+    from pyarrow import parquet
+
+    # as if the process had died between writing the joined file and removing those that it was made of
+    table = parquet.read_table(joined, partitioning=None)
+    for key in set(table["key"].to_pylist()):
+        own = table.filter([each == key for each in table["key"].to_pylist()])
+        parquet.write_table(own, joined.parent / f"{key}.parquet")
+    again = sr.evaluate_logs("logs", "gate.spatial", output="results")
+    assert again.evaluated == 0
+    assert again.table.equals(first.table)
+    assert set(keys_of(fleet / "results").values()) == {1}
+
+
+def test_a_full_disk_ends_a_batch_and_what_was_written_stays(fleet: Path) -> None:
+    code = (
+        "import resource, sys; from spatial_replay.cli.application import run;"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (12_000, 12_000)); sys.exit(run(sys.argv[1:]))"
+    )
+    arguments = ["batch", "logs", "--spec", "gate.spatial", "--jobs", "1"]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, "could not be written" in done.stderr) == (70, True), done.stderr
+    assert sr.evaluate_logs("logs", "gate.spatial", output="results").evaluated < LOGS
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_cluster_evaluates_a_batch_and_outlives_a_worker(fleet: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    cluster = distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
+    )
+    with cluster:
+        victim = next(iter(cluster.workers.values())).pid
+
+        def kill() -> None:
+            while not keys_of_files(fleet):
+                time.sleep(0.005)
+            os.kill(victim, signal.SIGKILL)
+
+        killer = threading.Thread(target=kill)
+        killer.start()
+        done = command("batch", "logs", "--spec", "gate.spatial", "--dask", cluster.scheduler_address)
+        killer.join()
+    assert done.code == 1, done.err
+    assert f"{2 * LOGS} results: 22 satisfied, 10 violated" in done.out
+    assert set(keys_of(fleet / "results").values()) == {1}
+
+
+def test_a_scheduler_that_does_not_answer_is_an_error(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    done = command("batch", "logs", "--spec", "gate.spatial", "--dask", "tcp://nowhere")
+    assert (done.code, "no scheduler answers" in done.err) == (2, True), done.err
