@@ -99,6 +99,10 @@ class AutomatonRun:
         if len(block.times_ns):
             self._steps(self._values(block))
 
+    def states(self, block: SeriesBlock) -> NDArray[np.bool_] | Integers:
+        """Take in the next samples, at least one; return the states after each, (T,) or as sets (T, S)."""
+        return self._steps(self._values(block))[1]
+
     def _values(self, block: SeriesBlock) -> Flags:
         """Return (P, T): whether each proposition is true in each sample, or unknown."""
         now = block.series[list(self.propositions), _NOW]

@@ -1,0 +1,450 @@
+"""Two formulas compared node by node, by meaning: the edits that turn one into the other.
+
+Equal nodes are found wherever they moved to and whatever they are called. Any of the edits can be made without
+the others (`TreeDiff.formula`), which is how the one that matters is found.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, Literal, TypeAlias
+
+from spatial_replay.spec.format import format_bound, format_formula, format_term
+from spatial_replay.spec.formula import (
+    Atom,
+    Boolean,
+    Formula,
+    Group,
+    Measurement,
+    Outline,
+    Quantified,
+    RegionName,
+    Span,
+    Temporal,
+    Term,
+    Truth,
+    iter_nodes,
+    operands_of,
+    operator_of,
+)
+from spatial_replay.spec.walks import base_of, iter_terms, map_leaves, map_terms, substitute_term
+
+EditKind: TypeAlias = Literal[
+    "constant", "region", "group", "definition", "replaced", "added", "removed", "moved", "renamed"
+]
+"""What was edited: a number of a node, a shape or group that it names, what its relation means (profile, scale),
+the node itself, one operand of a conjunction or disjunction, only its place, or only its name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Edit:
+    """One edit of a formula, wherever it occurs in it.
+
+    Attributes:
+        spec: the innermost named spec that it is in.
+        old, new: canonical text of the node before and after; None if it was added or removed.
+        old_nodes, new_nodes: ids of the nodes in the two trees.
+        old_span, new_span: the place of the first of them in the two texts.
+        depth: of the deepest of them, from 0 at the root.
+        subject: the region or group that was edited, or the constant whose value alone explains the edit.
+    """
+
+    kind: EditKind
+    spec: str
+    old: str | None
+    new: str | None
+    old_nodes: tuple[int, ...]
+    new_nodes: tuple[int, ...]
+    old_span: Span | None
+    new_span: Span | None
+    depth: int
+    subject: str | None = None
+
+    @property
+    def is_structural(self) -> bool:
+        """Whether operators, objects or operands changed, not only numbers, shapes or names."""
+        return self.kind in ("replaced", "added", "removed", "moved")
+
+    def __str__(self) -> str:
+        about = f" {self.subject}" if self.subject else ""
+        match self.kind:
+            case "added":
+                return f"added `{self.new}`"
+            case "removed":
+                return f"removed `{self.old}`"
+            case "moved":
+                return f"moved `{self.new}`"
+            case "renamed":
+                return f"renamed {self.old} to {self.new}"
+            case "region" | "group" | "definition":
+                return f"{self.kind}{about} changed in `{self.new}`"
+        return f"{self.kind}{about}: `{self.old}` to `{self.new}`"
+
+
+@dataclass(frozen=True, slots=True)
+class _Site:
+    """A place where the trees differ; `edit` is its number once sites of one edit are joined."""
+
+    edit: int
+    old: Formula | None
+    new: Formula | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Inner:
+    """A node of both trees with operands that differ, or, if `edit` is given, with another window."""
+
+    edit: int | None
+    old: Boolean | Temporal
+    new: Boolean | Temporal
+    operands: tuple[_Merged, ...]
+
+
+_Merged: TypeAlias = "Formula | _Site | _Inner"
+
+
+@dataclass(frozen=True, eq=False)
+class TreeDiff:
+    """The edits between two formulas; none if they mean the same under the same names."""
+
+    edits: tuple[Edit, ...]
+    _merged: _Merged = field(repr=False)
+
+    @property
+    def effective(self) -> tuple[int, ...]:
+        """The numbers of the edits that change what the formula means: all but new names."""
+        return tuple(number for number, edit in enumerate(self.edits) if edit.kind != "renamed")
+
+    def formula(self, edits: Collection[int]) -> Formula:
+        """Return the old formula with only these of the edits made, by number."""
+        built = _built(self._merged, frozenset(edits))
+        return Truth(True) if built is None else built
+
+
+def compare_trees(old: Formula, new: Formula, name: str) -> TreeDiff:
+    """Compare two formulas over the same regions (see `unify_regions`).
+
+    Args:
+        name: what the formulas are called.
+    """
+    comparison = _Comparison()
+    merged = comparison.align(_Place(old, 0, name, 0), _Place(new, 0, name, 0))
+    return comparison.finished(merged)
+
+
+def unify_regions(
+    formulas: Sequence[Formula], regions: Mapping[str, Outline], others: Mapping[str, Outline]
+) -> tuple[list[Formula], dict[str, Outline]]:
+    """Rename the regions of some formulas that others have with another shape; texts stay.
+
+    Returns:
+        The formulas, and the regions of both.
+    """
+    renamed: dict[str, str] = {}
+    joined = dict(others)
+    for name, outline in regions.items():
+        if others.get(name, outline) != outline:
+            own = f"{name} (before)"
+            while own in others or own in regions:
+                own += "'"
+            renamed[name] = own
+        joined[renamed.get(name, name)] = outline
+    return [_with_regions(formula, renamed) for formula in formulas], joined
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """A node with its id, the spec that it is in, and its depth."""
+
+    node: Formula
+    id: int
+    spec: str
+    depth: int
+
+    @property
+    def operands(self) -> list[_Place]:
+        """The nodes below, through specs that only repeat another."""
+        found, identifier = [], self.id + 1
+        for operand in operands_of(self.node):
+            found.append(_Place(operand, identifier, operand.name or self.spec, self.depth + 1))
+            identifier += sum(1 for _ in iter_nodes(operand))
+        return found
+
+    @property
+    def bare(self) -> _Place:
+        """The node itself, or what it only repeats under another name."""
+        place = self
+        while isinstance(place.node, Boolean) and place.node.operator == "spec":
+            place = place.operands[0]
+        return place
+
+
+class _Comparison:
+    """Aligns two trees; numbers meanings, so that equal ones are found at once."""
+
+    def __init__(self) -> None:
+        self._numbers: dict[Hashable, int] = {}
+        self._known: dict[int, tuple[Formula, int]] = {}
+        self._sites: list[tuple[EditKind, _Place | None, _Place | None, str | None]] = []
+
+    def meaning(self, node: Formula) -> int:
+        """Return a number that nodes of equal meaning share: names and the order of operands do not count."""
+        known = self._known.get(id(node))
+        if known is None:
+            known = self._known[id(node)] = (node, self._meaning(node))
+        return known[1]
+
+    def _meaning(self, node: Formula) -> int:
+        key: Hashable
+        match node:
+            case Truth():
+                key = node.value
+            case Atom():
+                key = (node.relation, node.expression)
+            case Quantified():
+                key = (node.quantifier, node.variables, node.group, self.meaning(node.body))
+            case Boolean(operator="spec"):
+                return self.meaning(node.operands[0])
+            case Boolean(operator="and" | "or" | "xor" | "<->"):
+                key = (node.operator, tuple(sorted(map(self.meaning, node.operands))))
+            case Boolean():
+                key = (node.operator, tuple(map(self.meaning, node.operands)))
+            case Temporal():
+                key = (node.operator, node.bound, tuple(map(self.meaning, node.operands)))
+        return self._numbers.setdefault(key, len(self._numbers))
+
+    def align(self, old: _Place, new: _Place) -> _Merged:
+        """Compare two nodes that stand in for each other."""
+        if old.node.name != new.node.name and None not in (old.node.name, new.node.name):
+            self._sites.append(("renamed", old, new, None))
+        if self.meaning(old.node) == self.meaning(new.node):
+            self._align_names(old, new)
+            return new.node
+        old, new = old.bare, new.bare
+        match old.node, new.node:
+            case Boolean(operator="and" | "or" as one), Boolean(operator=other) if one == other:
+                return self._matched(old.node, old.operands, new.node, new.operands)
+            case _, Boolean(operator="and" | "or") if self._is_among(old, new.operands):
+                return self._matched(new.node, [old], new.node, new.operands)
+            case Boolean(operator="and" | "or"), _ if self._is_among(new, old.operands):
+                return self._matched(old.node, old.operands, old.node, [new])
+            case Boolean(), Boolean() if old.node.operator == new.node.operator:
+                return _Inner(None, old.node, new.node, self._pairwise(old, new))
+            case Temporal(), Temporal() if old.node.operator == new.node.operator:
+                edit = None
+                if old.node.bound != new.node.bound:
+                    edit = self._site("constant", old, new).edit
+                return _Inner(edit, old.node, new.node, self._pairwise(old, new))
+        kind, subject = _kind_of(old.node, new.node)
+        return self._site(kind, old, new, subject)
+
+    def finished(self, merged: _Merged) -> TreeDiff:
+        """Join the sites of one edit, wherever they occur, and return the edits."""
+        moved = {
+            self.meaning(place.node)
+            for kind, place, _, _ in self._sites
+            if kind == "removed" and place is not None
+        } & {
+            self.meaning(place.node)
+            for kind, _, place, _ in self._sites
+            if kind == "added" and place is not None
+        }
+        joined: dict[Hashable, list[int]] = {}
+        for number, (kind, old, new, _) in enumerate(self._sites):
+            meanings = [None if place is None else self.meaning(place.node) for place in (old, new)]
+            if kind in ("added", "removed") and (meanings[0] in moved or meanings[1] in moved):
+                joined.setdefault(("moved", meanings[0] or meanings[1]), []).append(number)
+                continue
+            spec = (new or old or _NOWHERE).spec
+            key = (kind, spec, *(_text(place, kind) for place in (old, new)), *meanings)
+            joined.setdefault(key, []).append(number)
+        numbers = {site: edit for edit, sites in enumerate(joined.values()) for site in sites}
+        edits = tuple(self._edit(sites) for sites in joined.values())
+        return TreeDiff(edits, _renumbered(merged, numbers))
+
+    def _edit(self, sites: Sequence[int]) -> Edit:
+        found = [self._sites[site] for site in sites]
+        olds = [old for _, old, _, _ in found if old is not None]
+        news = [new for _, _, new, _ in found if new is not None]
+        kinds = {kind for kind, *_ in found}
+        kind: EditKind = "moved" if kinds == {"added", "removed"} else found[0][0]
+        first = (news or olds)[0]
+        return Edit(
+            kind,
+            first.spec,
+            _text(olds[0], kind) if olds else None,
+            _text(news[0], kind) if news else None,
+            tuple(place.id for place in olds),
+            tuple(place.id for place in news),
+            olds[0].node.span if olds else None,
+            news[0].node.span if news else None,
+            max(place.depth for place in (*olds, *news)),
+            found[0][3],
+        )
+
+    def _site(
+        self, kind: EditKind, old: _Place | None, new: _Place | None, subject: str | None = None
+    ) -> _Site:
+        self._sites.append((kind, old, new, subject))
+        return _Site(
+            len(self._sites) - 1, None if old is None else old.node, None if new is None else new.node
+        )
+
+    def _align_names(self, old: _Place, new: _Place) -> None:
+        """Note the nodes within equal ones that have other names."""
+        for one, other in zip(old.operands, new.operands, strict=False):
+            if self.meaning(one.node) == self.meaning(other.node):
+                if one.node.name != other.node.name and None not in (one.node.name, other.node.name):
+                    self._sites.append(("renamed", one, other, None))
+                self._align_names(one, other)
+
+    def _pairwise(self, old: _Place, new: _Place) -> tuple[_Merged, ...]:
+        pairs = zip(old.operands, new.operands, strict=True)
+        return tuple([self.align(one, other) for one, other in pairs])
+
+    def _is_among(self, place: _Place, operands: Sequence[_Place]) -> bool:
+        return any(self.meaning(place.node) == self.meaning(each.node) for each in operands)
+
+    def _matched(
+        self, old_node: Any, olds: Sequence[_Place], new_node: Any, news: Sequence[_Place]
+    ) -> _Inner:
+        """Match the operands of a conjunction or disjunction: equal ones, those of one name, similar ones."""
+        partner: dict[int, int] = {}
+        taken: set[int] = set()
+
+        def match(fits: Any) -> None:
+            for number, new in enumerate(news):
+                for index, old in enumerate(olds if number not in partner else ()):
+                    if index not in taken and fits(old, new):
+                        partner[number] = index
+                        taken.add(index)
+                        break
+
+        match(lambda old, new: self.meaning(old.node) == self.meaning(new.node))
+        match(lambda old, new: old.node.name is not None and old.node.name == new.node.name)
+        for least in (1.0, 0.5, 0.01):
+            match(lambda old, new, least=least: _similarity(old.bare.node, new.bare.node) >= least)
+        operands: list[_Merged] = [
+            self.align(olds[partner[number]], new) if number in partner else self._site("added", None, new)
+            for number, new in enumerate(news)
+        ]
+        operands += [self._site("removed", old, None) for index, old in enumerate(olds) if index not in taken]
+        return _Inner(None, old_node, new_node, tuple(operands))
+
+
+_NOWHERE = _Place(Truth(True), 0, "", 0)
+
+
+def _kind_of(old: Formula, new: Formula) -> tuple[EditKind, str | None]:
+    """Return what of a node was edited, and the region or group if that is it."""
+    if isinstance(old, Atom) and isinstance(new, Atom) and old.relation == new.relation:
+        if old.text == new.text:
+            for one, other in zip(iter_terms([old]), iter_terms([new]), strict=False):
+                if one != other and isinstance(base_of(other), RegionName):
+                    return "region", format_term(base_of(other))
+                if one != other and isinstance(base_of(other), Group):
+                    return "group", format_term(base_of(other))
+            return "definition", None
+        if _without_numbers(old) == _without_numbers(new):
+            return "constant", None
+    if isinstance(old, Quantified) and isinstance(new, Quantified):
+        if format_formula(old) == format_formula(new):
+            return "definition", None
+        if (old.quantifier, old.variables, old.group) == (new.quantifier, new.variables, new.group):
+            kind, subject = _kind_of(old.body, new.body)
+            return ("replaced", None) if kind in ("added", "removed") else (kind, subject)
+    return "replaced", None
+
+
+def _without_numbers(atom: Atom) -> Hashable:
+    texts = tuple(each for each in atom.parameters if isinstance(each, str))
+    # the number of a signal's comparison is a text too: NAME, comparison, number
+    texts = texts[:2] if atom.relation == "signal" else texts
+    return texts, len(atom.parameters), tuple(_without_radius(term) for term in atom.terms)
+
+
+def _without_radius(term: Term) -> Hashable:
+    base = base_of(term)
+    return type(term).__name__, format_term(base)
+
+
+def _similarity(old: Formula, new: Formula) -> float:
+    """Return how much of what two nodes are about is the same, 0 to 1; 0 for different operators."""
+    if operator_of(old) != operator_of(new):
+        return 0.0
+    one, other = _subjects(old), _subjects(new)
+    return (one & other).total() / max((one | other).total(), 1)
+
+
+def _subjects(formula: Formula) -> Counter[str]:
+    return Counter(format_term(base_of(term)) for term in iter_terms([formula])) + Counter(
+        [node.parameters[0] for _, _, node in iter_nodes(formula) if isinstance(node, Atom) and not node.terms]
+    )
+
+
+def _text(place: _Place | None, kind: EditKind) -> str | None:
+    if place is None:
+        return None
+    if kind == "renamed":
+        return place.node.name
+    if kind == "constant" and isinstance(place.node, Temporal):
+        # the operands stay or have edits of their own
+        return f"{place.node.operator}{format_bound(place.node.bound)} …"
+    return format_formula(place.node)
+
+
+def _built(merged: _Merged, chosen: frozenset[int]) -> Formula | None:
+    if isinstance(merged, _Site):
+        return merged.new if merged.edit in chosen else merged.old
+    if not isinstance(merged, _Inner):
+        return merged
+    head = merged.new if merged.edit in chosen else merged.old
+    operands = tuple(
+        each for operand in merged.operands if (each := _built(operand, chosen)) is not None
+    )
+    if head.operator in ("and", "or") and len(operands) < 2:
+        return operands[0] if operands else Truth(head.operator == "and")
+    return replace(head, operands=operands)
+
+
+def _renumbered(merged: _Merged, numbers: Mapping[int, int]) -> _Merged:
+    if isinstance(merged, _Site):
+        return replace(merged, edit=numbers[merged.edit])
+    if not isinstance(merged, _Inner):
+        return merged
+    operands = tuple(_renumbered(operand, numbers) for operand in merged.operands)
+    edit = None if merged.edit is None else numbers[merged.edit]
+    return replace(merged, edit=edit, operands=operands)
+
+
+def _with_regions(formula: Formula, renamed: Mapping[str, str]) -> Formula:
+    if not renamed:
+        return formula
+    match formula:
+        case Truth():
+            return formula
+        case Atom():
+            expression = map_leaves(formula.expression, partial(_leaf_with_regions, renamed=renamed))
+            terms = tuple(_term_with_regions(term, renamed) for term in formula.terms)
+            return replace(formula, expression=expression, terms=terms)
+        case Quantified():
+            return replace(formula, body=_with_regions(formula.body, renamed))
+        case _:
+            operands = tuple(_with_regions(each, renamed) for each in formula.operands)
+            return replace(formula, operands=operands)
+
+
+def _leaf_with_regions(leaf: Any, renamed: Mapping[str, str]) -> Any:
+    if not isinstance(leaf, Measurement):
+        return leaf
+    return map_terms(leaf, partial(_term_with_regions, renamed=renamed))
+
+
+def _term_with_regions(term: Term, renamed: Mapping[str, str]) -> Term:
+    if isinstance(term, RegionName):
+        return RegionName(renamed.get(term.name, term.name))
+    inner = getattr(term, "term", None)
+    return term if inner is None else replace(term, term=_term_with_regions(inner, renamed))
