@@ -21,11 +21,34 @@ from spatial_replay.errors import (
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.api import evaluate_logs, info, read_results, replay_log, tune, verify, write_report
+    from spatial_replay.api import (
+        clip_log,
+        diff_logs,
+        diff_specifications,
+        evaluate_logs,
+        info,
+        read_results,
+        replay_log,
+        tune,
+        verify,
+        write_report,
+    )
     from spatial_replay.automata.automaton import Automaton
     from spatial_replay.automata.compile import automaton
     from spatial_replay.automata.guards import Transition
     from spatial_replay.batch.run import BatchResult
+    from spatial_replay.compare.alignment import Alignment, Knot, ObjectDiff, Parting
+    from spatial_replay.compare.clips import Clip
+    from spatial_replay.compare.decision_diff import DecisionDiff
+    from spatial_replay.compare.edit_cause import EditOutcome
+    from spatial_replay.compare.runs import LogDiff, RunSpecDiff
+    from spatial_replay.compare.specifications import (
+        FirstDifference,
+        SpecDiff,
+        SpecificationDiff,
+        TextPlace,
+    )
+    from spatial_replay.compare.trees import Edit
     from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
     from spatial_replay.monitor.causes import Cause, LeastPart
     from spatial_replay.monitor.evaluate import Evaluation, evaluate
@@ -57,20 +80,28 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "Alignment",
     "Automaton",
     "BatchResult",
     "Candidate",
     "Cause",
+    "Clip",
     "Consideration",
     "ConvexPart",
     "DecidingAtom",
+    "DecisionDiff",
     "Diagnostic",
+    "Edit",
+    "EditOutcome",
     "Evaluation",
+    "FirstDifference",
     "Footprint",
     "GeometryError",
     "Guards",
     "Instant",
+    "Knot",
     "LeastPart",
+    "LogDiff",
     "LogError",
     "Measured",
     "MessageChannel",
@@ -80,21 +111,27 @@ __all__ = [
     "NoAutomatonError",
     "NodeResult",
     "NodeUpdate",
+    "ObjectDiff",
     "ObjectOverview",
     "OutputError",
     "Overview",
+    "Parting",
     "Planner",
     "Recorder",
     "Replayed",
+    "RunSpecDiff",
     "Sample",
     "Sentence",
     "Settings",
     "SpatialReplayError",
+    "SpecDiff",
     "SpecResult",
     "SpecUpdate",
     "Specification",
+    "SpecificationDiff",
     "SpecificationError",
     "Step",
+    "TextPlace",
     "Threshold",
     "Trace",
     "TraceError",
@@ -111,6 +148,9 @@ __all__ = [
     "WitnessStep",
     "__version__",
     "automaton",
+    "clip_log",
+    "diff_logs",
+    "diff_specifications",
     "evaluate",
     "evaluate_logs",
     "info",
@@ -127,11 +167,34 @@ __all__ = [
 __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
-        "api": ("evaluate_logs", "info", "read_results", "replay_log", "tune", "verify", "write_report"),
+        "api": (
+            "clip_log",
+            "diff_logs",
+            "diff_specifications",
+            "evaluate_logs",
+            "info",
+            "read_results",
+            "replay_log",
+            "tune",
+            "verify",
+            "write_report",
+        ),
         "batch.run": ("BatchResult",),
         "automata.automaton": ("Automaton",),
         "automata.compile": ("automaton",),
         "automata.guards": ("Transition",),
+        "compare.alignment": ("Alignment", "Knot", "ObjectDiff", "Parting"),
+        "compare.clips": ("Clip",),
+        "compare.edit_cause": ("EditOutcome",),
+        "compare.decision_diff": ("DecisionDiff",),
+        "compare.runs": ("LogDiff", "RunSpecDiff"),
+        "compare.specifications": (
+            "FirstDifference",
+            "SpecDiff",
+            "SpecificationDiff",
+            "TextPlace",
+        ),
+        "compare.trees": ("Edit",),
         "geometry.footprint": ("ConvexPart", "Footprint", "TrackedObject"),
         "monitor.causes": ("Cause", "LeastPart"),
         "monitor.evaluate": ("Evaluation", "evaluate"),

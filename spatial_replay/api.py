@@ -1,4 +1,4 @@
-"""What the commands do with whole logs, as functions: replay, report, tune, verify, info."""
+"""What the commands do with whole logs, as functions: replay, report, diff, clip, tune, verify, info."""
 
 from __future__ import annotations
 
@@ -9,15 +9,19 @@ from pathlib import Path
 from reprlib import repr as shortened
 from typing import TYPE_CHECKING, Literal, TypeAlias, TypedDict, Unpack
 
+from spatial_replay.compare.clips import Clip, cut_clip
+from spatial_replay.compare.runs import LogDiff, diff_sources
+from spatial_replay.compare.specifications import SpecificationDiff, diff_over_source
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import local_files
 from spatial_replay.logs.source import MemorySource, Source
 from spatial_replay.logs.topics import MAPPED
 from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.replay.annotated import load_files, run_replay
+from spatial_replay.replay.annotated import load_files, recorded_texts, run_replay
 from spatial_replay.replay.engine import Replayed
 from spatial_replay.replay.selection import ReplayOptions, Window
 from spatial_replay.replay.verification import Verified, verify_certificate
+from spatial_replay.report.comparison_page import write_comparison
 from spatial_replay.report.write import refuse_output
 from spatial_replay.report.write import write_report as write_page
 from spatial_replay.sources.open_log import open_source, read_trace
@@ -136,6 +140,117 @@ def write_report(
     refuse_output(Path(output), inputs)
     source = _source(log, options)
     return write_page(source, _files(specifications, source, constants), Path(output), how, inputs=inputs)
+
+
+def diff_specifications(
+    log: Log,
+    old: Specification | PathName,
+    new: Specification | PathName,
+    *,
+    output: PathName | None = None,
+    **options: Unpack[Evaluating],
+) -> SpecificationDiff:
+    """Compare two versions of a specification over a log: what changed, since when, and which edit did it.
+
+    The edit is found by evaluation: the old specification with this edit alone has the new verdict, and the
+    new one without it has the old verdict.
+
+    Args:
+        log: a file in any format, or a trace.
+        old, new: parsed, or as files.
+        output: a page to write, with both under one time cursor; its name ends in .html.
+        options: how to evaluate and read the log, as for `replay_log`.
+
+    Raises:
+        UsageError: no spec in common, options that do not work, no sample in the window.
+        SpecificationError: a specification with errors.
+        LogError: the log cannot be read.
+    """
+    constants, how = _evaluation(options)
+    source = _source(log, options)
+    one, other = (_files(file, source, constants)[0] for file in (old, new))
+    diff = diff_over_source(source, one, other, how)
+    if output is not None:
+        sides = (source, [one], how), (source, [other], how)
+        write_comparison(diff, sides, Path(output), inputs=_inputs(log, [old, new], options))
+    return diff
+
+
+def diff_logs(
+    a: Log,
+    b: Log,
+    specifications: Specifications | None = None,
+    *,
+    align: str = "time",
+    output: PathName | None = None,
+    **options: Unpack[Evaluating],
+) -> LogDiff:
+    """Compare two runs: which objects moved otherwise, and what that did to each spec and decision.
+
+    Args:
+        specifications: one or several, parsed or as files; None takes those that a log was written with.
+        align: "time" since the first sample, the "progress" of an automaton, or the name of a spec, whose
+            first change of sign in each run is the event.
+        output: a page to write, with both under one time cursor; its name ends in .html.
+        options: how to evaluate and read both logs, as for `replay_log`.
+
+    Raises:
+        UsageError: no common object, other units, nothing to align by, options that do not work.
+        SpecificationError: a specification with errors.
+        LogError: a log cannot be read.
+    """
+    constants, how = _evaluation(options)
+    sources = _source(a, options), _source(b, options)
+    own = [source for source in sources if recorded_texts(source)]
+    files: list[Specification] = []
+    if specifications is not None or own:
+        files = _files(specifications, (own or [sources[0]])[0], constants)
+    diff = diff_sources(sources, files, (how, how), align=align)
+    if output is not None:
+        sides = (sources[0], files, how), (sources[1], files, how)
+        inputs = [path for log in (a, b) for path in _inputs(log, specifications, options)]
+        write_comparison(diff, sides, Path(output), inputs=inputs)
+    return diff
+
+
+def clip_log(
+    log: Log,
+    specifications: Specifications | None = None,
+    *,
+    output: PathName,
+    around_ns: int = 0,
+    of: Sequence[str] = (),
+    topics: Sequence[str] | None = None,
+    **options: Unpack[Evaluating],
+) -> Clip:
+    """Write the smallest part of a log that has its verdicts, robustness and witnesses.
+
+    Args:
+        output: the clip to write (MCAP), an annotated log.
+        around_ns: keep at least so much before and after the samples that decide.
+        of: names of the specs whose verdicts are kept; all results without it.
+        topics: patterns of the topics to keep, such as "/camera/*"; None for all.
+
+    The other arguments are those of `replay_log`.
+
+    Raises:
+        UsageError: no such spec, options that do not work, an output that is an input.
+        SpecificationError: a specification with errors.
+        LogError: the log cannot be read.
+        OutputError: the clip cannot be written.
+    """
+    constants, how = _evaluation(options)
+    source = _source(log, options)
+    keep = None if topics is None else tuple([topics] if isinstance(topics, str) else topics)
+    return cut_clip(
+        source,
+        _files(specifications, source, constants),
+        Path(output),
+        replace(how, keep=keep),
+        around_ns=around_ns,
+        of=[of] if isinstance(of, str) else of,
+        inputs=_inputs(log, specifications, options),
+    )
 
 
 def _evaluation(options: Evaluating) -> tuple[Mapping[str, float | str] | None, ReplayOptions]:

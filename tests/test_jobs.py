@@ -69,8 +69,10 @@ def follow(page: str, names: dict[str, object], capsys: pytest.CaptureFixture[st
         elif block.language == "text":
             assert printed == block.text
         elif block.language == "sh":
+            printed = ""
             for command, code in commands(block):
                 ended = shell(command)
+                printed += ended.stdout
                 assert ended.returncode == code, f"{command}\n{ended.stdout}{ended.stderr}"
 
 
@@ -94,6 +96,15 @@ def test_a_failure_is_traced_from_the_verdict_to_a_report_and_an_annotated_log(
     follow("why-did-it-fail.md", {}, capsys)
     for file in ("table.html", "table.mcap", "layout.json", "table.csv"):
         assert Path(file).stat().st_size > 1_000
+
+
+@pytest.mark.usefixtures("desk")
+def test_what_changed_is_found_and_the_smallest_piece_that_shows_it_is_cut_out(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    follow("compare.md", {}, capsys)
+    assert Path("diff.html").stat().st_size > 10_000
+    assert Path("bug.mcap").stat().st_size < Path("recordings/push.mcap").stat().st_size / 5
 
 
 @pytest.fixture

@@ -36,7 +36,9 @@ DEBUG_VARIABLE = "SPATIAL_REPLAY_DEBUG"
 COMMANDS: dict[str, str] = {
     "batch": "Evaluate many logs, and show what fails.",
     "check": "Check a specification and print its tree.",
+    "clip": "Cut the smallest part of a log that shows a verdict.",
     "completion": "Print a shell completion script.",
+    "diff": "Compare two specifications over a log, or two logs.",
     "explain": "Explain a verdict.",
     "export": "Export the robustness of every node as a table.",
     "info": "Show what a log contains.",

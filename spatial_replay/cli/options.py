@@ -291,8 +291,14 @@ class EvaluationInputs:
         return ReplayOptions(self.window, self.each, semantics, self.strict_names, keep or None)
 
 
-def open_inputs(request: EvaluationArguments) -> EvaluationInputs:
+def open_inputs(
+    request: EvaluationArguments, *, known: Sequence[Specification] = (), can_do_without: bool = False
+) -> EvaluationInputs:
     """Open the log and load the specifications; their warnings go to standard error.
+
+    Args:
+        known: the specifications, if they are loaded already.
+        can_do_without: whether a log without any specification will do.
 
     Raises:
         UsageError: options that do not work.
@@ -300,11 +306,15 @@ def open_inputs(request: EvaluationArguments) -> EvaluationInputs:
     """
     # imported here so that --help stays fast
     from spatial_replay.replay import load_files
+    from spatial_replay.replay.annotated import recorded_texts
     from spatial_replay.sources.open_log import open_source
 
     source = open_source(request.log, **request.reading)
-    files = load_files(request.specs, source, profile=request.profile, constants=request.constants)
-    show_diagnostics(warning for file in files for warning in file.warnings)
+    files = list(known)
+    is_bare = can_do_without and not (request.specs or request.constants or recorded_texts(source))
+    if not files and not is_bare:
+        files = load_files(request.specs, source, profile=request.profile, constants=request.constants)
+        show_diagnostics(warning for file in files for warning in file.warnings)
     window, each = _window(source, request), objects_by_parameter(request.choices)
     return EvaluationInputs(source, files, window, each, request.strict_names)
 

@@ -18,7 +18,7 @@ from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.formula import Specification
-from spatial_replay.trace.trace import ABSENT, Trace
+from spatial_replay.trace.trace import Trace
 
 AlignmentKind: TypeAlias = Literal["time", "event", "progress"]
 
@@ -99,7 +99,9 @@ def align_runs(
         if paths[0] is None or paths[1] is None:
             continue
         common = _common(paths[0], paths[1])
-        knots = [Knot(x.time_ns, y.time_ns) for x, y in zip(paths[0][:common], paths[1][:common], strict=True)]
+        knots = [
+            Knot(x.time_ns, y.time_ns) for x, y in zip(paths[0][:common], paths[1][:common], strict=True)
+        ]
         if common == len(paths[0]) == len(paths[1]):
             knots.append(Knot(int(a[-1]), int(b[-1])))
         return _alignment("progress", one.title, knots, a, b)
@@ -115,13 +117,15 @@ def parting_of(one: SpecResult, other: SpecResult, files: Sequence[Specification
     if paths[0] is None or paths[1] is None or paths[0] == paths[1]:
         return None
     common = _common(paths[0], paths[1])
-    ends = [path[common] if common < len(path) else None for path in (paths[0], paths[1])]
-    if ends[0] is None and ends[1] is None:
+    one_end, other_end = (path[common] if common < len(path) else None for path in (paths[0], paths[1]))
+    if one_end is None and other_end is None:
         return None
     return Parting(
         one.title,
-        *(None if end is None else end.time_ns for end in ends),
-        *(() if end is None else end.states for end in ends),
+        None if one_end is None else one_end.time_ns,
+        None if other_end is None else other_end.time_ns,
+        () if one_end is None else one_end.states,
+        () if other_end is None else other_end.states,
     )
 
 
@@ -264,9 +268,7 @@ def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDif
     _check_units(a, b, names, shapes)
     both = FootprintBatch.concatenate([a.footprints, b.footprints])
     found = [
-        diff
-        for name in names
-        if (diff := _object_diff(name, a, b, alignment, shapes, both)) is not None
+        diff for name in names if (diff := _object_diff(name, a, b, alignment, shapes, both)) is not None
     ]
     never = int(a.times_ns[-1]) + 1
     return tuple(
@@ -275,7 +277,7 @@ def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDif
 
 
 class _Shapes:
-    """Numbers of the observations of a trace by which they are told apart."""
+    """Numbers of the observations of a trace by which they are compared."""
 
     def __init__(self, trace: Trace) -> None:
         batch = trace.footprints
@@ -284,7 +286,10 @@ class _Shapes:
         sums = _sums(np.concatenate([batch.vertices, batch.vertices**2], axis=1), vertex)
         self.mean = sums[:, :2] / count
         spread = sums[:, 2:] / count - self.mean**2
-        self.size = np.sqrt(np.maximum(spread.sum(axis=1), 0.0)) + _sums(batch.radius[:, None], batch.part_start)[:, 0]
+        self.size = (
+            np.sqrt(np.maximum(spread.sum(axis=1), 0.0))
+            + _sums(batch.radius[:, None], batch.part_start)[:, 0]
+        )
         others = [sums, self.size[:, None], *(each[:, None] for each in (batch.bottom, batch.top))]
         self.numbers = np.nan_to_num(
             np.concatenate([*others, trace.yaw[:, None], trace.uncertainty[:, None]], axis=1), nan=-1.5

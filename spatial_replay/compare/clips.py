@@ -1,8 +1,8 @@
 """The smallest part of a log that still shows why a verdict is what it is, as a log of its own.
 
 A window of samples is searched whose replay has the verdict, the robustness and the witness of the whole log.
-No window is measured again: atoms are those of the first replay, except the first few that look back to before
-the window, where a clip has no samples.
+No window is measured again: atoms are those of the first replay, except the first few that look back to
+before the window, where a clip has no samples.
 """
 
 from __future__ import annotations
@@ -10,12 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from spatial_replay.bags.decoders import decoder_of
+from spatial_replay.bags.ros_definitions import full_type_name
 from spatial_replay.bags.topic import Topic
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
@@ -31,6 +33,7 @@ from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.offline import evaluate_offline
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.result import SpecResult
+from spatial_replay.monitor.semantics import require_ltlf
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.monitor.witness.path import End, deciding_path
 from spatial_replay.replay.annotated import run_replay
@@ -54,8 +57,8 @@ class Clip:
     Attributes:
         whole, replayed: the replay of the log, and that of the clip.
         start_ns, end_ns: times of the first and the last sample of the clip.
-        kept: the titles of the results that the clip has in common with the log.
-        source_bytes, clip_bytes: sizes of the files; None for a log that is not one file.
+        kept: the titles of the results, and names of specs within them, that are as in the log.
+        source_bytes, clip_bytes: sizes of the files; None for a log that is not one file here.
     """
 
     whole: Replayed
@@ -82,7 +85,7 @@ class Clip:
         )
 
 
-def clip_log(
+def cut_clip(
     source: Source,
     files: Sequence[Specification],
     output: Path,
@@ -91,29 +94,27 @@ def clip_log(
     around_ns: int = 0,
     of: Sequence[str] = (),
     inputs: Sequence[Path] = (),
-    source_bytes: int | None = None,
     advance: Callable[[int], None] = lambda samples: None,
 ) -> Clip:
     """Write the smallest part of a log that has its verdicts, robustness and witnesses.
 
     Neither end can be cut further, by one sample or by any power of two, without another result. Messages are
-    those in the window, and before it the last of each topic and the last transform of each frame; times stay.
+    those in the window, and before it the last of each topic and the last transform of each frame. Times
+    stay.
 
     Args:
         options: what is evaluated; `keep` chooses the topics.
         around_ns: keep at least so much before and after the samples that decide.
-        of: names of the results to keep; all of them without it.
+        of: names of the specs to keep; all results without it.
         inputs: files that the output must not be.
-        source_bytes: the size of the log, for the record.
 
     Raises:
-        UsageError: no such result, an option that cannot work, an output that is an input.
+        UsageError: no such spec, an option that cannot work, an output that is an input.
         LogError: no sample in the log. OutputError: the output cannot be written.
     """
     if options.window.every != 1:
         raise UsageError("a clip keeps every sample; leave out --every")
-    if options.semantics != "ltlf":
-        raise UsageError("clips are cut by witnesses, which only the semantics 'ltlf' has")
+    require_ltlf(options.semantics, "a clip")
     first_pass = replace(options, keep=())
     whole = run_replay(source, files, first_pass, keep_leaves=True, advance=advance)
     chosen = _chosen(whole.results, of)
@@ -130,31 +131,58 @@ def clip_log(
             "samples": str(whole.samples),
             "start_ns": str(start_ns),
             "end_ns": str(end_ns),
-            "kept": ", ".join(result.title for result in chosen),
+            "kept": ", ".join(each.title for each in chosen),
         },
     )
     replayed = run_replay(
-        clipped, files, replace(options, window=Window(), keep=None), keep_leaves=True, output=output, inputs=inputs
+        clipped,
+        files,
+        replace(options, window=Window(), keep=None),
+        keep_leaves=True,
+        output=output,
+        inputs=inputs,
     )
     return Clip(
         whole,
         replayed,
         start_ns,
         end_ns,
-        tuple(result.title for result in chosen),
-        source_bytes,
+        tuple(each.title for each in chosen),
+        _size_of(source),
         output.stat().st_size,
     )
 
 
-def _chosen(results: Sequence[SpecResult], of: Sequence[str]) -> list[SpecResult]:
-    names = [name for result in results for name in (result.title, result.name)]
+def _size_of(source: Source) -> int | None:
+    """Return the size of a log on this machine that is one file."""
+    path = getattr(source, "path", None)
+    return path.stat().st_size if isinstance(path, Path) and path.is_file() else None
+
+
+class _Kept(NamedTuple):
+    """A node whose verdict a clip keeps, by its id, and what it is called."""
+
+    result: SpecResult
+    node: int
+    title: str
+
+
+def _chosen(results: Sequence[SpecResult], of: Sequence[str]) -> list[_Kept]:
+    """Return the results, or the results and named specs within them that are asked for."""
+    if not of:
+        return [_Kept(result, 0, result.title) for result in results]
+    found, known = [], dict[str, None]()
+    for result in results:
+        names = {node.name: node.id for node in reversed(result.nodes) if node.name is not None}
+        known |= dict.fromkeys([result.title, *names])
+        if result.title in of or result.name in of:
+            found.append(_Kept(result, 0, result.title))
+        found += [_Kept(result, names[name], name) for name in of if names.get(name)]
     for name in of:
-        if name not in names:
-            known = ", ".join(dict.fromkeys(result.title for result in results))
-            hint = nearest_hint(name, names) or f"there are {known}"
-            raise UsageError(f"no result is named {name!r}; {hint}")
-    return [result for result in results if not of or result.title in of or result.name in of]
+        if name not in known and all(name != result.name for result in results):
+            hint = nearest_hint(name, known) or f"there are {', '.join(known)}"
+            raise UsageError(f"no spec is named {name!r}; {hint}")
+    return found
 
 
 class _Reason(NamedTuple):
@@ -172,12 +200,13 @@ class _Reason(NamedTuple):
 
 
 class _Part:
-    """One result, evaluated over any window of its samples."""
+    """One node of a result, evaluated over any window of its samples."""
 
-    def __init__(self, result: SpecResult, trace: Trace | None, regions: Mapping[str, Outline]) -> None:
+    def __init__(self, kept: _Kept, trace: Trace | None, regions: Mapping[str, Outline]) -> None:
+        result = kept.result
         if result.leaves is None:
             raise UsageError("a clip needs the leaves of every sample, which were not stored")
-        self._result = result
+        self._result, self._node = result, kept.node
         self._leaves, self._times_ns = result.leaves, result.times_ns
         self._order = result.evidence.instance.program.leaves
         self._trace, self._regions = trace, regions
@@ -221,10 +250,12 @@ class _Part:
 
     def _reason(self, leaves: Floats, times_ns: Integers) -> _Reason:
         done = evaluate_offline(self._result.formula, self._order, np.ascontiguousarray(leaves), times_ns)
-        ends = tuple(float(end[0]) + 0.0 for wide in (True, False) for end in done.ends(0, wide=wide))
+        ends = tuple(
+            float(end[0]) + 0.0 for wide in (True, False) for end in done.ends(self._node, wide=wide)
+        )
         verdict = final_verdict(*ends[:2])
         end = {Verdict.SATISFIED: End.LOW, Verdict.VIOLATED: End.HIGH}.get(verdict, End.OPEN)
-        steps = deciding_path(self._result.formula, done, times_ns, 0, end).steps
+        steps = deciding_path(self._result.formula, done, times_ns, self._node, end).steps
         return _Reason(ends, tuple(step.node for step in steps), int(times_ns[steps[-1].sample]))
 
 
@@ -236,17 +267,18 @@ class _Search:
         source: Source,
         files: Sequence[Specification],
         options: ReplayOptions,
-        results: Sequence[SpecResult],
+        kept: Sequence[_Kept],
         around_ns: int,
     ) -> None:
+        results = [each.result for each in kept]
         needs_samples = any(
             result.object is not None or look_back([result.formula]) != (0, 0) for result in results
         )
         trace = None
         if needs_samples:
-            trace = Trace.concatenate(list(Selection(source, files, options).iter_traces()))
+            trace = Selection(source, files, options).trace()
         self._parts = [
-            _Part(result, trace, _regions(files, result)) for result in results if len(result.times_ns)
+            _Part(each, trace, _regions(files, each.result)) for each in kept if len(each.result.times_ns)
         ]
         self._times_ns = _joined_times([result.times_ns for result in results])
         decided = [part.reason.decided_ns for part in self._parts]
@@ -261,8 +293,8 @@ class _Search:
         """Return the times of the first and the last sample of the clip."""
         first, last = self._outwards()
         while True:
-            begin = self._cut(first, self._inner[0], lambda at, other=last: self._holds(at, other))
-            end = self._cut(last, self._inner[1], lambda at, other=begin: self._holds(other, at))
+            begin = self._cut(first, self._inner[0], partial(self._holds, last=last))
+            end = self._cut(last, self._inner[1], partial(self._holds, begin))
             if (begin, end) == (first, last):
                 return int(self._times_ns[first]), int(self._times_ns[last])
             first, last = begin, end
@@ -278,17 +310,13 @@ class _Search:
             step = max(2 * step, 1)
 
     def _cut(self, outer: int, inner: int, holds: Callable[[int], bool]) -> int:
-        """Return the end nearest to the inner one that holds, among those at doubling distances, then halves."""
+        """Return an end near the inner one that holds: at doubling distances first, then by halves."""
         direction = 1 if inner >= outer else -1
-        distance = abs(inner - outer)
-        step = 0
-        fails: int | None = None
-        while step < distance:
-            at = inner - direction * step
-            if holds(at):
-                break
+        fails, step, at = None, 0, inner
+        while step < abs(inner - outer) and not holds(at):
             fails, step = at, max(2 * step, 1)
-        else:
+            at = inner - direction * step
+        if step >= abs(inner - outer):
             at = outer
         if fails is None:
             return at
@@ -314,7 +342,11 @@ def _same(one: _Reason | None, other: _Reason) -> bool:
 
 def _joined_times(times_ns: Sequence[Integers]) -> Integers:
     longest = max(times_ns, key=len)
-    return longest if all(len(each) == len(longest) for each in times_ns) else np.unique(np.concatenate(times_ns))
+    return (
+        longest
+        if all(len(each) == len(longest) for each in times_ns)
+        else np.unique(np.concatenate(times_ns))
+    )
 
 
 def _regions(files: Sequence[Specification], result: SpecResult) -> Mapping[str, Outline]:
@@ -404,7 +436,8 @@ def _frame_names(channel: Channel) -> Callable[[bytes], Sequence[str]]:
     decode: Callable[[bytes], Any] | None = None
     if short_type(kind) in TRANSFORM_TYPES:
         with suppress(LogError):
-            topic = Topic(channel.topic, kind, channel.encoding, schema=channel.schema, metadata=channel.metadata)
+            name = full_type_name(kind) if channel.encoding in ("ros1", "cdr") else kind
+            topic = Topic(channel.topic, name, channel.encoding, schema=channel.schema)
             decode = decoder_of(topic)
 
     def names(payload: bytes) -> Sequence[str]:
@@ -419,7 +452,7 @@ def _frame_names(channel: Channel) -> Callable[[bytes], Sequence[str]]:
 
 def _children(message: Any) -> list[str]:
     try:
-        transforms = get_field(message, "transforms")
+        transforms: Any = get_field(message, "transforms")
     except (LookupError, AttributeError, TypeError):
         transforms = [message]
     return [str(get_field(each, "child_frame_id")) for each in transforms] or [""]

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
 
@@ -18,18 +16,20 @@ from spatial_replay.compare.alignment import (
     compare_objects,
     parting_of,
 )
+from spatial_replay.compare.decision_diff import DecisionDiff, compare_decisions
 from spatial_replay.errors import UsageError
 from spatial_replay.lazy import Displayed
-from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanDecision
 from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import CERTIFICATE
 from spatial_replay.monitor.evaluate import Evaluation, evaluate
 from spatial_replay.monitor.result import SpecResult
-from spatial_replay.monitor.sentences import number_text, reason_sentence, time_text
-from spatial_replay.planning.read import read_decisions
+from spatial_replay.monitor.semantics import require_ltlf
+from spatial_replay.monitor.sentences import number_text, reason_sentence
+from spatial_replay.replay.selection import DEFAULT_OPTIONS, LogNames, ReplayOptions, Selection
+from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Atom, Specification, iter_nodes
 from spatial_replay.spec.walks import other_names
-from spatial_replay.text import counted, json_number
+from spatial_replay.text import Instant, Sentence, counted, json_number
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
 
@@ -63,33 +63,32 @@ class RunSpecDiff:
     @property
     def is_different(self) -> bool:
         """Whether the verdict or a final number differs."""
-        numbers = [(each.robustness, each.lower, each.upper) for each in (self.a, self.b)]
-        return self.is_flipped or not np.array_equal(*np.array(numbers), equal_nan=True)
+        one, other = ((each.robustness, each.lower, each.upper) for each in (self.a, self.b))
+        return self.is_flipped or not np.array_equal(one, other, equal_nan=True)
 
-    def sentences(self, starts_ns: tuple[int, int]) -> Iterator[str]:
+    def sentences(self, starts_ns: tuple[int, int]) -> Iterator[Sentence]:
         """Yield what differs; times of each run count from its own start."""
         texts = [f"{each.verdict} ({number_text(each.robustness)})" for each in (self.a, self.b)]
-        yield " | ".join(texts)
+        yield Sentence(" | ".join(texts) + ("" if self.is_different else ", the same"))
         if self.first_ns is not None:
-            yield f"the sign of its value differs since {time_text(self.first_ns, starts_ns[0])}"
+            yield Sentence("the sign of its value differs since ", Instant(self.first_ns, starts_ns[0]))
         if self.parting is not None:
-            entered = [
-                f"state {', '.join(map(str, states))} at {time_text(time_ns, start_ns)}"
-                if time_ns is not None
-                else "the end of the run"
-                for time_ns, states, start_ns in (
-                    (self.parting.a_ns, self.parting.a_states, starts_ns[0]),
-                    (self.parting.b_ns, self.parting.b_states, starts_ns[1]),
-                )
-            ]
-            yield f"they part in the automaton: {' | '.join(entered)}"
+            where = self.parting
+            yield Sentence(
+                "they part in the automaton: ",
+                *_entered(where.a_ns, where.a_states, starts_ns[0]),
+                " | ",
+                *_entered(where.b_ns, where.b_states, starts_ns[1]),
+            )
         for node in self.nodes:
-            yield f"brought about by `{self.a.nodes[node].text}`"
+            yield Sentence(f"brought about by `{self.a.nodes[node].text}`")
         for which, result, start_ns in zip("AB", (self.a, self.b), starts_ns, strict=True):
             if self.is_flipped and result.causes and result.causes[0].witness is not None:
-                yield f"{which}: {reason_sentence(result.causes[0].witness, first_ns=start_ns)}"
-        for each in self.moved:
-            yield f"{each.name} moved otherwise: {_movement(each, starts_ns[0])}"
+                reason = reason_sentence(result.causes[0].witness, first_ns=start_ns)
+                yield Sentence(f"{which}: ", *reason.parts)
+        if self.moved:
+            names = ", ".join(each.name for each in self.moved)
+            yield Sentence(f"of what it is about, these moved otherwise: {names}")
 
     @property
     def document(self) -> dict[str, Any]:
@@ -115,24 +114,6 @@ class RunSpecDiff:
         }
 
 
-class DecisionDiff(NamedTuple):
-    """The first decision of two planned runs that differs.
-
-    Attributes:
-        number: of the decision, from 0.
-        a, b: the decisions in words, or that there is none.
-        a_ns, b_ns: when they were made.
-        maps: the objects whose gradient maps differ.
-    """
-
-    number: int
-    a: str
-    b: str
-    a_ns: int | None
-    b_ns: int | None
-    maps: tuple[str, ...]
-
-
 @dataclass(frozen=True, eq=False)
 class LogDiff(Displayed):
     """Two runs side by side.
@@ -147,6 +128,9 @@ class LogDiff(Displayed):
         only_a, only_b: objects that one run never has, and results of templates for them.
         specs: results of both runs.
         decision: the first decision that differs; None if none does, or the runs were not planned.
+        has_equal_samples: whether all samples are equal.
+        faults: what was lost while reading.
+        missing: a warning for each name in the specifications that a log never has.
         traces: the samples; None if the certificates say that they are equal.
     """
 
@@ -164,6 +148,7 @@ class LogDiff(Displayed):
     has_equal_samples: bool
     faults: tuple[str, ...]
     traces: tuple[Trace, Trace] | None = None
+    missing: tuple[Diagnostic, ...] = ()
 
     @property
     def is_empty(self) -> bool:
@@ -185,7 +170,7 @@ class LogDiff(Displayed):
             yield f"  {counts}; {self.alignment}: {pairs} of samples"
         start_ns = self.starts_ns[0]
         for each in self.objects[:_MOST_LISTED]:
-            yield f"  {each.name}: {_movement(each, start_ns)}"
+            yield f"  {each.name}: {movement_sentence(each, start_ns)}"
         if len(self.objects) > _MOST_LISTED:
             yield f"  and {counted(len(self.objects) - _MOST_LISTED, 'other object')} moved otherwise"
         for which, names in (("A", self.only_a), ("B", self.only_b)):
@@ -193,7 +178,7 @@ class LogDiff(Displayed):
                 yield f"  only in {which}: {', '.join(names[:_MOST_LISTED])}"
         for spec in self.specs:
             first, *rest = spec.sentences(self.starts_ns)
-            yield f"  {spec.a.title}: {first}{'' if spec.is_different else ', the same'}"
+            yield f"  {spec.a.title}: {first}"
             if spec.is_different:
                 yield from (f"    {sentence}" for sentence in rest)
         if self.decision is not None:
@@ -245,6 +230,49 @@ class LogDiff(Displayed):
         return "\n".join(self.lines())
 
 
+def diff_sources(
+    sources: tuple[Source, Source],
+    files: Sequence[Specification] = (),
+    options: tuple[ReplayOptions, ReplayOptions] = (DEFAULT_OPTIONS, DEFAULT_OPTIONS),
+    *,
+    align: str = "time",
+    advance: Callable[[int], None] = lambda samples: None,
+) -> LogDiff:
+    """Compare two logs; if their certificates say that they are equal, no sample is read.
+
+    Args:
+        options: how each log is evaluated.
+        advance: called with the number of samples of each block that is read.
+
+    Raises:
+        UsageError: what `compare_runs` raises. LogError: a log cannot be read.
+        SpecificationError: names that a log never has, if names are strict.
+    """
+    for own in options:
+        require_ltlf(own.semantics, "a diff")
+    is_whole = all(each.window.is_whole for each in options)
+    if is_whole and align == "time" and same_by_certificate(*sources):
+        names = sources[0].name, sources[1].name
+        return LogDiff(*names, (0, 0), (0, 0), True, None, (), (), (), (), None, True, ())
+    selections = [
+        Selection(source, tuple(files), replace(each, keep=()))
+        for source, each in zip(sources, options, strict=True)
+    ]
+    traces = selections[0].trace(advance), selections[1].trace(advance)
+    missing: list[Diagnostic] = []
+    for selection, trace in zip(selections, traces, strict=True):
+        if not len(selection.inside(trace)):
+            raise selection.nothing_to_evaluate(trace.faults)
+        known = LogNames()
+        known.add(trace)
+        missing += selection.missing_names(known)
+    windows = [(each.window.start_ns, each.window.end_ns) for each in options]
+    diff = compare_runs(
+        sources, traces, files, align=align, each=options[0].each, windows_ns=(windows[0], windows[1])
+    )
+    return replace(diff, missing=tuple(dict.fromkeys(missing)))
+
+
 def same_by_certificate(one: Source, other: Source) -> bool:
     """Say whether two logs have certificates of equal samples and messages."""
     hashes = [
@@ -280,15 +308,17 @@ def compare_runs(
     """
     for source, trace in zip(sources, traces, strict=True):
         if not len(trace):
-            raise UsageError(f"{source.name} has no sample in the requested window; there is nothing to compare")
+            raise UsageError(
+                f"{source.name} has no sample in the requested window; there is nothing to compare"
+            )
     a, b = traces
-    evaluations = [_evaluated(trace, files, each, window) for trace, window in zip(traces, windows_ns, strict=True)]
+    evaluations = [
+        _evaluated(trace, files, each, window) for trace, window in zip(traces, windows_ns, strict=True)
+    ]
     results = _paired(evaluations)
     alignment = align_runs((a.times_ns, b.times_ns), results, files, align)
     objects = compare_objects(a, b, alignment)
-    titles = [
-        {result.title for evaluation in own for result in evaluation} for own in evaluations
-    ]
+    titles = [{result.title for evaluation in own for result in evaluation} for own in evaluations]
     return LogDiff(
         sources[0].name,
         sources[1].name,
@@ -300,17 +330,11 @@ def compare_runs(
         tuple(sorted(set(a.names) - set(b.names)) + sorted(titles[0] - titles[1])),
         tuple(sorted(set(b.names) - set(a.names)) + sorted(titles[1] - titles[0])),
         tuple(_spec_diff(one, other, alignment, traces, objects, files) for one, other in results),
-        _decision_diff(sources),
+        compare_decisions(sources),
         a == b,
         (*a.faults, *b.faults),
         traces,
     )
-
-
-def certified_diff(sources: tuple[Source, Source]) -> LogDiff:
-    """Return the diff of two logs whose certificates are equal."""
-    names = sources[0].name, sources[1].name
-    return LogDiff(*names, (0, 0), (0, 0), True, None, (), (), (), (), None, True, ())
 
 
 def _evaluated(
@@ -349,9 +373,7 @@ def _spec_diff(
     nodes = _deepest_flipped(one, other)
     if not nodes and one.robustness != other.robustness:
         nodes = (one.witness().path[-1].node,)
-    names = [
-        name for node in nodes for name in sorted(_objects_of(one, node)) if name in moved
-    ]
+    names = [name for node in nodes for name in sorted(_objects_of(one, node)) if name in moved]
     return RunSpecDiff(
         one,
         other,
@@ -403,68 +425,24 @@ def _first_sign(
     return int(traces[0].times_ns[alignment.a[differs.argmax()]]) if differs.any() else None
 
 
-def _decision_diff(sources: tuple[Source, Source]) -> DecisionDiff | None:
-    """Return the first decision that differs, or None; of logs that were not planned, None."""
-    decisions: list[tuple[PlanDecision, ...]] = []
-    for source in sources:
-        path = getattr(source, "path", None)
-        found: tuple[PlanDecision, ...] = ()
-        if isinstance(path, Path) and source.kind == "MCAP":
-            with suppress(UsageError):
-                found = read_decisions(path).decisions
-        decisions.append(found)
-    for number in range(max(map(len, decisions))):
-        pair = [own[number] if number < len(own) else None for own in decisions]
-        if _compared(pair[0]) != _compared(pair[1]):
-            hashes = [_map_hashes(decision) for decision in pair]
-            maps = sorted(name for name in hashes[0].keys() & hashes[1].keys() if hashes[0][name] != hashes[1][name])
-            return DecisionDiff(
-                number,
-                *(_decision_text(decision) for decision in pair),
-                *(None if decision is None else decision.time_ns for decision in pair),
-                tuple(maps),
-            )
-    return None
-
-
-def _compared(decision: PlanDecision | None) -> bytes | None:
-    """Return what of a decision counts: what is to be done and why, not when it was made or how it went."""
-    if decision is None:
-        return None
-    copy = PlanDecision.FromString(decision.SerializeToString())
-    copy.ClearField("time_ns")
-    copy.ClearField("outcome")
-    copied: bytes = copy.SerializeToString(deterministic=True)
-    return copied
-
-
-def _map_hashes(decision: PlanDecision | None) -> dict[str, tuple[bytes, ...]]:
-    hashes: dict[str, tuple[bytes, ...]] = {}
-    for edge in () if decision is None else decision.considered:
-        for candidate in edge.candidates:
-            hashes[candidate.object] = (*hashes.get(candidate.object, ()), candidate.map_sha256)
-    return hashes
-
-
-def _decision_text(decision: PlanDecision | None) -> str:
-    if decision is None:
-        return "none: the run has no such decision"
-    target = decision.target
-    where = f"; {target.object} to ({target.x:.4g}, {target.y:.4g})" if decision.HasField("target") else ""
-    return f"{decision.reason}{where}"
-
-
-def _movement(each: ObjectDiff, start_ns: int) -> str:
-    parts = [f"differs since {time_text(each.first_ns, start_ns)}"]
+def movement_sentence(each: ObjectDiff, start_ns: int) -> Sentence:
+    """Return since when an object moved otherwise, and how far the two are apart."""
+    parts: list[str | Instant] = ["differs since ", Instant(each.first_ns, start_ns)]
     if each.shift:
-        parts[0] += f", by up to {number_text(each.shift)}"
+        parts.append(f", by up to {number_text(each.shift)}")
     if each.apart_ns is not None:
-        farthest = f"{number_text(each.greatest)} at {time_text(each.greatest_ns, start_ns)}"
-        parts.append(f"apart from itself since {time_text(each.apart_ns, start_ns)}, farthest by {farthest}")
+        parts += ["; apart from itself since ", Instant(each.apart_ns, start_ns)]
+        parts += [f", farthest by {number_text(each.greatest)} at ", Instant(each.greatest_ns, start_ns)]
     for which, count in (("A", each.only_a), ("B", each.only_b)):
         if count:
-            parts.append(f"only {which} has it in {counted(count, 'sample')}")
-    return "; ".join(parts)
+            parts.append(f"; only {which} has it in {counted(count, 'sample')}")
+    return Sentence(*parts)
+
+
+def _entered(time_ns: int | None, states: Sequence[int], start_ns: int) -> tuple[str | Instant, ...]:
+    if time_ns is None:
+        return ("the end of the run",)
+    return f"state {', '.join(map(str, states))} at ", Instant(time_ns, start_ns)
 
 
 def _result_value(result: SpecResult) -> dict[str, Any]:

@@ -1,41 +1,38 @@
 """Two versions of a specification over one log: which verdicts changed, since when, and which edit did it.
 
-The cause of a change is found by evaluation, not by guessing: the old formula with only these edits has the new
-result, and the new formula without them has the old one.
+The cause of a change is found by evaluation, not by guessing: the old formula with only these edits has the
+new result, and the new formula without them has the old one.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from spatial_replay.compare.edit_cause import EditOutcome, EditOutcomes, find_cause
 from spatial_replay.compare.trees import Edit, TreeDiff, compare_trees, unify_regions
 from spatial_replay.errors import SpecificationError, UsageError
-from spatial_replay.geometry.arrays import Floats
 from spatial_replay.lazy import Displayed
+from spatial_replay.logs.source import Source
 from spatial_replay.monitor.evaluate import evaluate
-from spatial_replay.monitor.offline import evaluate_offline, new_leaves
-from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.result import SpecResult
-from spatial_replay.monitor.sentences import number_text, reason_sentence, time_text
-from spatial_replay.monitor.verdict import Verdict, final_verdict
-from spatial_replay.spec.diagnostics import nearest_hint
+from spatial_replay.monitor.semantics import require_ltlf
+from spatial_replay.monitor.sentences import number_text, reason_sentence
+from spatial_replay.replay.selection import DEFAULT_OPTIONS, LogNames, ReplayOptions, Selection
+from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
 from spatial_replay.spec.format import format_duration
-from spatial_replay.spec.formula import Atom, Formula, NamedSpec, Quantified, Span, Specification
+from spatial_replay.spec.formula import NamedSpec, Span, Specification
 from spatial_replay.spec.load import parse_specification
-from spatial_replay.text import counted, json_number
+from spatial_replay.text import Instant, Sentence, counted, json_number
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
 
-_MOST_EVALUATIONS: Final = 256
-"""Formulas that are evaluated to find the cause of one change; the cause found by then stands."""
 _MOST_CONSTANTS: Final = 32
 """Changed constants of a file that edits are traced back to."""
 
@@ -46,26 +43,6 @@ class TextPlace(NamedTuple):
     filename: str
     line: int
     text: str
-
-
-class Outcome(NamedTuple):
-    """The result of a formula on a finished log; the robustness is NaN if not determined."""
-
-    verdict: Verdict
-    robustness: float
-    lower: float
-    upper: float
-
-    @classmethod
-    def of(cls, result: SpecResult) -> Outcome:
-        return cls(result.verdict, result.robustness, result.lower, result.upper)
-
-    def same_as(self, other: Outcome, *, verdict_only: bool = False) -> bool:
-        """Say whether two outcomes have one verdict and, unless that is all that counts, the same numbers."""
-        if verdict_only:
-            return self.verdict is other.verdict
-        pairs = zip(self[1:], other[1:], strict=True)
-        return self.verdict is other.verdict and all(a == b or (a != a and b != b) for a, b in pairs)
 
 
 class FirstDifference(NamedTuple):
@@ -96,7 +73,7 @@ class SpecDiff(Displayed):
     new: SpecResult
     edits: tuple[Edit, ...]
     cause: tuple[Edit, ...]
-    alone: tuple[Outcome, ...]
+    alone: tuple[EditOutcome, ...]
     old_places: Mapping[Edit, TextPlace]
     new_places: Mapping[Edit, TextPlace]
 
@@ -108,19 +85,19 @@ class SpecDiff(Displayed):
     @property
     def is_different(self) -> bool:
         """Whether the verdict or a final number changed."""
-        return not Outcome.of(self.old).same_as(Outcome.of(self.new))
+        return not EditOutcome.of(self.old).same_as(EditOutcome.of(self.new))
 
     @cached_property
     def first(self) -> FirstDifference | None:
-        """The first sample with another value or another interval; None if there is none."""
+        """The first sample with another value; None if there is none."""
         if self.old.times_ns.shape != self.new.times_ns.shape:
             return None
-        one, other = self.old.series[0, [0, 2, 3]], self.new.series[0, [0, 2, 3]]
-        differs = ((one != other) & ~(np.isnan(one) & np.isnan(other))).any(axis=0)
-        at = int(differs.argmax()) if len(differs) else 0
-        if not len(differs) or not differs[at]:
+        one, other = self.old.series[0, 0], self.new.series[0, 0]
+        differs = np.flatnonzero((one != other) & ~(np.isnan(one) & np.isnan(other)))
+        if not len(differs):
             return None
-        return FirstDifference(int(self.old.times_ns[at]), float(one[0, at]), float(other[0, at]))
+        at = int(differs[0])
+        return FirstDifference(int(self.old.times_ns[at]), float(one[at]), float(other[at]))
 
     @property
     def title(self) -> str:
@@ -128,29 +105,33 @@ class SpecDiff(Displayed):
         title = self.name if self.old.object is None else f"{self.name}({self.old.object})"
         return title if self.name == self.old_name else f"{title} (was {self.old_name})"
 
-    def sentences(self, first_ns: int) -> Iterator[str]:
+    def sentences(self, first_ns: int) -> Iterator[Sentence]:
         """Yield what changed, one sentence each, with times counted from `first_ns`."""
-        yield f"{_outcome_text(self.old)} → {_outcome_text(self.new)}"
+        yield Sentence(f"{_outcome_text(self.old)} → {_outcome_text(self.new)}")
         if self.first is not None:
             values = f"{number_text(self.first.old)} → {number_text(self.first.new)}"
-            yield f"first differs at {time_text(self.first.time_ns, first_ns)}: {values}"
+            yield Sentence("first differs at ", Instant(self.first.time_ns, first_ns), f": {values}")
         for edit, alone in zip(self.cause, self.alone, strict=True):
-            yield f"because: {edit}, in {edit.spec}"
-            for places in (self.old_places, self.new_places):
-                if edit in places:
-                    place = places[edit]
-                    yield f"  {place.filename}:{place.line}: {place.text}"
-            numbers = f"{alone.verdict}, robustness {number_text(alone.robustness)}"
-            yield f"  with this edit alone: {numbers}"
+            yield Sentence(f"because: {edit}, in `{edit.spec}`")
+            yield from (Sentence(f"  {each}") for each in self._lines_of(edit))
+            outcome = f"{alone.verdict}, robustness {number_text(alone.robustness)}"
+            yield Sentence(f"  with this edit alone: {outcome}")
         if len(self.cause) > 1:
-            yield f"only these {len(self.cause)} edits together bring it about"
+            yield Sentence(f"it takes these {len(self.cause)} edits together")
         if self.is_flipped and self.new.causes and self.new.causes[0].witness is not None:
             yield reason_sentence(self.new.causes[0].witness, first_ns=first_ns)
         others = [edit for edit in self.edits if edit not in self.cause]
         for edit in others[:_MOST_LISTED]:
-            yield f"{'also' if self.cause else 'edited, without effect on the result'}: {edit}"
+            what = "edited, too" if self.cause else "edited, without effect on the result"
+            yield Sentence(f"{what}: {edit}")
         if len(others) > _MOST_LISTED:
-            yield f"and {counted(len(others) - _MOST_LISTED, 'other edit')}"
+            yield Sentence(f"and {counted(len(others) - _MOST_LISTED, 'other edit')}")
+
+    def _lines_of(self, edit: Edit) -> Iterator[str]:
+        for sign, places in (("-", self.old_places), ("+", self.new_places)):
+            if edit in places:
+                place = places[edit]
+                yield f"{sign} {place.filename}:{place.line}: {place.text}"
 
     @property
     def document(self) -> dict[str, Any]:
@@ -161,13 +142,13 @@ class SpecDiff(Displayed):
             "old_name": self.old_name,
             "object": self.old.object,
             "flipped": self.is_flipped,
-            "old": _outcome_value(Outcome.of(self.old)),
-            "new": _outcome_value(Outcome.of(self.new)),
+            "old": EditOutcome.of(self.old).document,
+            "new": EditOutcome.of(self.new).document,
             "first_difference": None
             if first is None
             else {"time_ns": first.time_ns, "old": json_number(first.old), "new": json_number(first.new)},
             "cause": [
-                {**self._edit_value(edit), "alone": _outcome_value(alone)}
+                {**self._edit_value(edit), "alone": alone.document}
                 for edit, alone in zip(self.cause, self.alone, strict=True)
             ],
             "edits": [self._edit_value(edit) for edit in self.edits],
@@ -204,6 +185,8 @@ class SpecificationDiff(Displayed):
         specs: what both have, by the order of the new one: results of either, renamed ones included.
         removed, added: names of results that only the old, or only the new one has.
         first_ns: the time that sentences count from.
+        faults: what was lost while reading.
+        missing: a warning for each name in the specifications that the log never has.
     """
 
     log: str
@@ -214,7 +197,8 @@ class SpecificationDiff(Displayed):
     specs: tuple[SpecDiff, ...]
     removed: tuple[str, ...]
     added: tuple[str, ...]
-    faults: tuple[str, ...] = field(default=())
+    faults: tuple[str, ...] = ()
+    missing: tuple[Diagnostic, ...] = ()
 
     @property
     def is_empty(self) -> bool:
@@ -303,7 +287,9 @@ def compare_specifications(
         for specs, file in ((olds, old), (news, new))
     )
     trees = {
-        id(other.formula): _traced_back(compare_trees(one.formula, other.formula, other.name), one, other, old, new)
+        id(other.formula): _traced_back(
+            compare_trees(one.formula, other.formula, other.name), one, other, old, new
+        )
         for one, other in zip(olds, news, strict=True)
     }
     return SpecificationDiff(
@@ -322,6 +308,38 @@ def compare_specifications(
     )
 
 
+def diff_over_source(
+    source: Source,
+    old: Specification,
+    new: Specification,
+    options: ReplayOptions = DEFAULT_OPTIONS,
+    *,
+    advance: Callable[[int], None] = lambda samples: None,
+) -> SpecificationDiff:
+    """Compare two versions of a specification over a log; see `compare_specifications`.
+
+    Args:
+        advance: called with the number of samples of each block that is read.
+
+    Raises:
+        UsageError: what that raises, no sample in the window. LogError: the log cannot be read.
+        SpecificationError: names that the log never has, if names are strict.
+    """
+    require_ltlf(options.semantics, "a diff")
+    selection = Selection(source, (old, new), replace(options, keep=()))
+    trace = selection.trace(advance)
+    if not len(selection.inside(trace)):
+        raise selection.nothing_to_evaluate(trace.faults)
+    names = LogNames()
+    names.add(trace)
+    missing = selection.missing_names(names)
+    window = options.window
+    diff = compare_specifications(
+        old, new, trace, log=source.name, start_ns=window.start_ns, end_ns=window.end_ns, each=options.each
+    )
+    return replace(diff, missing=missing)
+
+
 def _paired(
     old: Specification, new: Specification
 ) -> tuple[list[tuple[NamedSpec, NamedSpec]], tuple[str, ...], tuple[str, ...]]:
@@ -337,9 +355,10 @@ def _paired(
     for other in tuple(added):
         for one in removed:
             formulas, _ = unify_regions([one.formula], old.regions, new.regions)
-            if one.parameter == other.parameter and not compare_trees(
-                formulas[0], other.formula, other.name
-            ).effective:
+            if (
+                one.parameter == other.parameter
+                and not compare_trees(formulas[0], other.formula, other.name).effective
+            ):
                 pairs.append((one, other))
                 removed.remove(one)
                 added.remove(other)
@@ -381,7 +400,9 @@ def _traced_back(
             rest = {_place_of(edit) for edit in compare_trees(before[0], formula, other.name).edits}
             edits = [
                 replace(edit, subject=name)
-                if edit.kind in ("constant", "replaced") and edit.subject is None and _place_of(edit) not in rest
+                if edit.kind in ("constant", "replaced")
+                and edit.subject is None
+                and _place_of(edit) not in rest
                 else edit
                 for edit in edits
             ]
@@ -395,8 +416,8 @@ def _place_of(edit: Edit) -> tuple[object, ...]:
 def _spec_diff(
     one: SpecResult, other: SpecResult, diff: TreeDiff, old: Specification, new: Specification
 ) -> SpecDiff:
-    outcomes = _Outcomes(one, other, diff)
-    cause = find_cause(diff, outcomes, Outcome.of(one), Outcome.of(other))
+    outcomes = EditOutcomes(one, other, diff)
+    cause = find_cause(diff, outcomes, EditOutcome.of(one), EditOutcome.of(other))
     return SpecDiff(
         other.name,
         one.name,
@@ -408,94 +429,6 @@ def _spec_diff(
         dict(_places(diff.edits, old, is_old=True)),
         dict(_places(diff.edits, new, is_old=False)),
     )
-
-
-class _Outcomes:
-    """What the old formula gives with some of the edits; atoms are those that were evaluated already."""
-
-    def __init__(self, one: SpecResult, other: SpecResult, diff: TreeDiff) -> None:
-        self._diff = diff
-        self._times_ns = one.times_ns
-        self._rows: dict[Atom | Quantified, Floats] = {}
-        blocks = [(each, each.leaves) for each in (one, other) if each.leaves is not None]
-        channels = max((len(leaves) for _, leaves in blocks), default=0)
-        for each, leaves in blocks:
-            columns = in_channels(leaves, channels)
-            for index, leaf in enumerate(each.evidence.instance.program.leaves):
-                self._rows[leaf] = columns[:, index]
-        self._known: dict[frozenset[int], Outcome] = {}
-        self.count = 0
-
-    def __call__(self, edits: Sequence[int]) -> Outcome:
-        """Return the outcome of the old formula with only these edits made."""
-        chosen = frozenset(edits)
-        if chosen not in self._known:
-            self.count += 1
-            self._known[chosen] = self._evaluated(self._diff.formula(chosen))
-        return self._known[chosen]
-
-    def _evaluated(self, formula: Formula) -> Outcome:
-        leaves = new_leaves(formula, ())
-        shape = next(iter(self._rows.values())).shape if self._rows else (1, len(self._times_ns))
-        rows = [self._rows[leaf] for leaf in leaves]
-        columns = np.stack(rows, axis=1) if rows else np.empty((shape[0], 0, shape[1]))
-        done = evaluate_offline(formula, leaves, columns, self._times_ns)
-        lower, upper = (float(end[0]) + 0.0 for end in done.ends(0))
-        least, greatest = (float(end[0]) + 0.0 for end in done.ends(0, wide=False))
-        return Outcome(final_verdict(lower, upper), least if least == greatest else math.nan, lower, upper)
-
-
-def find_cause(
-    diff: TreeDiff, outcome: Callable[[Sequence[int]], Outcome], old: Outcome, new: Outcome
-) -> tuple[int, ...]:
-    """Return the edits that changed a verdict or, if that stayed, the numbers; deepest first.
-
-    Making only these gives the new verdict (numbers), making all the others the old one, and none of them can
-    be left out. A single edit is looked for first, the deepest before others.
-
-    Args:
-        outcome: returns the outcome of the old formula with some of the edits.
-    """
-    if old.same_as(new):
-        return ()
-    verdict_only = old.verdict is not new.verdict
-    edits = sorted(diff.effective, key=lambda number: -diff.edits[number].depth)
-    evaluated = 0
-
-    def suffices(chosen: Sequence[int]) -> bool:
-        nonlocal evaluated
-        evaluated += 1
-        others = [number for number in edits if number not in chosen]
-        return (
-            evaluated <= _MOST_EVALUATIONS
-            and outcome(chosen).same_as(new, verdict_only=verdict_only)
-            and outcome(others).same_as(old, verdict_only=verdict_only)
-        )
-
-    for number in edits:
-        if suffices((number,)):
-            return (number,)
-    return tuple(minimised(edits, suffices))
-
-
-def minimised(parts: Sequence[int], holds: Callable[[Sequence[int]], bool]) -> list[int]:
-    """Return some of the parts for which a condition, which holds for all of them, still holds.
-
-    None of these can be left out alone (delta debugging: larger pieces are left out first).
-    """
-    current = list(parts)
-    size = max(len(current) // 2, 1)
-    while True:
-        at, removed = 0, False
-        while at < len(current):
-            rest = current[:at] + current[at + size :]
-            if rest and holds(rest):
-                current, removed = rest, True
-            else:
-                at += size
-        if size == 1 and not removed:
-            return current
-        size = max(size // 2, 1)
 
 
 _STATEMENT: Final = {"region": "region", "group": "group", "constant": "const", "replaced": "const"}
@@ -522,12 +455,3 @@ def _defining_line(lines: Sequence[str], statement: str, name: str) -> int | Non
 
 def _outcome_text(result: SpecResult) -> str:
     return f"{result.verdict} ({number_text(result.robustness)})"
-
-
-def _outcome_value(outcome: Outcome) -> dict[str, Any]:
-    return {
-        "verdict": str(outcome.verdict),
-        "robustness": json_number(outcome.robustness),
-        "lower": json_number(outcome.lower),
-        "upper": json_number(outcome.upper),
-    }

@@ -1,7 +1,7 @@
 """Two formulas compared node by node, by meaning: the edits that turn one into the other.
 
-Equal nodes are found wherever they moved to and whatever they are called. Any of the edits can be made without
-the others (`TreeDiff.formula`), which is how the one that matters is found.
+Equal nodes are found wherever they moved to and whatever they are called. Any of the edits can be made
+without the others (`TreeDiff.formula`), which is how the one that matters is found.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from spatial_replay.spec.format import format_bound, format_formula, format_term
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
+    Earlier,
+    Enlarged,
     Formula,
     Group,
     Measurement,
@@ -30,13 +32,13 @@ from spatial_replay.spec.formula import (
     operands_of,
     operator_of,
 )
-from spatial_replay.spec.walks import base_of, iter_terms, map_leaves, map_terms, substitute_term
+from spatial_replay.spec.walks import base_of, iter_terms, map_leaves, map_terms
 
 EditKind: TypeAlias = Literal[
     "constant", "region", "group", "definition", "replaced", "added", "removed", "moved", "renamed"
 ]
-"""What was edited: a number of a node, a shape or group that it names, what its relation means (profile, scale),
-the node itself, one operand of a conjunction or disjunction, only its place, or only its name."""
+"""What was edited: a number of a node, a shape or group that it names, what its relation means (profile,
+scale), the node itself, one operand of a conjunction or disjunction, only its place, or only its name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -380,9 +382,13 @@ def _similarity(old: Formula, new: Formula) -> float:
 
 
 def _subjects(formula: Formula) -> Counter[str]:
-    return Counter(format_term(base_of(term)) for term in iter_terms([formula])) + Counter(
-        [node.parameters[0] for _, _, node in iter_nodes(formula) if isinstance(node, Atom) and not node.terms]
+    found = Counter(format_term(base_of(term)) for term in iter_terms([formula]))
+    found.update(
+        str(node.parameters[0])
+        for _, _, node in iter_nodes(formula)
+        if isinstance(node, Atom) and not node.terms
     )
+    return found
 
 
 def _text(place: _Place | None, kind: EditKind) -> str | None:
@@ -402,9 +408,7 @@ def _built(merged: _Merged, chosen: frozenset[int]) -> Formula | None:
     if not isinstance(merged, _Inner):
         return merged
     head = merged.new if merged.edit in chosen else merged.old
-    operands = tuple(
-        each for operand in merged.operands if (each := _built(operand, chosen)) is not None
-    )
+    operands = tuple(each for operand in merged.operands if (each := _built(operand, chosen)) is not None)
     if head.operator in ("and", "or") and len(operands) < 2:
         return operands[0] if operands else Truth(head.operator == "and")
     return replace(head, operands=operands)
@@ -446,5 +450,7 @@ def _leaf_with_regions(leaf: Any, renamed: Mapping[str, str]) -> Any:
 def _term_with_regions(term: Term, renamed: Mapping[str, str]) -> Term:
     if isinstance(term, RegionName):
         return RegionName(renamed.get(term.name, term.name))
-    inner = getattr(term, "term", None)
-    return term if inner is None else replace(term, term=_term_with_regions(inner, renamed))
+    if not isinstance(term, (Earlier, Enlarged)):
+        return term
+    inner: Any = _term_with_regions(term.term, renamed)
+    return replace(term, term=inner)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from types import MappingProxyType
@@ -161,6 +161,18 @@ class Selection:
         """Read the samples of `iter_blocks`."""
         for _, trace in self.iter_blocks():
             yield trace
+
+    def trace(self, advance: Callable[[int], None] = lambda samples: None) -> Trace:
+        """Read the samples of `iter_blocks` as one trace.
+
+        Args:
+            advance: called with the number of samples of each block.
+        """
+        traces = []
+        for trace in self.iter_traces():
+            traces.append(trace)
+            advance(len(trace))
+        return Trace.concatenate(traces)
 
     def inside(self, trace: Trace) -> Trace:
         """Return those samples that are in the window."""

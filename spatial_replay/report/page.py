@@ -39,7 +39,7 @@ def header(report: RunReport, omissions: Sequence[str]) -> Html:
     Args:
         omissions: what the page leaves out to limit its size.
     """
-    title = element("div", element("h1", text(report.log)), _chip(report.verdict), **{"class": "title"})
+    title = element("div", element("h1", text(report.log)), chip(report.verdict), **{"class": "title"})
     return element(
         "header",
         element("a", "Skip to the run", **{"class": "skip", "href": "#main"}),
@@ -55,15 +55,15 @@ def panels(report: RunReport) -> Html:
     """Return the verdicts, and a place for each panel that is drawn."""
     has_automaton = any(result.automaton is not None for result in report.drawn)
     sections = [
-        _panel("verdicts", "Verdicts", *_verdicts(report)),
-        _panel("scene", "Scene", element("p", f"Seen from above, {report.axes}.", **{"class": "axes"})),
-        _panel("tree", "Specification"),
-        _panel("timeline", "Over time"),
-        _panel("automaton", "Automaton", kind="panel" if has_automaton else "panel wide"),
-        _panel("events", "Events"),
+        panel("verdicts", "Verdicts", *_verdicts(report)),
+        panel("scene", "Scene", element("p", f"Seen from above, {report.axes}.", **{"class": "axes"})),
+        panel("tree", "Specification"),
+        panel("timeline", "Over time"),
+        panel("automaton", "Automaton", kind="panel" if has_automaton else "panel wide"),
+        panel("events", "Events"),
     ]
     if report.decisions.decisions:
-        sections.append(_panel("decisions", "Decisions"))
+        sections.append(panel("decisions", "Decisions"))
     return element("main", *sections, id="main", tabindex="-1")
 
 
@@ -118,7 +118,7 @@ def _notice(role: str, what: str, details: Sequence[str]) -> Html:
     return element("div", element("strong", what), listed, role=role, **{"class": f"notice {role}"})
 
 
-def _panel(name: str, title: str, *content: Html, kind: str = "panel") -> Html:
+def panel(name: str, title: str, *content: Html, kind: str = "panel") -> Html:
     heading = element("h2", title, id=f"{name}-title")
     body = element("div", *content, id=f"{name}-body")
     return element("section", heading, body, id=name, **{"class": kind, "aria-labelledby": f"{name}-title"})
@@ -128,7 +128,7 @@ def _verdicts(report: RunReport) -> Iterator[Html]:
     if not report.results:
         yield element("p", "The templates matched no objects.")
     for part in report.vacuous:
-        yield element("p", *_sentence(part.message, report.first_ns))
+        yield element("p", *sentence_html(part.message, report.first_ns))
     places = {id(result): place for place, result in enumerate(report.drawn)}
     are_many = len(report.results) > _MANY
     worst = worst_first([each.result.verdict for each in report.results])
@@ -139,7 +139,7 @@ def _verdicts(report: RunReport) -> Iterator[Html]:
         is_unfolded = is_reported and not (are_many and number)
         unfolded = {"open": ""} if each.sentences and is_unfolded else {}
         attributes = {"class": "verdict", **drawn, **unfolded}
-        content = [element("p", *_sentence(sentence, report.first_ns)) for sentence in each.sentences]
+        content = [element("p", *sentence_html(sentence, report.first_ns)) for sentence in each.sentences]
         content += [_specs(each, report.first_ns)] if each.sentences else []
         yield element(
             "details" if content else "div", _summary(each, report.first_ns), *content, **attributes
@@ -160,7 +160,7 @@ def _summary(each: ReportedResult, first_ns: int) -> Html:
     marks = [element("span", decided_nothing, **{"class": "chip is-vacuous"})] if result.vacuous else []
     return element(
         "summary" if each.sentences else "div",
-        _chip(result.verdict),
+        chip(result.verdict),
         *marks,
         *_requirement(result.spec.id, result.title, result.spec.title),
         element("span", text(", ".join(numbers)), **{"class": "numbers"}),
@@ -189,7 +189,7 @@ def _specs(each: ReportedResult, first_ns: int) -> Html:
             numbers += f", violated since {Instant(settled_ns, first_ns)}"
         line = element("span", text(numbers), **{"class": "numbers"})
         rows.append(
-            element("li", _chip(node.verdict), *_requirement(about[0], node.name or "", about[1]), line)
+            element("li", chip(node.verdict), *_requirement(about[0], node.name or "", about[1]), line)
         )
     parts = [element("ul", *rows, **{"class": "specs"})] if rows else []
     if len(each.units) > 1:
@@ -200,7 +200,7 @@ def _specs(each: ReportedResult, first_ns: int) -> Html:
     return element("div", *parts)
 
 
-def _sentence(sentence: Sentence, first_ns: int) -> Iterator[Html]:
+def sentence_html(sentence: Sentence, first_ns: int) -> Iterator[Html]:
     """Yield a sentence: quoted parts as code, times with their ns since the log's first sample."""
     for part in sentence.parts:
         if isinstance(part, Instant):
@@ -210,7 +210,7 @@ def _sentence(sentence: Sentence, first_ns: int) -> Iterator[Html]:
             yield element("code", text(piece)) if number % 2 else text(piece)
 
 
-def _chip(verdict: str) -> Html:
+def chip(verdict: str) -> Html:
     return element("span", verdict, **{"class": f"chip is-{verdict}"})
 
 
@@ -278,42 +278,60 @@ def _rule(declarations: Mapping[str, str]) -> str:
 _STYLES: Final = ("uplot/uPlot.min.css", "browser/page.css", "browser/panels.css")
 _LIBRARY: Final = "uplot/uPlot.iife.min.js"
 _SCRIPTS: Final = (
-    "elements", "clock", "verdicts", "tree", "timeline", "curves", "decisions", "scene", "automaton", "page",
+    "elements", "read", "clock", "verdicts", "tree", "timeline", "curves", "decisions", "scene", "automaton",
 )  # fmt: skip
-"""Files of browser/; page.js comes last, since it runs the others."""
+"""Files of browser/; after them comes the one that runs them."""
 
 
 def page(report: RunReport) -> bytes:
     """Return the page, in UTF-8; equal reports give equal bytes."""
     data = page_data(report)
+    return document(
+        f"{report.log}: {report.verdict}",
+        [header(report, data.omissions), panels(report), footer(report)],
+        {"facts": json_text(data.facts)},
+        {"numbers": data.numbers},
+        "page",
+    )
+
+
+def document(
+    title: str, parts: Sequence[Html], facts: Mapping[str, str], numbers: Mapping[str, str], script_name: str
+) -> bytes:
+    """Return a whole page, in UTF-8.
+
+    Args:
+        parts: what is between the beginning of its body and the bar at the bottom.
+        facts, numbers: what the scripts read, as JSON and packed, by the ids of its elements.
+        script_name: the file of browser/ that runs the others.
+    """
     style = "\n".join([theme(), *map(_asset, _STYLES)])
-    library, script = _asset(_LIBRARY), _script()
-    parts = [
+    library, script = _asset(_LIBRARY), _script(script_name)
+    json_kind, packed_kind = "application/json", "application/octet-stream"
+    whole = [
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">',
         f'<meta http-equiv="Content-Security-Policy" content="{policy([library, script], style)}">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         '<meta name="color-scheme" content="light dark">',
-        element("title", text(f"{report.log}: {report.verdict}")),
+        element("title", text(title)),
         f"<style>{style}</style></head><body>",
-        header(report, data.omissions),
-        panels(report),
-        footer(report),
+        *parts,
         '<div id="transport" class="transport" role="group" aria-label="Time"></div>',
-        f'<script type="application/json" id="facts">{json_text(data.facts)}</script>',
-        f'<script type="application/octet-stream" id="numbers">{data.numbers}</script>',
+        *(f'<script type="{json_kind}" id="{name}">{each}</script>' for name, each in facts.items()),
+        *(f'<script type="{packed_kind}" id="{name}">{each}</script>' for name, each in numbers.items()),
         f"<script>{library}</script>",
         f"<script>{script}</script></body></html>\n",
     ]
-    return "".join(parts).encode("utf-8")
+    return "".join(whole).encode("utf-8")
 
 
 def _asset(name: str) -> str:
     return files(__package__).joinpath(name).read_text("utf-8")
 
 
-def _script() -> str:
+def _script(name: str) -> str:
     """Return our scripts as one, in a scope of its own."""
-    scripts = "\n".join(_asset(f"browser/{name}.js") for name in _SCRIPTS)
+    scripts = "\n".join(_asset(f"browser/{each}.js") for each in (*_SCRIPTS, name))
     return f'(() => {{\n"use strict";\n{scripts}\n}})();\n'
 
 

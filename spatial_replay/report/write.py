@@ -97,12 +97,23 @@ def write_report(
         OutputError: the output cannot be written.
     """
     refuse_output(output, inputs)
+    with replacing(output, inputs) as stream:
+        replayed, report = report_of(source, files, options, advance)
+        stream.write(page(report))
+    return replayed
+
+
+def report_of(
+    source: Source,
+    files: Sequence[Specification],
+    options: ReplayOptions = DEFAULT_OPTIONS,
+    advance: Callable[[int], None] = lambda samples: None,
+) -> tuple[Replayed, RunReport]:
+    """Evaluate specifications over a source, and collect what a page shows of it; see `write_report`."""
     collector = Collector()
     replay = Replay(source, files, options, keep_series=True, keep_leaves=True, show=collector.scene.add)
-    with replacing(output, inputs) as stream:
-        replayed = replay.run(collector.add, advance=advance)
-        stream.write(page(_report(source, replay, replayed, collector)))
-    return replayed
+    replayed = replay.run(collector.add, advance=advance)
+    return replayed, _report(source, replay, replayed, collector)
 
 
 def _report(source: Source, replay: Replay, replayed: Replayed, collector: Collector) -> RunReport:

@@ -3,9 +3,9 @@
 const STEPS_OF_SCENE = 65535;
 const ABSENT = 65535;
 
-function makeScene(clock) {
+function makeScene(clock, name = "scene") {
   const scene = readScene(clock.run);
-  const place = body("scene");
+  const place = body(name);
   if (!scene.times.length) {
     place.append(element("p", {}, "The log has no scene."));
     return;
@@ -59,8 +59,10 @@ function readScene(run) {
     result: places[2 * index], node: places[2 * index + 1],
   }]));
   const maps = run.decisions.flatMap((decision) => decision.maps);
-  const least = (axis) => Math.min(scene.low[axis], ...maps.map((map) => map.low[axis]));
-  const greatest = (axis) => Math.max(scene.high[axis], ...maps.map((map) => map.high[axis]));
+  // two runs side by side are drawn in one frame
+  const shown = [...maps, ...(run.frame ? [run.frame] : [])];
+  const least = (axis) => Math.min(scene.low[axis], ...shown.map((each) => each.low[axis]));
+  const greatest = (axis) => Math.max(scene.high[axis], ...shown.map((each) => each.high[axis]));
   return {
     times: numbers(scene.times),
     low: [least(0), least(1)],

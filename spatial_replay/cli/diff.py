@@ -1,0 +1,126 @@
+"""`spatial-replay diff`: two versions of a specification over a log, or two logs side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from spatial_replay.cli.application import ExitCode, most_severe
+from spatial_replay.cli.options import (
+    EvaluationArguments,
+    LogPath,
+    evaluation_options,
+    open_inputs,
+    output_option,
+)
+from spatial_replay.cli.progress import progress
+from spatial_replay.cli.terminal import show, show_diagnostics, show_json, warn
+from spatial_replay.errors import UsageError
+from spatial_replay.logs.remote import LogFile, local_files
+
+if TYPE_CHECKING:
+    from spatial_replay.compare.runs import LogDiff
+    from spatial_replay.compare.specifications import SpecificationDiff
+
+
+@click.command()
+@evaluation_options
+@click.argument("other", required=False, type=LogPath())
+@click.option(
+    "--align",
+    metavar="time|progress|NAME",
+    default="time",
+    show_default=True,
+    help="Two logs: align them by time since the first sample, by the progress of an automaton, or by the "
+    "first change of sign of the spec NAME.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
+@output_option("Page to write (HTML), with both under one time cursor.")
+def diff(
+    request: EvaluationArguments, other: LogFile | None, align: str, as_json: bool, output: Path | None
+) -> int:
+    """Compare two versions of a specification over a log, or two logs.
+
+    Of two specifications (--spec OLD --spec NEW; with one, OLD is that in the log): which verdicts and
+    numbers changed, at which sample first, and the edit that brought it about. That is checked by evaluating
+    with this edit alone, and with all others.
+
+    Of two logs: which objects moved otherwise and since when, what that did to each spec, and the first
+    decision of the planner that differs.
+
+    Exits with 0 if nothing differs, otherwise with 1.
+
+    \b
+    Examples:
+      spatial-replay diff run.mcap --spec old.spatial --spec new.spatial
+      spatial-replay diff before.mcap after.mcap --spec blocks.spatial -o diff.html
+      spatial-replay diff before.mcap after.mcap --spec blocks.spatial --align progress
+    """
+    # imported here so that --help stays fast
+    from spatial_replay.report.write import refuse_output
+
+    if output is not None:
+        refuse_output(output, _inputs(request, other))
+    if other is None and align != "time":
+        raise UsageError("--align applies to two logs; give the second one")
+    found = _of_specifications(request, output) if other is None else _of_logs(request, other, align, output)
+    if as_json:
+        show_json(found.document)
+    else:
+        show(*found.lines())
+        if output is not None:
+            show(f"wrote {output}")
+    warn(*found.faults)
+    show_diagnostics(found.missing)
+    code = ExitCode.SATISFIED if found.is_empty else ExitCode.VIOLATED
+    return most_severe([code, ExitCode.DAMAGED]) if found.faults else code
+
+
+def _of_specifications(request: EvaluationArguments, output: Path | None) -> SpecificationDiff:
+    from spatial_replay.compare.specifications import diff_over_source
+    from spatial_replay.report.comparison_page import write_comparison
+
+    if len(request.specs) > 2:
+        raise UsageError(f"{len(request.specs)} specifications; give two: --spec OLD --spec NEW")
+    if not request.specs:
+        raise UsageError("nothing to compare: give a second log, or --spec OLD --spec NEW")
+    inputs = open_inputs(request)
+    files = list(inputs.files)
+    if len(request.specs) == 1:
+        recorded = open_inputs(replace(request, specs=()))
+        if len(recorded.files) != 1:
+            names = ", ".join(file.filename for file in recorded.files)
+            raise UsageError(f"{inputs.source.name} has several specifications: {names}; give OLD, too")
+        files.insert(0, recorded.files[0])
+    options = inputs.options()
+    with progress("samples") as advance:
+        found = diff_over_source(inputs.source, files[0], files[-1], options, advance=advance)
+        if output is not None:
+            sides = (inputs.source, files[:1], options), (inputs.source, files[-1:], options)
+            write_comparison(found, sides, output, inputs=request.inputs, advance=advance)
+    return found
+
+
+def _of_logs(request: EvaluationArguments, other: LogFile, align: str, output: Path | None) -> LogDiff:
+    from spatial_replay.compare.runs import diff_sources
+    from spatial_replay.report.comparison_page import write_comparison
+
+    first = open_inputs(request, can_do_without=True)
+    second = open_inputs(replace(request, log=other), known=first.files, can_do_without=True)
+    sources, files = (first.source, second.source), first.files or second.files
+    options = first.options(), second.options()
+    with progress("samples") as advance:
+        found = diff_sources(sources, files, options, align=align, advance=advance)
+        if output is not None:
+            sides = (sources[0], files, options[0]), (sources[1], files, options[1])
+            write_comparison(found, sides, output, inputs=_inputs(request, other), advance=advance)
+    return found
+
+
+def _inputs(request: EvaluationArguments, other: LogFile | None) -> Sequence[Path]:
+    """Return the files that are read."""
+    return request.inputs if other is None else (*request.inputs, *local_files([other]))

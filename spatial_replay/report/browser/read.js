@@ -1,0 +1,80 @@
+// Reads the runs that the page carries.
+
+const ARRAYS = {
+  f8: Float64Array, f4: Float32Array, i4: Int32Array, u2: Uint16Array, u1: Uint8Array,
+};
+const VALUE = 0, NOW = 1, LOWER = 2, UPPER = 3;
+
+// A page of two runs has each under a name of its own: facts-a, numbers-a.
+async function readRun(name = "") {
+  const facts = JSON.parse(document.getElementById(`facts${name}`).textContent, (_, value) => printable(value));
+  const buffer = await unpacked(document.getElementById(`numbers${name}`).textContent);
+  const numbers = ({kind, offset, length}) => new ARRAYS[kind](buffer, offset, length);
+  const times = numbers(facts.times);
+  return {
+    ...facts,
+    numbers,
+    times,
+    results: facts.results.map((result) => readResult(result, numbers, times)),
+  };
+}
+
+// A text with spaces for control characters, such as those that turn the direction of what follows.
+function printable(value) {
+  return typeof value === "string" ? value.replace(/[\p{C}\p{Z}]/gu, " ") : value;
+}
+
+async function unpacked(text) {
+  const letters = atob(text);
+  const packed = new Uint8Array(letters.length);
+  for (let i = 0; i < letters.length; i++) packed[i] = letters.charCodeAt(i);
+  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return new Response(stream).arrayBuffer();
+}
+
+function readResult(result, numbers, times) {
+  const {first, samples} = result;
+  const series = numbers(result.series);
+  const nodes = result.nodes.map((node, index) => ({
+    ...node,
+    index,
+    depth: 0,
+    children: [],
+    // (4, samples) of this node
+    series: [VALUE, NOW, LOWER, UPPER].map(
+      (quantity) => series.subarray((4 * index + quantity) * samples, (4 * index + quantity + 1) * samples)),
+  }));
+  for (const node of nodes) {
+    if (node.parent === null) continue;
+    node.depth = nodes[node.parent].depth + 1;
+    nodes[node.parent].children.push(node);
+  }
+  const requirements = result.requirements.map((each) => ({...each, standing: numbers(each.standing)}));
+  const automaton = result.automaton && {...result.automaton, path: numbers(result.automaton.path)};
+  return {...result, nodes, requirements, automaton, times: times.subarray(first, first + samples)};
+}
+
+// Where a sample of the page is among those of a result: null before its first, `result.samples` after its last.
+function placeIn(result, sample) {
+  const place = sample - result.first;
+  return place < 0 || !result.samples ? null : Math.min(place, result.samples);
+}
+
+// The last index whose time is not later; 0 before the first.
+function indexAt(times, time) {
+  let low = 0, high = times.length;
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (times[middle] <= time + 1e-9) low = middle + 1;
+    else high = middle;
+  }
+  return Math.max(low - 1, 0);
+}
+
+// What is written in the page itself stays, where a browser cannot show the rest.
+function sayWhyNot(error) {
+  const said = element("p", {class: "notice alert", role: "alert"},
+    `This browser cannot show the run: ${error.message}. Verdicts and explanations are complete.`);
+  document.getElementById("main").prepend(said);
+  console.error(error);
+}

@@ -1,0 +1,124 @@
+"""What a diff states and a clip keeps is true of every specification and every log."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+
+import spatial_replay as sr
+from laws.strategies_monitor import HEADER, WORDS, recordings, specifications
+from laws.strategies_spec import formula_texts
+from spatial_replay.compare.trees import compare_trees, unify_regions
+from spatial_replay.spec.formula import Formula, NamedSpec, Specification
+
+OTHER_HEADER = HEADER.replace("box(-2, -2, 3, 2)", "box(-1, -2, 3, 1)")
+
+
+def numbers_of(result: sr.SpecResult) -> tuple[object, ...]:
+    return result.verdict, *(None if x != x else x for x in (result.robustness, result.lower, result.upper))
+
+
+@st.composite
+def versions(draw) -> tuple[sr.Specification, sr.Specification]:
+    """Two specifications that share some of their parts, and not always the shapes of their regions."""
+    small = replace(WORDS, max_depth=2)
+    parts = draw(st.lists(formula_texts(small), min_size=4, max_size=4))
+    texts = []
+    for header in (HEADER, draw(st.sampled_from([HEADER, OTHER_HEADER]))):
+        chosen = [parts[index] for index in draw(st.permutations(range(4)))[: draw(st.integers(1, 3))]]
+        joined = draw(st.sampled_from([" and ", " or "])).join(f"({part})" for part in chosen)
+        texts.append(f"{header}spec s = {draw(st.sampled_from(['', '', 'F ', 'G ']))}({joined})\n")
+    old, new = map(sr.parse_specification, texts)
+    return old, new
+
+
+@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+@given(pair=versions(), recording=recordings())
+def test_the_cause_of_a_change_undone_undoes_it(pair, recording):
+    old, new = pair
+    trace = recording.trace()
+    (diff,) = sr.diff_specifications(trace, old, new).specs
+    assert numbers_of(diff.old) == numbers_of(sr.evaluate(old, trace).result())
+    assert numbers_of(diff.new) == numbers_of(sr.evaluate(new, trace).result())
+    (before,), regions = unify_regions([old.specs[0].formula], old.regions, new.regions)
+    tree = compare_trees(before, new.specs[0].formula, "s")
+
+    def outcome(formula: Formula) -> tuple[object, ...]:
+        specification = Specification((NamedSpec("s", formula),), "paper", regions)
+        return numbers_of(sr.evaluate(specification, trace).result())
+
+    everything = tree.effective
+    assert outcome(tree.formula(())) == numbers_of(diff.old)
+    assert outcome(tree.formula(everything)) == numbers_of(diff.new)
+    assert bool(diff.cause) == (numbers_of(diff.old) != numbers_of(diff.new))
+    if diff.cause:
+        cause = [number for number in everything if tree.edits[number] in diff.cause]
+        compared = slice(0, 1) if diff.is_flipped else slice(None)
+        others = [number for number in everything if number not in cause]
+        assert outcome(tree.formula(cause))[compared] == numbers_of(diff.new)[compared]
+        assert outcome(tree.formula(others))[compared] == numbers_of(diff.old)[compared]
+
+
+@settings(max_examples=30)
+@given(text=formula_texts(WORDS), recording=recordings())
+def test_equal_specifications_differ_in_nothing(text, recording):
+    one, other = (sr.parse_specification(f"{HEADER}{line} = {text}\n") for line in ("spec s", "  spec  s"))
+    diff = sr.diff_specifications(recording.trace(), one, other)
+    assert diff.is_empty
+    assert not diff.spec("s").edits
+    assert diff.spec("s").first is None
+
+
+@settings(max_examples=30)
+@given(recording=recordings(), other=recordings(), text=formula_texts(WORDS))
+def test_runs_differ_unless_they_are_equal(recording, other, text):
+    specification = sr.parse_specification(f"{HEADER}spec s = {text}\n")
+    one, another = recording.trace(), other.trace()
+    assert sr.diff_logs(one, one, specification).is_empty
+    assume(set(one.names) & set(another.names))
+    try:
+        diff = sr.diff_logs(one, another, specification)
+    except sr.UsageError as error:
+        assert "other units" in str(error)
+        return
+    assert diff.is_empty == (one == another)
+    for spec in diff.specs:
+        assert numbers_of(spec.a) == numbers_of(sr.evaluate(specification, one).result())
+        assert numbers_of(spec.b) == numbers_of(sr.evaluate(specification, another).result())
+
+
+@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+@given(specification=specifications(), recording=recordings(max_size=7))
+def test_a_clip_has_the_verdicts_the_robustness_and_the_witnesses_of_the_log(specification, recording):
+    # a log holds what is unreadable as numbers that are not finite, which these observations do not have
+    trace = replace(recording, unreadable=frozenset()).trace()
+    each = {"ego": "all"} if specification.specs[0].parameter else {}
+    whole = sr.evaluate(specification, trace, each=each)
+    assume(whole.results)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "clip.mcap")
+        clip = sr.clip_log(trace, specification, output=path, each=each)
+        cut = sr.read_trace(path)
+    assert len(cut) == clip.replayed.samples <= len(trace)
+    assert set(cut.times_ns.tolist()) <= set(trace.times_ns.tolist())
+    again = sr.evaluate(specification, cut, each=each)
+    for one, other in zip(whole, again, strict=True):
+        assert (one.title, numbers_of(one)) == (other.title, numbers_of(other))
+        mine, its = one.witness(), other.witness()
+        assert (mine.time_ns, [step.node for step in mine.path]) == (
+            its.time_ns,
+            [step.node for step in its.path],
+        )
+        assert (mine.deciding is None) == (its.deciding is None)
+        if mine.deciding is not None and its.deciding is not None:
+            assert mine.deciding.text == its.deciding.text
+            assert np.array_equal(
+                [mine.deciding.lower, mine.deciding.upper, mine.deciding.value],
+                [its.deciding.lower, its.deciding.upper, its.deciding.value],
+                equal_nan=True,
+            )
