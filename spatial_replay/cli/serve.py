@@ -84,14 +84,15 @@ def serve(
         return None
     warn_of_input(evaluated.replayed)
     try:
-        _serve(evaluated, files, host, port, play)
+        return _serve(evaluated, files, host, port, play)
     except KeyboardInterrupt:
         # the regular way to stop the server
         return ExitCode.INTERRUPTED
-    return None
 
 
-def _serve(evaluated: Evaluated, files: SpecificationFiles | None, host: str, port: int, play: bool) -> None:
+def _serve(
+    evaluated: Evaluated, files: SpecificationFiles | None, host: str, port: int, play: bool
+) -> ExitCode | None:
     # imported here so that --help stays fast
     from spatial_replay.serve import open_server
 
@@ -104,13 +105,13 @@ def _serve(evaluated: Evaluated, files: SpecificationFiles | None, host: str, po
         show("  layout to import there: run the same command with --layout > live.json")
         if files is None:
             server.wait()
-            return
+            return None
 
         def write() -> Mapping[str, float | str]:
             edited = server.edited
             return edited.loaded.write_constants(edited.given)
 
-        follow_saves(files, server.show_saved, write, refuse=server.show_error, check=server.check)
+        return follow_saves(files, server.show_saved, write, refuse=server.show_error, check=server.check)
 
 
 def _is_loopback(host: str) -> bool:

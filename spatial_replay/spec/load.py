@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as shortened
@@ -61,7 +62,7 @@ def parse_specification(
     text = text.removeprefix("\ufeff")
     names = RELATION_NAMES | given.keys()
     if constants:
-        text = _with_constants(text, filename, names, constants)
+        text = _constant_writer(text, filename, names)(constants)
     faults = Faults(SourceText.of(text, filename))
     tokens = _tokens(text, names, faults)
     statements = parse_statements(tokens, names, faults)
@@ -172,16 +173,24 @@ def _check_relations(relations: Mapping[str, Relation]) -> None:
         parameters_of(name, relation)
 
 
-def _with_constants(
-    text: str, filename: str, names: frozenset[str], constants: Mapping[str, float | str]
-) -> str:
-    """Return the text with other values in its `const` lines, so that it says what is evaluated."""
+def constant_writer(specification: Specification) -> Callable[[Mapping[str, float | str]], str]:
+    """Return a function that returns a specification's text with other values in its `const` lines.
+
+    For many values in turn; `parse_specification` with `constants` parses the text itself each time.
+    """
+    names = RELATION_NAMES | specification.relations
+    return _constant_writer(specification.source, specification.filename, names)
+
+
+def _constant_writer(
+    text: str, filename: str, names: frozenset[str]
+) -> Callable[[Mapping[str, float | str]], str]:
     faults = Faults(SourceText.of(text, filename))
     namespace = Namespace(faults)
     namespace.declare(parse_statements(_tokens(text, names, faults), names, faults))
     faults.raise_if_any()
     lines = {name: each for name, each in namespace.definitions.items() if isinstance(each, ConstStatement)}
-    return replaced(text, lines, namespace.constants, constants)
+    return partial(replaced, text, lines, namespace.constants)
 
 
 def _tokens(text: str, names: frozenset[str], faults: Faults) -> list[Token]:

@@ -7,6 +7,8 @@ not hold at the value found so far; in a random order few of many runs are.
 
 from __future__ import annotations
 
+import itertools
+import math
 import random
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -19,9 +21,11 @@ from spatial_replay.tuning.margins import Margins, Point
 
 _PARTS: Final = 1 << 20
 """Steps by which all constants together are tightened."""
-_ROUNDS, _GENERATIONS, _CANDIDATES = 6, 25, 6
+_ROUNDS, _GENERATIONS, _CANDIDATES = 6, 15, 6
 """Bounds of the search over several constants: rounds of adding runs, generations in a round, and candidates
 of a generation for each constant."""
+_MOST_LINES, _SECANTS = 64, 24
+"""The most lines of the grid that are all looked at, and the most steps on one of them."""
 _FAR: Final = 1e12
 """In place of an infinite margin."""
 
@@ -194,7 +198,35 @@ class Search:
         return [run for run in worst if run not in known and (not known or margin(run, point) < least)]
 
     def _optimised(self, runs: Sequence[int], start: Point) -> Point:
-        """Return the best point for some runs that the optimiser finds."""
+        """Return the best point for some runs: of all on few grid lines, or else the best that is found.
+
+        The lines go along an axis with a direction, on which the best number is narrowed down.
+        """
+        axis = self._line_axis
+        others = [each for each in range(len(self._steps)) if each != axis]
+        best: tuple[float, Point] = (-np.inf, start)
+
+        def look(numbers: Sequence[int]) -> float:
+            nonlocal best
+            point = list(start)
+            for other, number in zip(others, numbers, strict=True):
+                point[other] = number
+            found = self._best_on_line(runs, tuple(point), axis)
+            best = max(best, found)
+            return -found[0]
+
+        sizes = [self._steps[other] for other in others]
+        if axis is not None and math.prod(size + 1 for size in sizes) <= _MOST_LINES:
+            for numbers in itertools.product(*(range(size + 1) for size in sizes)):
+                look(numbers)
+        else:
+            self._evolve(look, sizes, [start[other] for other in others])
+        return self._climbed(runs, best[1])
+
+    def _evolve(
+        self, cost: Callable[[Sequence[int]], float], sizes: Sequence[int], start: Sequence[int]
+    ) -> None:
+        """Let SciPy look for numbers, from 0 to some sizes, of the least cost."""
         try:
             from scipy.optimize import differential_evolution
         except ImportError:
@@ -202,24 +234,62 @@ class Search:
             raise UsageError(
                 f"tuning several constants needs SciPy, which is not installed: {remedy}"
             ) from None
-
-        def cost(shares: Sequence[float]) -> float:
-            point = tuple(round(share * steps) for share, steps in zip(shares, self._steps, strict=True))
-            least = min(self._margins.margin(run, point) for run in runs)
-            return -min(max(least, -_FAR), _FAR)
-
-        found = differential_evolution(
-            cost,
-            [(0.0, 1.0)] * len(self._steps),
+        differential_evolution(
+            lambda shares: cost([round(share * size) for share, size in zip(shares, sizes, strict=True)]),
+            [(0.0, 1.0)] * len(sizes),
             rng=np.random.default_rng(self._seed),
-            x0=[number / steps for number, steps in zip(start, self._steps, strict=True)],
+            x0=[number / size for number, size in zip(start, sizes, strict=True)],
             init="sobol",
             popsize=_CANDIDATES,
             maxiter=_GENERATIONS,
             polish=False,
         )
-        point = tuple(round(share * steps) for share, steps in zip(found.x, self._steps, strict=True))
-        return self._climbed(runs, point)
+
+    @property
+    def _line_axis(self) -> int | None:
+        """The axis with a direction that has the most numbers, or None."""
+        axes = [axis for axis, each in enumerate(self._margins.directions) if each is not None]
+        return max(axes, key=lambda axis: self._steps[axis], default=None)
+
+    def _best_on_line(self, runs: Sequence[int], point: Point, axis: int | None) -> tuple[float, Point]:
+        """Return the best point that is found along an axis, with its margin.
+
+        Margins of good runs rise towards looser values, those of bad ones fall: the best is where they meet.
+        They are often linear in a threshold, so that a few secants find it.
+        """
+        if axis is None:
+            return self._sides(runs, point)[0], point
+        best: tuple[float, Point] = (-np.inf, point)
+
+        def excess(looseness: int) -> float:
+            nonlocal best
+            moved = self._with(point, axis, self._numbered(axis, looseness))
+            least, good, bad = self._sides(runs, moved)
+            best = max(best, (least, moved))
+            return good - bad
+
+        low, high = 0, self._steps[axis]
+        below, above = excess(low), excess(high)
+        if below >= 0.0 or above < 0.0:
+            return best
+        for turn in range(_SECANTS):
+            if high - low <= 1:
+                break
+            share = 0.5 if turn % 3 == 2 else below / (below - above)
+            middle = min(max(low + round(share * (high - low)), low + 1), high - 1)
+            if (found := excess(middle)) >= 0.0:
+                high, above = middle, found
+            else:
+                low, below = middle, found
+        return best
+
+    def _sides(self, runs: Sequence[int], point: Point) -> tuple[float, float, float]:
+        """Return the least margin of some runs, and those of the good and of the bad among them, bounded."""
+        least = [_FAR, _FAR]
+        for run in runs:
+            side = int(not self._margins.runs[run].is_good)
+            least[side] = max(min(self._margins.margin(run, point), least[side]), -_FAR)
+        return min(least), least[0], least[1]
 
     def _climbed(self, runs: Sequence[int], point: Point) -> Point:
         """Move a point along single axes while the least margin grows, by steps that halve."""
@@ -253,10 +323,16 @@ class Search:
         margin = self._margins.margin
         worst = [min(runs, key=lambda run: margin(run, point)) for runs in (self._good, self._bad) if runs]
         for few in (*[[run] for run in worst], worst):
-            best = self._optimised(few, point)
-            if not self._all_hold(few, best):
+            best = self._best_for_one(few[0]) if len(few) == 1 else None
+            if not self._all_hold(few, best or self._optimised(few, point)):
                 return tuple(few)
         return tuple(run for run in self._good + self._bad if not self._margins.holds(run, point))
+
+    def _best_for_one(self, run: int) -> Point | None:
+        """Return the point with the widest margin of one run, if the constants have directions."""
+        if None in self._margins.directions:
+            return None
+        return self._at([int(run in self._good)] * len(self._steps), 1)
 
     # ---------------------------------------------------------------------------------------------- points
 

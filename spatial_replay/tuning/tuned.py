@@ -16,6 +16,7 @@ from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.load import constant_writer
 from spatial_replay.text import counted, json_number
 from spatial_replay.tuning.direction import Direction
 from spatial_replay.tuning.margins import LabelledRun, Margins, Point
@@ -251,7 +252,7 @@ def tune_runs(
         raise UsageError(
             f"{len(varied)} constants are more than the {MOST_CONSTANTS} that are tuned together"
         )
-    parse = partial(_with_values, specification)
+    parse = partial(_with_values, specification, constant_writer(specification))
     margins = Margins(runs, parse, varied, each or {}, advance=advance)
     search = Search(margins, seed)
     found = search.best()
@@ -271,13 +272,10 @@ def _check(specification: Specification, runs: Sequence[LabelledRun]) -> None:
         raise UsageError(f"the runs have {samples} samples, more than {MOST_SAMPLES}; tune on some of them")
 
 
-def _with_values(specification: Specification, values: Mapping[str, Value]) -> Specification:
-    return parse_specification(
-        specification.source,
-        filename=specification.filename,
-        profile=specification.profile,
-        constants=values,
-    )
+def _with_values(
+    specification: Specification, write: Callable[[Mapping[str, Value]], str], values: Mapping[str, Value]
+) -> Specification:
+    return parse_specification(write(values), filename=specification.filename, profile=specification.profile)
 
 
 def _tuning(specification: Specification, margins: Margins, search: Search, found: Found) -> Tuning:

@@ -16,16 +16,19 @@ import pytest
 
 from cli.program import PROGRAM, environment, run_program
 from serve.viewer import State, viewer
+from spatial_replay.logs.topics import CURVES_TOPIC
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 TABLE = ("serve", str(RECORDINGS / "table.jsonl"), "--spec", str(RECORDINGS / "table.spatial"))
 
 
 @contextmanager
-def running(*options: str) -> Iterator[tuple[subprocess.Popen[str], str, str]]:
+def running(
+    *options: str, spec: Path = RECORDINGS / "table.spatial"
+) -> Iterator[tuple[subprocess.Popen[str], str, str]]:
     """The program at work, its address, and what it said until then."""
     with subprocess.Popen(
-        [*PROGRAM, *TABLE, *options],
+        [*PROGRAM, *TABLE[:-1], str(spec), *options],
         env=environment(),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -86,6 +89,45 @@ def test_the_server_evaluates_with_the_chosen_semantics(tmp_path: Path) -> None:
 
         asyncio.run(looking())
         process.send_signal(signal.SIGINT)
+
+
+def test_viewers_follow_a_saved_file_and_write_constants_into_it(tmp_path: Path) -> None:
+    path = tmp_path / "table.spatial"
+    text = (RECORDINGS / "table.spatial").read_text()
+    path.write_text(text)
+    edited = text.replace("near = 0.08", "near = 0.01").replace("deadline = 8s", "deadline = 9s")
+    assert edited != text
+    with running("--port", "0", "--watch", spec=path) as (process, address, _):
+
+        async def looking() -> None:
+            async with viewer(address) as own:
+                await own.subscribe([CURVES_TOPIC])
+                before = await own.message(CURVES_TOPIC)
+                await own.send(op="subscribeParameterUpdates", parameterNames=["near", "deadline"])
+                path.write_text(edited)
+                assert "`table_set` is violated" in await own.note("verdict", "violated")
+                await own.message(CURVES_TOPIC, lambda each: each.data != before.data)
+                assert await own.constants() == {"deadline": "9s", "near": 0.01}
+                path.write_text(edited.replace("const near", "cosnt near"))
+                assert "cosnt" in await own.note("specification")
+                assert await own.constants() == {"deadline": "9s", "near": 0.01}
+                path.write_text(edited)
+                await own.set(near=0.09)
+                assert "`table_set` is satisfied" in await own.note("verdict", "(near = 0.09)")
+                # what was changed by hand stays while something else is edited, until it is written
+                path.write_text(edited.replace("deadline = 9s", "deadline = 8s"))
+                await own.note("verdict", "(near = 0.09)")
+                assert await own.call("write_constants", {}) == {"written": {"near": 0.09}}
+                assert path.read_text() == text.replace("near = 0.08", "near = 0.09")
+                with pytest.raises(ValueError, match="did you mean 'near'"):
+                    await own.call("write_constants", {"constants": {"naer": 1}})
+
+        asyncio.run(looking())
+        process.send_signal(signal.SIGINT)
+        said, warned = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "table.spatial saved" in said
+    assert "the evaluation before stays" in warned
 
 
 def test_the_layout_is_printed(tmp_path: Path) -> None:

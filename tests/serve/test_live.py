@@ -253,6 +253,14 @@ def test_a_change_that_fails_in_evaluation_restores_the_former_values() -> None:
         watch(server, looking)
 
 
+def test_constants_are_not_written_into_files_that_are_not_watched(server: Serving) -> None:
+    async def looking(own: Viewer) -> None:
+        with pytest.raises(ValueError, match="give --spec FILE and --watch"):
+            await own.call("write_constants", {"constants": {"far": 0.2}})
+
+    watch(server, looking)
+
+
 def test_the_last_of_many_changes_counts(server: Serving) -> None:
     async def looking(own: Viewer) -> None:
         for number in range(50):
