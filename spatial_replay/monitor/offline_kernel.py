@@ -12,21 +12,7 @@ import numpy as np
 
 from spatial_replay.compiled import inlined, kernel, piece
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.online.codes import (
-    AHEAD,
-    AND,
-    CONSTANT,
-    DELAY,
-    HISTORICALLY,
-    LEAF,
-    NOT,
-    OFFLINE_TARGET,
-    ONCE,
-    OR,
-    SAMPLES,
-    SINCE,
-    WINDOW_MAX,
-)
+from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.state import past_value
 
 
@@ -53,7 +39,7 @@ def _at(steps: Steps, step: int) -> int:
 @inlined
 def _distance(steps: Steps, unit: int, earlier: int, later: int) -> int:
     """Return the distance from one step to a later one, in samples or in ns."""
-    if unit == SAMPLES:
+    if unit == codes.SAMPLES:
         return later - earlier
     return int(abs(steps.stamps[_at(steps, later)] - steps.stamps[_at(steps, earlier)]))
 
@@ -61,7 +47,7 @@ def _distance(steps: Steps, unit: int, earlier: int, later: int) -> int:
 @piece
 def _run_past(code: int, first: Floats, second: Floats, target: Floats, steps: Steps) -> None:
     """Run an unbounded once, historically or since."""
-    value = np.inf if code == HISTORICALLY else -np.inf
+    value = np.inf if code == codes.HISTORICALLY else -np.inf
     for i in range(steps.length):
         k = _at(steps, i)
         value = past_value(code, first[k], second[k], value)
@@ -115,15 +101,15 @@ def _run_boolean(
 ) -> None:
     code, a, b = row[0], row[1], row[2]
     first, second = columns[channel, a], columns[channel, b]
-    if code == CONSTANT:
+    if code == codes.CONSTANT:
         target[begin:end] = row[4] * np.inf
-    elif code == NOT:
+    elif code == codes.NOT:
         for k in range(begin, end):
             target[k] = -columns[mirror, a, k]
-    elif code == AND:
+    elif code == codes.AND:
         for k in range(begin, end):
             target[k] = min(first[k], second[k])
-    elif code == OR:
+    elif code == codes.OR:
         for k in range(begin, end):
             target[k] = max(first[k], second[k])
 
@@ -145,24 +131,24 @@ def run_offline(
     for r in range(rows.shape[0]):
         row = rows[r]
         code = row[0]
-        is_ahead = code >= AHEAD
-        past = code - AHEAD if is_ahead else code
+        is_ahead = code >= codes.AHEAD
+        past = code - codes.AHEAD if is_ahead else code
         steps = Steps(stamps, end - 1 if is_ahead else begin, -1 if is_ahead else 1, end - begin)
         for channel in range(channels):
             mirror = channel ^ 1 if channels > 1 else channel
-            target = columns[channel, row[OFFLINE_TARGET]]
-            if code == LEAF:
+            target = columns[channel, row[codes.OFFLINE_TARGET]]
+            if code == codes.LEAF:
                 target[begin:end] = leaves[channel, row[1], begin:end]
                 continue
             source = columns[channel, row[1]]
-            if past < ONCE:
+            if past < codes.ONCE:
                 _run_boolean(row, columns, channel, mirror, target, begin, end)
-            elif past <= SINCE:
+            elif past <= codes.SINCE:
                 _run_past(past, source, columns[channel, row[2]], target, steps)
-            elif past == DELAY:
+            elif past == codes.DELAY:
                 _run_delay(source, target, steps, row[3], row[4], row[5] * np.inf)
             else:
-                sign = 1.0 if past == WINDOW_MAX else -1.0
+                sign = 1.0 if past == codes.WINDOW_MAX else -1.0
                 _slide(source, target, steps, row[3], row[4], row[5], sign, extrema)
 
 

@@ -15,37 +15,8 @@ import numpy as np
 
 from spatial_replay.compiled import kernel, piece
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.online.codes import (
-    AND,
-    CONSTANT,
-    DELAY,
-    HISTORICALLY,
-    LEAF,
-    NOT,
-    NOW_EITHER,
-    NOW_FALSE,
-    NOW_LAST_OPERAND,
-    NOW_TRUE,
-    ONCE,
-    OR,
-    PART_IS_FLAT,
-    REPORT_AND,
-    REPORT_CODE,
-    REPORT_END,
-    REPORT_FIRST,
-    REPORT_IMPLIES,
-    REPORT_INDEX,
-    REPORT_NOT,
-    REPORT_OR,
-    REPORT_PART,
-    REPORT_RULE,
-    REPORT_SIGNAL,
-    REPORT_XOR,
-    SINCE,
-    WINDOW_MAX,
-    WINDOW_MIN,
-    in_channels,
-)
+from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.online.program import Program
 from spatial_replay.monitor.online.state import (
     NUMBERS,
@@ -68,13 +39,13 @@ from spatial_replay.monitor.online.windows import kept_from, step_windows
 @piece
 def _combine_low(code: int, low: float, high: float, other_low: float, other_high: float) -> float:
     """Return the lower end of a Boolean operator over two intervals; the upper end is its mirror image."""
-    if code == REPORT_AND:
+    if code == codes.REPORT_AND:
         return min(low, other_low)
-    if code == REPORT_OR:
+    if code == codes.REPORT_OR:
         return max(low, other_low)
-    if code == REPORT_XOR:
+    if code == codes.REPORT_XOR:
         return max(min(low, -other_high), min(-high, other_low))
-    if code == REPORT_IMPLIES:
+    if code == codes.REPORT_IMPLIES:
         return max(-high, other_low)
     return min(max(-high, other_low), max(-other_high, low))
 
@@ -83,10 +54,10 @@ def _combine_low(code: int, low: float, high: float, other_low: float, other_hig
 def _combine(code: int, into: Floats, other: Floats, count: int) -> None:
     for pair in range(0, NUMBERS, 2):
         low, high, other_low, other_high = into[pair], into[pair + 1], other[pair], other[pair + 1]
-        if code == REPORT_AND:
+        if code == codes.REPORT_AND:
             for k in range(count):
                 low[k], high[k] = min(low[k], other_low[k]), min(high[k], other_high[k])
-        elif code == REPORT_OR:
+        elif code == codes.REPORT_OR:
             for k in range(count):
                 low[k], high[k] = max(low[k], other_low[k]), max(high[k], other_high[k])
         else:
@@ -102,13 +73,13 @@ def _set_now(rule: int, into: Floats, first: Floats, last: Floats, count: int) -
     """Compute what a part is now, from what its first and its last operand are."""
     for number in (2, 3):
         for k in range(count):
-            if rule == NOW_LAST_OPERAND:
+            if rule == codes.NOW_LAST_OPERAND:
                 into[number, k] = last[number, k]
-            elif rule == NOW_EITHER:
+            elif rule == codes.NOW_EITHER:
                 into[number, k] = max(first[number, k], last[number, k])
-            elif rule == NOW_TRUE:
+            elif rule == codes.NOW_TRUE:
                 into[number, k] = np.inf
-            elif rule == NOW_FALSE:
+            elif rule == codes.NOW_FALSE:
                 into[number, k] = -np.inf
 
 
@@ -146,10 +117,14 @@ def report(
     wide_high = wide_low + nominal_high
     numbers = scratch.nodes
     for n in range(reports.shape[0] - 1, -1, -1):
-        code, index, rule = reports[n, REPORT_CODE], reports[n, REPORT_INDEX], reports[n, REPORT_RULE]
-        start, stop = reports[n, REPORT_FIRST], reports[n, REPORT_END]
+        code, index, rule = (
+            reports[n, codes.REPORT_CODE],
+            reports[n, codes.REPORT_INDEX],
+            reports[n, codes.REPORT_RULE],
+        )
+        start, stop = reports[n, codes.REPORT_FIRST], reports[n, codes.REPORT_END]
         rows = numbers[n]
-        if code == REPORT_SIGNAL:  # settled by the first sample
+        if code == codes.REPORT_SIGNAL:  # settled by the first sample
             for k in range(count):
                 rows[0, k], rows[1, k] = memory.firsts[0, index], memory.firsts[nominal_high, index]
                 rows[2, k], rows[3, k] = (
@@ -158,12 +133,12 @@ def report(
                 )
                 rows[4, k], rows[5, k] = memory.firsts[wide_low, index], memory.firsts[wide_high, index]
                 rows[6, k], rows[7, k] = memory.firsts[wide_low, index], memory.firsts[wide_high, index]
-        elif code == REPORT_PART:
+        elif code == codes.REPORT_PART:
             for number in range(NUMBERS):
                 for k in range(count):
                     rows[number, k] = scratch.parts[index, number, k]
             _set_now(rule, rows, numbers[operands[start]], numbers[operands[stop - 1]], count)
-        elif code == REPORT_NOT:
+        elif code == codes.REPORT_NOT:
             child = numbers[operands[start]]
             for pair in range(0, NUMBERS, 2):
                 for k in range(count):
@@ -199,24 +174,24 @@ def step_signals(
             target = history[channel, s, begin : begin + count]
             first = history[channel, a, begin : begin + count]
             second = history[channel, b, begin : begin + count]
-            if code == LEAF:
+            if code == codes.LEAF:
                 for k in range(count):
                     target[k] = leaves[channel, a, t + k]
-            elif code == CONSTANT:
+            elif code == codes.CONSTANT:
                 for k in range(count):
                     target[k] = signals[s, 4] * np.inf
-            elif code == NOT:
+            elif code == codes.NOT:
                 for k in range(count):
                     target[k] = -history[mirror, a, begin + k]
-            elif code == AND:
+            elif code == codes.AND:
                 for k in range(count):
                     target[k] = min(first[k], second[k])
-            elif code == OR:
+            elif code == codes.OR:
                 for k in range(count):
                     target[k] = max(first[k], second[k])
-            elif code in (ONCE, HISTORICALLY, SINCE):
+            elif code in (codes.ONCE, codes.HISTORICALLY, codes.SINCE):
                 _run_past(code, first, second, target, running[channel, s], position == 0)
-            elif code == DELAY:
+            elif code == codes.DELAY:
                 for k in range(count):
                     source = behind(stamps, offset, position + k, signals[s, 3], signals[s, 4])
                     if source >= offset:
@@ -232,7 +207,7 @@ def step_signals(
             running[channel, s] = target[count - 1]
             if position == 0:
                 memory.firsts[channel, s] = target[0]
-        if code in (WINDOW_MAX, WINDOW_MIN):
+        if code in (codes.WINDOW_MAX, codes.WINDOW_MIN):
             newest = behind(stamps, offset, position + count - 1, signals[s, 3], signals[s, 4])
             wedge_next[signals[s, 6]] = max(wedge_next[signals[s, 6]], newest + 1)
 
@@ -242,7 +217,7 @@ def _run_past(code: int, first: Floats, second: Floats, target: Floats, before: 
     """Run an unbounded once, historically or since, from its value at the previous sample."""
     value = before
     if starts:
-        value = np.inf if code == HISTORICALLY else -np.inf
+        value = np.inf if code == codes.HISTORICALLY else -np.inf
     for k in range(len(target)):
         value = past_value(code, first[k], second[k], value)
         target[k] = value
@@ -265,7 +240,7 @@ def _slide(
 
     The wedge is a ring; `ends` counts the positions that ever left and entered it.
     """  # fmt: skip
-    sign = 1.0 if signal[0] == WINDOW_MAX else -1.0
+    sign = 1.0 if signal[0] == codes.WINDOW_MAX else -1.0
     size = wedge.shape[0]
     head, tail = ends[0], ends[1]
     for k in range(count):
@@ -333,7 +308,7 @@ def step_with_windows(
     step_tables(tables.nodes, tables.parts, memory, scratch, channels, position, start_ns, begin, count)
     for p in range(len(tables.parts)):
         part = tables.parts[p]
-        if not part[PART_IS_FLAT]:
+        if not part[codes.PART_IS_FLAT]:
             step_windows(
                 tables.nodes, part, memory, scratch, channels, position, offset, count, scratch.parts[p]
             )
@@ -362,7 +337,7 @@ class OnlineRun:
         self._scratch = scratch_for(program, room, tile)
         self._final = np.zeros((len(program.reports), 2))
         self._tables = Tables.of(program)
-        self._take_in = step if program.parts[:, PART_IS_FLAT].all() else step_with_windows
+        self._take_in = step if program.parts[:, codes.PART_IS_FLAT].all() else step_with_windows
         self._channels = 1
         self._position = 0
         self._offset = 0

@@ -14,30 +14,7 @@ import numpy as np
 
 from spatial_replay.compiled import inlined, piece
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.online.codes import (
-    ANCHORED_RELEASE,
-    ANCHORED_UNTIL,
-    LITERAL,
-    NODE_A,
-    NODE_B,
-    NODE_CODE,
-    NODE_DEPENDS,
-    NODE_HIGH,
-    NODE_LOW,
-    NODE_UNIT,
-    NODE_VARIABLE,
-    NODE_WEAK,
-    PART_AND,
-    PART_END,
-    PART_END_CORNER,
-    PART_FIRST,
-    PART_IS_FLAT,
-    PART_OR,
-    PART_TABLE_START,
-    PART_VARIABLES,
-    SAMPLES,
-    UNTIL,
-)
+from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.state import Memory, Scratch
 
 
@@ -70,13 +47,13 @@ def corner_value(corner: int, variable: int) -> float:
 @piece
 def _start(nodes: Integers, part: Integers, table: Floats, values: Floats) -> None:
     """Fill the table before the first sample: each operator as it is there."""
-    first, end = part[PART_FIRST], part[PART_END]
-    for corner in range(1 << part[PART_VARIABLES]):
+    first, end = part[codes.PART_FIRST], part[codes.PART_END]
+    for corner in range(1 << part[codes.PART_VARIABLES]):
         for d in range(first, end):
-            if nodes[d, NODE_VARIABLE] >= 0:
-                values[d - first] = corner_value(corner, nodes[d, NODE_VARIABLE])
-            elif nodes[d, NODE_CODE] == PART_OR:
-                values[d - first] = max(values[nodes[d, NODE_A]], values[nodes[d, NODE_B]])
+            if nodes[d, codes.NODE_VARIABLE] >= 0:
+                values[d - first] = corner_value(corner, nodes[d, codes.NODE_VARIABLE])
+            elif nodes[d, codes.NODE_CODE] == codes.PART_OR:
+                values[d - first] = max(values[nodes[d, codes.NODE_A]], values[nodes[d, codes.NODE_B]])
         table[corner] = values[end - 1 - first]
 
 
@@ -92,28 +69,28 @@ def _fill_columns(
     columns: Floats,
 ) -> None:
     """Compute the nodes that depend on no variable, over some samples."""
-    for d in range(part[PART_FIRST], part[PART_END]):
-        code, a, b = nodes[d, NODE_CODE], nodes[d, NODE_A], nodes[d, NODE_B]
-        column = columns[d - part[PART_FIRST]]
-        if code == LITERAL and b:
+    for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
+        code, a, b = nodes[d, codes.NODE_CODE], nodes[d, codes.NODE_A], nodes[d, codes.NODE_B]
+        column = columns[d - part[codes.PART_FIRST]]
+        if code == codes.LITERAL and b:
             for k in range(count):
                 column[k] = -history[mirror, a, begin + k]
-        elif code == LITERAL:
+        elif code == codes.LITERAL:
             for k in range(count):
                 column[k] = history[channel, a, begin + k]
-        elif nodes[d, NODE_DEPENDS]:
+        elif nodes[d, codes.NODE_DEPENDS]:
             continue
-        elif code == PART_AND:
+        elif code == codes.PART_AND:
             for k in range(count):
                 column[k] = min(columns[a, k], columns[b, k])
-        elif code == PART_OR:
+        elif code == codes.PART_OR:
             for k in range(count):
                 column[k] = max(columns[a, k], columns[b, k])
 
 
 @piece
 def _is_anchored(code: int) -> bool:
-    return code in (ANCHORED_UNTIL, ANCHORED_RELEASE)
+    return code in (codes.ANCHORED_UNTIL, codes.ANCHORED_RELEASE)
 
 
 @piece
@@ -124,10 +101,10 @@ def _expand(node: Integers, left: float, right: float, later: float, position: i
     """
     value = later
     counts = True
-    if _is_anchored(node[NODE_CODE]):
-        now = position if node[NODE_UNIT] == SAMPLES else elapsed_ns
-        counts = node[NODE_LOW] <= now and (node[NODE_HIGH] < 0 or now <= node[NODE_HIGH])
-    if node[NODE_CODE] == UNTIL or node[NODE_CODE] == ANCHORED_UNTIL:
+    if _is_anchored(node[codes.NODE_CODE]):
+        now = position if node[codes.NODE_UNIT] == codes.SAMPLES else elapsed_ns
+        counts = node[codes.NODE_LOW] <= now and (node[codes.NODE_HIGH] < 0 or now <= node[codes.NODE_HIGH])
+    if node[codes.NODE_CODE] == codes.UNTIL or node[codes.NODE_CODE] == codes.ANCHORED_UNTIL:
         value = min(left, value)
         return max(right, value) if counts else value
     value = max(left, value)
@@ -137,12 +114,16 @@ def _expand(node: Integers, left: float, right: float, later: float, position: i
 @piece
 def _close_windows(nodes: Integers, part: Integers, table: Floats, position: int, elapsed_ns: int) -> None:
     """Settle the anchored operators whose window no later sample can fall into."""
-    for d in range(part[PART_FIRST], part[PART_END]):
-        now = position if nodes[d, NODE_UNIT] == SAMPLES else elapsed_ns
-        if _is_anchored(nodes[d, NODE_CODE]) and nodes[d, NODE_HIGH] >= 0 and now >= nodes[d, NODE_HIGH]:
-            bit = 1 << nodes[d, NODE_VARIABLE]
-            for corner in range(1 << part[PART_VARIABLES]):
-                table[corner] = table[corner | bit] if nodes[d, NODE_WEAK] else table[corner & ~bit]
+    for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
+        now = position if nodes[d, codes.NODE_UNIT] == codes.SAMPLES else elapsed_ns
+        if (
+            _is_anchored(nodes[d, codes.NODE_CODE])
+            and nodes[d, codes.NODE_HIGH] >= 0
+            and now >= nodes[d, codes.NODE_HIGH]
+        ):
+            bit = 1 << nodes[d, codes.NODE_VARIABLE]
+            for corner in range(1 << part[codes.PART_VARIABLES]):
+                table[corner] = table[corner | bit] if nodes[d, codes.NODE_WEAK] else table[corner & ~bit]
 
 
 @inlined
@@ -152,10 +133,10 @@ def _step_channel(
 ) -> None:  # fmt: skip
     """Run `step_tables` in one channel; put the values of an ending run and the bounds into the scratch."""
     first, end, variables, end_corner = (
-        part[PART_FIRST],
-        part[PART_END],
-        part[PART_VARIABLES],
-        part[PART_END_CORNER],
+        part[codes.PART_FIRST],
+        part[codes.PART_END],
+        part[codes.PART_VARIABLES],
+        part[codes.PART_END_CORNER],
     )
     corners = 1 << variables
     columns, values, fresh, point = scratch.columns, scratch.values, scratch.fresh, scratch.point
@@ -163,7 +144,9 @@ def _step_channel(
     if position == 0:
         _start(nodes, part, table, values)
     _fill_columns(nodes, part, channel, mirror, memory.history, begin, count, columns)
-    anchored = _is_anchored(nodes[end - 1, NODE_CODE]) or nodes[end - 1, NODE_CODE] == PART_OR
+    anchored = (
+        _is_anchored(nodes[end - 1, codes.NODE_CODE]) or nodes[end - 1, codes.NODE_CODE] == codes.PART_OR
+    )
     if variables == 1 and not anchored:
         _step_simple(nodes[end - 1], table, columns, count, end_corner, ends, lows, highs)
         return
@@ -171,20 +154,20 @@ def _step_channel(
         elapsed_ns = memory.stamps[begin + k] - start_ns
         for corner in range(corners):
             for d in range(first, end):
-                if not nodes[d, NODE_DEPENDS]:
+                if not nodes[d, codes.NODE_DEPENDS]:
                     values[d - first] = columns[d - first, k]
                     continue
-                code, a, b = nodes[d, NODE_CODE], nodes[d, NODE_A], nodes[d, NODE_B]
-                if code == PART_AND:
+                code, a, b = nodes[d, codes.NODE_CODE], nodes[d, codes.NODE_A], nodes[d, codes.NODE_B]
+                if code == codes.PART_AND:
                     value = min(values[a], values[b])
-                elif code == PART_OR:
+                elif code == codes.PART_OR:
                     value = max(values[a], values[b])
                 else:
-                    later = corner_value(corner, nodes[d, NODE_VARIABLE])
-                    neutral = np.inf if code in (UNTIL, ANCHORED_UNTIL) else -np.inf
+                    later = corner_value(corner, nodes[d, codes.NODE_VARIABLE])
+                    neutral = np.inf if code in (codes.UNTIL, codes.ANCHORED_UNTIL) else -np.inf
                     left = values[a] if a >= 0 else neutral
                     value = _expand(nodes[d], left, values[b], later, position + k, elapsed_ns)
-                    point[nodes[d, NODE_VARIABLE]] = value
+                    point[nodes[d, codes.NODE_VARIABLE]] = value
                 values[d - first] = value
             fresh[corner] = read_table(table, variables, point, scratch.order)
         for corner in range(corners):
@@ -207,8 +190,8 @@ def _step_simple(
 ) -> None:
     """Run `step_tables` for a single until or release: a table of two numbers."""
     low, high = table[0], table[1]
-    a, b = node[NODE_A], node[NODE_B]
-    until = node[NODE_CODE] == UNTIL
+    a, b = node[codes.NODE_A], node[codes.NODE_B]
+    until = node[codes.NODE_CODE] == codes.UNTIL
     for k in range(count):
         right = columns[b, k]
         if until:
@@ -239,11 +222,13 @@ def step_tables(
     ends, lows, highs = scratch.series[0], scratch.series[1], scratch.series[2]
     for p in range(parts.shape[0]):
         part, numbers = parts[p], scratch.parts[p]
-        if not part[PART_IS_FLAT]:
+        if not part[codes.PART_IS_FLAT]:
             continue
         for channel in range(channels):
             table = memory.tables[
-                channel, part[PART_TABLE_START] : part[PART_TABLE_START] + (1 << part[PART_VARIABLES])
+                channel,
+                part[codes.PART_TABLE_START] : part[codes.PART_TABLE_START]
+                + (1 << part[codes.PART_VARIABLES]),
             ]
             mirror = channel ^ nominal_high
             _step_channel(

@@ -18,51 +18,7 @@ import numpy as np
 
 from spatial_replay.compiled import inlined, kernel, piece
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.online.codes import (
-    DELAY,
-    LITERAL,
-    NODE_A,
-    NODE_B,
-    NODE_CODE,
-    NODE_DEPENDS,
-    NODE_HIGH,
-    NODE_LOW,
-    NODE_TABLE,
-    NODE_UNIT,
-    NODE_VARIABLE,
-    NODE_WEAK,
-    OPEN_CORNER,
-    OPEN_END,
-    OPEN_HIGH,
-    OPEN_LOW,
-    PART_AND,
-    PART_CELL_START,
-    PART_END,
-    PART_FIRST,
-    PART_IS_FLAT,
-    PART_IS_REMEMBERING,
-    PART_OR,
-    PART_TABLE_START,
-    PART_TABLES,
-    PART_VARIABLES,
-    PART_WINDOW_MAX,
-    PART_WINDOW_MIN,
-    PAST_DELAY,
-    PAST_SINCE,
-    PAST_TRIGGER,
-    PAST_WINDOW_MAX,
-    PAST_WINDOW_MIN,
-    RELEASE,
-    SAMPLES,
-    SHIFT,
-    SIGNAL_CODE,
-    SIGNAL_HIGH,
-    SIGNAL_LOW,
-    SIGNAL_UNIT,
-    UNTIL,
-    WINDOW_MAX,
-    WINDOW_MIN,
-)
+from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.state import (
     NUMBERS,
     Memory,
@@ -96,8 +52,8 @@ class Look(NamedTuple):
 @inlined
 def _cells_of(part: Integers) -> tuple[int, int, int]:
     """Return where a part's cells hold its base, its variables' positions and its tables' positions."""
-    base = part[PART_CELL_START]
-    return base, base + 1, base + 1 + part[PART_VARIABLES]
+    base = part[codes.PART_CELL_START]
+    return base, base + 1, base + 1 + part[codes.PART_VARIABLES]
 
 
 @piece
@@ -110,7 +66,7 @@ def reach(
     Returns whether every window that they look through has closed. `plain` holds the lower ends before
     they are widened to what the tables start from.
     """
-    first, end = part[PART_FIRST], part[PART_END]
+    first, end = part[codes.PART_FIRST], part[codes.PART_END]
     base, boundaries, states = _cells_of(part)
     cells, low, high = memory.cells, scratch.low, scratch.high
     for d in range(end - first):
@@ -120,13 +76,13 @@ def reach(
     closed = True
     for d in range(end - 1, first - 1, -1):
         node = nodes[d]
-        a, b = node[NODE_A], node[NODE_B]
+        a, b = node[codes.NODE_A], node[codes.NODE_B]
         scratch.plain[d - first] = low[d - first]
-        if node[NODE_VARIABLE] >= 0 and cells[base] > 0:
-            low[d - first] = min(low[d - first], cells[boundaries + node[NODE_VARIABLE]])
-        if node[NODE_TABLE] >= 0:
-            low[d - first] = min(low[d - first], cells[states + node[NODE_TABLE]] + 1)
-        if node[NODE_CODE] == LITERAL:
+        if node[codes.NODE_VARIABLE] >= 0 and cells[base] > 0:
+            low[d - first] = min(low[d - first], cells[boundaries + node[codes.NODE_VARIABLE]])
+        if node[codes.NODE_TABLE] >= 0:
+            low[d - first] = min(low[d - first], cells[states + node[codes.NODE_TABLE]] + 1)
+        if node[codes.NODE_CODE] == codes.LITERAL:
             continue
         child_low, child_high, child_closed = _operands_reach(
             node, low[d - first], high[d - first], memory.stamps, offset, last
@@ -135,7 +91,14 @@ def reach(
         if a >= 0:
             low[a] = min(low[a], child_low)
             high[a] = max(high[a], child_high, high[d - first])
-        if node[NODE_CODE] in (PART_AND, PART_OR, UNTIL, RELEASE, PAST_SINCE, PAST_TRIGGER):
+        if node[codes.NODE_CODE] in (
+            codes.PART_AND,
+            codes.PART_OR,
+            codes.UNTIL,
+            codes.RELEASE,
+            codes.PAST_SINCE,
+            codes.PAST_TRIGGER,
+        ):
             low[b] = min(low[b], child_low)
             high[b] = max(high[b], child_high)
     return closed
@@ -146,17 +109,22 @@ def _operands_reach(
     node: Integers, low: int, high: int, stamps: Integers, offset: int, last: int
 ) -> tuple[int, int, bool]:
     """Return the operands' positions a node looks at from low … high, and whether all of them are known."""
-    code, unit, near, far = node[NODE_CODE], node[NODE_UNIT], node[NODE_LOW], node[NODE_HIGH]
-    if code in (PART_WINDOW_MAX, PART_WINDOW_MIN):
+    code, unit, near, far = (
+        node[codes.NODE_CODE],
+        node[codes.NODE_UNIT],
+        node[codes.NODE_LOW],
+        node[codes.NODE_HIGH],
+    )
+    if code in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN):
         closed = is_closed(stamps, offset, last, high, unit, far)
         return low, last_ahead(stamps, offset, last, high, unit, far), closed
-    if code == SHIFT:
+    if code == codes.SHIFT:
         shifted = ahead(stamps, offset, last, high, unit, near)
         wanted = last_ahead(stamps, offset, last, high, unit, far) if far >= 0 else shifted
         return low, min(max(shifted, wanted), last), shifted <= last
-    if code in (PAST_WINDOW_MAX, PAST_WINDOW_MIN):
+    if code in (codes.PAST_WINDOW_MAX, codes.PAST_WINDOW_MIN):
         return first_behind(stamps, offset, min(low, last), unit, far), high, True
-    if code == PAST_DELAY:
+    if code == codes.PAST_DELAY:
         return max(behind(stamps, offset, min(low, last), unit, near), offset), high, True
     return low, high, True
 
@@ -164,9 +132,9 @@ def _operands_reach(
 @inlined
 def _beyond(mode: int, weak: int) -> float:
     """Return the value an operator that is still open takes from beyond the last sample."""
-    if mode == OPEN_END:
+    if mode == codes.OPEN_END:
         return np.inf if weak else -np.inf
-    return np.inf if mode == OPEN_HIGH else -np.inf
+    return np.inf if mode == codes.OPEN_HIGH else -np.inf
 
 
 @inlined
@@ -174,11 +142,11 @@ def _run_boolean(
     node: Integers, columns: Floats, target: Floats, history: Floats, look: Look, begin: int, end: int
 ) -> None:
     """Run a literal, a conjunction or a disjunction."""
-    code, a, b = node[NODE_CODE], node[NODE_A], node[NODE_B]
-    if code == PART_AND:
+    code, a, b = node[codes.NODE_CODE], node[codes.NODE_A], node[codes.NODE_B]
+    if code == codes.PART_AND:
         for k in range(begin, end):
             target[k] = min(columns[a, k], columns[b, k])
-    elif code == PART_OR:
+    elif code == codes.PART_OR:
         for k in range(begin, end):
             target[k] = max(columns[a, k], columns[b, k])
     elif b:
@@ -194,8 +162,8 @@ def _run_recurrence(
     node: Integers, columns: Floats, target: Floats, start: float, begin: int, end: int, step: int
 ) -> None:
     """Run an operator without a window: until and release backwards, since and trigger forwards."""
-    a, b = node[NODE_A], node[NODE_B]
-    is_strong = node[NODE_CODE] in (UNTIL, PAST_SINCE)
+    a, b = node[codes.NODE_A], node[codes.NODE_B]
+    is_strong = node[codes.NODE_CODE] in (codes.UNTIL, codes.PAST_SINCE)
     value = start
     for k in range(begin, end, step):
         if is_strong:
@@ -211,18 +179,18 @@ def _run_window(
     last: int, mode: int, wedge: Integers,
 ) -> None:  # fmt: skip
     """Run a bounded operator at low … high: the extremum of `source` over the window ahead or behind."""
-    unit, near, far = node[NODE_UNIT], node[NODE_LOW], node[NODE_HIGH]
-    is_ahead = node[NODE_CODE] in (PART_WINDOW_MAX, PART_WINDOW_MIN)
-    sign = 1.0 if node[NODE_CODE] in (PART_WINDOW_MAX, PAST_WINDOW_MAX) else -1.0
+    unit, near, far = node[codes.NODE_UNIT], node[codes.NODE_LOW], node[codes.NODE_HIGH]
+    is_ahead = node[codes.NODE_CODE] in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN)
+    sign = 1.0 if node[codes.NODE_CODE] in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX) else -1.0
     nearest, beyond_farthest = (near, far + 1) if is_ahead else (-far, 1 - near)
     head = tail = entering = 0
     start = after = offset
-    if unit != SAMPLES:
+    if unit != codes.SAMPLES:
         newest = last if is_ahead else low
         start = first_after(stamps, offset, newest, low, nearest)
         after = first_after(stamps, offset, newest, low, beyond_farthest)
     for position in range(low, high + 1):
-        if unit == SAMPLES:
+        if unit == codes.SAMPLES:
             start, after = max(position + nearest, offset), min(position + beyond_farthest, last + 1)
         else:
             newest = last if is_ahead else position
@@ -240,7 +208,7 @@ def _run_window(
             head += 1
         result = source[wedge[head] - offset] if tail > head else -sign * np.inf
         if is_ahead and not is_closed(stamps, offset, last, position, unit, far):
-            beyond = _beyond(mode, node[NODE_WEAK])
+            beyond = _beyond(mode, node[codes.NODE_WEAK])
             result = max(result, beyond) if sign > 0 else min(result, beyond)
         target[position - offset] = result
 
@@ -251,9 +219,9 @@ def _run_shift(
     last: int, mode: int,
 ) -> None:  # fmt: skip
     """Run a shift or a delay at positions low … high: `source` at a distance ahead or behind."""
-    unit, distance = node[NODE_UNIT], node[NODE_LOW]
-    is_ahead = node[NODE_CODE] == SHIFT
-    missing = _beyond(mode if is_ahead else OPEN_END, node[NODE_WEAK])
+    unit, distance = node[codes.NODE_UNIT], node[codes.NODE_LOW]
+    is_ahead = node[codes.NODE_CODE] == codes.SHIFT
+    missing = _beyond(mode if is_ahead else codes.OPEN_END, node[codes.NODE_WEAK])
     for position in range(low, high + 1):
         if is_ahead:
             at = ahead(stamps, offset, last, position, unit, distance)
@@ -268,11 +236,11 @@ def _run_until(
     scratch: Scratch, offset: int,
 ) -> None:  # fmt: skip
     """Run an unbounded until or release at low … high; its variable's value goes to the point."""
-    variable = node[NODE_VARIABLE]
-    if look.mode == OPEN_CORNER:
+    variable = node[codes.NODE_VARIABLE]
+    if look.mode == codes.OPEN_CORNER:
         after = corner_value(look.corner, variable) if variable >= 0 else -np.inf
     else:
-        after = _beyond(look.mode, node[NODE_WEAK])
+        after = _beyond(look.mode, node[codes.NODE_WEAK])
     _run_recurrence(node, scratch.columns, target, after, high - offset, low - offset - 1, -1)
     if variable >= 0:
         boundary = memory.cells[_cells_of(part)[1] + variable]
@@ -285,10 +253,10 @@ def _run_since(
     scratch: Scratch, offset: int,
 ) -> None:  # fmt: skip
     """Run an unbounded since or trigger from the position of its table up to `high`."""
-    table, variables = node[NODE_TABLE], part[PART_VARIABLES]
+    table, variables = node[codes.NODE_TABLE], part[codes.PART_VARIABLES]
     start = memory.cells[_cells_of(part)[2] + table]
     if start < 0:
-        value = np.inf if node[NODE_WEAK] else -np.inf
+        value = np.inf if node[codes.NODE_WEAK] else -np.inf
     else:
         at = table << variables
         value = read_table(tables[at : at + (1 << variables)], variables, scratch.point, scratch.order)
@@ -306,25 +274,25 @@ def _run_columns(
     `scratch.point` receives the variables' values where the table's base ends, `scratch.starts` the
     values that past operators start from.
     """
-    first, stamps, columns = part[PART_FIRST], memory.stamps, scratch.columns
-    for d in range(first, part[PART_END]):
+    first, stamps, columns = part[codes.PART_FIRST], memory.stamps, scratch.columns
+    for d in range(first, part[codes.PART_END]):
         node = nodes[d]
-        if look.corner > 0 and not node[NODE_DEPENDS]:
+        if look.corner > 0 and not node[codes.NODE_DEPENDS]:
             continue  # the same at every corner
-        code, target = node[NODE_CODE], columns[d - first]
+        code, target = node[codes.NODE_CODE], columns[d - first]
         low, high = scratch.low[d - first], scratch.high[d - first]
-        if code in (LITERAL, PART_AND, PART_OR):
+        if code in (codes.LITERAL, codes.PART_AND, codes.PART_OR):
             begin, end = low - offset, high - offset + 1
             _run_boolean(node, columns, target, memory.history, look, begin, end)
-        elif code in (UNTIL, RELEASE):
+        elif code in (codes.UNTIL, codes.RELEASE):
             _run_until(node, part, target, low, high, look, memory, scratch, offset)
-        elif code in (PAST_SINCE, PAST_TRIGGER):
+        elif code in (codes.PAST_SINCE, codes.PAST_TRIGGER):
             _run_since(node, part, tables, target, high, memory, scratch, offset)
-        elif code in (SHIFT, PAST_DELAY):
-            source = columns[node[NODE_A]]
+        elif code in (codes.SHIFT, codes.PAST_DELAY):
+            source = columns[node[codes.NODE_A]]
             _run_shift(node, source, target, low, high, stamps, offset, last, look.mode)
         else:
-            source = columns[node[NODE_A]]
+            source = columns[node[codes.NODE_A]]
             _run_window(node, source, target, low, high, stamps, offset, last, look.mode, scratch.wedge)
 
 
@@ -335,9 +303,9 @@ def _value_at_first(
 ) -> float:  # fmt: skip
     """Return the part's value at the first sample, given a run over the recent ones."""
     _run_columns(nodes, part, tables, look, memory, scratch, offset, last)
-    if memory.cells[part[PART_CELL_START]] == 0:
-        return float(scratch.columns[part[PART_END] - 1 - part[PART_FIRST], 0 - offset])
-    variables = part[PART_VARIABLES]
+    if memory.cells[part[codes.PART_CELL_START]] == 0:
+        return float(scratch.columns[part[codes.PART_END] - 1 - part[codes.PART_FIRST], 0 - offset])
+    variables = part[codes.PART_VARIABLES]
     return read_table(tables[: 1 << variables], variables, scratch.point, scratch.order)
 
 
@@ -354,8 +322,12 @@ def _absorb(
         for channel in range(channels):
             mirror = channel ^ 1 if channels > 1 else channel
             _renew_tables(nodes, part, channel, mirror, memory, scratch, offset, last)
-        for d in range(part[PART_FIRST], part[PART_END]):
-            variable, table, at = nodes[d, NODE_VARIABLE], nodes[d, NODE_TABLE], d - part[PART_FIRST]
+        for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
+            variable, table, at = (
+                nodes[d, codes.NODE_VARIABLE],
+                nodes[d, codes.NODE_TABLE],
+                d - part[codes.PART_FIRST],
+            )
             if variable >= 0:
                 cells[boundaries + variable] = scratch.high[at] + 1
             if table >= 0:
@@ -369,14 +341,14 @@ def _renew_tables(
     offset: int, last: int,
 ) -> None:  # fmt: skip
     """Renew the tables of a part, in one channel, after adding the position at its base."""
-    first, fresh, size = part[PART_FIRST], scratch.fresh, 1 << part[PART_VARIABLES]
+    first, fresh, size = part[codes.PART_FIRST], scratch.fresh, 1 << part[codes.PART_VARIABLES]
     states = _cells_of(part)[2]
     tables = _tables_of(part, channel, memory)
     for corner in range(size):
-        look = Look(channel, mirror, OPEN_CORNER, corner)
+        look = Look(channel, mirror, codes.OPEN_CORNER, corner)
         fresh[corner] = _value_at_first(nodes, part, tables, look, memory, scratch, offset, last)
-        for d in range(first, part[PART_END]):
-            table = nodes[d, NODE_TABLE]
+        for d in range(first, part[codes.PART_END]):
+            table = nodes[d, codes.NODE_TABLE]
             if table >= 0:
                 state = scratch.plain[d - first] - 1
                 is_new = state > memory.cells[states + table]
@@ -389,8 +361,8 @@ def _renew_tables(
 @piece
 def _tables_of(part: Integers, channel: int, memory: Memory) -> Floats:
     """Return a part's own table and those of its past operators, one after the other."""
-    start = part[PART_TABLE_START]
-    return memory.tables[channel, start : start + (part[PART_TABLES] << part[PART_VARIABLES])]
+    start = part[codes.PART_TABLE_START]
+    return memory.tables[channel, start : start + (part[codes.PART_TABLES] << part[codes.PART_VARIABLES])]
 
 
 @piece
@@ -405,10 +377,10 @@ def step_windows(
     """
     nominal_high = 1 if channels > 1 else 0
     wide_low = 2 if channels > 2 else 0
-    nodes_of_part = part[PART_END] - part[PART_FIRST]
+    nodes_of_part = part[codes.PART_END] - part[codes.PART_FIRST]
     for k in range(count):
         last = position + k
-        base = min(memory.cells[part[PART_CELL_START]], last)
+        base = min(memory.cells[part[codes.PART_CELL_START]], last)
         reach(nodes, part, memory, scratch, base, last, offset, last)
         scratch.high[:nodes_of_part] = last
         for which in range(NUMBERS):
@@ -422,11 +394,11 @@ def step_windows(
                 numbers[which, k] = numbers[which - 6, k]
                 continue
             channel = (0 if which < 2 else wide_low) + (nominal_high if which % 2 else 0)
-            mode = OPEN_LOW if which == 4 else OPEN_HIGH if which == 5 else OPEN_END
+            mode = codes.OPEN_LOW if which == 4 else codes.OPEN_HIGH if which == 5 else codes.OPEN_END
             look = Look(channel, channel ^ nominal_high, mode, 0)
             tables = _tables_of(part, channel, memory)
             numbers[which, k] = _value_at_first(nodes, part, tables, look, memory, scratch, offset, last)
-            if which < 2 and part[PART_IS_REMEMBERING]:
+            if which < 2 and part[codes.PART_IS_REMEMBERING]:
                 numbers[which + 2, k] = scratch.columns[nodes_of_part - 1, last - offset]
         _absorb(nodes, part, memory, scratch, channels, offset, last)
 
@@ -439,16 +411,16 @@ def kept_from(
     """Return the first position that anything may still look at after the sample at `last`."""
     keep = last
     for s in range(signals.shape[0]):
-        code, unit = signals[s, SIGNAL_CODE], signals[s, SIGNAL_UNIT]
-        if code == DELAY:
-            keep = min(keep, behind(memory.stamps, offset, last, unit, signals[s, SIGNAL_LOW]))
-        elif code in (WINDOW_MAX, WINDOW_MIN):
-            keep = min(keep, first_behind(memory.stamps, offset, last, unit, signals[s, SIGNAL_HIGH]))
+        code, unit = signals[s, codes.SIGNAL_CODE], signals[s, codes.SIGNAL_UNIT]
+        if code == codes.DELAY:
+            keep = min(keep, behind(memory.stamps, offset, last, unit, signals[s, codes.SIGNAL_LOW]))
+        elif code in (codes.WINDOW_MAX, codes.WINDOW_MIN):
+            keep = min(keep, first_behind(memory.stamps, offset, last, unit, signals[s, codes.SIGNAL_HIGH]))
     for p in range(parts.shape[0]):
         part = parts[p]
-        if not part[PART_IS_FLAT]:
-            base = min(memory.cells[part[PART_CELL_START]], last)
+        if not part[codes.PART_IS_FLAT]:
+            base = min(memory.cells[part[codes.PART_CELL_START]], last)
             reach(nodes, part, memory, scratch, base, last, offset, last)
-            for d in range(part[PART_END] - part[PART_FIRST]):
+            for d in range(part[codes.PART_END] - part[codes.PART_FIRST]):
                 keep = min(keep, scratch.low[d])
     return max(keep, offset)
