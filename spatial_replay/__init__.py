@@ -58,6 +58,8 @@ if TYPE_CHECKING:
     from spatial_replay.monitor.verdict import Verdict
     from spatial_replay.monitor.violation import Violation
     from spatial_replay.monitor.witness.atom import DecidingAtom, Measured
+    from spatial_replay.monitor.witness.evidence import Gap
+    from spatial_replay.monitor.witness.path import MissedResponse
     from spatial_replay.monitor.witness.threshold import Threshold
     from spatial_replay.monitor.witness.witness import Witness, WitnessStep
     from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Step
@@ -96,6 +98,7 @@ __all__ = [
     "Evaluation",
     "FirstDifference",
     "Footprint",
+    "Gap",
     "GeometryError",
     "Guards",
     "Instant",
@@ -105,6 +108,7 @@ __all__ = [
     "LogError",
     "Measured",
     "MessageChannel",
+    "MissedResponse",
     "MissingFileError",
     "Monitor",
     "NamedSpec",
@@ -204,6 +208,8 @@ __getattr__, __dir__ = loaded_when_used(
         "monitor.verdict": ("Verdict",),
         "monitor.violation": ("Violation",),
         "monitor.witness.atom": ("DecidingAtom", "Measured"),
+        "monitor.witness.evidence": ("Gap",),
+        "monitor.witness.path": ("MissedResponse",),
         "monitor.witness.threshold": ("Threshold",),
         "monitor.witness.witness": ("Witness", "WitnessStep"),
         "planning.decisions": ("Candidate", "Consideration", "Guards", "Step"),
