@@ -46,6 +46,15 @@ class Sentence(str):
         return made
 
 
+def counted_from(text: str, first_ns: int) -> str:
+    """Return a text whose times, if it knows them, count from `first_ns`."""
+    if not isinstance(text, Sentence):
+        return text
+    return Sentence(
+        *(Instant(part.time_ns, first_ns) if isinstance(part, Instant) else part for part in text.parts)
+    )
+
+
 def counted(count: int, noun: str) -> str:
     """Return a count with its noun: "1 sample", "1,579 samples"."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"

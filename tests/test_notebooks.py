@@ -33,7 +33,9 @@ class Expected(NamedTuple):
 
 EXPECTED = {
     "record-and-replay": Expected(
-        NOTEBOOKS, 2, ("■ satisfied", "pending", "(True, True)", "first satisfied at 8.1s", "annotated.mcap")
+        NOTEBOOKS,
+        2,
+        ("■ satisfied", "pending", "(True, True)", "first satisfied at 8.100 s", "annotated.mcap"),
     ),
     "edit-a-specification": Expected(
         ROOT,

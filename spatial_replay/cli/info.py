@@ -19,7 +19,7 @@ from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, show_file, show_json, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile
-from spatial_replay.text import counted, escaped
+from spatial_replay.text import counted, counted_from, escaped
 
 if TYPE_CHECKING:
     from spatial_replay.bags.reader import MessageReader
@@ -100,7 +100,8 @@ def info(
         with progress("samples") as advance:
             overview = overview_of(open_source(log, **reading), advance)
     faults = tuple(dict.fromkeys((*overview.faults, *(surveyed.faults if surveyed else ()))))
-    warn(*dict.fromkeys((*faults, *(surveyed.remarks if surveyed else ()), *overview.remarks)))
+    remarks = (counted_from(each, overview.start_ns or 0) for each in overview.remarks)
+    warn(*dict.fromkeys((*faults, *(surveyed.remarks if surveyed else ()), *remarks)))
     if as_json:
         show_json(_document(overview, surveyed, faults))
     else:

@@ -26,6 +26,7 @@ from spatial_replay.mapping.timeline import (
 )
 from spatial_replay.mapping.topic_reader import ReportFault, TopicReader
 from spatial_replay.mapping.transforms import FrameTree, Transforms
+from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.trace import ABSENT, Trace
 
 _MOST_NAMES = 8
@@ -302,9 +303,9 @@ class Remarks:
                 " `fixed_frame` in the mapping brings them into one"
             )
         self._texts, self._missing, self._stale, self._skipped, self._frames = [], {}, {}, {}, set()
-        return tuple(f"{self._name}: {text}" for text in texts)
+        return tuple(Sentence(f"{self._name}: ", text) for text in texts)
 
-    def _missing_texts(self) -> Iterator[str]:
+    def _missing_texts(self) -> Iterator[Sentence]:
         fixed = self._mapping.fixed_frame
         for (topic, frame, is_known), (count, first_ns) in sorted(self._missing.items()):
             reason = f"no transform from {frame!r} to {fixed!r} at that time"
@@ -313,9 +314,11 @@ class Remarks:
             elif not is_known:
                 reason = f"no transform to {fixed!r} names the frame {frame!r}"
             are = "observation is" if count == 1 else "observations are"
-            yield f"{topic}: {count} {are} unknown, the first at {first_ns} ns: {reason}"
+            yield Sentence(
+                f"{topic}: {count} {are} unknown, the first at ", Instant(first_ns, 0), f": {reason}"
+            )
 
-    def _stale_texts(self) -> Iterator[str]:
+    def _stale_texts(self) -> Iterator[Sentence]:
         by_topic: dict[str, list[tuple[str, int, int]]] = {}
         for (topic, name), (count, first_ns) in sorted(self._stale.items()):
             by_topic.setdefault(topic, []).append((name, count, first_ns))
@@ -324,9 +327,10 @@ class Remarks:
             more = f" and {len(stale) - _MOST_NAMES} more" if len(stale) > _MOST_NAMES else ""
             most = max(count for _, count, _ in stale)
             first_ns = min(first for _, _, first in stale)
-            yield (
-                f"{topic}: {names}{more} are unknown in up to {most} samples, the first at {first_ns} ns:"
-                " the topic was silent for longer than max_age"
+            yield Sentence(
+                f"{topic}: {names}{more} are unknown in up to {most} samples, the first at ",
+                Instant(first_ns, 0),
+                ": the topic was silent for longer than max_age",
             )
 
 

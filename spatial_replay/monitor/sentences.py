@@ -98,11 +98,17 @@ def number_text(number: float) -> str:
     return f"{number:.{_DIGITS}g}"
 
 
+def divisor_of(atom: Formula) -> float:
+    """Return what `scale` divides the number of an atom by; 1 for others."""
+    expression = atom.expression if isinstance(atom, Atom) else None
+    return expression.divisor if isinstance(expression, Scaled) else 1.0
+
+
 def amount_text(number: float, atom: Formula) -> str:
     """Return a number of an atom in the unit of the log: what `scale` divided it by is said beside it."""
-    if not isinstance(atom, Atom) or not isinstance(atom.expression, Scaled):
+    divisor = divisor_of(atom)
+    if divisor == 1.0:
         return number_text(number)
-    divisor = atom.expression.divisor
     return f"{number_text(number * divisor)} ({number_text(number)} on its scale of {number_text(divisor)})"
 
 
@@ -238,7 +244,7 @@ def _flip(
         limit = f"{change} in place of {number_text(threshold.value)}"
         return f"{would} with {limit} in `{deciding.text}`."
     margin = change.removeprefix("-").removesuffix(" or less").removesuffix(" or more")
-    if isinstance(deciding.atom.expression, Scaled):
+    if divisor_of(deciding.atom) != 1.0:
         margin = amount_text(abs(threshold.flips_at), deciding.atom)
     how = "were allowed to fail by" if threshold.flips_at < 0.0 else "had to hold by"
     return f"{would} if `{deciding.text}` {how} {margin}."

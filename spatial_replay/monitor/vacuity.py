@@ -87,7 +87,7 @@ def find_vacuous(evidence: Evidence, leaves: Floats, times_ns: Integers) -> tupl
         path = deciding_path(instance.formula, done, times_ns, 0, End.LOW)
         node, sample = path.steps[-1].node, path.steps[-1].sample
         if node not in {each.node for each in found}:
-            found += _infinite(node, nodes[node], Instant(int(times_ns[sample]), int(times_ns[0])))
+            found += _infinite(node, nodes[node], Instant(int(times_ns[sample]), evidence.first_ns()))
     return tuple(
         Vacuous(each.node, text, each.reason, Sentence(f"`{text}` ", *each.what))
         for each in sorted(found, key=lambda each: each.node)

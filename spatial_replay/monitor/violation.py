@@ -13,7 +13,7 @@ from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.causes import Conjunct, conjuncts_of
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.program import Program, compile_formula
-from spatial_replay.monitor.sentences import amount_text, missed_text, number_text, sentences_of
+from spatial_replay.monitor.sentences import amount_text, divisor_of, missed_text, number_text, sentences_of
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom
 from spatial_replay.monitor.witness.evidence import Evidence
@@ -21,7 +21,6 @@ from spatial_replay.monitor.witness.path import End
 from spatial_replay.monitor.witness.threshold import Threshold
 from spatial_replay.monitor.witness.witness import Witness, find_witness
 from spatial_replay.spec.checks import object_names, signal_names
-from spatial_replay.spec.expressions import Scaled
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import NamedSpec, Number, Specification
 from spatial_replay.text import Instant, Sentence
@@ -93,13 +92,8 @@ class Violation:
         number = self.atom.upper if self.atom.end is End.HIGH else self.atom.lower
         size = amount_text(abs(number), self.atom.atom)
         how = f"{'holds' if number >= 0.0 else 'fails'} by {size}"
-        short = _short(self.atom, self.spec, abs(number) * _divisor(self.atom))
+        short = _short(self.atom, self.spec, abs(number) * divisor_of(self.atom.atom))
         return f"{short}: `{self.atom.text}` {how} at {when}"
-
-
-def _divisor(atom: DecidingAtom) -> float:
-    """Return what `scale` divides the atom's number by, so that amounts are said in the log's own unit."""
-    return atom.atom.expression.divisor if isinstance(atom.atom.expression, Scaled) else 1.0
 
 
 def _short(atom: DecidingAtom, spec: str, amount: float) -> str:

@@ -18,6 +18,7 @@ from spatial_replay.recording.recording import Recording, refuse_templates
 from spatial_replay.spec import check_names
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
+from spatial_replay.text import counted_from
 from spatial_replay.trace.trace import Trace
 
 
@@ -155,5 +156,5 @@ class _Tally:
             tuple(self.faults),
             self._unreadable,
             tuple(remark for remark in remarks if remark.severity == "error"),
-            tuple(self.remarks),
+            tuple(counted_from(each, self._times[0]) for each in self.remarks),
         )

@@ -33,6 +33,7 @@ from spatial_replay.replay.selection import (
 )
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
+from spatial_replay.text import counted_from
 from spatial_replay.trace.trace import Trace
 
 if TYPE_CHECKING:
@@ -218,14 +219,15 @@ class Replay:
             raise self._selection.nothing_to_evaluate(self._faults)
         missing = self._selection.missing_names(self._names)
         options = self._selection.options
+        first_ns = first_sample_ns(self._source) if options.window.start_ns else self._times[0]
         return Replayed(
             log=self._source.name,
             samples=self._samples,
-            first_ns=first_sample_ns(self._source) if options.window.start_ns else self._times[0],
+            first_ns=first_ns,
             start_ns=self._times[0],
             end_ns=self._times[-1],
             faults=tuple(self._faults),
-            remarks=tuple(self._remarks),
+            remarks=tuple(counted_from(each, first_ns) for each in self._remarks),
             missing=missing,
             unreadable=self._unreadable,
             results=replayed_specs(

@@ -41,6 +41,7 @@ from spatial_replay.spec import parse_specification
 from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
 from spatial_replay.spec.format import format_duration, format_specification
 from spatial_replay.spec.formula import Constant, Specification, iter_nodes
+from spatial_replay.text import counted_from
 from spatial_replay.trace.trace import Trace
 
 MOST_NUMBERS: Final = 1 << 27
@@ -274,7 +275,7 @@ class Evaluated:
             start_ns=int(times_ns[0]),
             end_ns=int(times_ns[-1]),
             faults=loaded.faults,
-            remarks=loaded.remarks,
+            remarks=tuple(counted_from(each, loaded.first_ns) for each in loaded.remarks),
             missing=loaded.missing,
             unreadable=loaded.inside.unreadable_count,
             results=replayed_specs(

@@ -22,6 +22,7 @@ from spatial_replay.replay.kept_messages import source_keeping
 from spatial_replay.spec import check_names
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
+from spatial_replay.text import time_text
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace, window_of
 
@@ -241,8 +242,8 @@ class Selection:
             return LogError("; ".join([f"{name} has no sample", *faults[:1]]))
         first_ns, last_ns = spans[0][0], spans[-1][1]
         return UsageError(
-            f"{name} has no sample in the requested window; its samples are from {first_ns} to {last_ns} ns, "
-            f"{(last_ns - first_ns) / 1e9:.3f} s"
+            f"{name} has no sample in the requested window; its samples are from 0.000 s to "
+            f"{time_text(last_ns, first_ns)} ({first_ns} to {last_ns} ns on its clock)"
         )
 
     def _missing_names(self, names: LogNames) -> list[Diagnostic]:

@@ -32,7 +32,7 @@ class Pointer(NamedTuple):
     Attributes:
         ends: (2, 2), from where to where it points.
         text: the atom's.
-        number: its robustness.
+        number: its robustness, in the unit of the log where `scale` divides it.
     """
 
     ends: Floats

@@ -18,6 +18,7 @@ from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.output_file import refuse_inputs, replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.source import Source, axes_of
+from spatial_replay.monitor.sentences import divisor_of
 from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions
@@ -165,7 +166,8 @@ def _pointer(witness: Witness) -> Pointer | None:
     for measured in witness.deciding.measured:
         if measured.contact is not None:
             ends = np.array([measured.contact.first, measured.contact.second])
-            return Pointer(ends, witness.deciding.text, witness.deciding.value)
+            number = witness.deciding.value * divisor_of(witness.deciding.atom)
+            return Pointer(ends, witness.deciding.text, number)
     return None
 
 

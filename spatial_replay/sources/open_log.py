@@ -26,6 +26,7 @@ from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.read_options import Lost, OnTimeJump, ReadOptions, count_of
 from spatial_replay.logs.remote import LogFile, RemoteFile, log_file
 from spatial_replay.logs.source import IterTraces, Source, TrackSource, reading_only
+from spatial_replay.text import counted_from
 from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.trace import Trace
 
@@ -114,7 +115,8 @@ def read_trace(
         others = count_of(trace.faults) - 1
         more = f"\n… and {others} more" if others else ""
         raise LogError(f"{trace.faults[0]}{more}; allow_damage=True reads the rest")
-    return trace
+    first_ns = int(trace.times_ns[0]) if len(trace) else 0
+    return replace(trace, remarks=tuple(counted_from(each, first_ns) for each in trace.remarks))
 
 
 def _require_path(value: object) -> None:

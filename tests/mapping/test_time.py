@@ -67,7 +67,7 @@ def test_an_object_with_an_old_observation_exists_but_is_unknown() -> None:
         feed.add("/a", tick * SECOND // 2, point(tick))
     made = make("max_age: 1500ms\ntopics: {/a: {}, /b: {}}", feed)
     assert made.states("b") == "++++????"
-    assert "/b: b are unknown in up to 4 samples, the first at 2000000000 ns" in made.remarks[0]
+    assert "/b: b are unknown in up to 4 samples, the first at 2.000 s" in made.remarks[0]
     assert make("topics: {/a: {}, /b: {max_age: forever}}", feed).states("b") == "++++++++"
     assert make("topics: {/a: {}, /b: {}}", feed).states("b") == "+++?????"
 
