@@ -41,6 +41,31 @@ def test_help_loads_no_command_and_no_numerical_library(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, b"")
 
 
+def test_a_replay_of_a_short_log_loads_no_compiler_and_no_encoder(tmp_path: Path) -> None:
+    recordings = Path(__file__).resolve().parents[2] / "recordings"
+    arguments = ["replay", f"{recordings}/push.mcap", "--spec", f"{recordings}/push.spatial", "--to", "1s"]
+    program = (
+        "import sys\n"
+        "from spatial_replay.cli import run\n"
+        f"run({arguments!r})\n"
+        "unneeded = {'numba', 'jsonschema', 'matplotlib', 'rich', 'rosbags', 'shapely', 'yaml',\n"
+        "    'mcap_protobuf', "
+        "'foxglove_schemas_protobuf', 'spatial_replay.annotate.annotator', 'spatial_replay.automata',\n"
+        "    'spatial_replay.bags.open', 'spatial_replay.logs.mcap.writer'} & set(sys.modules)\n"
+        "sys.exit(', '.join(sorted(unneeded)) or 0)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        env={key: value for key, value in os.environ.items() if key != "SPATIAL_REPLAY_KERNELS"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "push.mcap: 30 samples" in done.stdout
+
+
 def test_a_group_without_a_command_prints_its_help_and_no_error(tmp_path: Path) -> None:
     done = run_program("record", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")

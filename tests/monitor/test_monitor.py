@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import tracemalloc
 from math import inf
 
@@ -53,6 +56,31 @@ def test_a_monitor_refuses_invalid_arguments_and_samples():
         monitor.update(at(3, p=1))
     with pytest.raises(UsageError, match=r"start_ns is 1\.5; give integer nanoseconds"):
         Monitor(parse_specification("p >= 0"), start_ns=1.5)
+
+
+def test_the_first_violation_waits_for_no_code():
+    # in a process of its own, where nothing has been compiled for others
+    program = """
+import sys
+from spatial_replay import Footprint, Monitor, Sample, parse_specification
+from spatial_replay.compiled import kernels
+
+apart = "region bin = box(0, 0, 9, 9)\\nspec apart = G (cup dist jug >= 1)\\nspec light = G (load <= 1)"
+inside = "spec inside = G (cup enclosedin bin and cup oriented[0.5] jug)"
+safe = "spec safe = apart and light and inside"
+monitor = Monitor(parse_specification(f"{apart}\\n{inside}\\n{safe}"))
+ready = {each.__name__ for each in kernels() if each.is_compiled}
+objects = {"cup": Footprint.box(0, 0, 1, 1), "jug": Footprint.box(1.5, 0, 9.5, 1)}
+found = monitor.update(Sample(0, objects, {"load": 2.0})).violations
+print(*found)
+sys.exit(", ".join({each.__name__ for each in kernels() if each.is_compiled} - ready) or 0)
+"""
+    environment = {key: value for key, value in os.environ.items() if key != "SPATIAL_REPLAY_KERNELS"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "cup is 0.5 too close to jug" in done.stdout
 
 
 def test_memory_does_not_grow_with_the_samples():

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 
-def _run(*arguments: str) -> None:
+def _run(*arguments: str, cache: str | None = None) -> None:
+    environment = os.environ if cache is None else os.environ | {"SPATIAL_REPLAY_CACHE": cache}
     command = [sys.executable, "-m", "spatial_replay", *arguments]
-    done = subprocess.run(command, capture_output=True, check=False)
+    done = subprocess.run(command, env=environment, capture_output=True, check=False)
     if done.returncode not in (0, 1, 4):
         raise RuntimeError(f"{' '.join(command)} ended with {done.returncode}: {done.stderr.decode()}")
 
@@ -20,6 +21,22 @@ def _run(*arguments: str) -> None:
 def bench_help(measure: Any) -> None:
     """`spatial-replay --help`."""
     measure("--help", lambda _: _run("--help"), limit_s=0.3)
+
+
+def bench_short_replay(measure: Any) -> None:
+    """`spatial-replay replay` of 300 samples, and the first one on a machine, which has no compiled code."""
+    recordings = Path(__file__).resolve().parents[2] / "recordings"
+    with tempfile.TemporaryDirectory() as folder:
+        log = f"{folder}/table.mcap"
+        _run("record", "tracks", str(recordings / "table.jsonl"), "-o", log)
+        command = ("replay", log, "--spec", str(recordings / "table.spatial"))
+        measure("warm cache", lambda _: _run(*command), limit_s=0.7)
+        measure(
+            "no cache",
+            lambda cache: _run(*command, cache=cache),
+            prepare=lambda: tempfile.mkdtemp(dir=folder),
+            limit_s=8.0,
+        )
 
 
 def bench_replay_command(measure: Any) -> None:
