@@ -14,20 +14,16 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spatial_replay.annotate.rings import Form, Rings, extents, outlines_of, rings_of
 from spatial_replay.annotate.scene_entities import (
     LABEL_LENGTH,
     OBJECT,
     REGION,
-    Form,
     Region,
-    Rings,
     SceneLayout,
     SceneTemplate,
     border_of,
-    extents,
     make_template,
-    outlines_of,
-    rings_of,
     words_of_object,
     words_of_region,
     words_of_witness,

@@ -1,0 +1,118 @@
+"""Footprints as rings of points, one for each part, as scenes and reports draw them."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Floats, Integers, flat_index, starts_from_counts
+from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import Footprint
+
+ROUND: Final = 32
+"""Points on the ring of a rounded part."""
+
+
+class Rings(NamedTuple):
+    """The rings of R footprints, as ragged rows.
+
+    Attributes:
+        start: (R + 1,) int64, where each footprint's points begin.
+        points: (P, 2), counter-clockwise.
+        form: (R,) int64, index into `forms`.
+        forms: for each form, the lengths of its rings and whether it has a height.
+    """
+
+    start: Integers
+    points: Floats
+    form: Integers
+    forms: tuple[Form, ...]
+
+    def rings_of(self, footprint: int) -> tuple[Floats, ...]:
+        """Return the rings (n, 2) of one of the footprints."""
+        points = self.points[self.start[footprint] : self.start[footprint + 1]]
+        ends = np.cumsum(self.forms[self.form[footprint]].rings)[:-1]
+        return tuple(np.split(points, ends))
+
+
+class Form(NamedTuple):
+    """The primitives of a footprint: the lengths of its rings, and whether it has a height."""
+
+    rings: tuple[int, ...]
+    has_height: bool
+
+
+def rings_of(footprints: FootprintBatch, point_radius: float) -> Rings:
+    """Return the rings of footprints; a bare point becomes a disc of the given radius."""
+    counts = np.diff(footprints.vertex_start)
+    is_round = (counts == 1) | (footprints.radius > 0.0)
+    lengths = np.where(is_round, ROUND, counts)
+    part_start = starts_from_counts(lengths)
+    points = np.empty((part_start[-1], 2))
+    straight = ~is_round
+    points[flat_index(part_start[:-1][straight], counts[straight])] = footprints.vertices[
+        flat_index(footprints.vertex_start[:-1][straight], counts[straight])
+    ]
+    for count in np.unique(counts[is_round]).tolist():
+        parts = np.flatnonzero(is_round & (counts == count))
+        corners = footprints.vertices[footprints.vertex_start[parts][:, None] + np.arange(count)]
+        radius = np.where(footprints.radius[parts] > 0.0, footprints.radius[parts], point_radius)
+        points[part_start[parts][:, None] + np.arange(ROUND)] = _rounded(corners, radius)
+    form, forms = _forms(footprints, lengths)
+    return Rings(part_start[footprints.part_start], points, form, forms)
+
+
+def outlines_of(footprint: Footprint) -> list[Floats]:
+    """Return the ring (n, 2) of each part of one footprint."""
+    return list(rings_of(FootprintBatch.from_footprints([footprint]), 0.0).rings_of(0))
+
+
+def extents(footprints: FootprintBatch) -> Floats:
+    """Return (R,) the longer side of each footprint's bounding box."""
+    owner = np.repeat(np.arange(len(footprints)), np.diff(footprints.part_start))
+    vertex_part = np.repeat(np.arange(len(owner)), np.diff(footprints.vertex_start))
+    radius = footprints.radius[vertex_part][:, None]
+    low = np.full((len(footprints), 2), np.inf)
+    high = np.full((len(footprints), 2), -np.inf)
+    np.minimum.at(low, owner[vertex_part], footprints.vertices - radius)
+    np.maximum.at(high, owner[vertex_part], footprints.vertices + radius)
+    return np.asarray((high - low).max(axis=1))
+
+
+_ANGLES = np.arange(ROUND) * (2.0 * np.pi / ROUND)
+_DIRECTIONS: Final = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+
+
+def _rounded(corners: Floats, radius: Floats) -> Floats:
+    """Return the rings (M, ROUND, 2) of M parts: the outermost point in each direction.
+
+    Args:
+        corners: (M, n, 2).
+        radius: (M,).
+    """
+    x, y = _DIRECTIONS[:, :1], _DIRECTIONS[:, 1:]
+    reach = corners[:, None, :, 0] * x + corners[:, None, :, 1] * y
+    outermost = np.take_along_axis(corners, reach.argmax(axis=2)[:, :, None], axis=1)
+    return np.asarray(outermost + radius[:, None, None] * _DIRECTIONS)
+
+
+def _forms(footprints: FootprintBatch, lengths: Integers) -> tuple[Integers, tuple[Form, ...]]:
+    """Return (R,) the form of each footprint, and the forms."""
+    part_counts = np.diff(footprints.part_start)
+    has_height = ~np.isnan(footprints.bottom)
+    key = part_counts * 2 + has_height
+    for part in range(int(part_counts.max(initial=0))):
+        there = part_counts > part
+        length = np.zeros(len(footprints), np.int64)
+        length[there] = lengths[footprints.part_start[:-1][there] + part]
+        _, key = np.unique(key * (int(length.max()) + 1) + length, return_inverse=True)
+    _, examples, form = np.unique(key, return_index=True, return_inverse=True)
+    forms = tuple(
+        Form(
+            tuple(lengths[footprints.part_start[row] : footprints.part_start[row + 1]].tolist()),
+            bool(has_height[row]),
+        )
+        for row in examples.tolist()
+    )
+    return form.astype(np.int64), forms
