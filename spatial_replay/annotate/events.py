@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
@@ -18,6 +17,7 @@ from spatial_replay.annotate.deciding_leaf import (
     find_leaf,
     leaves_below,
 )
+from spatial_replay.annotate.event_sentences import change_sentence, end_sentence, leaf_words, past_sentence
 from spatial_replay.annotate.leaf_history import DecidingLeaf, LeafHistory, SettledViolation
 from spatial_replay.annotate.specification import ReportedTree
 from spatial_replay.annotate.verdict_changes import (
@@ -38,7 +38,7 @@ from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.online.operators import looks_ahead
 from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.monitor.sentences import amount_text, number_text
+from spatial_replay.monitor.sentences import amount_text
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.vacuity import Vacuous
 from spatial_replay.monitor.verdict import Verdict, final_verdict
@@ -47,71 +47,6 @@ from spatial_replay.spec.formula import Formula, Specification, iter_nodes, oper
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.walks import substitute
 from spatial_replay.text import requirement_text, time_text
-
-_NOW: Final[Mapping[int, str]] = {
-    HOLDING: "holds so far",
-    FAILING: "is pending",
-    SATISFIED: "is satisfied, whatever comes",
-    VIOLATED: "is violated, whatever comes",
-}
-
-
-def leaf_words(text: str, number: float, amount: str, *, past: bool = False) -> str:
-    """Return a leaf and its number in words, as in "`a closeto[1] b` fails by 3.2".
-
-    Args:
-        amount: the number without its sign, in words.
-    """
-    if number == 0.0:
-        return f"`{text}` just {'held' if past else 'holds'}"
-    holds, fails = ("held", "failed") if past else ("holds", "fails")
-    return f"`{text}` {holds if number > 0.0 else fails} by {amount}"
-
-
-def change_sentence(title: str, after: Period, witness: str) -> str:
-    """Return a sentence on what has begun.
-
-    Args:
-        title: what the node is called.
-        witness: the leaf that its number is that of, in words; "" for none.
-    """
-    is_short = after.code == FAILING
-    because = ""
-    if math.isfinite(after.worst):
-        number = number_text(abs(after.worst))
-        because = f", {number} short of holding" if is_short else f", by {number}"
-    if witness:
-        because = f": {witness}"
-    return f"{title} {_NOW[after.code]}{because}."
-
-
-def end_sentence(title: str, verdict: Verdict, ends: tuple[float, float], witness: str) -> str:
-    """Return a sentence on the verdict over the finished log.
-
-    Args:
-        ends: of the interval of its value; NaN where that is not determined.
-    """
-    amount, because = "", f": {witness}" if witness else ""
-    number = ends[verdict is Verdict.VIOLATED]
-    if verdict is Verdict.UNKNOWN:
-        low, high = map(number_text, ends)
-        because = f": robustness {'not determined' if math.isnan(number) else f'between {low} and {high}'}"
-    elif not witness and math.isfinite(number):
-        amount = f" by {number_text(abs(number))}"
-    return f"{title} is {verdict}{amount}, for the log has ended{because}."
-
-
-def past_sentence(before: Period, until_ns: int, witness: str) -> str:
-    """Return a sentence on the period before, until another began."""
-    seconds = time_text(until_ns, before.start_ns)
-    if before.code == FAILING:
-        return f"Before, it was pending for {seconds}."
-    worst = ""
-    if witness:
-        worst = f"; its worst was that {witness}"
-    elif math.isfinite(before.worst):
-        worst = f", by {number_text(abs(before.worst))} or more"
-    return f"Before, it held for {seconds}{worst}."
 
 
 class ReportedNode(NamedTuple):
