@@ -147,6 +147,8 @@ class AtomBuilder:
         right = "(b, c)" if name == "between" else "b"
         what = "an axis, x, y or z" if expected[0].name == "axis" else "a number"
         hint = f"write a {name}[{bracket}] {right}, where {expected[0].name} is {what}"
+        if len(expected) == 1 and len(written.parameters) == 2:
+            hint += "; decimals have a point: 0.1"
         count = f"{len(expected)} parameter{'s' if len(expected) > 1 else ''}, not {len(written.parameters)}"
         self.resolver.fault(written.operator, scope, f"{name!r} takes {count}", hint)
 

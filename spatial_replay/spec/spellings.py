@@ -231,6 +231,19 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
     found = f"{token.value!r} cannot stand here"
     if window := _meant_window(tokens, position):
         return found, f"a window is written with both of its ends: {window}"
+    if (
+        token.type == "NUMBER"
+        and "RELATION" in (last.type, before.type)
+        and last.type in ("RELATION", "LPAR")
+    ):
+        relation = last if last.type == "RELATION" else before
+        return found, f"numbers of a relation stand in square brackets: {relation.value}[{token.value}]"
+    if before.type == "RSQB" and last.value in ("s", "ms"):
+        return f"{last.value!r} cannot stand here", "each number has its unit: [0s, 5s], [200ms, 1s]"
+    if token.type in _RELATIONS and before.type == "SLASH" and last.type == "NAME":
+        first = tokens[position - 3].value if position > 2 else ""
+        hint = f'a name with a slash is written in quotes: "{first}/{last.value}"'
+        return f"{token.value!r} needs an object, region or group on its left", hint
     if last.type in _STATEMENTS and token.type != "NAME" and token.value.isidentifier():
         kind = "a relation" if "RELATION" not in accepted and token.type in _RELATIONS else "a reserved word"
         return f"{token.value!r} is {kind}, so no name for a {last.value}", "give it another name"

@@ -34,6 +34,11 @@ spec template(ego) = ego ovlp goal
 @pytest.mark.parametrize(
     ("statement", "where", "message", "hint"),
     [
+        ("spec s = a closeto[0,1] b", "closeto", "takes 1 parameter, not 2", "decimals have a point: 0.1"),
+        ("spec s = a closeto(5) b", "5", "'5' cannot stand here", "square brackets: closeto[5]"),
+        ("spec s = a closeto 5 b", "5", "'5' cannot stand here", "square brackets: closeto[5]"),
+        ("spec s = F[0,5]s a ovlp b", "a", "'s' cannot stand here", "each number has its unit: [0s, 5s]"),
+        ("spec s = robot_1/base ovlp b", "ovlp", "needs an object", 'in quotes: "robot_1/base"'),
         ("spec s = F[5s] a ovlp b", "]", "']' cannot stand here", "both of its ends: F[0, 5s]"),
         ("spec s = F<=5s a ovlp b", "<=", "'<=' cannot stand here", "both of its ends: F[0, 5s]"),
         ("spec s = G[>=2s] a ovlp b", ">=", "'>=' cannot stand here", "both of its ends: G[2s, inf]"),
