@@ -138,8 +138,8 @@ def run_batch(
         SpecificationError: specifications with errors.
         OutputError: rows cannot be written; those written so far stay.
     """
-    files = _spec_files(suite)
-    logs = _found(suite)
+    files = checked_spec_files(suite)
+    logs = found_logs(suite)
     folder = ResultsFolder.create(results)
     with folder.locked():
         identities = Identities(folder.path / IDENTITIES)
@@ -191,8 +191,13 @@ def _require_shared(folder: ResultsFolder, tasks: Sequence[StoredTask], errors: 
         )
 
 
-def _spec_files(suite: Suite) -> list[tuple[SpecFile, ...]]:
-    """Return the specification files of each case, checked; all errors are reported together."""
+def checked_spec_files(suite: Suite) -> list[tuple[SpecFile, ...]]:
+    """Return the specification files of each case, checked; all errors are reported together.
+
+    Raises:
+        SpecificationError: specifications with errors.
+        UsageError: files that cannot be used, templates without objects.
+    """
     texts: dict[Path, SpecificationText] = {}
     files: list[tuple[SpecFile, ...]] = []
     diagnoses: dict[str, Any] = {}
@@ -261,8 +266,12 @@ def _check_each(case: Case, files: Sequence[Specification]) -> None:
             )
 
 
-def _found(suite: Suite) -> list[list[FoundLog]]:
-    """Return the logs of each case; patterns without a log are reported together."""
+def found_logs(suite: Suite) -> list[list[FoundLog]]:
+    """Return the logs of each case.
+
+    Raises:
+        UsageError: patterns without a log; all are listed.
+    """
     logs, faults = [], []
     for case in suite.cases:
         try:

@@ -1,0 +1,157 @@
+"""A pytest plugin: suites named `*.replay.yaml` are collected, as one test for each log and spec.
+
+Every run of pytest imports this module, so it loads nothing of the package until there is such a file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from spatial_replay.batch.rows import ResultRow, Task
+    from spatial_replay.batch.suite import Case
+
+_ENDINGS = (".replay.yaml", ".replay.yml")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option for the number of processes."""
+    parser.getgroup("spatial-replay").addoption(
+        "--replay-jobs",
+        type=int,
+        default=1,
+        metavar="N",
+        help="Processes that evaluate the logs of *.replay.yaml files.  [default: 1]",
+    )
+
+
+def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
+    """Collect suites."""
+    return SuiteFile.from_parent(parent, path=file_path) if file_path.name.endswith(_ENDINGS) else None
+
+
+class SuiteFile(pytest.File):
+    """A suite: its tests are the specs over the logs of its cases."""
+
+    def collect(self) -> Iterable[pytest.Item]:
+        """Yield a test for each case, log and spec; faults of the suite end the collection."""
+        from spatial_replay.batch.rows import Task
+        from spatial_replay.batch.run import checked_spec_files, found_logs
+        from spatial_replay.batch.suite import load_suite
+        from spatial_replay.errors import SpatialReplayError
+
+        try:
+            suite = load_suite(self.path)
+            cases = list(zip(suite.cases, checked_spec_files(suite), found_logs(suite), strict=True))
+        except SpatialReplayError as error:
+            raise self.CollectError(str(error)) from None
+        for case, files, logs in cases:
+            for log in logs:
+                task = Task(log.path, tuple(file.text for file in files), case.conditions)
+                for number, file in enumerate(files):
+                    # several specification files may use one name
+                    stem = f"{file.name.removesuffix('.spatial')}." if len(files) > 1 else ""
+                    for spec in _result_names(task, number):
+                        name = f"{case.name}[{log.name}-{stem}{spec}]"
+                        yield ReplayItem.from_parent(
+                            self, name=name, case=case, task=task, file=number, spec=spec, log=log.name
+                        )
+
+
+class ReplayItem(pytest.Item):
+    """A spec over a log."""
+
+    def __init__(
+        self, *, case: Case, task: Task, file: int, spec: str, log: str, name: str, parent: SuiteFile
+    ) -> None:
+        super().__init__(name, parent)
+        self.task = task
+        self._case, self._file, self._spec, self._log = case, file, spec, log
+        if self.config.pluginmanager.hasplugin("xdist"):
+            # with --dist loadgroup, one worker gets all specs of a log
+            self.add_marker(pytest.mark.xdist_group(task.log))
+
+    def runtest(self) -> None:
+        """Evaluate the log, unless another of its specs has, and fail for each result that does not pass."""
+        rows = [row for row in _results(self.session).rows(self.task)[self._file] if row.spec == self._spec]
+        ids = dict.fromkeys([*filter(None, (row.requirement for row in rows)), *self._case.requirements])
+        self.user_properties += [("requirement", each) for each in ids]
+        failures = [text for row in rows if (text := self._failure(row)) is not None]
+        if failures:
+            raise _NotSatisfiedError("\n\n".join(failures))
+
+    def _failure(self, row: ResultRow) -> str | None:
+        """Return what is wrong with a result and what explains it; None if it passes."""
+        failure = row.error
+        if row.verdict is not None:
+            failure = self._case.expectation.failure(row.verdict, row.robustness)
+            if failure is None and row.faults:
+                failure = f"the log is damaged: {row.faults[0]}"
+        if failure is None:
+            return None
+        title = row.spec if row.object is None else f"{row.spec}[{row.object}]"
+        sentence = [f"{title}: {row.title}"] if row.title else []
+        return "\n".join([f"{self._log}: {title}: {failure}", *sentence, *row.explanation])
+
+    def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
+        """Return the explanation alone: where it was raised says nothing."""
+        if isinstance(excinfo.value, _NotSatisfiedError):
+            return str(excinfo.value)
+        return super().repr_failure(excinfo)
+
+    def reportinfo(self) -> tuple[Path, int | None, str]:
+        """Return the suite's file and a title."""
+        return self.path, None, f"{self._spec} over {self._log}, case {self._case.name}"
+
+
+class _NotSatisfiedError(Exception):
+    """A result that is not what a case expects."""
+
+
+class _Results:
+    """The rows of the logs of a session; each log is evaluated once, whoever of its tests comes first.
+
+    With several processes, all logs are evaluated when the first test runs.
+    """
+
+    def __init__(self, jobs: int, tasks: Iterable[Task]) -> None:
+        self._jobs = jobs
+        self._tasks = list(dict.fromkeys(tasks))
+        self._rows: dict[Task, tuple[tuple[ResultRow, ...], ...]] = {}
+
+    def rows(self, task: Task) -> tuple[tuple[ResultRow, ...], ...]:
+        """Return the rows of a log, by specification file."""
+        if task not in self._rows:
+            self._rows.update(self._evaluated(self._tasks if self._jobs > 1 else [task]))
+        return self._rows[task]
+
+    def _evaluated(self, tasks: list[Task]) -> Iterator[tuple[Task, tuple[tuple[ResultRow, ...], ...]]]:
+        from spatial_replay.batch.rows import error_rows, rows_from_task
+        from spatial_replay.batch.run import workers_of
+        from spatial_replay.batch.workers import WorkerLost
+
+        for task, rows in workers_of(self._jobs).results(rows_from_task, tasks):
+            yield task, error_rows(task, str(rows), "machine") if isinstance(rows, WorkerLost) else rows
+
+
+_RESULTS = pytest.StashKey[_Results]()
+
+
+def _results(session: pytest.Session) -> _Results:
+    """Return the results of a session's tests, none of which is evaluated yet at first."""
+    if _RESULTS not in session.stash:
+        jobs = session.config.getoption("--replay-jobs")
+        tasks = [item.task for item in session.items if isinstance(item, ReplayItem)]
+        # under xdist, every worker is one of several processes already
+        session.stash[_RESULTS] = _Results(1 if hasattr(session.config, "workerinput") else jobs, tasks)
+    return session.stash[_RESULTS]
+
+
+def _result_names(task: Task, file: int) -> list[str]:
+    from spatial_replay.batch.rows import parsed_specifications
+
+    return [spec.name for spec in parsed_specifications(task.specs, task.conditions)[file].results]

@@ -1,0 +1,47 @@
+"""Assertions for tests of one's own: a log satisfies a specification, or the test fails with the reason."""
+
+from __future__ import annotations
+
+from typing import Unpack
+
+from spatial_replay.api import Evaluating, Log, Specifications, replay_log
+from spatial_replay.batch.suite import Expectation
+from spatial_replay.replay.engine import Replayed
+
+
+def assert_satisfied(
+    log: Log,
+    specifications: Specifications | None = None,
+    *,
+    at_least: float | None = None,
+    **options: Unpack[Evaluating],
+) -> Replayed:
+    """Evaluate specifications over a log, and fail unless every result is satisfied.
+
+    Args:
+        log: a file in any format, an address, or a trace.
+        specifications: one or several, parsed or as files; None takes those that the log was written with.
+        at_least: the least robustness that passes, in the units of the formula.
+        options: how to evaluate and read the log, as for `replay_log`.
+
+    Returns:
+        What `replay_log` returns, for further assertions.
+
+    Raises:
+        AssertionError: a result is violated, unknown, or less robust; its text is what `explain` says.
+        UsageError, SpecificationError, LogError: it cannot be evaluated.
+    """
+    __tracebackhide__ = True
+    replayed = replay_log(log, specifications, **options)
+    expectation = Expectation(at_least=at_least)
+    reasons = []
+    for result in replayed.results:
+        failure = expectation.failure(result.verdict, result.robustness)
+        if failure is not None:
+            title = result.name if result.object is None else f"{result.name}[{result.object}]"
+            explanation = result.sentences(replayed.first_ns) if result.can_explain else ()
+            reasons.append("\n".join([f"{replayed.log}: {title}: {failure}", *map(str, explanation)]))
+    reasons += [f"{replayed.log} is damaged: {fault}" for fault in replayed.faults[:1]]
+    if reasons:
+        raise AssertionError("\n\n".join(reasons))
+    return replayed
