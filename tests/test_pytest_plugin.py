@@ -77,7 +77,7 @@ def test_faults_of_a_suite_and_of_its_logs_are_shown_without_a_traceback(
     result.assert_outcomes(failed=3, errors=1)
     result.stdout.fnmatch_lines(["*table.replay.yaml:2:*perhaps*", "*broken.jsonl*holds no sample*"])
     result.stdout.no_fnmatch_line("*Traceback*")
-    result.stdout.no_fnmatch_line("*.py:*")
+    result.stdout.no_fnmatch_line("*rows.py:*")
 
 
 def test_several_processes_and_workers_of_xdist_give_the_same_outcomes(
