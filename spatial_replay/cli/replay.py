@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -137,7 +138,7 @@ def replay(
     if json_file != "-":
         print_verdicts(replayed, output, window_ns)
     verdicts = [str(result.verdict) for result in replayed.results]
-    if json_file != "-" and semantics == "ltlf" and "violated" in verdicts:
+    if "violated" in verdicts and json_file != "-" and semantics == "ltlf" and sys.stderr.isatty():
         hint = "`spatial-replay explain` with the same log and specifications says what would have helped"
         show_message("note", hint, "cyan")
     return exit_code_from_verdicts([*verdicts, *_failures(replayed, fail_on)], damaged=bool(replayed.faults))

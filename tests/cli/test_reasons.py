@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,17 @@ def test_the_requirements_of_a_result_its_parts_and_causes_are_in_every_output(
     run(["explain", str(LOG), "--spec", "mission.spatial"])
     said = capsys.readouterr().out
     assert "`safe` (REQ-3: keeps its distance) is violated since 5.533 s" in said
+
+
+def test_on_a_terminal_a_violation_leads_to_explain(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = ["replay", str(LOG), "--spec", "mission.spatial"]
+    run(arguments)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    run(arguments)
+    assert "`spatial-replay explain` with the same log" in capsys.readouterr().err
 
 
 def test_many_results_are_counted_and_the_worst_come_first(
