@@ -82,6 +82,7 @@ _MEANT_SIGNS: Mapping[str, str] = MappingProxyType(
 _LENGTHS = frozenset({"m", "cm", "mm", "km", "um", "in", "ft", "px"})
 _TIMES: Mapping[str, float] = MappingProxyType({"us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "sec": 1.0})
 _DEFINING = frozenset({"let", "var", "val", "define", "param", "parameter", "constant", "set"})
+_WITH_NUMBER = frozenset({"closeto", "farfrom", "touch", "oriented", "moved"})
 _STATEMENTS = frozenset({"CONST", "REGION", "GROUP", "DEF", "SPEC"})
 
 _BEFORE_FORMULA = frozenset({"EQUAL", "LPAR", "RSQB", "COLON", "AND", "OR", "XOR", "IMPLIES", "IFF", "NOT"})
@@ -231,13 +232,9 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
     found = f"{token.value!r} cannot stand here"
     if window := _meant_window(tokens, position):
         return found, f"a window is written with both of its ends: {window}"
-    if (
-        token.type == "NUMBER"
-        and "RELATION" in (last.type, before.type)
-        and last.type in ("RELATION", "LPAR")
-    ):
-        relation = last if last.type == "RELATION" else before
-        return found, f"numbers of a relation stand in square brackets: {relation.value}[{token.value}]"
+    relation = last if last.type == "RELATION" else before
+    if token.type == "NUMBER" and relation.value in _WITH_NUMBER and last.type in ("RELATION", "LPAR"):
+        return found, f"the number of a relation stands in square brackets: {relation.value}[{token.value}]"
     if before.type == "RSQB" and last.value in ("s", "ms"):
         return f"{last.value!r} cannot stand here", "each number has its unit: [0s, 5s], [200ms, 1s]"
     if token.type in _RELATIONS and before.type == "SLASH" and last.type == "NAME":
