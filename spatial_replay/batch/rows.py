@@ -26,7 +26,6 @@ from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.sentences import reason_sentence
 from spatial_replay.monitor.vacuity import no_instances
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.replay.selection import ReplayOptions, Window, first_sample_ns
 from spatial_replay.sources.open_log import open_source
@@ -251,7 +250,7 @@ def _row_of_log(replayed: Replayed) -> ResultRow:
 
 
 def _row(log: ResultRow, result: SpecResult, first_ns: int, line: int) -> ResultRow:
-    witness = _witness(result)
+    witness = result.worst
     deciding = None if witness is None else witness.deciding
     return replace(
         log,
@@ -274,13 +273,6 @@ def _row(log: ResultRow, result: SpecResult, first_ns: int, line: int) -> Result
         explanation=_some(result.sentences(first_ns)),
         vacuous=_some([part.message for part in result.vacuous]),
     )
-
-
-def _witness(result: SpecResult) -> Witness | None:
-    """Return the witness of the first cause or, of a satisfied result, that of its verdict."""
-    if not result.can_explain:
-        return None
-    return result.causes[0].witness if result.causes else result.witness()
 
 
 def _idle_row(log: ResultRow, spec: NamedSpec, line: int) -> ResultRow:

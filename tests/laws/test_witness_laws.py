@@ -201,11 +201,15 @@ def test_the_threshold_of_a_relation_flips_the_verdict(text, number, recording):
         return evaluate(parse_specification(f"{HEADER}spec s = {text.format(repr(value))}\n"), trace)
 
     evaluation = evaluated(number)
-    witness = evaluation.witness()
-    threshold = witness.threshold
-    reported = REPORTED.search(sentences_of(witness, first_ns=0)[-1])
-    if reported and threshold is not None and threshold.value == number:
-        assert evaluated(float(reported[1])).verdict is not evaluation.verdict
-    if threshold is not None and threshold.is_written and threshold.value == number:
-        assert evaluated(threshold.flips_at).verdict is threshold.verdict
-        assert threshold.verdict is not evaluation.verdict
+    witnesses = [evaluation.witness()]
+    if evaluation.verdict is Verdict.SATISFIED:
+        # what settled it names the number that would have led to another verdict in the end
+        witnesses.append(evaluation.result().worst)
+    for witness in witnesses:
+        threshold = witness.threshold
+        reported = REPORTED.search(sentences_of(witness, first_ns=0)[-1])
+        if reported and threshold is not None and threshold.value == number:
+            assert evaluated(float(reported[1])).verdict is not evaluation.verdict
+        if threshold is not None and threshold.is_written and threshold.value == number:
+            assert evaluated(threshold.flips_at).verdict is threshold.verdict
+            assert threshold.verdict is not evaluation.verdict
