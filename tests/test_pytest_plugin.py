@@ -11,9 +11,8 @@ from pathlib import Path
 import pytest
 
 import spatial_replay as sr
-from spatial_replay import pytest_plugin
+from spatial_replay import UsageError, pytest_plugin
 from spatial_replay.cli import run
-from spatial_replay.errors import UsageError
 from spatial_replay.testing import assert_satisfied
 
 pytest_plugins = ["pytester"]

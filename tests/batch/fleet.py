@@ -7,7 +7,7 @@ from pathlib import Path
 
 from click.testing import CliRunner, Result
 
-from spatial_replay.cli.application import run
+from spatial_replay.cli import run
 
 GATE = """\
 # at least as far apart as in the standard

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from cli.program import PROGRAM, environment
-from spatial_replay.cli.application import run
+from spatial_replay.cli import run
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 LOG = str(RECORDINGS / "table.jsonl")

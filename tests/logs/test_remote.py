@@ -23,8 +23,9 @@ from mcap.reader import make_reader
 
 import spatial_replay as sr
 from logs.web_server import WebServer, serving
+from spatial_replay import LogError, MissingFileError, UsageError
 from spatial_replay.cli import run
-from spatial_replay.errors import LogError, MissingFileError, RemoteError, UsageError
+from spatial_replay.errors import RemoteError
 from spatial_replay.logs import Channel, LogWriter, Messages, Schema
 from spatial_replay.logs.remote import joined_ranges, matching_addresses
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import spatial_replay as sr
-from spatial_replay.errors import MissingFileError, SpatialReplayError, SpecificationError, UsageError
+from spatial_replay import MissingFileError, SpatialReplayError, SpecificationError, UsageError
 from spatial_replay.replay import SpecificationFiles, write_constants
 
 TEXT = "const near = 70 in [40, 100]  # pixels\nspec s = F cube dist cup <= near\n"

@@ -10,8 +10,8 @@ import pytest
 
 import spatial_replay as sr
 from replay.runs import write_tracks
-from spatial_replay.cli.application import run
-from spatial_replay.errors import UsageError
+from spatial_replay import UsageError
+from spatial_replay.cli import run
 from tuning.tuned_runs import run_at
 
 TEXT = """\
