@@ -41,6 +41,8 @@ _GUESS_S: Final = 2e-6
 """For each element of its arrays, the time a kernel is expected to take when it was never run."""
 _LONG: Final = 3.0
 """How many times that a kernel takes whose calls are long: it works on pairs of elements."""
+_CALL: Final = 32
+"""As many elements take as long as what a call costs anyway."""
 _STALE_S: Final = 7 * 24 * 3600.0
 _PACKAGE: Final = Path(__file__).parent
 
@@ -143,7 +145,7 @@ class _Kernel(Generic[_Arguments, _Result]):
     def __call__(self, *arguments: _Arguments.args, **named: _Arguments.kwargs) -> _Result:
         if self._compiled is not None and _process.only is None:
             return self._compiled(*arguments, **named)
-        elements = 1 + _elements(arguments)
+        elements = _CALL + _elements(arguments)
         if not self._may_interpret(elements):
             return self.compiled()(*arguments, **named)
         run = cast(Callable[..., _Result], self.interpreted())
