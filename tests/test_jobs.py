@@ -107,6 +107,12 @@ def test_what_changed_is_found_and_the_smallest_piece_that_shows_it_is_cut_out(
     assert Path("bug.mcap").stat().st_size < Path("recordings/push.mcap").stat().st_size / 5
 
 
+@pytest.mark.usefixtures("desk")
+def test_numbers_that_fit_recorded_runs_are_found_and_written(capsys: pytest.CaptureFixture[str]) -> None:
+    follow("tuning.md", {}, capsys)
+    assert "const clearance = 0.8 in [0, 2]    # metres, a first guess" in Path("pass.spatial").read_text()
+
+
 @pytest.fixture
 def gate(desk: Path) -> list[Block]:
     """The page's files, with its fifty logs made."""

@@ -48,7 +48,7 @@ COMMANDS: dict[str, str] = {
     "replay": "Evaluate specifications over a log.",
     "report": "Write an HTML report of a run.",
     "results": "Show what a batch found.",
-    "serve": "Replay live to a viewer, with tunable constants.",
+    "serve": "Replay live to a viewer, with constants to change.",
     "tune": "Find the constants that fit recorded runs.",
     "verify": "Recompute a log's certificate and compare.",
     "warmup": "Compile everything once, for images.",

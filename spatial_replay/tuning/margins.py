@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -51,7 +51,7 @@ def load_runs(
     read: Callable[[Path], Trace],
     advance: Callable[[int], None] = lambda runs: None,
 ) -> list[LabelledRun]:
-    """Read runs; a file gives its name, with its folder where two files have the same.
+    """Read runs; a file gives its name; if two files have the same, all are named with their folders.
 
     Args:
         read: returns the samples of a log.
@@ -67,14 +67,14 @@ def load_runs(
     if both:
         names = ", ".join(sorted(each.name for each in both))
         raise UsageError(f"{names} cannot be good and bad at once; leave it out of one of them")
-    bases = Counter(each.name for each in paths)
+    has_own_names = len({each.name for each in paths}) == len(paths)
     runs = []
     for is_good, logs in ((True, good), (False, bad)):
         for number, log in enumerate(logs, 1):
             if isinstance(log, Trace):
                 name, trace = f"{'good' if is_good else 'bad'} run {number}", log
             else:
-                name = log.name if bases[log.name] == 1 else log.as_posix()
+                name = log.name if has_own_names else log.as_posix()
                 trace = read(log)
                 advance(1)
             runs.append(LabelledRun(name, is_good, trace))
