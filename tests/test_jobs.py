@@ -114,9 +114,10 @@ def test_numbers_that_fit_recorded_runs_are_found_and_written(capsys: pytest.Cap
 
 
 @pytest.fixture
-def gate(desk: Path) -> list[Block]:
-    """The page's files, with its fifty logs made."""
-    page = blocks("fifty-logs-in-ci.md")
+def gate(desk: Path, monkeypatch: pytest.MonkeyPatch) -> list[Block]:
+    """The blocks of the page about CI, with its files and logs made, in a folder of its own."""
+    monkeypatch.delenv("GITHUB_ACTIONS", raising=False)
+    page = blocks("ci.md")
     for block in page:
         if block.title:
             (desk / block.title).write_text(block.text, "utf-8")
@@ -125,38 +126,43 @@ def gate(desk: Path) -> list[Block]:
     return page
 
 
-def test_one_process_gates_fifty_logs_and_names_those_that_fail(gate: list[Block]) -> None:
+def test_fifty_logs_are_gated_by_one_command_a_suite_and_a_baseline(gate: list[Block]) -> None:
+    for block in gate:
+        for command, code in commands(block) if block.language == "sh" else ():
+            ended = shell(command)
+            assert ended.returncode == code, f"{command}\n{ended.stdout}{ended.stderr}"
+    assert {path.name for path in Path("pages").iterdir()} == {"index.html", "reports"}
+    assert len(Path("rows.jsonl").read_text().splitlines()) == 82
+    assert Path("main.results/last_run.parquet").exists()
     ended = shell("python gate.py")
-    shown = next(block.text for block in gate if block.language == "text")
-    assert (ended.stdout, ended.returncode) == (shown, 1)
+    assert (ended.stdout, ended.stderr) == (next(b.text for b in gate if b.language == "text"), "")
 
 
-def test_a_shell_loop_fails_the_build_when_one_log_fails(gate: list[Block]) -> None:
-    assert any("sh gate.sh logs/*.jsonl" in block.text for block in gate if block.language == "sh")
-    assert shell("sh gate.sh logs/run-00.jsonl logs/run-01.jsonl").returncode == 0
-    ended = shell("sh gate.sh logs/run-00.jsonl logs/run-49.jsonl")
-    assert ended.returncode == 1
-    assert ended.stderr == "logs/run-49.jsonl: exit code 1\n"
-    assert {path.name for path in Path("results").iterdir()} >= {"run-00.jsonl.json", "run-49.jsonl.json"}
+def test_the_jobs_of_both_services_run_the_gate(gate: list[Block]) -> None:
+    github = yaml.safe_load(Path("github.yml").read_text())
+    gitlab = yaml.safe_load(Path("gitlab.yml").read_text())
+    steps = [step["run"] for step in github["jobs"]["gate"]["steps"] if "run" in step]
+    for script in (steps, gitlab["gate"]["script"]):
+        install, *rest = script
+        # what is under test is installed already
+        assert install.startswith("pip install './spatial-replay[parquet]'")
+        ended = shell(" && ".join(rest))
+        assert ended.returncode == 0, ended.stderr
+    assert Path(gitlab["gate"]["artifacts"]["reports"]["junit"]).exists()
+    assert Path(gitlab["gate"]["artifacts"]["paths"][0], "index.html").exists()
+    assert Path(gitlab["gate"]["cache"]["paths"][0], "last_run.parquet").exists()
+    Path("gate.spatial").write_text(Path("gate.spatial").read_text().replace("0.3", "0.5"))
+    assert shell(steps[-1]).returncode == 1
 
 
 def test_a_missing_log_does_not_pass_the_gate(gate: list[Block]) -> None:
     assert gate
-    assert shell("sh gate.sh logs/run-50.jsonl").returncode == 1
+    assert shell("spatial-replay batch logs/run-50.jsonl --spec gate.spatial").returncode == 2
     shutil.rmtree("logs")
-    assert shell("python gate.py").returncode == 1
+    assert shell("spatial-replay batch suite.yaml").returncode == 2
 
 
 def test_a_specification_that_checks_nothing_does_not_pass_the_gate(gate: list[Block]) -> None:
     assert gate
     Path("gate.spatial").write_text("spec late = G[60s, 90s] (cart dist person >= 0.3)")
-    assert shell("sh gate.sh logs/run-00.jsonl").returncode == 1
-    ended = shell("python gate.py")
-    assert ended.returncode == 1
-    assert "{'vacuous': 50}" in ended.stdout
-
-
-def test_the_workflow_runs_the_gate_of_the_page(gate: list[Block]) -> None:
-    workflow = yaml.safe_load(next(block.text for block in gate if block.language == "yaml"))
-    steps = [step["run"] for step in workflow["jobs"]["gate"]["steps"] if "run" in step]
-    assert steps[-1] == "sh gate.sh logs/*.jsonl"
+    assert shell("spatial-replay batch logs --spec gate.spatial --fail-on vacuous").returncode == 1

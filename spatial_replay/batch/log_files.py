@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from glob import glob, has_magic
@@ -13,10 +12,11 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from spatial_replay.batch.suite import LogPattern
-from spatial_replay.errors import LogError, UsageError
+from spatial_replay.errors import LogError, SpatialReplayError, UsageError
 from spatial_replay.logs.mcap.chunks import MAGIC
 from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.output_file import replacing
+from spatial_replay.logs.remote import RemoteFile, is_address, log_file, matching_addresses
 from spatial_replay.logs.topics import CERTIFICATE
 from spatial_replay.text import counted
 
@@ -24,7 +24,6 @@ _ENDINGS: Final = (".mcap", ".bag", ".db3", ".jsonl", ".jsonl.gz", ".csv", ".xml
 """Of logs in a folder; any other file has to be named."""
 _BAG: Final = "metadata.yaml"
 """What makes a folder one log: a ROS 2 bag."""
-_ADDRESS: Final = re.compile(r"[a-z][a-z0-9+.-]*://")
 _MOST_LOGS: Final = 2_000_000
 _MOST_FAULTS: Final = 100
 _HASHED_WHOLE: Final = 16 * 2**20
@@ -46,20 +45,26 @@ class FoundLog(NamedTuple):
 def find_logs(patterns: Sequence[LogPattern], folder: Path) -> list[FoundLog]:
     """Return the logs that patterns stand for, in their order, sorted within each; each log once.
 
-    A folder stands for all logs in it and below, a ROS 2 bag for itself. Addresses are taken as they are.
+    A folder stands for all logs in it and below, a ROS 2 bag for itself; `s3://bucket/folder/` and patterns
+    of addresses for what the bucket lists.
 
     Args:
         folder: what relative paths are relative to.
 
     Raises:
         UsageError: patterns without a log; all are listed, with their places.
+        RemoteError: a bucket cannot be listed.
     """
     found: dict[str, FoundLog] = {}
     faults = []
     for pattern in patterns:
-        logs = list(_logs_of(pattern.text, folder))
+        place = f"{pattern.place}: " if pattern.place else ""
+        try:
+            logs = list(_logs_of(pattern.text, folder))
+        except UsageError as error:
+            faults.append(f"{place}{error}")
+            continue
         if not logs:
-            place = f"{pattern.place}: " if pattern.place else ""
             faults.append(f"{place}{_nothing(pattern.text, folder)}")
         found.update((log.path, log) for log in logs if log.path not in found)
         if len(found) > _MOST_LOGS:
@@ -71,8 +76,8 @@ def find_logs(patterns: Sequence[LogPattern], folder: Path) -> list[FoundLog]:
 
 
 def _logs_of(text: str, folder: Path) -> Iterator[FoundLog]:
-    if _ADDRESS.match(text):
-        yield FoundLog(text, text)
+    if is_address(text):
+        yield from _logs_at(text)
         return
     try:
         path = folder / text
@@ -87,6 +92,18 @@ def _logs_of(text: str, folder: Path) -> Iterator[FoundLog]:
     except (OSError, ValueError):
         # a name that cannot be one, such as one with a null character
         return
+
+
+def _logs_at(address: str) -> Iterator[FoundLog]:
+    """Yield the log at an address, or those of a bucket that a pattern or a folder stands for."""
+    is_folder = address.endswith("/")
+    # in the address of a web server, "?" begins a query
+    if address.startswith(("http://", "https://")) or not (is_folder or has_magic(address)):
+        yield FoundLog(str(log_file(address)), address)
+        return
+    for each in matching_addresses(address):
+        if not is_folder or each.lower().endswith(_ENDINGS):
+            yield FoundLog(each, each)
 
 
 def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
@@ -112,6 +129,8 @@ def _found(path: Path, folder: Path) -> FoundLog:
 
 
 def _nothing(text: str, folder: Path) -> str:
+    if is_address(text):
+        return f"{text}: no log there; check the pattern"
     if has_magic(text):
         return f"{text}: no log matches this pattern; check it, and the folder it starts from"
     if (folder / text).is_dir():
@@ -123,7 +142,8 @@ class Identities:
     """What logs hold, as hashes: those of unchanged files are remembered.
 
     A file is unchanged while its path, size and time of modification are. A log of ours that is large is
-    identified by its certificate and size, which its end says; any other by its bytes.
+    identified by its certificate and size, which its end says; any other by its bytes. At an address, it is
+    the version that the server gives.
 
     One object belongs to one batch; `save` keeps what it knows for the next one.
     """
@@ -159,11 +179,13 @@ class Identities:
 
     def _of_one(self, path: str) -> str | None:
         try:
+            if is_address(path):
+                return _version_at(path)
             state = _state(path)
             if state not in self._used:
                 self._used[state] = self._known.get(state) or _identity(path)
             return self._used[state]
-        except (OSError, ValueError):
+        except (OSError, ValueError, SpatialReplayError):
             return None
 
 
@@ -188,6 +210,23 @@ def _identity(path: str) -> str:
     for each in files:
         total.update(f"{each.name}\0{_hash_of(each)}\0".encode("utf-8", "surrogatepass"))
     return f"files:{total.hexdigest()}"
+
+
+def _version_at(address: str) -> str:
+    """Return the identity of a log at an address; without a version, its bytes are hashed.
+
+    Raises:
+        UsageError, RemoteError: it cannot be read.
+    """
+    file = RemoteFile(address)
+    version = file.version
+    if version.tag is not None:
+        text = json.dumps([str(file), version.size, version.tag])
+        return f"version:{hashlib.sha256(text.encode()).hexdigest()}"
+    digest = hashlib.sha256()
+    for piece in file.iter_whole():
+        digest.update(piece)
+    return f"sha256:{digest.hexdigest()}"
 
 
 def _hash_of(path: Path) -> str:

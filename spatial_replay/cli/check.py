@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from spatial_replay.cli.findings import Form, show_findings
 from spatial_replay.cli.options import (
     LogPath,
     ReadArguments,
@@ -50,6 +52,14 @@ _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
 @reading_options
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 @click.option(
+    "--format",
+    "form",
+    type=click.Choice(["text", "github", "sarif"]),
+    default="text",
+    help="Print errors and warnings for GitHub's annotations, or for code scanning, and no tree."
+    "  [default: text]",
+)
+@click.option(
     "--dfa",
     metavar="FILE|-",
     help="Automaton to write, as .dot, .hoa or .svg; - prints it as text.",
@@ -62,6 +72,7 @@ def check(
     strict_names: bool,
     profile: str | None,
     as_json: bool,
+    form: Form,
     dfa: str | None,
     of: str | None,
     reading: ReadArguments,
@@ -75,28 +86,45 @@ def check(
     Examples:
       spatial-replay check blocks.spatial --log run.mcap
       spatial-replay check blocks.spatial --dfa blocks.svg
+      spatial-replay check blocks.spatial --format github
     """
     if of is not None and dfa is None:
         raise UsageError("--of chooses an automaton; add --dfa FILE")
     if as_json and dfa == "-":
         raise UsageError("--json and --dfa - both write to standard output; give --dfa a file")
+    if form != "text" and (as_json or dfa == "-"):
+        raise UsageError(
+            f"--format {form} writes to standard output; remove {'--json' if as_json else '--dfa -'}"
+        )
     if log is None:
         _refuse_log_options(reading, strict_names)
-    (parsed,) = load_spec_options([specification], profile, constants)
+    with _findings_of(specification, form):
+        (parsed,) = load_spec_options([specification], profile, constants)
     inputs = local_files([specification] if log is None else [specification, log])
     if dfa is not None:
         _check_automaton_options(parsed, of, dfa, inputs)
     compared = _compare_with_log(parsed, log, reading, strict_names) if log is not None else _Compared()
     diagnostics = [*parsed.warnings, *compared.diagnostics]
     show_diagnostics(diagnostics)
+    show_findings(form, specification, diagnostics)
     if any(each.severity == "error" for each in diagnostics):
         raise SpecificationError([each for each in diagnostics if each.severity == "error"])
     if as_json:
         show_json(_document(parsed, diagnostics, compared))
-    else:
+    elif form == "text":
         show(*_lines(parsed, compared))
     if dfa is not None:
         _write_automata(parsed, of, dfa, inputs, quiet=as_json)
+
+
+@contextmanager
+def _findings_of(specification: Path, form: Form) -> Iterator[None]:
+    """Print the errors of a specification that cannot be parsed in the form that was asked for, too."""
+    try:
+        yield
+    except SpecificationError as error:
+        show_findings(form, specification, error.diagnoses)
+        raise
 
 
 @dataclass(frozen=True, slots=True)

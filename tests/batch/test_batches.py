@@ -280,3 +280,22 @@ def test_github_gets_annotations_at_the_lines_of_specs_and_a_summary(
     )
     summary = Path("summary.md").read_text()
     assert "| logs | apart | REQ-3 | 2 | 2 | 0 | 0 | -0.2 |" in summary
+
+
+def test_logs_at_addresses_are_evaluated_once_for_each_version(fleet: Path) -> None:
+    pytest.importorskip("obstore")
+    from logs.web_server import serving
+
+    recording = Path(__file__).parents[2] / "recordings/table.jsonl"
+    Path("few.jsonl").write_text("".join(recording.read_text().splitlines(keepends=True)[:5]))
+    Path("few.spatial").write_text("spec near = G (cup dist plate <= 5)")
+    sr.replay_log("few.jsonl", "few.spatial", output="few.mcap")
+    with serving({"few.mcap": Path("few.mcap").read_bytes()}) as server:
+        arguments = [server.url("few.mcap"), "--spec", "few.spatial"]
+        done = batch(*arguments)
+        assert (done.code, "1 result: 1 satisfied" in done.out) == (0, True), done.err
+        assert "1 known" in batch(*arguments).out
+        done = batch(*arguments, server.url("gone.mcap"))
+    assert done.code == 2
+    assert "2 results: 1 satisfied, 1 error" in done.out
+    assert "there is no such file" in done.out

@@ -171,3 +171,23 @@ def test_with_a_log_the_numbers_behind_each_threshold_are_shown(
     said = capsys.readouterr().out
     assert "battery >= 0.75: goes from 0.6 to 0.9, holds in 2 of 4 samples\n" in said
     assert "1.05 <= crate dist cube <= 1.25: goes from 1 to 1.3, holds in 2 of 4 samples\n" in said
+
+
+def test_errors_are_marked_at_their_lines_for_github_and_for_code_scanning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "done.spatial"
+    path.write_text("spec a = G (cube ovlp hand)\nspec b = F (cube enclosedinn goal)\n")
+    assert run(["check", str(path), "--format", "github"]) == 2
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith(f"::error file={path},line=2,col=18::")
+    assert "did you mean 'enclosedin'" in line
+    assert run(["check", str(path), "--format", "sarif"]) == 2
+    (found,) = json.loads(capsys.readouterr().out)["runs"][0]["results"]
+    place = found["locations"][0]["physicalLocation"]
+    assert place["artifactLocation"]["uri"] == path.as_posix()
+    assert (place["region"]["startLine"], place["region"]["startColumn"]) == (2, 18)
+    path.write_text("spec a = G (cube ovlp hand)")
+    assert run(["check", str(path), "--format", "sarif"]) == 0
+    assert json.loads(capsys.readouterr().out)["runs"][0]["results"] == []
+    assert run(["check", str(path), "--format", "github", "--json"]) == 2

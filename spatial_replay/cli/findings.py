@@ -1,0 +1,68 @@
+"""Errors and warnings about a specification, for programs that show them at its lines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+from spatial_replay import __version__
+from spatial_replay.cli.terminal import PROGRAM, show, show_json
+from spatial_replay.errors import Diagnosis
+
+Form: TypeAlias = Literal["text", "github", "sarif"]
+
+
+def show_findings(form: Form, path: Path, diagnoses: Sequence[Diagnosis]) -> None:
+    """Print errors and warnings as workflow commands of GitHub, or as one SARIF object; not as text.
+
+    Args:
+        path: the file that they are about, as it was given.
+    """
+    if form == "github":
+        # imported here so that --help stays fast
+        from spatial_replay.batch.github import annotation
+
+        for each in diagnoses:
+            show(annotation(_level(each), str(path), each.line, _message(each), column=each.column))
+    elif form == "sarif":
+        show_json(_sarif(path, diagnoses))
+
+
+def _level(diagnosis: Diagnosis) -> Literal["error", "warning"]:
+    return "warning" if getattr(diagnosis, "severity", "error") == "warning" else "error"
+
+
+def _message(diagnosis: Diagnosis) -> str:
+    hint = getattr(diagnosis, "hint", "")
+    return f"{diagnosis.message}; {hint}" if hint else diagnosis.message
+
+
+def _sarif(path: Path, diagnoses: Sequence[Diagnosis]) -> dict[str, Any]:
+    """Return a SARIF 2.1.0 log with one run."""
+    driver = {"name": PROGRAM, "version": __version__, "rules": [{"id": "specification"}]}
+    results = [
+        {
+            "ruleId": "specification",
+            "level": _level(each),
+            "message": {"text": _message(each)},
+            "locations": [
+                {
+                    "physicalLocation": {
+                        "artifactLocation": {"uri": path.as_posix()},
+                        "region": {
+                            "startLine": each.line,
+                            "startColumn": each.column,
+                            "endColumn": each.column + getattr(each, "width", 1),
+                        },
+                    }
+                }
+            ],
+        }
+        for each in diagnoses
+    ]
+    return {
+        "$schema": "https://json.schemastore.org/sarif-2.1.0.json",
+        "version": "2.1.0",
+        "runs": [{"tool": {"driver": driver}, "columnKind": "unicodeCodePoints", "results": results}],
+    }
