@@ -277,30 +277,32 @@ def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDif
 
 
 class _Shapes:
-    """Numbers of the observations of a trace by which they are compared."""
+    """Columns of numbers of the observations of a trace, by which they are compared."""
 
     def __init__(self, trace: Trace) -> None:
         batch = trace.footprints
         vertex = batch.vertex_start[batch.part_start]
-        count = np.maximum(np.diff(vertex), 1)[:, None]
-        sums = _sums(np.concatenate([batch.vertices, batch.vertices**2], axis=1), vertex)
-        self.mean = sums[:, :2] / count
-        spread = sums[:, 2:] / count - self.mean**2
-        self.size = (
-            np.sqrt(np.maximum(spread.sum(axis=1), 0.0))
-            + _sums(batch.radius[:, None], batch.part_start)[:, 0]
-        )
-        others = [sums, self.size[:, None], *(each[:, None] for each in (batch.bottom, batch.top))]
-        self.numbers = np.nan_to_num(
-            np.concatenate([*others, trace.yaw[:, None], trace.uncertainty[:, None]], axis=1), nan=-1.5
-        )
+        count = np.maximum(np.diff(vertex), 1)
+        x, y = np.ascontiguousarray(batch.vertices.T)
+        sums = [_sums(each, vertex) for each in (x, y, x * x, y * y)]
+        self.mean = sums[0] / count, sums[1] / count
+        spread = (sums[2] + sums[3]) / count - self.mean[0] ** 2 - self.mean[1] ** 2
+        self.size = np.sqrt(np.maximum(spread, 0.0)) + _sums(batch.radius, batch.part_start)
+        optional = [each for each in (batch.bottom, batch.top, trace.yaw) if not np.isnan(each).all()]
+        self.columns = [*sums, self.size, trace.uncertainty, *optional]
+
+    def differ(self, rows: Integers, other: _Shapes, other_rows: Integers) -> Booleans:
+        """Return which of some observations are not those of another trace, in pairs."""
+        differs = np.full(len(rows), len(self.columns) != len(other.columns))
+        for column, beside in zip(self.columns, other.columns, strict=False):
+            one, two = column[rows], beside[other_rows]
+            differs |= (one != two) & ~(np.isnan(one) & np.isnan(two))
+        return differs
 
 
 def _sums(values: Floats, start: Integers) -> Floats:
-    """Return the sum of each ragged row, (R, K)."""
-    if not len(start) - 1:
-        return np.empty((0, values.shape[1]))
-    return np.asarray(np.add.reduceat(np.concatenate([values, np.zeros((1, values.shape[1]))]), start[:-1]))
+    """Return the sum of each ragged row, (R,)."""
+    return np.asarray(np.add.reduceat(values, start[:-1])) if len(start) > 1 else np.empty(0)
 
 
 def _object_diff(
@@ -316,8 +318,7 @@ def _object_diff(
     differs: Booleans = (one >= 0) != (other >= 0)
     only_a, only_b = (int(np.count_nonzero(differs & (rows >= 0))) for rows in (one, other))
     pairs = np.flatnonzero((one >= 0) & (other >= 0))
-    unequal = (shapes[0].numbers[one[pairs]] != shapes[1].numbers[other[pairs]]).any(axis=1)
-    pairs = pairs[unequal]
+    pairs = pairs[shapes[0].differ(one[pairs], shapes[1], other[pairs])]
     differs[pairs] = True
     if not differs.any():
         return None
@@ -329,7 +330,8 @@ def _object_diff(
     operands = [Operand(one[:, None]), Operand(other[:, None] + len(a.footprints))]
     distance = measure(both, operands, [MeasureRequest("signed_distance", 0, 1)])[0]
     apart = np.flatnonzero(distance > 0.0)
-    shift = np.hypot(*(shapes[0].mean[one] - shapes[1].mean[other]).T)
+    x, y = (mine[one] - its[other] for mine, its in zip(shapes[0].mean, shapes[1].mean, strict=True))
+    shift = np.hypot(x, y)
     farthest = int(distance.argmax())
     return ObjectDiff(
         name,

@@ -38,7 +38,7 @@ from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.monitor.witness.path import End, deciding_path
 from spatial_replay.replay.annotated import run_replay
 from spatial_replay.replay.engine import Replayed
-from spatial_replay.replay.kept_messages import source_keeping
+from spatial_replay.replay.kept_messages import KEEP_ALL, source_keeping
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Selection, Window
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.formula import Outline, Specification
@@ -120,7 +120,7 @@ def cut_clip(
     chosen = _chosen(whole.results, of)
     search = _Search(source, files, first_pass, chosen, around_ns)
     start_ns, end_ns = search.window()
-    kept = source_keeping(source, options.keep)
+    kept = source_keeping(source, KEEP_ALL if options.keep is None else options.keep)
     clipped = _ClippedSource(
         kept,
         start_ns,
@@ -389,7 +389,9 @@ class _ClippedSource:
         last = min(self.end_ns, FOREVER if end_ns is None else end_ns)
         if len(self.latched) and (start_ns or 0) <= self.start_ns:
             yield Block(Trace.from_samples(()), self.latched)
-        yield from self.source.iter_blocks(first, last)
+        for block in self.source.iter_blocks(first, last):
+            # an external log is read from before the window, for what is valid in it
+            yield replace(block, messages=_between(block.messages, first, last))
 
     def attachments(self) -> tuple[Attachment, ...]:
         """See `Source.attachments`."""
@@ -427,7 +429,12 @@ def _messages_before(source: Source, end_ns: int) -> Iterator[Messages]:
             if {channel.topic for channel in walk.channels.values()} <= {OBJECTS}:
                 return
     for block in read_blocks(source, None, end_ns):
-        yield block.messages
+        yield _between(block.messages, 0, end_ns)
+
+
+def _between(messages: Messages, start_ns: int, end_ns: int) -> Messages:
+    begin, end = window_of(messages.log_time_ns, start_ns, end_ns)
+    return messages if end - begin == len(messages) else select(messages, np.arange(begin, end))
 
 
 def _frame_names(channel: Channel) -> Callable[[bytes], Sequence[str]]:

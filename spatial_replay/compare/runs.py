@@ -44,7 +44,7 @@ class RunSpecDiff:
         a, b: the results.
         first_ns: the first sample of A with a value of another sign than the one beside it in B, or None.
         nodes: ids of the deepest nodes whose verdicts differ.
-        parting: where the runs part in its automaton; None if they do not, or it has none.
+        parting: where the runs part in its automaton; None if the verdict is the same, or it has none.
         moved: the objects that the deciding atoms are about, as far as they moved otherwise.
     """
 
@@ -331,7 +331,7 @@ def compare_runs(
         tuple(sorted(set(b.names) - set(a.names)) + sorted(titles[1] - titles[0])),
         tuple(_spec_diff(one, other, alignment, traces, objects, files) for one, other in results),
         compare_decisions(sources),
-        a == b,
+        not objects and a == b,
         (*a.faults, *b.faults),
         traces,
     )
@@ -379,7 +379,7 @@ def _spec_diff(
         other,
         _first_sign(one, other, alignment, traces),
         nodes,
-        parting_of(one, other, files),
+        parting_of(one, other, files) if one.verdict is not other.verdict else None,
         tuple(moved[name] for name in dict.fromkeys(names)),
     )
 

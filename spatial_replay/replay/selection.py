@@ -13,7 +13,7 @@ from spatial_replay.errors import LogError, SpecificationError, UsageError
 from spatial_replay.logs.messages import Block, Channel, Messages, merge, messages_of, select
 from spatial_replay.logs.objects.encode import encode_objects
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.source import Source, read_ahead, read_blocks, reading_only, within
+from spatial_replay.logs.source import MemorySource, Source, read_ahead, read_blocks, reading_only, within
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
 from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.instances import Instance, find_instances
@@ -169,6 +169,10 @@ class Selection:
         Args:
             advance: called with the number of samples of each block.
         """
+        if isinstance(self.source, MemorySource) and self.window.is_whole:
+            # with the measurements that it has cached
+            advance(len(self.source.trace))
+            return self.source.trace
         traces = []
         for trace in self.iter_traces():
             traces.append(trace)

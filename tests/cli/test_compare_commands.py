@@ -1,0 +1,205 @@
+"""`spatial-replay diff` and `spatial-replay clip`, as a user types them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+import spatial_replay as sr
+from bags.bag_files import START_NS, drive, write_ros1
+from spatial_replay.cli import run
+
+RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
+TABLE = ("table.jsonl", "--spec", "table.spatial", "--spec", "table_edited.spatial")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    for name in ("table.jsonl", "table.spatial", "table_edited.spatial", "push.mcap", "push_edited.spatial"):
+        shutil.copy(RECORDINGS / name, tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    code = run(list(arguments))
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+@pytest.mark.usefixtures("folder")
+def test_the_edit_that_flips_a_verdict_is_named_with_its_lines(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = said(capsys, "diff", *TABLE)
+    assert code == 1
+    assert "table_set: satisfied (0.0248667) → violated (-0.155214)" in out
+    assert "because: constant deadline: `F[0s, 8s] …` to `F[0s, 4s] …`, in `laid`" in out
+    assert "+ table_edited.spatial:2: const deadline = 4s" in out
+    code, out, _ = said(capsys, "diff", *TABLE, "--json")
+    (changed,) = [each for each in json.loads(out)["specifications"] if each["edits"]]
+    assert (code, changed["flipped"]) == (1, True)
+    assert [edit["subject"] for edit in changed["cause"]] == ["deadline"]
+    assert changed["cause"][0]["alone"]["verdict"] == "violated"
+
+
+@pytest.mark.usefixtures("folder")
+def test_what_is_equal_differs_in_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    same = ("--spec", "table.spatial")
+    assert said(capsys, "diff", "table.jsonl", *same, *same)[0] == 0
+    code, out, _ = said(capsys, "diff", "push.mcap", "push.mcap")
+    assert (code, out.splitlines()[1:]) == (0, ["  the same samples and messages, by their certificates"])
+    code, out, _ = said(capsys, "diff", "table.jsonl", "table.jsonl")
+    assert (code, out.splitlines()[1:]) == (0, ["  the same 300 samples"])
+
+
+MOVED = 0.5
+
+
+def shifted(log: str, name: str) -> None:
+    """A copy of a log of tracks in which one object stands elsewhere from 5 s on."""
+    lines = []
+    for line in Path(log).read_text().splitlines():
+        sample = json.loads(line)
+        for each in sample["objects"] if sample["time_ns"] >= 5 * 10**9 else ():
+            if each["name"] == name:
+                for part in each.get("parts", [{"vertices": each.get("polygon", [])}]):
+                    part["vertices"][:] = [[x + MOVED, y] for x, y in part["vertices"]]
+        lines.append(json.dumps(sample))
+    Path("moved.jsonl").write_text("\n".join(lines))
+
+
+@pytest.mark.usefixtures("folder")
+def test_of_two_runs_it_says_who_moved_otherwise_since_when_and_what_that_did(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    shifted("table.jsonl", "spoon")
+    logs = ("table.jsonl", "moved.jsonl", "--spec", "table.spatial")
+    code, out, _ = said(capsys, "diff", *logs, "--json")
+    found = json.loads(out)
+    (spoon,) = found["objects"]
+    assert (code, spoon["name"]) == (1, "spoon")
+    assert spoon["first_ns"] >= 5 * 10**9 > spoon["first_ns"] - 10**8
+    assert spoon["greatest_shift"] == pytest.approx(MOVED)
+    flipped = {each["name"]: each for each in found["specifications"]}["table_set"]
+    assert (flipped["a"]["verdict"], flipped["b"]["verdict"]) == ("satisfied", "violated")
+    assert flipped["moved"] == ["spoon"]
+    code, out, _ = said(capsys, "diff", *logs, "-o", "diff.html")
+    assert code == 1
+    assert "spoon: differs since 5.000 s, by up to 0.5; apart from itself since 5.000 s" in out
+    page = Path("diff.html").read_text()
+    assert "moved otherwise" in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["diff", "table.jsonl"], "give a second log, or --spec OLD --spec NEW"),
+        (["diff", *TABLE, "--spec", "push_edited.spatial"], "3 specifications; give two"),
+        (
+            ["diff", "table.jsonl", "--spec", "table.spatial", "--spec", "push_edited.spatial"],
+            "table.spatial and push_edited.spatial have no spec in common",
+        ),
+        (["diff", *TABLE, "--align", "progress"], "--align applies to two logs"),
+        (["diff", *TABLE, "-o", "diff.txt"], "diff.html"),
+        (["diff", *TABLE, "-o", "table.spatial"], "table.spatial"),
+        (["diff", "table.jsonl", "push.mcap"], "the runs have no object in common"),
+        (["diff", "push.mcap", "push.mcap", "--align", "gap"], "did you mean 'gaps'?"),
+        (["clip", *TABLE[:3], "-o", "bug.mcap", "--of", "lade"], "did you mean 'laid'?"),
+        (["clip", *TABLE[:3], "-o", "bug.mcap", "--around", "5"], "--around: '5' is not a duration"),
+        (["clip", *TABLE[:3], "-o", "table.jsonl"], "table.jsonl"),
+        (["clip", *TABLE[:3], "-o", "bug.mcap", "--every", "2"], "a clip keeps every sample"),
+        (["clip", "push.mcap", "-o", "bug.mcap", "--topics", "/camera/*"], "no topic of push.mcap fits"),
+    ],
+)
+def test_mistakes_are_named_with_their_remedy(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
+) -> None:
+    code, _, err = said(capsys, *arguments)
+    assert code == 2
+    assert words in err
+
+
+@pytest.mark.usefixtures("folder")
+def test_runs_in_other_units_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    lines = [json.loads(line) for line in Path("table.jsonl").read_text().splitlines()[:3]]
+    for sample in lines:
+        for each in sample["objects"]:
+            for part in each.get("parts", [{"vertices": each.get("polygon", [])}]):
+                part["vertices"][:] = [[1000 * x, 1000 * y] for x, y in part["vertices"]]
+                part["radius"] = 1000 * part.get("radius", 0.0)
+    Path("mm.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    code, _, err = said(capsys, "diff", "table.jsonl", "mm.jsonl")
+    assert code == 2
+    assert "in other units" in err
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_clip_says_how_small_it_got_and_is_replayed_without_other_files(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    arguments = ("clip", "push.mcap", "--spec", "push_edited.spatial", "--of", "gaps", "-o", "bug.mcap")
+    code, out, _ = said(capsys, *arguments)
+    assert code == 0
+    assert "gaps: 1 of 540 samples, 5.533 s to 5.533 s of the log" in out
+    size = Path("bug.mcap").stat().st_size
+    assert f"{size:,} bytes" in out
+    assert size < Path("push.mcap").stat().st_size / 5
+    code, out, _ = said(capsys, "replay", "bug.mcap", "--json", "-")
+    (push,) = json.loads(out)["specifications"]
+    assert {node["name"]: node["robustness"] for node in push["nodes"]}["gaps"] == pytest.approx(-0.00484626)
+    assert said(capsys, "verify", "bug.mcap")[0] == 0
+    before = Path("bug.mcap").read_bytes()
+    said(capsys, *arguments)
+    assert Path("bug.mcap").read_bytes() == before
+    assert said(capsys, *arguments, "--around", "1s")[1].count("61 of 540 samples") == 1
+
+
+def test_a_verdict_that_needs_the_whole_log_is_said_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    samples = [sr.Sample(index * 10**9, {}, {"level": float(index in (0, 4))}) for index in range(5)]
+    Path("ends.spatial").write_text("spec ends = (level >= 1) and F[4, 4] (level >= 1)")
+    with sr.Recorder("run.mcap") as recorder:
+        for sample in samples:
+            recorder.write(sample)
+    code, out, _ = said(capsys, "clip", "run.mcap", "--spec", "ends.spatial", "-o", "bug.mcap")
+    assert code == 0
+    assert "nothing smaller has these verdicts and witnesses" in out
+    assert len(sr.read_trace("bug.mcap")) == 5
+
+
+MAPPING = """\
+sample: {topic: /b}
+topics:
+  /a: {name: a, position: [x, y], shape: {disc: 0.5}}
+  /b: {name: b, position: [x, y], shape: {disc: 0.5}}
+"""
+
+
+def test_a_clip_of_a_bag_keeps_what_was_valid_before_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_ros1(
+        Path("drive.bag"),
+        [each for each in drive() if each.topic != "/words" or each.time_ns < START_NS + 10**9],
+    )
+    Path("drive.yaml").write_text(MAPPING)
+    Path("near.spatial").write_text("spec far = G (a dist b >= 2)")
+    arguments = ("drive.bag", "--mapping", "drive.yaml", "--spec", "near.spatial")
+    code, out, _ = said(capsys, "clip", *arguments, "-o", "bug.mcap", "--around", "500ms")
+    assert code == 0
+    assert "of 60 samples" in out
+    info = json.loads(said(capsys, "info", "bug.mcap", "--json")[1])
+    counts = {each["topic"]: each["messages"] for each in info["topics"]}
+    # the strings ended long before; the last of them is still what a viewer shows
+    assert counts["/words"] == 1
+    assert 8 <= counts["/a"] <= 14
+    code, out, _ = said(capsys, "clip", *arguments, "-o", "small.mcap", "--topics", "/a")
+    info = json.loads(said(capsys, "info", "small.mcap", "--json")[1])
+    assert "/words" not in {each["topic"] for each in info["topics"]}

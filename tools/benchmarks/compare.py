@@ -1,0 +1,92 @@
+"""Diffs of specifications and of runs, and clips: compared with one evaluation, and with the whole log."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+import spatial_replay as sr
+
+SAMPLES = 100_000
+LONG = 1_000_000
+
+
+def _repeated(trace: sr.Trace, count: int) -> sr.Trace:
+    """The same run again and again, with times that go on."""
+    length_ns = int(trace.times_ns[-1] - trace.times_ns[0]) + 33_000_000
+    runs = [
+        replace(trace, times_ns=trace.times_ns + index * length_ns)
+        for index in range(-(-count // len(trace)))
+    ]
+    return sr.Trace.concatenate(runs).slice(0, count)
+
+
+def bench_diff(measure: Any) -> None:
+    """Two versions of the block-pushing specification over 100,000 samples, and two such runs."""
+    data = Path(os.environ.get("SPATIAL_REPLAY_DATA", "")) / "paper"
+    if not data.is_dir():
+        return
+    text = json.loads((data / "expected.json").read_text())["blocks_moving_passage"]["spec"]
+    trace = _repeated(sr.read_trace(data / "blocks_moving_passage.jsonl.gz"), SAMPLES)
+    old = sr.parse_specification(text)
+    new = sr.parse_specification(text.replace("(red2 closeto blue2)", "(red2 closeto[60] blue2)"))
+    moved = replace(trace, footprints=replace(trace.footprints, vertices=trace.footprints.vertices + 1.0))
+    sr.diff_specifications(trace, old, new)
+    sr.diff_logs(trace, moved, old)
+
+    def fresh() -> sr.Trace:
+        return replace(trace)
+
+    started = perf_counter()
+    sr.evaluate(old, fresh())
+    evaluation_s = perf_counter() - started
+    measure("one evaluation", lambda own: sr.evaluate(old, own), prepare=fresh, unit="trace", runs=3)
+    measure(
+        "two specifications",
+        lambda own: sr.diff_specifications(own, old, new),
+        prepare=fresh,
+        unit="trace",
+        runs=3,
+        limit_s=1.5 * evaluation_s,
+    )
+    measure(
+        "two runs",
+        lambda pair: sr.diff_logs(*pair, old),
+        prepare=lambda: (replace(trace), replace(moved)),
+        unit="pair",
+        runs=3,
+        limit_s=1.0,
+    )
+
+
+def _long_run() -> Iterator[sr.Sample]:
+    for index in range(LONG):
+        x = 3.0 + np.cos(index / 1000.0) - (2.5 if index == 654_321 else 0.0)
+        objects = {"robot": sr.Footprint.box(0, 0, 1, 1), "person": sr.Footprint.box(x, 0, x + 0.5, 0.5)}
+        yield sr.Sample(index * 10_000_000, objects)
+
+
+def bench_clip(measure: Any) -> None:
+    """A violated distance over a log of a million samples."""
+    with tempfile.TemporaryDirectory() as folder:
+        log, output = Path(folder, "run.mcap"), Path(folder, "bug.mcap")
+        with sr.Recorder(log) as recorder:
+            for sample in _long_run():
+                recorder.write(sample)
+        specification = sr.parse_specification("spec apart = G (robot dist person >= 0.5)")
+        measure(
+            "a million samples",
+            lambda _: sr.clip_log(log, specification, output=output),
+            unit="log",
+            runs=1,
+            limit_s=10.0,
+        )
+        measure.size("clip", output.stat().st_size, log.stat().st_size // 100)
