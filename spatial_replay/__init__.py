@@ -77,7 +77,7 @@ if TYPE_CHECKING:
     from spatial_replay.text import Instant, Sentence
     from spatial_replay.trace.sample import Sample
     from spatial_replay.trace.trace import Trace
-    from spatial_replay.tuning.tuned import Tuning
+    from spatial_replay.tuning.tuned import Surface, Tuning
 
 __version__ = "0.1.0"
 
@@ -135,6 +135,7 @@ __all__ = [
     "SpecificationDiff",
     "SpecificationError",
     "Step",
+    "Surface",
     "TextPlace",
     "Threshold",
     "Trace",
@@ -227,6 +228,6 @@ __getattr__, __dir__ = loaded_when_used(
         "text": ("Instant", "Sentence"),
         "trace.sample": ("Sample",),
         "trace.trace": ("Trace",),
-        "tuning.tuned": ("Tuning",),
+        "tuning.tuned": ("Surface", "Tuning"),
     },
 )
