@@ -113,7 +113,7 @@ class _NotSatisfiedError(Exception):
 
 
 class _Results:
-    """The rows of the logs of a session; each log is evaluated once, whoever of its tests comes first.
+    """The rows of the logs of a session; each log is evaluated once, for the first of its tests.
 
     With several processes, all logs are evaluated when the first test runs.
     """
