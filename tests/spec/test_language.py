@@ -199,7 +199,11 @@ def test_constants_stand_for_numbers_and_durations_and_can_be_replaced() -> None
 def test_a_specification_lists_its_constants() -> None:
     text = "const e = far\nconst far = 2.5\nconst wait = 2s\nspec s = F[0, wait] a closeto[e] b"
     constants = parse_specification(text, constants={"far": 7}).constants
-    assert constants == {"e": Constant(7.0), "far": Constant(7.0), "wait": Constant(2.0, 2_000_000_000)}
+    assert constants == {
+        "e": Constant(7.0, is_computed=True),
+        "far": Constant(7.0),
+        "wait": Constant(2.0, 2_000_000_000),
+    }
 
 
 @pytest.mark.parametrize(
