@@ -219,7 +219,7 @@ def _version_at(address: str) -> str:
         UsageError, RemoteError: it cannot be read.
     """
     file = RemoteFile(address)
-    version = file.version
+    version = file.current_version()
     if version.tag is not None:
         text = json.dumps([str(file), version.size, version.tag])
         return f"version:{hashlib.sha256(text.encode()).hexdigest()}"

@@ -22,6 +22,7 @@ from spatial_replay.errors import (
     UsageError,
 )
 from spatial_replay.logs.source import Source
+from spatial_replay.logs.topics import MAPPED
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.sentences import reason_sentence
 from spatial_replay.monitor.vacuity import no_instances
@@ -150,7 +151,8 @@ def opened_task(task: Task, files: Sequence[Specification]) -> tuple[Source, Rep
     parameters = {spec.parameter for file in files for spec in file.results}
     each = {name: objects for name, objects in conditions.each if name in parameters}
     window = _window(source, conditions)
-    return source, ReplayOptions(window, each, conditions.semantics, conditions.strict_names)
+    # no other messages are read than those that samples are made of
+    return source, ReplayOptions(window, each, conditions.semantics, conditions.strict_names, (MAPPED,))
 
 
 def _window(source: Source, conditions: Conditions) -> Window:

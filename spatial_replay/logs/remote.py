@@ -178,6 +178,18 @@ class RemoteFile(PathLike[str]):
                 self._version = self._opened()
             return self._version
 
+    def current_version(self) -> FileVersion:
+        """Return the version, without a look at the content where the server can.
+
+        Raises:
+            MissingFileError, RemoteError: it cannot be read.
+        """
+        try:
+            return self._versioned(self._get({"head": True}).meta)
+        except SpatialReplayError:
+            # a signed address is for reading alone
+            return self.version
+
     def open(self) -> BinaryIO:
         """Open it for reading, from any number of streams."""
         return cast(BinaryIO, RemoteStream(self))

@@ -369,3 +369,25 @@ def test_joined_ranges_cover_what_was_wanted_and_waste_less_than_a_tenth(
     assert wanted <= set(read)
     assert len(read) <= len(set(read)) + sum(end - begin for begin, end in ranges) - len(wanted)
     assert len(set(read) - wanted) <= 0.1 * sum(end - begin for begin, end in ranges)
+
+
+def test_a_batch_takes_addresses_and_evaluates_what_has_changed_there(
+    server: WebServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "s.spatial").write_text("spec apart = G (cup dist plate >= 0.1)")
+    batch = [
+        "batch",
+        server.url("drive.mcap"),
+        "--spec",
+        f"{tmp_path}/s.spatial",
+        "-o",
+        f"{tmp_path}/results",
+    ]
+    asked = []
+    for _ in range(2):
+        assert run(batch) == 0
+        asked.append(len(server.asked))
+    assert asked[1] - asked[0] <= 1
+    del server.files["drive.mcap"]
+    assert run(batch) != 0
+    assert "there is no such file" in "".join(capsys.readouterr())

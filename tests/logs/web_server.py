@@ -61,6 +61,12 @@ def serving(files: dict[str, bytes]) -> Iterator[WebServer]:
             ranged = {"Content-Range": f"bytes {begin}-{end - 1}/{len(content)}", "ETag": tag}
             self._answer(206, content[begin:end], ranged, cut=fault == "cut")
 
+        def do_HEAD(self) -> None:
+            content = server.files.get(self.path.removeprefix("/logs/"))
+            tag = f'"{hashlib.sha256(content or b"").hexdigest()[:16]}"'
+            length = {"Content-Length": str(len(content or b"")), "ETag": tag}
+            self._answer(404 if content is None else 200, b"", length)
+
         def _range(self, size: int) -> tuple[int, int]:
             first, _, last = self.headers["Range"].removeprefix("bytes=").partition("-")
             if not first:
