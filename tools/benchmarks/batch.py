@@ -1,0 +1,101 @@
+"""Many logs: two workers against one, what a log costs beyond its evaluation, and very many results."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import spatial_replay as sr
+from spatial_replay.batch.data_set import ResultsFolder, run_columns
+from spatial_replay.batch.rows import Task, rows_from_task
+from spatial_replay.batch.run import read_specification_text, run_batch
+from spatial_replay.batch.run_table import worst_rows
+from spatial_replay.batch.suite import Suite
+from spatial_replay.batch.workers import LocalProcesses, ThisProcess, Workers
+from spatial_replay.logs.source import MemorySource
+from spatial_replay.recording.record_source import record_source
+
+LOGS, FEW_LOGS = 1_000, 60
+ROWS = 100_000
+TWO_MORE = "spec apart = G (red1 dist blue1 >= -20)\nspec near = F (red1 dist blue1 <= 400)\n"
+
+
+def bench_batch(bench: Any) -> None:
+    """Logs of 1,579 samples under three specs."""
+    data = Path(os.environ.get("SPATIAL_REPLAY_DATA", "")) / "paper"
+    if not data.is_dir():
+        bench.remark("no recording of the blocks")
+        return
+    count = LOGS if bench.full else FEW_LOGS
+    trace = sr.read_trace(data / "blocks_moving_passage.jsonl.gz")
+    text = json.loads((data / "expected.json").read_text())["blocks_moving_passage"]["spec"]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        spec = folder / "blocks.spatial"
+        spec.write_text(f"{text.rstrip()}\n{TWO_MORE}")
+        (folder / "logs").mkdir()
+        for number in range(count):
+            own = replace(trace, times_ns=trace.times_ns + number)
+            record_source(MemorySource(own), folder / f"logs/{number:04}.mcap")
+        suite = Suite("logs", folder, Suite.of_logs(["logs"], [spec]).cases)
+
+        def run(workers: Workers, results: str) -> float:
+            return _seconds(lambda: run_batch(suite, folder / results, workers))
+
+        task = Task(str(folder / "logs/0000.mcap"), (read_specification_text(spec),))
+        for _ in range(10):
+            rows_from_task(task)
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        bare_s = min(_seconds(lambda: rows_from_task(task)) for _ in range(20))
+        one_s = run(ThisProcess(), "one")
+        after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        bench.quantile("one worker", [one_s / count], 0.5, unit="log")
+        bench.quantile("beyond its evaluation", [one_s / count - bare_s], 0.5, unit="log", limit_s=0.005)
+        bench.ratio("memory after all to after ten", after / before, 1.1)
+        two_s = run(LocalProcesses(2), "two")
+        bench.quantile("two workers", [two_s / count], 0.5, unit="log")
+        bench.ratio("two workers to half of one", 2.0 * two_s / one_s, 2.0 / 1.8)
+        bench.quantile("nothing new", [run(LocalProcesses(2), "two")], 0.5, unit="run", limit_s=2.0)
+
+
+def bench_results(bench: Any) -> None:
+    """The worst ten of very many rows, from the file."""
+    import numpy as np
+    import pyarrow as pa
+
+    numbers = np.random.default_rng(1).normal(1.0, 0.5, ROWS)
+    place = np.arange(ROWS)
+    known = {
+        "key": [f"{number:032x}" for number in place],
+        "log": [f"logs/{number // 3:06}.mcap" for number in place],
+        "spec": [f"spec{number % 3}" for number in place],
+        "robustness": numbers,
+        "verdict": np.where(numbers < 0.0, "violated", "satisfied"),
+        "failure": [None if number >= 0.0 else "violated, expected satisfied" for number in numbers],
+        "reason": [f"`a dist b >= 1` decides by {number:.6g}: a and b are apart." for number in numbers],
+    }
+    schema = run_columns()
+    columns = {each.name: known.get(each.name, pa.nulls(ROWS, each.type)) for each in schema}
+    with tempfile.TemporaryDirectory() as folder:
+        results = ResultsFolder.create(Path(folder) / "results")
+        results.write_run(pa.table(columns, schema=schema))
+        bench.measure(
+            f"worst ten of {ROWS:,} rows",
+            lambda _: worst_rows(ResultsFolder.open(results.path).read_run(), 10),
+            unit="search",
+            runs=5,
+            limit_s=1.0,
+        )
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    begin = time.perf_counter()
+    work()
+    return time.perf_counter() - begin
