@@ -17,6 +17,8 @@ from spatial_replay.errors import UsageError
 _VIEWS: Mapping[str, str] = MappingProxyType(
     {
         "spatial_replay.automata.automaton": "automaton_view",
+        "spatial_replay.compare.runs": "diff_view",
+        "spatial_replay.compare.specifications": "diff_view",
         "spatial_replay.monitor.evaluate": "evaluation_view",
         "spatial_replay.monitor.result": "evaluation_view",
         "spatial_replay.planning.decisions": "planning_view",
