@@ -117,7 +117,8 @@ class LogWriter:
         closings: list[tuple[int, int, list[MessageRange], int]] = []
         for number, lane in enumerate(self._lanes):
             places = np.flatnonzero(lanes == number)
-            if not lane.open and not len(places):
+            if not len(places):
+                closings += self._overtaken(lane, messages.log_time_ns)
                 continue
             own = messages if len(places) == len(messages) else select(messages, places)
             before = {
@@ -225,7 +226,7 @@ class LogWriter:
         ends = np.cumsum(batch.sizes)
         latest = np.maximum.accumulate(times_ns)
         begin = at = 0
-        if lane.open and self._clock and (self._clock() - lane.began_s) * 1e9 >= CHUNK_NS:
+        if lane.open and self._is_over(lane):
             yield 0, 0, *_closed(lane)
         while lane.open or begin < len(places):
             if not lane.open:
@@ -247,6 +248,19 @@ class LogWriter:
                 yield late, 0, *_closed(lane)
             else:
                 return
+
+    def _overtaken(
+        self, lane: _Lane, times_ns: Integers
+    ) -> Iterator[tuple[int, int, list[MessageRange], int]]:
+        """Yield what `_divide` does if all messages of a call are of the other lane."""
+        if lane.open:
+            late = (times_ns >= lane.began_ns + CHUNK_NS) | self._is_over(lane)
+            if late.any():
+                yield int(late.argmax()), 0, *_closed(lane)
+
+    def _is_over(self, lane: _Lane) -> bool:
+        """Return whether a second of the clock has passed since a chunk began."""
+        return self._clock is not None and (self._clock() - lane.began_s) * 1e9 >= CHUNK_NS
 
     def _pack(self, ranges: list[MessageRange], size: int) -> None:
         """Compress a chunk on the other thread, and write those that are ready."""
