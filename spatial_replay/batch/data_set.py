@@ -128,7 +128,8 @@ class ResultsFolder:
         _pyarrow()
         try:
             path.mkdir(parents=True, exist_ok=True)
-            is_new = not any(path.iterdir())
+            # a batch that was killed at its very beginning leaves a partial file
+            is_new = all(each.name.endswith(".partial") for each in path.iterdir())
         except FileExistsError:
             raise UsageError(f"{path} is a file; results are a folder, give it another name") from None
         except OSError as error:
