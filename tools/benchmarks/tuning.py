@@ -24,8 +24,8 @@ SEVERAL, FEW_SEVERAL = 100, 10
 
 ONE = """
 const near = 70 in [0, 400]
-spec passed = (G ((red1 closeto[near] blue1) -> (red1 below blue1))) or (F (red2 ovlp blue2))
-spec met = F (red1 dist blue1 <= near)
+spec passed = (G ((red1 dist blue1 >= near) or (red1 below blue1))) or (F (red2 ovlp blue2))
+spec met = F (green1 dist blue1 >= near)
 """
 FIVE = """
 const near = 150 in [0, 400]
@@ -34,8 +34,8 @@ const soon = 20s in [0s, 52s]
 const grow = 5 in [0, 60]
 const lane = 200 in [0, 900]
 spec met = F[0s, soon] (red1 dist blue1 <= near)
-spec apart = G (red2 dist blue3 >= far)
-spec swept = F (red3 ovlp enlarge(blue1, grow))
+spec apart = G (red2 dist green2 >= far)
+spec swept = F (green1 ovlp enlarge(blue1, grow))
 spec seen = F (red1 dist blue2 <= lane)
 """
 
