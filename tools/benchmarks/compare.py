@@ -69,7 +69,7 @@ def bench_diff(measure: Any) -> None:
 
 def _long_run() -> Iterator[sr.Sample]:
     for index in range(LONG):
-        x = 3.0 + np.cos(index / 1000.0) - (2.5 if index == 654_321 else 0.0)
+        x = 3.0 + np.cos(index / 1000.0) - (2.5 if index == LONG // 3 else 0.0)
         objects = {"robot": sr.Footprint.box(0, 0, 1, 1), "person": sr.Footprint.box(x, 0, x + 0.5, 0.5)}
         yield sr.Sample(index * 10_000_000, objects)
 
