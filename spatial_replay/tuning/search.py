@@ -166,10 +166,7 @@ class Search:
                 low, high = number, most
                 while high - low > 1:
                     middle = (low + high) // 2
-                    if self._margins.holds(run, at(middle)):
-                        high = middle
-                    else:
-                        low = middle
+                    low, high = (low, middle) if self._margins.holds(run, at(middle)) else (middle, high)
                 number = high
         return number
 
@@ -355,9 +352,28 @@ class Search:
     def _least_margin(self, point: Point) -> float:
         return min(self._margins.margin(run, point) for run in (*self._good, *self._bad))
 
+    def _edge_of_each(self, point: Point, axis: int, end: int, least: float) -> int:
+        """Return the last number from a point's to an end up to which all runs hold, run by run.
+
+        For an axis with a direction: only good runs fail at tighter values, only bad ones at looser ones.
+        """
+        is_looser = (end > point[axis]) == (self._margins.directions[axis] == 1)
+        # where the specification is invalid, one good run shows it as well as all
+        for run in [*self._bad, *self._good[:1]] if is_looser else self._good:
+            if not self._margins.holds(run, self._with(point, axis, end), least):
+                inside, outside = point[axis], end
+                while abs(outside - inside) > 1:
+                    middle = (inside + outside) // 2
+                    holds = self._margins.holds(run, self._with(point, axis, middle), least)
+                    inside, outside = (middle, outside) if holds else (inside, middle)
+                end = inside
+        return end
+
     def _edge(self, point: Point, axis: int, towards: int, least: float) -> int:
         """Return the last number in one direction up to which all margins are at least so large."""
         runs, end = [*self._bad, *self._good], self._steps[axis] if towards > 0 else 0
+        if self._margins.directions[axis] is not None:
+            return self._edge_of_each(point, axis, end, least)
 
         def holds(number: int) -> bool:
             nonlocal runs
