@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from importlib.resources import files
 from pathlib import Path
 
 import pytest
@@ -299,3 +300,13 @@ def test_logs_at_addresses_are_evaluated_once_for_each_version(fleet: Path) -> N
     assert done.code == 2
     assert "2 results: 1 satisfied, 1 error" in done.out
     assert "there is no such file" in done.out
+
+
+def test_every_key_of_suites_is_documented_and_the_published_schema_is_that_of_the_package() -> None:
+    root = Path(__file__).parents[2]
+    schema = json.loads((root / "schemas/suite.schema.json").read_text())
+    page = (root / "docs/ci.md").read_text()
+    case = schema["properties"]["cases"]["items"]["properties"]
+    assert [key for key in [*schema["properties"], *case] if f"`{key}`" not in page] == []
+    packaged = (files("spatial_replay.batch") / "suite.schema.json").read_text()
+    assert json.loads(packaged) == schema
