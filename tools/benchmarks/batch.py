@@ -22,7 +22,7 @@ from spatial_replay.batch.workers import LocalProcesses, ThisProcess, Workers
 from spatial_replay.logs.source import MemorySource
 from spatial_replay.recording.record_source import record_source
 
-LOGS, FEW_LOGS = 1_000, 30
+LOGS, FEW_LOGS = 1_000, 16
 ROWS = 100_000
 TWO_MORE = "spec apart = G (red1 dist blue1 >= -20)\nspec near = F (red1 dist blue1 <= 400)\n"
 
