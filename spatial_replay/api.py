@@ -185,7 +185,7 @@ def diff_logs(
     output: PathName | None = None,
     **options: Unpack[Evaluating],
 ) -> LogDiff:
-    """Compare two runs: which objects moved otherwise, and what that did to each spec and decision.
+    """Compare two runs: which objects moved differently, and what that did to each spec and decision.
 
     Args:
         specifications: one or several, parsed or as files; None takes those that a log was written with.

@@ -49,7 +49,7 @@ def diff(
     numbers changed, at which sample first, and the edit that brought it about. That is checked by evaluating
     with this edit alone, and with all others.
 
-    Of two logs: which objects moved otherwise and since when, what that did to each spec, and the first
+    Of two logs: which objects moved differently and since when, what that did to each spec, and the first
     decision of the planner that differs.
 
     Exits with 0 if nothing differs, otherwise with 1.

@@ -226,7 +226,7 @@ def _common(one: Sequence[_Visit], other: Sequence[_Visit]) -> int:
     )
 
 
-# -------------------------------------------------------------------------------- who moved otherwise
+# ------------------------------------------------------------------------------ who moved differently
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,7 +253,7 @@ class ObjectDiff:
 
 
 def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDiff, ...]:
-    """Return the common objects that moved otherwise: those apart first come first, then the farthest.
+    """Return the common objects that moved differently: those apart first come first, then the farthest.
 
     Raises:
         UsageError: no object is in both runs, or one run is in another unit.

@@ -1,4 +1,4 @@
-"""Two runs side by side: where they part, who moved otherwise, and what that did to each spec."""
+"""Two runs side by side: where they part, who moved differently, and what that did to each spec."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class RunSpecDiff:
         first_ns: the first sample of A with a value of another sign than the one beside it in B, or None.
         nodes: ids of the deepest nodes whose verdicts differ.
         parting: where the runs part in its automaton; None if the verdict is the same, or it has none.
-        moved: the objects that the deciding atoms are about, as far as they moved otherwise.
+        moved: the objects that the deciding atoms are about, as far as they moved differently.
     """
 
     a: SpecResult
@@ -88,7 +88,7 @@ class RunSpecDiff:
                 yield Sentence(f"{which}: ", *reason.parts)
         if self.moved:
             names = ", ".join(each.name for each in self.moved)
-            yield Sentence(f"of what it is about, these moved otherwise: {names}")
+            yield Sentence(f"of what it is about, these moved differently: {names}")
 
     @property
     def document(self) -> dict[str, Any]:
@@ -124,7 +124,7 @@ class LogDiff(Displayed):
         starts_ns: the times of their first samples, which sentences count from.
         is_certified: whether the certificates say that samples and messages are equal; nothing else was read.
         alignment: how samples correspond; None if nothing differs.
-        objects: those that moved otherwise, the first apart first.
+        objects: those that moved differently, the first apart first.
         only_a, only_b: objects that one run never has, and results of templates for them.
         specs: results of both runs.
         decision: the first decision that differs; None if none does, or the runs were not planned.
@@ -172,7 +172,7 @@ class LogDiff(Displayed):
         for each in self.objects[:_MOST_LISTED]:
             yield f"  {each.name}: {movement_sentence(each, start_ns)}"
         if len(self.objects) > _MOST_LISTED:
-            yield f"  and {counted(len(self.objects) - _MOST_LISTED, 'other object')} moved otherwise"
+            yield f"  and {counted(len(self.objects) - _MOST_LISTED, 'other object')} moved differently"
         for which, names in (("A", self.only_a), ("B", self.only_b)):
             if names:
                 yield f"  only in {which}: {', '.join(names[:_MOST_LISTED])}"
@@ -426,7 +426,7 @@ def _first_sign(
 
 
 def movement_sentence(each: ObjectDiff, start_ns: int) -> Sentence:
-    """Return since when an object moved otherwise, and how far the two are apart."""
+    """Return since when an object moved differently, and how far the two are apart."""
     parts: list[str | Instant] = ["differs since ", Instant(each.first_ns, start_ns)]
     if each.shift:
         parts.append(f", by up to {number_text(each.shift)}")

@@ -122,7 +122,7 @@ def _changes(diff: SpecificationDiff | LogDiff, first_ns: tuple[int, int]) -> It
         Sentence(f"{each.name}: ", *movement_sentence(each, diff.starts_ns[0]).parts) for each in diff.objects
     ]
     if moved:
-        yield _change("who moved otherwise", None, moved, first_ns)
+        yield _change("who moved differently", None, moved, first_ns)
     for which, names in (("A", diff.only_a), ("B", diff.only_b)):
         if names:
             yield element("p", text(f"Only in {which}: {', '.join(names)}"))

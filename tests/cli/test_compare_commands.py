@@ -71,7 +71,7 @@ def shifted(log: str, name: str) -> None:
 
 
 @pytest.mark.usefixtures("folder")
-def test_of_two_runs_it_says_who_moved_otherwise_since_when_and_what_that_did(
+def test_of_two_runs_it_says_who_moved_differently_since_when_and_what_that_did(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     shifted("table.jsonl", "spoon")
@@ -89,7 +89,7 @@ def test_of_two_runs_it_says_who_moved_otherwise_since_when_and_what_that_did(
     assert code == 1
     assert "spoon: differs since 5.000 s, by up to 0.5; apart from itself since 5.000 s" in out
     page = Path("diff.html").read_text()
-    assert "moved otherwise" in page
+    assert "moved differently" in page
     assert "http://" not in page.replace("http://www.w3.org", "")
 
 
