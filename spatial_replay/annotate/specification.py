@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from operator import attrgetter
 from pathlib import PurePath
 from typing import TYPE_CHECKING, NamedTuple
@@ -194,7 +195,7 @@ def logged_specifications(files: Sequence[Specification]) -> list[Specification]
             count += 1
             stem = f"{own}-{count}"
         stems.add(stem)
-        logged.append(replace(_self_contained(file), filename=f"{stem}{suffix}"))
+        logged.append(replace(_self_contained(_Same(file)), filename=f"{stem}{suffix}"))
     return logged
 
 
@@ -203,7 +204,23 @@ def specification_attachments(files: Sequence[Specification], prefix: str) -> li
     return [Attachment(f"{prefix}{file.filename}", "text/plain", file.source.encode()) for file in files]
 
 
-def _self_contained(file: Specification) -> Specification:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Same:
+    """A specification that equals itself alone: equal ones may have other texts."""
+
+    file: Specification
+
+    def __hash__(self) -> int:
+        return id(self.file)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and other.file is self.file
+
+
+# many logs are evaluated with the same specifications
+@lru_cache(maxsize=64)
+def _self_contained(same: _Same) -> Specification:
+    file = same.file
     for text_of in (attrgetter("source"), format_specification):
         try:
             text = text_of(file)

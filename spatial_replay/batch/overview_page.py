@@ -14,7 +14,7 @@ from spatial_replay import __version__
 from spatial_replay.batch.run_table import Total, Values, totals, worst_rows
 from spatial_replay.notebook.figures import Html, element
 from spatial_replay.report.page import policy, text, theme
-from spatial_replay.text import counted
+from spatial_replay.text import counted, sentence_parts
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -110,22 +110,31 @@ def _totals(by_spec: Sequence[Total]) -> Html:
 
 
 def _worst(rows: Sequence[Values], reports: Mapping[tuple[str, str], str]) -> Html:
-    head = element("tr", *(element("th", each) for each in ("log", "spec", "reason")))
+    names = [element("th", each) for each in ("log", "spec")]
+    head = element("tr", *names, _number("th", "robustness"), element("th", "reason"))
     body = [
         element(
             "tr",
-            element("td", _linked((row["case"], row["log"]), reports)),
+            element("td", _linked((row["case"], row["log"]), reports), **{"class": "log"}),
             element("td", text(_title(row["spec"], row["object"]))),
-            element("td", text(row["reason"] or row["failure"])),
+            _number("td", "" if math.isnan(row["robustness"]) else f"{row['robustness']:.4g}"),
+            element("td", *_with_code(row["reason"] or row["failure"])),
         )
         for row in rows
     ]
     return element("table", element("thead", head), element("tbody", *body))
 
 
+def _with_code(sentence: str) -> Iterator[Html]:
+    """Yield a sentence, its formulas as code."""
+    for number, piece in enumerate(sentence_parts(sentence)):
+        yield element("code", text(piece)) if number % 2 else text(piece)
+
+
 def _plots(table: pa.Table, by_spec: Sequence[Total]) -> Iterator[Html]:
     import pyarrow.compute as pc
 
+    has_cases = len({each.group["case"] for each in by_spec}) > 1
     for each in by_spec:
         group = each.group
         fits = pc.and_(
@@ -135,7 +144,8 @@ def _plots(table: pa.Table, by_spec: Sequence[Total]) -> Iterator[Html]:
         numbers = np.asarray(table.filter(fits).column("robustness").to_numpy(), np.float64)
         finite = numbers[np.isfinite(numbers)]
         if len(finite):
-            title = " ".join(filter(None, (group["case"], group["requirement"], group["spec"])))
+            case = group["case"] if has_cases else None
+            title = " · ".join(filter(None, (case, group["requirement"], group["spec"])))
             yield element("figure", element("figcaption", text(title)), _histogram(finite))
 
 
@@ -189,7 +199,7 @@ def _matrix(
         words = f"The {len(cells):,} worst of {counted(logs, 'log')}; the table of the run has them all."
         yield element("p", words)
     cases = {case for case, _, _ in columns}
-    titles = [f"{case} {spec or file}" if len(cases) > 1 else spec or file for case, file, spec in columns]
+    titles = [f"{case} · {spec or file}" if len(cases) > 1 else spec or file for case, file, spec in columns]
     head = [_sortable("log", ""), *(_sortable(title, "number") for title in titles)]
     body = []
     for name, of_log in cells.items():

@@ -6,16 +6,12 @@ own tools do (AWS_ACCESS_KEY_ID, GOOGLE_SERVICE_ACCOUNT, AZURE_STORAGE_ACCOUNT_N
 
 from __future__ import annotations
 
-import io
-import os
-from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import timedelta
 from fnmatch import fnmatchcase
-from itertools import pairwise
 from os import PathLike, fspath
 from pathlib import Path
 from threading import Lock
@@ -23,9 +19,7 @@ from typing import Any, BinaryIO, Final, TypeAlias, cast
 from urllib.parse import unquote, urlsplit
 
 from spatial_replay.errors import MissingFileError, RemoteError, SpatialReplayError, UsageError
-
-Range: TypeAlias = tuple[int, int]
-"""Bytes from the first up to, not including, the second."""
+from spatial_replay.logs.byte_ranges import MOST_HELD_BYTES, HeldBytes, Range, RangeStream, joined_ranges
 
 _CREDENTIALS: Final = {
     "s3": "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for a public bucket",
@@ -45,11 +39,6 @@ _HEAD_BYTES: Final = 2**16
 _LEAST_BYTES: Final = 2**16
 _PIECE_BYTES: Final = 2**23
 _AT_ONCE: Final = 32
-_BATCH_BYTES: Final = 2**26
-"""What is read at once if that is all; of more, the first batches are smaller, and one is read ahead."""
-_HELD_BYTES: Final = 2**28
-_WASTE: Final = 0.08
-"""The share of bytes that may be read between ranges, unused, to save requests."""
 _ATTEMPTS: Final = 3
 _RETRIES: Final[Any] = {
     "max_retries": 6,
@@ -152,7 +141,7 @@ class RemoteFile(PathLike[str]):
         self.name = name
         self._obstore = _obstore()
         self._store = _store(self._scheme, bucket)
-        self._held = _HeldBytes()
+        self._held = HeldBytes()
         self._lock, self._opening = Lock(), Lock()
         self._version: FileVersion | None = None
 
@@ -178,6 +167,11 @@ class RemoteFile(PathLike[str]):
                 self._version = self._opened()
             return self._version
 
+    @property
+    def size(self) -> int:
+        """In bytes; see `version` for what is raised."""
+        return self.version.size
+
     def current_version(self) -> FileVersion:
         """Return the version, without a look at the content where the server can.
 
@@ -192,7 +186,7 @@ class RemoteFile(PathLike[str]):
 
     def open(self) -> BinaryIO:
         """Open it for reading, from any number of streams."""
-        return cast(BinaryIO, RemoteStream(self))
+        return cast(BinaryIO, RangeStream(self))
 
     def read(self, begin: int, end: int) -> bytes:
         """Return a range of its bytes, less where it ends before that.
@@ -201,7 +195,7 @@ class RemoteFile(PathLike[str]):
             MissingFileError, RemoteError: it cannot be read, or has changed.
         """
         end = min(end, self.version.size)
-        if end - begin > _HELD_BYTES // 2:
+        if end - begin > MOST_HELD_BYTES // 2:
             bounds = range(begin, end, _PIECE_BYTES)
             return b"".join(self.iter_pieces([(each, min(each + _PIECE_BYTES, end)) for each in bounds]))
         while True:
@@ -338,142 +332,7 @@ def open_file(file: LogFile) -> BinaryIO:
 
 def file_size(file: LogFile) -> int:
     """Return its size in bytes."""
-    return file.version.size if isinstance(file, RemoteFile) else file.stat().st_size
-
-
-class RemoteStream(io.RawIOBase):
-    """A position in a remote file, and the ranges that are going to be read from it, in batches."""
-
-    def __init__(self, file: RemoteFile) -> None:
-        super().__init__()
-        self._file = file
-        self._position = 0
-        self._batches: list[list[Range]] = []
-        self._batch_of: dict[int, int] = {}
-        self._fetching: dict[int, Future[None]] = {}
-        self._thread: ThreadPoolExecutor | None = None
-
-    def plan(self, ranges: Iterable[Range]) -> None:
-        """Announce which ranges are going to be read, in this order.
-
-        They are fetched in batches when the first of them is read, and one batch ahead.
-        """
-        batch, size, most = list[Range](), 0, _BATCH_BYTES
-        wanted = list(ranges)
-        if sum(end - begin for begin, end in wanted) > _BATCH_BYTES:
-            # the reader may stop after the first messages
-            most = _BATCH_BYTES // 32
-        for begin, end in wanted:
-            batch.append((begin, end))
-            self._batch_of.setdefault(begin, len(self._batches))
-            size += end - begin
-            if size >= most:
-                self._batches.append(batch)
-                batch, size, most = [], 0, min(4 * most, _BATCH_BYTES // 2)
-        if batch:
-            self._batches.append(batch)
-
-    def seekable(self) -> bool:
-        return True
-
-    def readable(self) -> bool:
-        return True
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position}.get(whence)
-        self._position = (self._file.version.size if base is None else base) + offset
-        return self._position
-
-    def read(self, size: int = -1) -> bytes:
-        end = self._file.version.size if size < 0 else self._position + size
-        if (batch := self._batch_of.get(self._position)) is not None:
-            self._fetch(batch)
-        data = self._file.read(self._position, end)
-        self._position += len(data)
-        return data
-
-    def close(self) -> None:
-        if self._thread is not None:
-            self._thread.shutdown(wait=False, cancel_futures=True)
-        super().close()
-
-    def _fetch(self, batch: int) -> None:
-        if self._thread is None:
-            self._thread = ThreadPoolExecutor(1, "remote-batches")
-        # not ahead of the first one: a search for the first sample needs no other
-        for each in range(batch, min(batch + 1 + bool(batch), len(self._batches))):
-            if each not in self._fetching:
-                self._fetching[each] = self._thread.submit(self._file.fetch, self._batches[each])
-        self._fetching[batch].result()
-
-
-def plan_reads(stream: BinaryIO, ranges: Iterable[Range]) -> None:
-    """Announce the ranges that are going to be read from a stream, if it is of a remote file."""
-    if isinstance(stream, RemoteStream):
-        stream.plan(ranges)
-
-
-def joined_ranges(ranges: Sequence[Range]) -> list[Range]:
-    """Return ranges in order, joined over the smallest gaps as long as these add up to little."""
-    ordered = sorted(each for each in ranges if each[1] > each[0])
-    wanted = sum(end - begin for begin, end in ordered)
-    gaps = sorted((after[0] - before[1], i) for i, (before, after) in enumerate(pairwise(ordered)))
-    bridged, wasted = set[int](), 0
-    for gap, index in gaps:
-        wasted += max(gap, 0)
-        if wasted > _WASTE * wanted:
-            break
-        bridged.add(index)
-    result: list[Range] = []
-    for index, (begin, end) in enumerate(ordered):
-        if index - 1 in bridged:
-            result[-1] = (result[-1][0], max(result[-1][1], end))
-        else:
-            result.append((begin, end))
-    return result
-
-
-class _HeldBytes:
-    """Parts of a file that do not overlap; the oldest are dropped when there are too many."""
-
-    def __init__(self) -> None:
-        self._begins: list[int] = []
-        self._parts: dict[int, bytes] = {}
-        self._size = 0
-
-    def missing(self, begin: int, end: int) -> list[Range]:
-        """Return the parts of a range that are not held."""
-        gaps = []
-        for start, data in self._overlapping(begin, end):
-            if start > begin:
-                gaps.append((begin, start))
-            begin = max(begin, start + len(data))
-        return [*gaps, (begin, end)] if begin < end else gaps
-
-    def read(self, begin: int, end: int) -> bytes:
-        """Return a range that is held."""
-        return b"".join(
-            data[max(begin - start, 0) : end - start] for start, data in self._overlapping(begin, end)
-        )
-
-    def add(self, begin: int, data: bytes) -> None:
-        """Take in what is not held of a part."""
-        for start, end in self.missing(begin, begin + len(data)):
-            self._begins.insert(bisect_right(self._begins, start), start)
-            self._parts[start] = data if end - start == len(data) else data[start - begin : end - begin]
-            self._size += end - start
-        while self._size > _HELD_BYTES and len(self._parts) > 1:
-            oldest = next(iter(self._parts))
-            self._size -= len(self._parts.pop(oldest))
-            self._begins.remove(oldest)
-
-    def _overlapping(self, begin: int, end: int) -> Iterator[tuple[int, bytes]]:
-        index = max(bisect_right(self._begins, begin) - 1, 0)
-        while index < len(self._begins) and self._begins[index] < end:
-            start = self._begins[index]
-            if start + len(self._parts[start]) > begin:
-                yield start, self._parts[start]
-            index += 1
+    return file.size if isinstance(file, RemoteFile) else file.stat().st_size
 
 
 def _obstore() -> Any:

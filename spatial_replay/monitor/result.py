@@ -322,7 +322,7 @@ class SpecResult(Displayed):
             # of the whole formula, the headline has said the first of them
             found += about if cause.node != node else about[1:]
         if not causes and self.can_explain:
-            witness = self.worst_of(node, causes)
+            witness = self.worst if node == 0 and not self.causes else self.worst_of(node, causes)
             found += () if witness is None else sentences_of(witness, first_ns=first_ns)[1:]
         return tuple(found)
 

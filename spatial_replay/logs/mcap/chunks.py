@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from spatial_replay.compiled import elementwise, kernel, piece
 from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.remote import plan_reads
+from spatial_replay.logs.byte_ranges import plan_reads
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")

@@ -20,6 +20,7 @@ from mcap import records
 
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.footprint import Concave
+from spatial_replay.logs.byte_ranges import plan_reads
 from spatial_replay.logs.mcap.chunks import (
     ChunkPlace,
     DamageError,
@@ -39,7 +40,7 @@ from spatial_replay.logs.mcap.index import (
 from spatial_replay.logs.messages import BLOCK_SAMPLES, Attachment, Block, Channel, Messages, Schema
 from spatial_replay.logs.objects.decode import decode_objects
 from spatial_replay.logs.read_options import FaultList
-from spatial_replay.logs.remote import LogFile, RemoteFile, open_file, plan_reads
+from spatial_replay.logs.remote import LogFile, RemoteFile, open_file
 from spatial_replay.logs.topics import ALL, DERIVED, METADATA, OBJECTS, is_kept
 from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.sample import LATEST_NS
