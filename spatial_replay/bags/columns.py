@@ -282,8 +282,8 @@ def without_jumps(columns: Columns, name: str, checked: Collection[str]) -> Colu
 
 def _rows_by_topic(topics: Sequence[str]) -> Iterator[tuple[str, Integers | slice]]:
     names = sorted(set(topics))
-    if len(names) == 1:
-        yield names[0], slice(None)
+    if len(names) < 2:
+        yield from ((name, slice(None)) for name in names)
         return
     number = {name: code for code, name in enumerate(names)}
     codes = np.fromiter(map(number.__getitem__, topics), np.int64, len(topics))

@@ -17,6 +17,7 @@ from spatial_replay.bags.decoders import topics_by_name
 from spatial_replay.bags.mcap_log import McapLog
 from spatial_replay.bags.metadata import LARGEST_METADATA, BagMetadata, bag_metadata_from_text
 from spatial_replay.bags.reader import MessageReader
+from spatial_replay.bags.ros_definitions import full_type_name
 from spatial_replay.bags.sqlite import SQLITE_MAGIC, SqliteBag
 from spatial_replay.bags.topic import Topic
 from spatial_replay.bags.unpacking import ZSTD_MAGIC, temporary_folder, unpack_file, unpacked
@@ -27,6 +28,9 @@ from spatial_replay.logs.read_options import FaultList
 
 METADATA_FILE = "metadata.yaml"
 _ENDINGS = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
+
+_CDR_BEGIN = b"\x00"
+"""How every message of ROS 2 begins, and none that is compressed."""
 
 _File: TypeAlias = McapLog | SqliteBag
 
@@ -146,8 +150,14 @@ class BagFolder(MessageReader):
             pairs = zip(self._files, reads, strict=True)
             columns = merged(TimedColumns(file.start_ns or 0, open_file) for file, open_file in pairs)
         if self._metadata and self._metadata.compression == "message":
-            columns = map(self._unpacked, columns)
+            return self._all_unpacked(columns)
         return columns
+
+    def _all_unpacked(self, columns: Columns) -> Columns:
+        """Decompress messages; a topic with messages that are plain is remarked once."""
+        plain = set[str]()
+        for packed in columns:
+            yield self._unpacked(packed, plain)
 
     def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
         return {
@@ -174,7 +184,8 @@ class BagFolder(MessageReader):
         name = name or f"{self.name}/{METADATA_FILE}"
         for topic in self._topics:
             type_name = self._metadata.types.get(topic.name, topic.type)
-            if topic.name in topics and type_name != topic.type:
+            # recorders write pkg/Type and pkg/msg/Type for one type
+            if topic.name in topics and full_type_name(type_name) != full_type_name(topic.type):
                 self._faults.add(
                     f"{name}: it declares messages of {type_name!r:.100} on {topic.name!r}; they are of"
                     f" {topic.type!r}"
@@ -211,16 +222,29 @@ class BagFolder(MessageReader):
             self._faults.add(f"{self.name}: {error}")
             return ()
 
-    def _unpacked(self, packed: MessageColumns) -> MessageColumns:
+    def _unpacked(self, packed: MessageColumns, plain: set[str]) -> MessageColumns:
         payloads: list[bytes] = []
         places: list[int] = []
+        lost: dict[str, list[str]] = {}
         for place, payload in enumerate(packed.payloads):
+            topic, when = packed.topics[place], f"{packed.log_time_ns[place]} ns"
             try:
-                payloads.append(unpacked(payload))
+                if not payload.startswith(_CDR_BEGIN):
+                    payloads.append(unpacked(payload))
+                else:
+                    payloads.append(payload)
+                    if topic not in plain:
+                        plain.add(topic)
+                        self._remarks.add(
+                            f"{self.name}: messages on {topic!r} are plain, the first at {when}, although"
+                            f" {METADATA_FILE} declares them as compressed; they are read as they are"
+                        )
                 places.append(place)
             except LogError as error:
-                where = f"on {packed.topics[place]!r} at {packed.log_time_ns[place]} ns"
-                self._faults.add(f"{self.name}: {where}: {error}")
+                lost.setdefault(topic, []).append(f"on {topic!r} at {when}: {error}")
+        for first, *others in lost.values():
+            more = f"; so are {len(others)} more up to {packed.log_time_ns[-1]} ns" if others else ""
+            self._faults.add(f"{self.name}: {first}, and is lost{more}")
         return replace(packed.take(np.array(places, np.int64)), payloads=payloads)
 
 

@@ -155,6 +155,16 @@ class Assembler:
         trace = self._settle(max(self._newest_ns, self._latest_ns))
         for reader in self._readers.values():
             reader.finish()
+            if reader.unstamped:
+                were = (
+                    "message without objects was"
+                    if reader.unstamped == 1
+                    else "messages without objects were"
+                )
+                self._remarks.add(
+                    f"{reader.name}: {reader.unstamped} {were} left out: they have no stamp for the clock"
+                    " header"
+                )
         self._settled_ns = LATEST_NS
         return trace
 

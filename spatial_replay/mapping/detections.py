@@ -77,6 +77,26 @@ class Detections:
     deleted: list[tuple[int, int]]
     skipped: int
 
+    def repeated(self, index: int, count: int) -> Detections:
+        """Return one of the objects `count` times, each in a message of its own, without frame and stamp."""
+        same = np.full(count, index, np.int64)
+        poses = self.poses
+        return Detections(
+            message=np.arange(count, dtype=np.int64),
+            name=self.name[same],
+            class_code=self.class_code[same],
+            frames=None,
+            stamp_ns=None,
+            poses=Poses(poses.position[same], poses.rotation[same], poses.yaw[same]),
+            solids=self.solids.repeated(index, count),
+            height=None if self.height is None else self.height[same],
+            uncertainty=self.uncertainty[same],
+            covariance=None if self.covariance is None else self.covariance[same],
+            lifetime_ns=None,
+            deleted=[],
+            skipped=0,
+        )
+
 
 @dataclass(slots=True)
 class DetectionChunk:

@@ -77,6 +77,7 @@ class Extractor:
         self._list: Get | None = None
         self._binding: Binding | None = None
         self._time: TimeGetter | None = None
+        self._time_of_empty: TimeGetter | None = None
         self._is_time_bound = False
 
     @property
@@ -97,16 +98,27 @@ class Extractor:
     def stamp(self, message: object) -> int | None:
         """Return the stamp of a message, or that of its first object; None if it has none.
 
+        A message without objects has its own stamp, if its type has one: it says that there are none.
+
         Raises:
             FieldError: there is no stamp where the layout says.
         """
         first = next(iter(self._elements(message)), None)
-        if first is not None:
-            self._bind_time(first, message)
+        if first is None:
+            return self._stamp_of_empty(message)
+        self._bind_time(first, message)
         if self._time is None:
             return None
-        source = message if self._time.path.from_message else first
-        return None if source is None else self._time.nanoseconds([source])[0]
+        return self._time.nanoseconds([message if self._time.path.from_message else first])[0]
+
+    def _stamp_of_empty(self, message: object) -> int | None:
+        time = self._time
+        if time is None or not time.path.from_message:
+            if self._time_of_empty is None:
+                own = [each for each in self._layout.stamp if FieldPath.of(each.field).from_message]
+                self._time_of_empty = bind_time(own, message, message)
+            time = self._time_of_empty
+        return None if time is None else time.nanoseconds([message])[0]
 
     def read(self, messages: Sequence[object], places: Integers) -> DetectionChunk:
         """Extract the objects of some messages.

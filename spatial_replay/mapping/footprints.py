@@ -46,6 +46,21 @@ class Solids:
     point_start: Integers
     points: Floats
 
+    def repeated(self, owner: int, count: int) -> Solids:
+        """Return the solids of one object, `count` times."""
+        own = np.flatnonzero(self.owner == owner)
+        pieces = np.tile(own, count)
+        sizes = np.diff(self.point_start)[pieces]
+        return Solids(
+            owner=np.repeat(np.arange(count, dtype=np.int64), len(own)),
+            kind=self.kind[pieces],
+            position=self.position[pieces],
+            rotation=self.rotation[pieces],
+            size=self.size[pieces],
+            point_start=starts_from_counts(sizes),
+            points=self.points[flat_index(self.point_start[pieces], sizes)],
+        )
+
 
 def footprints_from_solids(solids: Solids, count: int) -> FootprintBatch:
     """Return the footprints (R,) of objects; an object has no height if one of its solids has none.

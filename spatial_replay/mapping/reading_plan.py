@@ -165,7 +165,7 @@ def _planned(
     is_static = is_transforms and (topic.latched or topic.name.rsplit("/", 1)[-1] == "tf_static")
     layout = layout_of_topic(topic.type, entry) if entry is not None and entry.reads_objects else None
     stays = topic.latched or (layout is not None and layout.stays)
-    default = FOREVER_NS if stays else mapping.max_age_ns or DEFAULT_MAX_AGE_NS
+    default = mapping.max_age_ns or (FOREVER_NS if stays else DEFAULT_MAX_AGE_NS)
     max_age_ns = (entry.max_age_ns if entry is not None else None) or default
     return PlannedTopic(
         name=topic.name,

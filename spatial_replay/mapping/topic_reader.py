@@ -90,6 +90,8 @@ class TopicReader:
         self.decodes_on_arrival = planned.is_transforms or planned.clock == "header"
         self.transforms = TransformReader() if planned.is_transforms else None
         self.extractor: Extractor | None = None
+        self.unstamped = 0
+        """Messages without objects and without a stamp, which have no time on the clock `header`."""
         if planned.layout is not None and planned.mapping is not None:
             self.extractor = Extractor(
                 planned.layout, planned.mapping, names, classes, needs_frame=needs_frame
@@ -137,8 +139,11 @@ class TopicReader:
             return time_ns
 
         times = self._read_each(read, messages, log_times_ns, good)
-        # a message of an empty list has no stamp, and nothing is lost with it
-        good &= [time_ns is not None for time_ns in times]
+        # a list without objects and without a header has no stamp
+        has_stamp = np.array([time_ns is not None for time_ns in times], np.bool_)
+        if self.extractor is not None:
+            self.unstamped += int(np.count_nonzero(good & ~has_stamp))
+        good &= has_stamp
         return np.array([time_ns or 0 for time_ns in times], np.int64)
 
     def read(self, log_times_ns: Integers, contents: Sequence[Any]) -> TopicColumns:

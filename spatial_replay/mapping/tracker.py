@@ -5,8 +5,9 @@ The tracker holds the last state of every object and signal, so that a log can b
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.mapping.detections import Detections
-from spatial_replay.mapping.model import LogMapping
+from spatial_replay.mapping.model import FOREVER_NS, LogMapping
 from spatial_replay.mapping.names import Codes
 from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.mapping.timeline import (
@@ -31,6 +32,15 @@ from spatial_replay.trace.trace import ABSENT, Trace
 
 _MOST_NAMES = 8
 """Names listed in one remark."""
+
+
+class _Carried(NamedTuple):
+    """A frame that a static transform fixes to its parent, as one message reports it."""
+
+    time_ns: int
+    log_time_ns: int
+    detections: Detections
+    place: int
 
 
 class Tracker:
@@ -66,6 +76,7 @@ class Tracker:
         self._rows = ObservationRows.blank(np.empty(0, np.int64))
         self._added: list[ObservationRows] = []
         self._events = {name: Events.none() for name in readers}
+        self._carried: dict[str, dict[int, list[_Carried]]] = {}
         self._signals: dict[tuple[str, int], tuple[Integers, Floats]] = {}
         self._topic_of_name: dict[int, str] = {}
 
@@ -79,21 +90,24 @@ class Tracker:
                 times_ns, log_times_ns = times_ns[columns.good], log_times_ns[columns.good]
                 if columns.detections is not None and len(times_ns):
                     self._take_detections(reader, times_ns, log_times_ns, columns.detections)
+                elif columns.signals.size:
+                    self._count_replaced(name, times_ns, np.flatnonzero(times_ns[1:] == times_ns[:-1]))
                 for index, values in enumerate(columns.signals.T if len(times_ns) else ()):
                     self._take_signal((name, index), times_ns, values)
             if reader.extractor is not None:
                 self._remarks.note_frames(reader.extractor.noted_frames)
             if self._plan.sampled_topic in (None, name):
                 sampled.append(times_ns)
-        if self._added:
-            self._rows = ObservationRows.concatenate([self._rows, *self._added])
-            self._added = []
+        self._store_added()
         return np.concatenate(sampled)
 
     def trace(self, times_ns: Integers) -> Trace:
         """Return the samples at some times, up to the time of the last `advance`."""
         if not len(times_ns):
             return Trace.from_samples(())
+        for topic, carried in self._carried.items():
+            self._place_carried(topic, carried, times_ns)
+        self._store_added()
         codes, rows, classes = self._states(times_ns)
         names = [self._names.by_code[code] for code in codes.tolist()]
         appears = (rows != ABSENT).any(axis=0).tolist()
@@ -140,6 +154,9 @@ class Tracker:
         for name, last in self._events.items():
             self._events[name] = replace(last, row=number[last.row])
         self._signals = {key: (times[-1:], values[-1:]) for key, (times, values) in self._signals.items()}
+        for carried in self._carried.values():
+            for each in carried.values():
+                del each[:-1]
 
     def _take_detections(
         self, reader: TopicReader, times_ns: Integers, log_times_ns: Integers, detections: Detections
@@ -147,17 +164,23 @@ class Tracker:
         if detections.skipped:
             self._remarks.count_skipped(reader.name, detections.skipped)
         self._claim_names(reader.name, detections.name)
+        layout = reader.planned.layout
+        is_complete = layout is not None and layout.complete
+        if reader.planned.is_static:
+            carried = self._carried.setdefault(reader.name, {})
+            for index, code in enumerate(detections.name.tolist()):
+                message = int(detections.message[index])
+                each = _Carried(int(times_ns[message]), int(log_times_ns[message]), detections, index)
+                carried.setdefault(code, []).append(each)
+            return
+        self._count_replaced(reader.name, times_ns, _replaced(detections, times_ns, is_complete=is_complete))
 
         def report(index: int, what: str) -> None:
-            name = self._names.by_code[int(detections.name[index])]
-            log_time_ns = int(log_times_ns[detections.message[index]])
-            self._report(reader.name, log_time_ns, f"object {name!r}{what}")
+            self._report_object(reader.name, log_times_ns[detections.message[index]], detections, index, what)
 
         transforms = self._transforms(reader, detections, times_ns)
         rows = rows_from_detections(detections, transforms, self._plan.mapping.axes, self._concave, report)
         number = self._add(rows)
-        layout = reader.planned.layout
-        is_complete = layout is not None and layout.complete
         again = _repeated_names(detections) if is_complete else []
         if again:
             for index in again:
@@ -167,6 +190,65 @@ class Tracker:
         before = self._events[reader.name]
         events = events_from_messages(detections, times_ns, number, alive=before, is_complete=is_complete)
         self._events[reader.name] = events.after(before)
+
+    def _place_carried(
+        self, topic: str, carried: Mapping[int, Sequence[_Carried]], times_ns: Integers
+    ) -> None:
+        """Place the frames of static transforms at the times of samples: they move with their parents."""
+        mapping, before = self._plan.mapping, self._events[topic]
+        events: list[Events] = []
+        for code, reports in carried.items():
+            starts = np.searchsorted(times_ns, [each.time_ns for each in reports]).tolist()
+            for each, start, end in zip(reports, starts, [*starts[1:], len(times_ns)], strict=True):
+                at = times_ns[start:end]
+                if not len(at):
+                    continue
+                detections, index = each.detections, each.place
+                transforms = None
+                if detections.frames is not None and mapping.fixed_frame is not None:
+                    frame = detections.frames[index]
+                    transforms = self._tree.between(mapping.fixed_frame, frame, at, by_stamp=False)
+                    self._count_missing(topic, frame, at[~transforms.known])
+
+                def report(_: int, what: str, each: _Carried = each) -> None:
+                    self._report_object(topic, each.log_time_ns, each.detections, each.place, what)
+
+                # while nothing moves, one observation is enough
+                changed = _changes(transforms, len(at))
+                moved = None if transforms is None else transforms.select(changed)
+                repeated = detections.repeated(index, len(changed))
+                rows = rows_from_detections(repeated, moved, mapping.axes, self._concave, report)
+                number = self._add(rows)[np.searchsorted(changed, np.arange(len(at)), "right") - 1]
+                same = np.full(len(at), code, np.int64)
+                classes = np.full(len(at), detections.class_code[index], np.int64)
+                events.append(Events(same, at, number, np.full(len(at), FOREVER_NS, np.int64), classes))
+        for new in events:
+            before = new.after(before)
+        self._events[topic] = before
+
+    def _report_object(
+        self, topic: str, log_time_ns: int, detections: Detections, index: int, what: str
+    ) -> None:
+        name = self._names.by_code[int(detections.name[index])]
+        self._report(topic, int(log_time_ns), f"object {name!r}{what}")
+
+    def _count_missing(self, topic: str, frame: str, times_ns: Integers) -> None:
+        if len(times_ns):
+            is_known = frame in self._tree.names
+            self._remarks.count_missing(topic, frame, len(times_ns), int(times_ns[0]), is_known=is_known)
+
+    def _count_replaced(self, topic: str, times_ns: Integers, replaced: Integers) -> None:
+        """Count messages of which nothing, or not all, counts, because a later one has the same time."""
+        start_ns, end_ns = self._window_ns
+        at = times_ns[replaced]
+        at = at[(at >= start_ns) & (at < end_ns)]
+        if len(at):
+            self._remarks.count_replaced(topic, len(at), int(at[0]))
+
+    def _store_added(self) -> None:
+        if self._added:
+            self._rows = ObservationRows.concatenate([self._rows, *self._added])
+            self._added = []
 
     def _add(self, rows: ObservationRows) -> Integers:
         """Add observations; return their row numbers."""
@@ -207,11 +289,7 @@ class Tracker:
                 between = self._tree.between(fixed, frame, at, by_stamp=by_stamp)
                 result.put(chosen, between)
                 missing = clock_ns[chosen[~between.known]]
-                missing = missing[self._is_relevant(reader, missing)]
-                if len(missing):
-                    self._remarks.count_missing(
-                        reader.name, frame, len(missing), int(missing[0]), is_known=frame in self._tree.names
-                    )
+                self._count_missing(reader.name, frame, missing[self._is_relevant(reader, missing)])
         return result
 
     def _is_relevant(self, reader: TopicReader, times_ns: Integers) -> Booleans:
@@ -266,6 +344,7 @@ class Remarks:
         self._missing: dict[tuple[str, str, bool], tuple[int, int]] = {}
         self._stale: dict[tuple[str, str], tuple[int, int]] = {}
         self._skipped: dict[str, int] = {}
+        self._replaced: dict[str, tuple[int, int]] = {}
         self._frames: set[str] = set()
 
     def add(self, text: str) -> None:
@@ -285,6 +364,11 @@ class Remarks:
         """Count objects without solids."""
         self._skipped[topic] = self._skipped.get(topic, 0) + count
 
+    def count_replaced(self, topic: str, count: int, first_ns: int) -> None:
+        """Count messages that have the time of a later one."""
+        before, first = self._replaced.get(topic, (0, first_ns))
+        self._replaced[topic] = before + count, first
+
     def note_frames(self, frames: Iterable[str]) -> None:
         """Note frames whose coordinates are not transformed."""
         if len(self._frames) < _MOST_NAMES:
@@ -296,13 +380,20 @@ class Remarks:
         for topic, count in sorted(self._skipped.items()):
             were = "object was" if count == 1 else "objects were"
             texts.append(f"{topic}: {count} {were} left out, without a solid: lines, arrows or texts")
+        for topic, (count, first_ns) in sorted(self._replaced.items()):
+            was = "message was" if count == 1 else "messages were"
+            first = f"{topic}: {count} {was} left out, the first at "
+            texts.append(
+                Sentence(first, Instant(first_ns, 0), ": of those with the same time the last counts")
+            )
         if self._mapping.fixed_frame is None and len(self._frames) > 1:
             listed = ", ".join(sorted(map(repr, self._frames)))
             texts.append(
                 f"coordinates are in the frames {listed} and taken as they are;"
                 " `fixed_frame` in the mapping brings them into one"
             )
-        self._texts, self._missing, self._stale, self._skipped, self._frames = [], {}, {}, {}, set()
+        self._texts, self._missing, self._stale, self._frames = [], {}, {}, set()
+        self._skipped, self._replaced = {}, {}
         return tuple(Sentence(f"{self._name}: ", text) for text in texts)
 
     def _missing_texts(self) -> Iterator[Sentence]:
@@ -332,6 +423,32 @@ class Remarks:
                 Instant(first_ns, 0),
                 ": the topic was silent for longer than max_age",
             )
+
+
+def _replaced(detections: Detections, times_ns: Integers, *, is_complete: bool) -> Integers:
+    """Return the messages with an object that a later message of the same time reports, or leaves out."""
+    followed = np.append(times_ns[1:] == times_ns[:-1], False)
+    if is_complete or not followed.any():
+        return np.flatnonzero(followed)
+    message = detections.message
+    order = np.lexsort((message, detections.name, times_ns[message]))
+    name, at, message = detections.name[order], times_ns[message[order]], message[order]
+    is_again = (name[1:] == name[:-1]) & (at[1:] == at[:-1]) & (message[1:] != message[:-1])
+    return np.unique(message[:-1][is_again])
+
+
+def _changes(transforms: Transforms | None, count: int) -> Integers:
+    """Return the indices of transforms that differ from the one before, and the first."""
+    if transforms is None:
+        return np.zeros(min(count, 1), np.int64)
+    changed = np.ones(count, np.bool_)
+    rotation, translation, known = transforms
+    changed[1:] = (
+        (rotation[1:] != rotation[:-1]).any(axis=(1, 2))
+        | (translation[1:] != translation[:-1]).any(axis=1)
+        | (known[1:] != known[:-1])
+    )
+    return np.flatnonzero(changed)
 
 
 def _repeated_names(detections: Detections) -> list[int]:

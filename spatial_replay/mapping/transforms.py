@@ -139,6 +139,9 @@ class Transforms(NamedTuple):
         for whole, part in zip(self, others, strict=True):
             whole[places] = part
 
+    def select(self, places: Integers) -> Transforms:
+        return Transforms(self.rotation[places], self.translation[places], self.known[places])
+
     def after(self, first: Transforms) -> Transforms:
         """Return a_from_c for a_from_b (this) and b_from_c (`first`)."""
         return Transforms(

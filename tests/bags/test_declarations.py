@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import zstandard
 from mcap.records import Statistics
 from mcap.writer import Writer
 
@@ -23,6 +25,7 @@ from bags.bag_files import (
     write_ros2,
 )
 from spatial_replay import LogError, read_trace
+from spatial_replay.bags.mcap_log import McapLog
 from spatial_replay.cli import run
 from spatial_replay.logs.read_options import FaultList, count_of
 
@@ -57,8 +60,6 @@ def lying_type(folder: Path) -> Path:
 
 
 def lost_row(folder: Path) -> Path:
-    import sqlite3
-
     bag = write_ros2(folder / "drive", drive(20), storage="sqlite3")
     with sqlite3.connect(next(bag.glob("*.db3"))) as database:
         database.execute("DELETE FROM messages WHERE id = 10")
@@ -136,6 +137,73 @@ def test_a_sound_log_is_not_damaged(folder: Path) -> None:
     assert code_of("replay", write_ros1(folder / "drive.bag", drive(20))) == 0
     assert code_of("replay", write_ros2(folder / "drive", drive(20))) == 0
     assert code_of("replay", mcap_declaring(folder, only_total)) == 0
+
+
+def other_type_name(folder: Path) -> Path:
+    bag = write_ros2(folder / "drive", drive(20))
+    metadata = bag / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace(POINT, POINT.replace("/msg/", "/")))
+    return bag
+
+
+def later_fields(folder: Path) -> Path:
+    """An attachment with bytes behind the fields that are known; the log was cut before its index."""
+    log = folder / "drive.mcap"
+    with log.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        channel = writer.register_channel("/a", "json", 0)
+        for tick in range(9):
+            writer.add_message(channel, START_NS + tick * SECOND // 10, b'{"x": 0, "y": 0}', START_NS)
+        writer.add_attachment(0, 0, "é.txt", "text/plain", b"some")
+        writer.finish()
+    data = log.read_bytes()
+    at = data.index("é.txt".encode()) - 29
+    length = int.from_bytes(data[at + 1 : at + 9], "little")
+    end = at + 9 + length
+    record = data[at : at + 1] + (length + 4).to_bytes(8, "little") + data[at + 9 : end] + b"more"
+    log.write_bytes(data[:at] + record + data[end:])
+    return log
+
+
+def test_a_type_without_its_middle_part_is_the_same_type(folder: Path) -> None:
+    assert code_of("replay", other_type_name(folder)) == 0
+
+
+def test_an_attachment_with_fields_of_a_later_version_is_sound(folder: Path) -> None:
+    log = later_fields(folder)
+    assert [each.data for each in McapLog(log).attachments()] == [b"some"]
+
+
+def test_messages_that_are_plain_although_compression_is_declared_are_read(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = write_ros2(folder / "drive", drive(200), storage="sqlite3", compression="message")
+    (file,) = bag.glob("*.db3")
+    with sqlite3.connect(file) as database:
+        rows = database.execute("SELECT id, data FROM messages WHERE id > 90").fetchall()
+        plain = [(zstandard.ZstdDecompressor().decompress(data), row) for row, data in rows]
+        database.executemany("UPDATE messages SET data = ? WHERE id = ?", plain)
+    database.close()
+    assert code_of("replay", bag) == 0
+    assert "messages on '/a' are plain, the first at" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("first", [0, 90])
+def test_messages_that_do_not_decompress_are_counted_together(
+    folder: Path, first: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = write_ros2(folder / "drive", drive(200), storage="sqlite3", compression="message")
+    (file,) = bag.glob("*.db3")
+    with sqlite3.connect(file) as database:
+        database.execute("UPDATE messages SET data = 'junk' WHERE id > ?", (first,))
+        database.execute("UPDATE messages SET data = CAST(data AS BLOB)")
+    database.close()
+    assert code_of("replay", bag) == 3
+    said = capsys.readouterr().err
+    assert "a message does not decompress" in said
+    assert "more up to" in said
+    assert len(said.splitlines()) < 10
 
 
 def test_a_log_without_a_sample_says_why(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

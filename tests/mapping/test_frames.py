@@ -124,6 +124,21 @@ def test_a_frame_may_change_its_parent() -> None:
     assert [made.centre(n, "p") for n in range(4)] == [(1, 10), (2, 10), (3, -10), (4, -10)]
 
 
+def test_a_frame_that_is_fixed_to_a_moving_one_moves_with_it() -> None:
+    feed = Feed(latched=frozenset({"/tf_static"}))
+    feed.add("/tf_static", 0, tf(transform("base", "camera", (1, 0, 0)), transform("map", "door", (0, 3, 0))))
+    for tick in range(1, 7):
+        feed.add("/tf", tick * SECOND, tf(transform("map", "base", (tick, 0, 0), time_ns=tick * SECOND)))
+        feed.add("/tick", tick * SECOND, {})
+    text = "fixed_frame: map\nmax_age: 1s\nsample: {topic: /tick}\ntopics: {/tf_static: {}}"
+    made = make(text, feed)
+    assert [made.centre(n, "camera") for n in range(6)] == [(tick + 1, 0) for tick in range(1, 7)]
+    assert made.states("door") == "++++++"
+    assert made.remarks == ()
+    assert make(text, feed, batch=2).trace == made.trace
+    assert make(text, feed, start_ns=4 * SECOND).trace == made.trace.slice(3, 6)
+
+
 def test_frames_in_a_cycle_make_objects_unknown() -> None:
     feed = Feed(latched=frozenset({"/tf_static"}))
     feed.add("/tf_static", 0, tf(transform("a", "b", (1, 0, 0)), transform("b", "a", (1, 0, 0))))

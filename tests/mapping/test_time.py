@@ -86,6 +86,49 @@ def test_an_object_that_a_complete_list_leaves_out_is_absent() -> None:
     assert (kept.states("t1"), kept.states("t2")) == ("+++++", "+++++")
 
 
+def test_lists_that_are_empty_before_the_first_object_are_samples() -> None:
+    def listed(*numbers: int, time_ns: int) -> Any:
+        found = [ros("apriltag_msgs/AprilTagDetection", id=number) for number in numbers]
+        return ros("apriltag_msgs/AprilTagDetectionArray", header=header("", time_ns), detections=found)
+
+    def marked(*numbers: int, time_ns: int) -> Any:
+        marks = [
+            ros("visualization_msgs/Marker", header=header("", time_ns), ns="m", id=number, type=1)
+            for number in numbers
+        ]
+        return ros("visualization_msgs/MarkerArray", markers=marks)
+
+    tags, things, marks = Feed(), Feed(), Feed()
+    for tick, numbers in enumerate([(), (), (), (1,), ()]):
+        tags.add("/tags", tick + 9, listed(*numbers, time_ns=tick * SECOND))
+        marks.add("/marks", tick + 9, marked(*numbers, time_ns=tick * SECOND))
+        stamp = {"stamp": {"sec": tick, "nanosec": 0}}
+        each = [{"id": number, "x": 0.0, "y": 0.0, "header": stamp} for number in numbers]
+        things.add("/things", tick + 9, {"header": stamp, "things": each})
+    made = make("clock: header\ntopics: {/tags: {}}", tags)
+    assert seconds(made.trace.times_ns) == [0, 1, 2, 3, 4]
+    assert made.states("tag1")[:3] + made.states("tag1")[4] == "----"
+    # objects have stamps of their own, and a list without objects that of its header
+    made = make("clock: header\ntopics: {/things: {objects: 'things[*]', name: 't{id}'}}", things)
+    assert (seconds(made.trace.times_ns), made.states("t1")) == ([0, 1, 2, 3, 4], "---+-")
+    # what has no stamp at all is counted
+    made = make("clock: header\ntopics: {/marks: {}}", marks)
+    assert seconds(made.trace.times_ns) == [3]
+    assert "/marks: 4 messages without objects were left out" in made.remarks[0]
+
+
+def test_a_max_age_of_the_file_counts_for_latched_topics_and_markers_too() -> None:
+    cube = ros("visualization_msgs/Marker", header=header("map"), ns="m", type=1)
+    feed = Feed(latched=frozenset({"/b"})).add("/b", 0, point(0)).add("/m", 0, cube)
+    for tick in range(4):
+        feed.add("/a", tick * SECOND, point(tick))
+    text = "sample: {{topic: /a}}\n{head}topics: {{/a: {{}}, /m: {{}}, /b: {{{own}}}}}"
+    assert make(text.format(head="", own=""), feed).states("b") == "++++"
+    made = make(text.format(head="max_age: 2s\n", own=""), feed)
+    assert (made.states("b"), made.states("m_0")) == ("+++?", "+++?")
+    assert make(text.format(head="max_age: 2s\n", own="max_age: forever"), feed).states("b") == "++++"
+
+
 def test_a_silent_list_makes_its_objects_unknown() -> None:
     feed = Feed().add("/list", 0, {"things": [{"id": 1, "x": 0.0, "y": 0.0}]})
     for tick in range(4):
@@ -112,6 +155,12 @@ def test_of_equal_times_the_later_one_counts() -> None:
     made = make("topics: {/p: {}}", feed)
     assert made.trace.times_ns.tolist() == [5, 6]
     assert made.centre(0, "p") == (2.0, 0.0)
+    assert "/p: 1 message was left out, the first at 0.000 s: of those with the same time the last" in str(
+        made.remarks[0]
+    )
+    # two objects at one time replace nothing
+    both = Feed().add("/p", 5, {"id": 1, **point(1)}).add("/p", 5, {"id": 2, **point(2)})
+    assert make("topics: {/p: {name: 'o{id}'}}", both).remarks == ()
 
 
 def restarted() -> Feed:

@@ -303,6 +303,10 @@ def _iter_places(window: bytes, mark: bytes) -> Iterator[int]:
         at = window.find(mark, at + 1)
 
 
+_ATTACHMENT_NUMBERS = 32
+"""Bytes of the two times and three lengths of an attachment."""
+
+
 def iter_attachments(
     stream: BinaryIO, directory: Directory, faults: FaultList, name: str
 ) -> Iterator[Attachment]:
@@ -310,11 +314,14 @@ def iter_attachments(
     for offset, length in directory.attachments:
         stream.seek(offset + RECORD_HEAD.size)
         body = stream.read(length - RECORD_HEAD.size)
-        checksum = int.from_bytes(body[-4:], "little")
         try:
-            if checksum and zlib.crc32(body[:-4]) != checksum:
-                raise DamageError("an attachment's checksum does not fit")
             record = decoded(records.Attachment.read, body)
+            # behind the fields that are known there may be others
+            texts = len(record.name.encode()) + len(record.media_type.encode())
+            size = _ATTACHMENT_NUMBERS + texts + len(record.data)
+            checksum = int.from_bytes(body[size : size + 4], "little")
+            if checksum and zlib.crc32(body[:size]) != checksum:
+                raise DamageError("an attachment's checksum does not fit")
         except DamageError as damage:
             faults.add(f"{name}: at byte {offset}: {damage}; the attachment is lost")
             continue
