@@ -11,9 +11,9 @@ from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import (
     EvaluationArguments,
     evaluation_options,
+    log_output_option,
     naming_option,
     open_inputs,
-    output_option,
     warn_of_input,
 )
 from spatial_replay.cli.output import print_verdicts
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @evaluation_options
-@output_option("Clip to write (MCAP).", required=True)
+@log_output_option("Clip to write (MCAP).")
 @click.option(
     "--of",
     metavar="NAME",

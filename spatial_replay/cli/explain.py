@@ -73,8 +73,11 @@ def explain(
     if as_json:
         show_json([each.document for each in results])
     else:
-        for number, each in enumerate(_texts(results)):
-            show(*([""] if number else []), *each)
+        texts = list(_texts(results))
+        if replayed.vacuous and node is None and object_name is None:
+            texts.append([each.message for each in replayed.vacuous])
+        for number, lines in enumerate(texts):
+            show(*([""] if number else []), *lines)
     return exit_code_from_verdicts((each.verdict for each in results), bool(replayed.faults))
 
 

@@ -42,6 +42,20 @@ class _OutputFile(click.Path):
         return super().convert(value, param, ctx)
 
 
+class _LogOutput(_OutputFile):
+    """A path to write a log to; the name of a file of another kind is refused."""
+
+    def convert(
+        self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
+    ) -> str | bytes | os.PathLike[str]:
+        ending = Path(value).suffix
+        if ending.lower() in (".csv", ".html", ".json", ".jsonl", ".parquet"):
+            self.fail(
+                f"{value}: what is written is a log (MCAP); name it {Path(value).stem}.mcap", param, ctx
+            )
+        return super().convert(value, param, ctx)
+
+
 class LogPath(click.Path):
     """A path or an address of a log."""
 
@@ -57,6 +71,11 @@ class LogPath(click.Path):
 def output_option(text: str, *, required: bool = False) -> Callable[[_Command], _Command]:
     """Return the option `-o FILE`, with its help."""
     return click.option("-o", "--output", type=_OutputFile(path_type=Path), required=required, help=text)
+
+
+def log_output_option(text: str) -> Callable[[_Command], _Command]:
+    """Return the required option `-o FILE` of a command that writes a log, with its help."""
+    return click.option("-o", "--output", type=_LogOutput(path_type=Path), required=True, help=text)
 
 
 def specs_option(text: str) -> Callable[[_Command], _Command]:

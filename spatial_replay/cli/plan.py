@@ -12,7 +12,7 @@ from spatial_replay.cli.application import exit_code_from_verdicts
 from spatial_replay.cli.options import (
     constants_option,
     load_spec_options,
-    output_option,
+    log_output_option,
     profile_option,
     require_choice,
 )
@@ -50,7 +50,7 @@ def planning_command(scenario: str) -> click.Command:
     """
 
     @click.command(scenario, help=help_text)
-    @output_option("Log to write (MCAP).", required=True)
+    @log_output_option("Log to write (MCAP).")
     @click.option(
         "--spec",
         metavar="SPEC",

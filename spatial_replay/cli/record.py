@@ -17,7 +17,7 @@ from spatial_replay.cli.options import (
     gather,
     input_files,
     load_spec_options,
-    output_option,
+    log_output_option,
     profile_option,
     reading_options,
     specs_option,
@@ -107,7 +107,7 @@ def recording_command(scenario: str) -> click.Command:
     """
 
     @click.command(scenario, help=help_text)
-    @output_option("Log to write (MCAP).", required=True)
+    @log_output_option("Log to write (MCAP).")
     @specs_option(
         "Specification to evaluate while recording; repeat for several.  [default: the scenario's own]"
     )
@@ -172,7 +172,7 @@ for _scenario in SCENARIOS:
 
 @record.command()
 @click.argument("file", type=click.Path(path_type=Path))
-@output_option("Log to write (MCAP).", required=True)
+@log_output_option("Log to write (MCAP).")
 @specs_option("Specification to evaluate while recording; repeat for several.")
 @constants_option
 @profile_option

@@ -139,6 +139,8 @@ def _faults(mapping: LogMapping, known: dict[str, Topic]) -> list[str]:
         elif name not in known:
             listed = ", ".join(sorted(known)[:20]) or "none"
             hint = nearest_hint(name, known) or f"its topics are {listed}"
+            if name in named and not hint.endswith("?"):
+                hint += "; where only some logs have it, add `optional: true`"
             faults.append(f"{where}: the log has no topic {name!r}; {hint}")
         elif (reason := known[name].unreadable) is not None:
             faults.append(f"{where}: its messages cannot be decoded: {reason}")

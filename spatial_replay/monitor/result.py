@@ -330,10 +330,12 @@ class SpecResult(Displayed):
         instance = f" for {self.object}" if self.object is not None else ""
         lower, upper = self.final[node].tolist()
         settled_ns = self.certain_ns(node)
+        verdict = final_verdict(lower, upper)
         return verdict_sentence(
             f"`{self._name_of(node)}`{instance}",
-            final_verdict(lower, upper),
+            verdict,
             (lower, upper),
+            has_ended=settled_ns is None and verdict is Verdict.VIOLATED and self.can_explain,
             certain_since=None if settled_ns is None else Instant(settled_ns, first_ns),
             least=self._least(node, causes),
         )

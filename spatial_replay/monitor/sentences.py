@@ -17,11 +17,12 @@ from spatial_replay.spec.formula import Atom, Formula
 from spatial_replay.text import Instant, Sentence, counted, requirement_text, shortened_formula
 
 _DIGITS = 6
+_ENDED = ", for the log has ended"
 _EDGES = {"min_x": "left", "max_x": "right", "min_y": "lower", "max_y": "upper"}
 
 
 def sentences_of(
-    witness: Witness, *, first_ns: int, requirement: str = "", is_open: bool = False
+    witness: Witness, *, first_ns: int, requirement: str = "", is_open: bool = False, has_ended: bool = False
 ) -> tuple[Sentence, ...]:
     """Return sentences on why a node has its verdict: what decided it, and what would flip it.
 
@@ -29,6 +30,7 @@ def sentences_of(
         first_ns: the time that others are counted from.
         requirement: what its spec stands for, see `requirement_text`.
         is_open: whether it is pending: samples after those evaluated decide it.
+        has_ended: whether it was pending until the log ended, and is violated for that.
     """
     title = f"`{witness.path[0].name or shortened_formula(witness.path[0].text)}`"
     title += f" for {witness.object}" if witness.object is not None else ""
@@ -39,7 +41,7 @@ def sentences_of(
     elif is_open:
         sentences = [Sentence(f"{title} is pending: {numbers} so far, and later samples decide.")]
     else:
-        sentences = [Sentence(f"{title} is {witness.verdict}: {numbers}.")]
+        sentences = [Sentence(f"{title} is {witness.verdict}{_ENDED if has_ended else ''}: {numbers}.")]
     if witness.missed is not None and not is_open:
         sentences.append(Sentence(missed_text(witness.missed, first_ns), "."))
     if witness.deciding is None:
@@ -63,7 +65,8 @@ def cause_sentences(cause: Cause, *, first_ns: int, object: str | None = None) -
     """Return sentences on one cause of a verdict: since when, what decided it, and what would flip it."""
     requirement = requirement_text(cause.requirement, cause.title)
     if cause.witness is not None:
-        return sentences_of(cause.witness, first_ns=first_ns, requirement=requirement)
+        has_ended = cause.settled_ns is None and cause.verdict is Verdict.VIOLATED
+        return sentences_of(cause.witness, first_ns=first_ns, requirement=requirement, has_ended=has_ended)
     instance = f" for {object}" if object is not None else ""
     instance += f" ({requirement})" if requirement else ""
     if cause.settled_ns is not None:
@@ -78,6 +81,7 @@ def verdict_sentence(
     ends: tuple[float, float],
     *,
     certain_since: Instant | None = None,
+    has_ended: bool = False,
     least: LeastPart | None = None,
 ) -> Sentence:
     """Return a sentence on the verdict of a result as a whole.
@@ -86,11 +90,13 @@ def verdict_sentence(
         title: what the result is called.
         ends: of its interval for the finished log.
         certain_since: since when it is certain.
+        has_ended: whether it was pending until the log ended, and is violated for that.
         least: the part that its number is of, if that is another than the first cause.
     """
     since = (", certain since ", certain_since) if certain_since is not None else ()
     of = f" (the least robustness is that of `{least.name}`)" if least is not None else ""
-    return Sentence(f"{title} is {verdict}: {_robustness(*ends)}", *since, f"{of}.")
+    how = f"{verdict}{_ENDED if has_ended else ''}"
+    return Sentence(f"{title} is {how}: {_robustness(*ends)}", *since, f"{of}.")
 
 
 def number_text(number: float) -> str:

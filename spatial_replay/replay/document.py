@@ -218,10 +218,15 @@ def explain_results(
         object: explain only results about this object of a template.
         goes_on: whether the log has samples after those evaluated, which could change a verdict.
 
+    Returns:
+        One explanation for each; none where all that there is are templates without objects.
+
     Raises:
-        UsageError: no such node or object, or nothing was evaluated.
+        UsageError: no such node or object.
     """
     results = [result for result in replayed.results if object in (None, result.object)]
+    if not results and node is None and object is None:
+        return []
     if not results:
         known = ", ".join(sorted({result.object for result in replayed.results if result.object})) or "none"
         if object is None:

@@ -183,5 +183,5 @@ def value_given(name: str, value: object) -> Value:
             return number
         return Duration(-number.ns) if isinstance(number, Duration) else 0.0 - number
     raise UsageError(
-        f"constants: {name!r} is {value!r}; give a finite number or, as a text, a duration: '2s', '500ms'"
+        f"constants: {name!r} cannot be {value!r}; give a finite number, or a duration such as '2s', '500ms'"
     )

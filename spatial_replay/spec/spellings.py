@@ -81,6 +81,8 @@ _MEANT_SIGNS: Mapping[str, str] = MappingProxyType(
 )
 _LENGTHS = frozenset({"m", "cm", "mm", "km", "um", "in", "ft", "px"})
 _TIMES: Mapping[str, float] = MappingProxyType({"us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "sec": 1.0})
+_OPPOSITE: Mapping[str, str] = MappingProxyType({"STAR": "/", "SLASH": "*", "PLUS": "-", "MINUS": "+"})
+"""Signs of arithmetic, and what each is on the other side of a comparison."""
 _DEFINING = frozenset({"let", "var", "val", "define", "param", "parameter", "constant", "set"})
 _WITH_NUMBER = frozenset({"closeto", "farfrom", "touch", "oriented", "moved"})
 _STATEMENTS = frozenset({"CONST", "REGION", "GROUP", "DEF", "SPEC"})
@@ -264,6 +266,15 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
         return found, hint
     if last.type == "NAME" and before.type == "COMPARE" and token.type in ("COMPARE", "$END"):
         return _meant_comparison(tokens, position)
+    if last.type == "COMPARE" and token.type in ("NUMBER", "MINUS") and _has_arithmetic(tokens, position):
+        return "a signal is compared as it is", _meant_arithmetic(tokens, position)
+    if token.type == "COMPARE" and [each.type for each in tokens[position - 5 : position : 2]] == [
+        "LPAR", "COMMA", "RPAR",
+    ]:  # fmt: skip
+        _, first, _, second, _ = (each.value for each in tokens[position - 5 : position])
+        if position > 5 and tokens[position - 6].value.lower() in ("distance", "d", "sd"):
+            hint = f"a distance is written between its objects: {first} dist {second} {token.value} ..."
+            return f"{tokens[position - 6].value!r} is not a function", hint
     if token.type == "COMPARE" and last.type in ("RPAR", "AND", "OR"):
         hint = "a comparison is about a signal, battery >= 1.5, or a distance, a dist b <= 2"
         return found, f"{hint}; a range is two comparisons, joined by and"
@@ -272,7 +283,7 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
 
 def _meant_window(tokens: Sequence[Token], position: int) -> str:
     """Return the window that was meant behind the nearest operator; "" where none was begun."""
-    start = next((n for n in range(position - 1, max(-1, position - 5), -1) if _is_temporal(tokens[n])), None)
+    start = next((n for n in range(position - 1, max(-1, position - 6), -1) if _is_temporal(tokens[n])), None)
     if start is None:
         return ""
     inner = tokens[start + 1 : start + 6]
@@ -285,9 +296,40 @@ def _meant_window(tokens: Sequence[Token], position: int) -> str:
             return f"{operator}[{numbers[0]}, inf]" if sign[0] == ">" else f"{operator}[0, {numbers[0]}]"
         case ["LSQB", "NUMBER", "RSQB", *_]:
             return f"{operator}[0, {numbers[0]}]"
-        case ["LSQB", "NUMBER", "NUMBER", *_] | ["LPAR", "NUMBER", "COMMA", "NUMBER", *_]:
+        case (
+            ["LSQB", "NUMBER", "NUMBER", *_]
+            | ["LSQB", "NUMBER", "MINUS", "NUMBER", "RSQB"]
+            | ["LPAR", "NUMBER", "COMMA", "NUMBER", *_]
+        ):
             return f"{operator}[{numbers[0]}, {numbers[1]}]"
     return ""
+
+
+def _has_arithmetic(tokens: Sequence[Token], position: int) -> bool:
+    """Return whether the left side of the comparison in front of a token is computed."""
+    for token in reversed(tokens[: position - 1]):
+        if token.type in _OPPOSITE:
+            return True
+        if token.type not in ("NAME", "NUMBER"):
+            break
+    return False
+
+
+def _meant_arithmetic(tokens: Sequence[Token], position: int) -> str:
+    """Return how a comparison of a computed signal is written, with the arithmetic on its other side."""
+    before = [*tokens[max(0, position - 5) : position]]
+    match [each.type for each in before[-4:]]:
+        case ["NAME", sign, "NUMBER", "COMPARE"] if sign in _OPPOSITE:
+            name, _, number, comparison = (each.value for each in before[-4:])
+        case ["NUMBER", "STAR" | "PLUS" as sign, "NAME", "COMPARE"]:
+            number, _, name, comparison = (each.value for each in before[-4:])
+        case _:
+            return "write it with one signal and a number: battery >= 1.5; only constants are computed"
+    right = tokens[position]
+    is_alone = len(before) < 5 or before[0].type not in _OPPOSITE
+    if right.type != "NUMBER" or not is_alone:
+        return "put the numbers on the other side: battery >= 3 / 2"
+    return f"put the numbers on the other side: {name} {comparison} {right.value} {_OPPOSITE[sign]} {number}"
 
 
 def _is_temporal(token: Token) -> bool:

@@ -166,7 +166,7 @@ def test_explain_lists_every_failing_spec_the_settled_one_first(
     assert lines[0] == "REQ-7: done and safe"
     assert lines[1].startswith("`mission` is violated: robustness -0.144867, certain since 5.533 s")
     assert lines[2] == "`safe` is violated since 5.533 s, whatever came after."
-    assert any(line.startswith("`goal` is violated: ") for line in lines[3:])
+    assert any(line.startswith("`goal` is violated, for the log has ended: ") for line in lines[3:])
 
 
 def test_explain_names_the_part_with_the_least_robustness(

@@ -184,6 +184,7 @@ TEN_FAULTS = "\n".join(
         ((*REPLAY, "-o", "."), "is a folder"),
         ((*REPLAY, "--from", "3"), "--from: '3' has no unit: 3s after the log's first sample, or 3 ns"),
         ((*REPLAY, "-o", "out.csv"), "export the annotated log: spatial-replay export OUT.mcap -o out.csv"),
+        (("record", "tracks", "run.jsonl", "-o", "out.csv"), "is a log (MCAP); name it out.mcap"),
         ((*REPLAY, "-o", "out.html"), "spatial-replay report LOG --spec SPEC -o out.html"),
         ((*REPLAY, "--from", "soon"), "'soon' is not a time; write 12.5s"),
         ((*REPLAY, "--from", "99s"), "run.jsonl has no sample in the requested window; its samples are from"),
@@ -221,6 +222,9 @@ def test_a_template_requires_each(folder: Path) -> None:
     assert "vacuous: `near(ego)` was never evaluated: no object stands for ego." in unknown.stdout
     assert "near.spatial:1:6: warning: the log never has the class 'dog'" in unknown.stderr
     assert "its classes are Block, dish" in unknown.stderr
+    explained = run_program("explain", *replay[1:], "--each", "ego=class:dog", cwd=folder)
+    assert explained.returncode == 0
+    assert explained.stdout == "`near(ego)` was never evaluated: no object stands for ego.\n"
     gate = run_program(*replay, "--each", "ego=class:dog", "--fail-on", "vacuous", "--json", "-", cwd=folder)
     assert gate.returncode == 1
     assert json.loads(gate.stdout)["log"]["missing"] == ["the log never has the class 'dog'"]

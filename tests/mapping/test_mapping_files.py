@@ -149,13 +149,17 @@ def test_the_published_schema_is_the_one_in_use() -> None:
 
 
 def test_topics_missing_from_the_log_are_reported_with_a_hint() -> None:
-    mapping = parse_mapping("sample: {topic: /tick}\ntopics: {/pse: {}, /other: {type: foo/Bar}}", "m.yaml")
+    mapping = parse_mapping(
+        "sample: {topic: /tick}\ntopics: {/pse: {}, /scan: {}, /other: {type: foo/Bar}}", "m.yaml"
+    )
     with pytest.raises(UsageError) as caught:
         ReadingPlan.of(
             mapping, [Topic("/pose", "geometry_msgs/msg/PoseStamped", "cdr"), Topic("/other", "", "cdr")]
         )
     assert str(caught.value).splitlines() == [
         "m.yaml: topics./pse: the log has no topic '/pse'; did you mean '/pose'?",
+        "m.yaml: topics./scan: the log has no topic '/scan'; its topics are /other, /pose; where only some "
+        "logs have it, add `optional: true`",
         "m.yaml: sample.topic: the log has no topic '/tick'; its topics are /other, /pose",
         *[line for line in str(caught.value).splitlines() if "'foo/Bar' is not a known type" in line],
     ]

@@ -101,7 +101,7 @@ def test_explanations_name_every_cause_and_what_would_have_prevented_it() -> Non
         "What decides is `battery >= 0.2`, which fails by 0.06 at 4.000 s (within `charged`): "
         "battery is 0.14.",
         "It would not have been violated then with 0.139999 or less in place of 0.2 in `battery >= 0.2`.",
-        "`deliver` is violated: robustness -7.76.",
+        "`deliver` is violated, for the log has ended: robustness -7.76.",
         "What decides is `red enclosedin bin`, which fails by 7.76 at 4.000 s (its greatest within "
         "`deliver`): red sticks out of bin by 7.76.",
         "It would be satisfied if `red enclosedin bin` were allowed to fail by 7.76001.",

@@ -329,7 +329,7 @@ def test_backquotes_in_names_leave_text_and_code_apart(tmp_path: Path, name: str
     page = report_of_samples(tmp_path / "run.html", moving(6, name), f"spec s = F ({quoted} dist b <= -9)")
     codes = [text for inside, text in page.texts if "section#verdicts" in inside and inside[-1] == "code#"]
     assert codes[:2] == ["s", f"{quoted} dist b <= -9"]
-    assert " is violated: robustness " in page.within("section#verdicts")
+    assert " is violated, for the log has ended: robustness " in page.within("section#verdicts")
     parts = next(each["parts"] for each in page.facts["events"] if "violated" in each["parts"][2])
     assert parts[1] == "s"
     assert f"{quoted} dist b <= -9" in parts
