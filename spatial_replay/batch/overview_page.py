@@ -13,8 +13,9 @@ import numpy as np
 from spatial_replay import __version__
 from spatial_replay.batch.run_table import Total, Values, totals, worst_rows
 from spatial_replay.notebook.figures import Html, element
+from spatial_replay.report.compact import sentence_parts
 from spatial_replay.report.page import policy, text, theme
-from spatial_replay.text import counted, sentence_parts
+from spatial_replay.text import counted
 
 if TYPE_CHECKING:
     import pyarrow as pa
