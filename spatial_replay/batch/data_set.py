@@ -98,14 +98,15 @@ def write_rows(folder: Path, spec_hash: str, key: str, rows: Sequence[ResultRow]
         partition.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise output_error(partition, error) from error
-    _write(partition / f"{key}.parquet", table_of({key: rows}))
+    # it is joined with others soon: what makes searching fast would take longer than the rest
+    _write(partition / f"{key}.parquet", table_of({key: rows}), use_dictionary=False, write_statistics=False)
 
 
-def _write(path: Path, table: pa.Table) -> None:
+def _write(path: Path, table: pa.Table, **options: Any) -> None:
     from pyarrow import parquet
 
     with replacing(path) as stream:
-        parquet.write_table(table, stream, compression="zstd")
+        parquet.write_table(table, stream, compression="zstd", **options)
 
 
 class ResultsFolder:
@@ -281,8 +282,9 @@ def _read(file: Path, names: Sequence[str] | None = None) -> pa.Table:
     from pyarrow import parquet
 
     try:
-        # a folder named spec=… is no column here
-        return parquet.read_table(file, columns=names, partitioning=None, use_threads=False)
+        # not `read_table`, to which a folder named spec=… is a column, and which takes twice as long
+        with parquet.ParquetFile(file) as opened:
+            return opened.read(names, use_threads=False)
     except (OSError, pa.ArrowException) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise LogError(
