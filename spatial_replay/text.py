@@ -16,6 +16,11 @@ _MOST_NAMES: Final = 2_000
 """Bounds of the comparison, which takes quadratic time: names come from logs and may be hostile."""
 
 
+def is_encodable(text: str) -> bool:
+    """Return whether a text fits UTF-8, unlike one with half of a surrogate pair."""
+    return text.isascii() or not any("\ud800" <= character <= "\udfff" for character in text)
+
+
 @dataclass(frozen=True, slots=True)
 class Instant:
     """A time in a sentence, printed in seconds since `first_ns`."""

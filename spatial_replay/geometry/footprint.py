@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.arrays import Floats, read_only_floats
 from spatial_replay.geometry.outline import NOT_CONVEX, SOUND, convex_hull, convex_pieces, normalise_polygons
+from spatial_replay.text import is_encodable
 
 Concave: TypeAlias = Literal["decompose", "hull"]
 """How a non-convex polygon is treated: split into convex parts, or replaced by its convex hull."""
@@ -173,6 +174,11 @@ class TrackedObject:
             raise GeometryError(f"footprint is {self.footprint!r}; give a Footprint")
         if self.class_name is not None and not isinstance(self.class_name, str):
             raise GeometryError(f"class_name is {self.class_name!r}; give a text or None")
+        if self.class_name is not None and not is_encodable(self.class_name):
+            raise GeometryError(
+                f"class_name is {self.class_name!r}, with half a character (a lone surrogate), which no log"
+                ' can hold; decode it with errors="replace"'
+            )
         if self.yaw is not None:
             object.__setattr__(self, "yaw", _finite(self.yaw, "yaw"))
         if self.height is not None:
@@ -203,7 +209,7 @@ def _tidy(vertices: ArrayLike) -> tuple[Floats, bool]:
 def _finite(value: float, what: str) -> float:
     try:
         number = float(value)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise GeometryError(f"{what} is {value!r}; give a number") from error
     if not math.isfinite(number):
         raise GeometryError(f"{what} is {number}; give a finite number")

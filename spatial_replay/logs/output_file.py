@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import io
 import os
+import stat
+import sys
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -55,11 +57,43 @@ def _move(partial: Path, output: Path) -> None:
 
 
 def open_output(output: Path) -> BinaryIO:
-    """Open a file to write in place; opening, writing and closing it fail with an OutputError."""
-    return _stream(output, output)
+    """Open a file to write in place; opening, writing and closing it fail with an OutputError.
+
+    Raises:
+        OutputError: it cannot be written, or another program, or another part of this one, is writing it.
+    """
+    with _writing(output):
+        descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
+    try:
+        with _writing(output):
+            if stat.S_ISREG(os.fstat(descriptor).st_mode):
+                # only the owner of the lock may empty the file
+                _lock(descriptor, output)
+                os.ftruncate(descriptor, 0)
+        return _stream(descriptor, output)
+    except BaseException:
+        os.close(descriptor)
+        raise
 
 
-def _stream(file: int | Path, output: Path) -> BinaryIO:
+def _lock(descriptor: int, output: Path) -> None:
+    """Lock a file for as long as it is open; the lock dies with its process."""
+    if sys.platform == "win32":
+        return
+    import fcntl
+
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise OutputError(
+            f"{output} is being written by another recorder or program; give this log another name"
+        ) from None
+    except OSError:
+        # some file systems of networks have no locks
+        return
+
+
+def _stream(file: int, output: Path) -> BinaryIO:
     with _writing(output):
         return io.BufferedWriter(_OutputFile(file, output), 1 << 20)
 
@@ -67,7 +101,7 @@ def _stream(file: int | Path, output: Path) -> BinaryIO:
 class _OutputFile(io.FileIO):
     """An unbuffered file whose failures become OutputErrors, also under a library that writes to it."""
 
-    def __init__(self, file: int | Path, output: Path) -> None:
+    def __init__(self, file: int, output: Path) -> None:
         super().__init__(file, "wb")
         self._output = output
 

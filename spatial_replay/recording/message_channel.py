@@ -112,6 +112,9 @@ class MessageQueue:
         while self._is_full(size):
             if not self._blocks:
                 return False
+            if self._failure is not None:
+                # no one makes room any more
+                raise self._failure
             self._ring()
             time.sleep(_PAUSE_S)
         self._bytes_in += size

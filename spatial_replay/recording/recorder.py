@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from itertools import takewhile
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
@@ -16,7 +17,7 @@ import numpy as np
 
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.compiled import compile_ahead
-from spatial_replay.errors import OutputError, TraceError, UsageError
+from spatial_replay.errors import OutputError, SpatialReplayError, TraceError, UsageError
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.contact import contacts
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
@@ -105,7 +106,7 @@ class Recorder:
         self._dropped = 0
         self._last_ns = -1
         self._closed = False
-        self._failure: Exception | None = None
+        self._failure: SpatialReplayError | None = None
         self._entered = ExitStack()
         self._stream = open_output(self._path)
         try:
@@ -176,6 +177,7 @@ class Recorder:
             if not self._blocks:
                 self._dropped += 1
                 return
+            self._raise_failure()
             time.sleep(_PAUSE_S)
         self._queue.put(sample)
         if self._queue.qsize() >= self._enough:
@@ -209,9 +211,13 @@ class Recorder:
             self.close(interrupted=error is not None)
 
     def _finish(self, *, interrupted: bool) -> None:
-        """Write the end of the log, unless writing failed before."""
+        """Write the end of the log; after a failure, as far as that is possible, and say that it failed."""
         try:
-            if self._failure is None:
+            if self._failure is not None:
+                with suppress(Exception):
+                    self._recording.break_off(dropped=self._dropped, messages_dropped=self._messages.dropped)
+                    self._writer.close()
+            else:
                 self._recording.end(
                     interrupted=interrupted, dropped=self._dropped, messages_dropped=self._messages.dropped
                 )
@@ -226,6 +232,12 @@ class Recorder:
 
     def _work(self) -> None:
         """Encode and write waiting samples, until `close`."""
+        try:
+            self._write_waiting()
+        except Exception as error:
+            self._fail(error)
+
+    def _write_waiting(self) -> None:
         flushed = time.monotonic()
         ended = False
         while not ended:
@@ -239,17 +251,38 @@ class Recorder:
 
     def _record(self, samples: Sequence[Sample], messages: Messages) -> None:
         """Encode and write samples and messages; after a failure, drop them."""
-        if self._failure is None and (samples or len(messages)):
-            self._try(lambda: self._recording.add(Trace.from_samples(samples), messages))
+        if self._failure is not None or not (samples or len(messages)):
+            return
+        try:
+            trace = Trace.from_samples(samples)
+        except Exception as error:
+            # what comes before the sample that cannot be encoded is written
+            sound = list(takewhile(_is_encodable, samples))
+            self._try(lambda: self._recording.add(Trace.from_samples(sound), messages))
+            self._fail(error)
+        else:
+            self._try(lambda: self._recording.add(trace, messages))
 
     def _try(self, step: Callable[[], None]) -> None:
         """Do a step of the writing thread."""
         try:
             step()
         except Exception as error:
-            # raised by the next `write`, since an error that ends a thread goes unnoticed
-            self._failure = error
-            self._messages.fail(error)
+            self._fail(error)
+
+    def _fail(self, error: Exception) -> None:
+        """Let the next `write` raise an error, which would go unnoticed in this thread."""
+        failure = (
+            error
+            if isinstance(error, SpatialReplayError)
+            else OutputError(
+                f"{self._path.name} ends here: a sample or message could not be written"
+                f" ({type(error).__name__}: {error})"
+            )
+        )
+        failure.__cause__ = error if failure is not error else error.__cause__
+        self._failure = failure
+        self._messages.fail(failure)
 
     def _ring(self) -> None:
         """Wake the writing thread before its gathering time is over."""
@@ -275,6 +308,14 @@ class Recorder:
     def _raise_failure(self) -> None:
         if self._failure is not None:
             raise self._failure
+
+
+def _is_encodable(sample: Sample) -> bool:
+    try:
+        Trace.from_samples([sample])
+    except Exception:
+        return False
+    return True
 
 
 def warm_up(files: Sequence[Specification], automata: Sequence[SpecAutomaton]) -> None:

@@ -130,13 +130,7 @@ class Recording:
             interrupted: whether the recording ended early.
             dropped, messages_dropped: how many samples, and messages beside them, found no place.
         """
-        ending = {
-            "samples": str(self._samples),
-            "dropped": str(dropped),
-            "interrupted": json.dumps(interrupted),
-        }
-        if self._messages or messages_dropped:
-            ending |= {"messages": str(self._messages), "messages_dropped": str(messages_dropped)}
+        ending = self._ending(interrupted, dropped, messages_dropped)
         if self._samples:
             self._sink.write_messages(self._evaluation.end(self._end_ns))
         layout = self._evaluation.layout(self._topics, self._axes)
@@ -144,6 +138,21 @@ class Recording:
         self._sink.add_metadata(ENDING, ending)
         hashes = certificate(self._sample_hash, self._message_hash, self._files, self._result_hash)
         self._sink.add_metadata(CERTIFICATE, hashes)
+
+    def break_off(self, *, dropped: int = 0, messages_dropped: int = 0) -> None:
+        """Write the end of a log whose last samples could not be written: it has no certificate."""
+        ending = self._ending(True, dropped, messages_dropped) | {"failed": "true"}
+        self._sink.add_metadata(ENDING, ending)
+
+    def _ending(self, interrupted: bool, dropped: int, messages_dropped: int) -> dict[str, str]:
+        ending = {
+            "samples": str(self._samples),
+            "dropped": str(dropped),
+            "interrupted": json.dumps(interrupted),
+        }
+        if self._messages or messages_dropped:
+            ending |= {"messages": str(self._messages), "messages_dropped": str(messages_dropped)}
+        return ending
 
 
 def _metadata(files: Sequence[Specification], about: Mapping[str, str]) -> dict[str, str]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.text import is_encodable
 
 LATEST_NS = 2**63 - 1
 """The latest time of a sample."""
@@ -29,6 +30,16 @@ def require_time(value: object, name: str) -> None:
         return
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
         raise UsageError(f"{name} is {shortened(value)}; give integer nanoseconds, 0 or more")
+
+
+def _require_name(name: object, what: str) -> None:
+    if not isinstance(name, str) or not name:
+        raise TraceError(f"{what} is named {shortened(name)}; give a text that is not empty")
+    if not is_encodable(name):
+        raise TraceError(
+            f"{what} is named {shortened(name)}, with half a character (a lone surrogate), which no log can"
+            ' hold; decode names with errors="replace"'
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +66,7 @@ class Sample:
             raise TraceError(f"time_ns is {self.time_ns}; give a time from 0 to 2**63 - 1 ns")
         objects: dict[str, TrackedObject | Footprint] = {}
         for name, tracked in self.objects.items():
-            if not isinstance(name, str) or not name:
-                raise TraceError(f"an object is named {name!r}; give a text that is not empty")
+            _require_name(name, "an object")
             if isinstance(tracked, Footprint):
                 tracked = TrackedObject(tracked)
             elif not isinstance(tracked, TrackedObject):
@@ -64,11 +74,10 @@ class Sample:
             objects[name] = tracked
         signals: dict[str, float] = {}
         for name, value in self.signals.items():
-            if not isinstance(name, str) or not name:
-                raise TraceError(f"a signal is named {name!r}; give a text that is not empty")
+            _require_name(name, "a signal")
             try:
                 signals[name] = float(value)
-            except (TypeError, ValueError) as error:
-                raise TraceError(f"signal {name!r} is {value!r}; give a number") from error
+            except (TypeError, ValueError, OverflowError) as error:
+                raise TraceError(f"signal {name!r} is {shortened(value)}; give a number") from error
         object.__setattr__(self, "objects", MappingProxyType(objects))
         object.__setattr__(self, "signals", MappingProxyType(signals))

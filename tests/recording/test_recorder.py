@@ -17,7 +17,18 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
 from replay.runs import PAST, SPECIFICATION, content_of, run, sample
-from spatial_replay import OutputError, Recorder, TraceError, UsageError, parse_specification, read_trace
+from spatial_replay import (
+    Footprint,
+    GeometryError,
+    OutputError,
+    Recorder,
+    Sample,
+    TraceError,
+    TrackedObject,
+    UsageError,
+    parse_specification,
+    read_trace,
+)
 from spatial_replay.recording import ENDING
 from spatial_replay.replay import load_files, run_replay
 from spatial_replay.sources import open_source
@@ -121,6 +132,50 @@ def test_a_full_disk_is_raised_in_the_loop() -> None:
     with pytest.raises(OutputError, match="no space left on the device"), Recorder("/dev/full") as recorder:
         for index in range(10**6):
             recorder.write(sample(index))
+
+
+def test_a_name_that_no_log_can_hold_is_refused_alone(tmp_path: Path) -> None:
+    box = Footprint.box(0, 0, 1, 1)
+    for index, bad in enumerate(({"objects": {"\ud800": box}}, {"signals": {"\udfff": 1.0}})):
+        path = tmp_path / f"run{index}.mcap"
+        with Recorder(path) as recorder:
+            recorder.write(sample(0))
+            with pytest.raises(TraceError, match="lone surrogate"):
+                recorder.write(Sample(5, **bad))
+            with pytest.raises(GeometryError, match="lone surrogate"):
+                TrackedObject(box, class_name="\ud83d")
+            recorder.write(sample(1))
+        assert read_trace(path) == run(2)
+        assert _ending(path)["interrupted"] == "false"
+
+
+def test_a_log_is_finished_whatever_goes_wrong_while_it_is_written(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    broken = sample(3)
+    # as no constructor lets it be
+    object.__setattr__(broken, "objects", {"a": None})
+    with (
+        pytest.raises(OutputError, match=r"run\.mcap ends here: .*AttributeError"),
+        Recorder(path) as recorder,
+    ):
+        for index in range(3):
+            recorder.write(sample(index))
+        recorder.write(broken)
+        recorder.write(sample(4))
+    assert read_trace(path) == run(3)
+    assert _ending(path) == {"samples": "3", "dropped": "0", "interrupted": "true", "failed": "true"}
+
+
+def test_a_second_recorder_of_a_log_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Recorder(path) as recorder:
+        recorder.write(sample(0))
+        with pytest.raises(OutputError, match="is being written by another recorder"):
+            Recorder(path)
+        recorder.write(sample(1))
+    assert read_trace(path) == run(2)
+    Recorder(path).close()
+    assert len(open_source(path).metadata()) > 1
 
 
 def test_one_specification_needs_no_list(tmp_path: Path) -> None:

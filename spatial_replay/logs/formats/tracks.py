@@ -22,6 +22,7 @@ from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.read_options import FaultList
+from spatial_replay.text import is_encodable
 from spatial_replay.trace.observations import Observations, trace_from_observations
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
@@ -318,9 +319,7 @@ def _check_keys(entry: dict[str, Any], known: set[str], what: str) -> None:
 
 def _is_text(text: str, *, empty: bool = False) -> bool:
     """Return whether a text fits UTF-8, unlike the halves of surrogate pairs that JSON can spell."""
-    if not text:
-        return empty
-    return text.isascii() or not any("\ud800" <= character <= "\udfff" for character in text)
+    return is_encodable(text) if text else empty
 
 
 def _kind(value: Any) -> str:
