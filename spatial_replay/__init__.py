@@ -37,11 +37,13 @@ if TYPE_CHECKING:
     from spatial_replay.automata.compile import automaton
     from spatial_replay.automata.guards import Transition
     from spatial_replay.batch.run import BatchResult
-    from spatial_replay.compare.alignment import Alignment, Knot, ObjectDiff, Parting
+    from spatial_replay.compare.alignment import Alignment, Knot, Parting
     from spatial_replay.compare.clips import Clip
     from spatial_replay.compare.decision_diff import DecisionDiff
     from spatial_replay.compare.edit_cause import EditOutcome
-    from spatial_replay.compare.runs import LogDiff, RunSpecDiff
+    from spatial_replay.compare.movement import ObjectDiff
+    from spatial_replay.compare.run_results import RunSpecDiff
+    from spatial_replay.compare.runs import LogDiff
     from spatial_replay.compare.specifications import (
         FirstDifference,
         SpecDiff,
@@ -188,11 +190,13 @@ __getattr__, __dir__ = loaded_when_used(
         "automata.automaton": ("Automaton",),
         "automata.compile": ("automaton",),
         "automata.guards": ("Transition",),
-        "compare.alignment": ("Alignment", "Knot", "ObjectDiff", "Parting"),
+        "compare.alignment": ("Alignment", "Knot", "Parting"),
         "compare.clips": ("Clip",),
         "compare.edit_cause": ("EditOutcome",),
         "compare.decision_diff": ("DecisionDiff",),
-        "compare.runs": ("LogDiff", "RunSpecDiff"),
+        "compare.movement": ("ObjectDiff",),
+        "compare.run_results": ("RunSpecDiff",),
+        "compare.runs": ("LogDiff",),
         "compare.specifications": (
             "FirstDifference",
             "SpecDiff",

@@ -21,7 +21,7 @@ from spatial_replay.automata.guards import (
 )
 from spatial_replay.automata.minimise import Machine
 from spatial_replay.automata.propositions import Proposition
-from spatial_replay.compiled import kernel
+from spatial_replay.compiled import elementwise, kernel
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Flags, Integers
 from spatial_replay.lazy import Displayed, drawn_as_svg
@@ -317,6 +317,7 @@ class TransitionTable:
         return result
 
 
+@elementwise
 @kernel
 def _walk(entries: Integers, decisions: Integers, state: int, values: Flags, result: Integers) -> None:
     for t in range(values.shape[1]):

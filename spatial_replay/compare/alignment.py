@@ -1,29 +1,23 @@
-"""Which sample of one run stands beside which of another, and how far each object is from itself there."""
+"""Which sample of one run stands beside which of another, and where two runs part in an automaton."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 from spatial_replay.annotate.automaton_state import AutomatonRun
 from spatial_replay.automata.compile import automaton
 from spatial_replay.errors import NoAutomatonError, UsageError
-from spatial_replay.geometry.arrays import Booleans, Floats, Integers
-from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
+from spatial_replay.geometry.arrays import Integers
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.formula import Specification
-from spatial_replay.trace.trace import Trace
 
 AlignmentKind: TypeAlias = Literal["time", "event", "progress"]
-
-_OTHER_UNITS: Final = 8.0
-"""Where every common object is so many times as large in one run, that run is in another unit."""
 
 
 class Knot(NamedTuple):
@@ -224,144 +218,3 @@ def _common(one: Sequence[_Visit], other: Sequence[_Visit]) -> int:
     return next(
         (index for index, (a, b) in enumerate(pairs) if a.states != b.states), min(len(one), len(other))
     )
-
-
-# ------------------------------------------------------------------------------ who moved differently
-
-
-@dataclass(frozen=True, slots=True)
-class ObjectDiff:
-    """One object in two aligned runs.
-
-    Attributes:
-        first_ns: the first sample of A in which it is not just where, or as, it is in B.
-        apart_ns: the first one in which the two footprints do not touch; None if they always do.
-        greatest: the greatest signed distance between the two footprints, at `greatest_ns`; NaN where none
-            was measured.
-        shift: how far its vertices' mean is away at most.
-        only_a, only_b: in how many pairs of samples only one run has it.
-    """
-
-    name: str
-    first_ns: int
-    apart_ns: int | None
-    greatest: float
-    greatest_ns: int
-    shift: float
-    only_a: int
-    only_b: int
-
-
-def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDiff, ...]:
-    """Return the common objects that moved differently: those apart first come first, then the farthest.
-
-    Raises:
-        UsageError: no object is in both runs, or one run is in another unit.
-    """
-    names = sorted(set(a.names) & set(b.names))
-    if not names and (a.names or b.names):
-        raise UsageError(
-            f"the runs have no object in common: {_listed(a.names)}; {_listed(b.names)}. "
-            "Map the same things to the same names"
-        )
-    shapes = _Shapes(a), _Shapes(b)
-    _check_units(a, b, names, shapes)
-    both = FootprintBatch.concatenate([a.footprints, b.footprints])
-    found = [
-        diff for name in names if (diff := _object_diff(name, a, b, alignment, shapes, both)) is not None
-    ]
-    never = int(a.times_ns[-1]) + 1
-    return tuple(
-        sorted(found, key=lambda each: (each.apart_ns or never, -each.shift, each.first_ns, each.name))
-    )
-
-
-class _Shapes:
-    """Columns of numbers of the observations of a trace, by which they are compared."""
-
-    def __init__(self, trace: Trace) -> None:
-        batch = trace.footprints
-        vertex = batch.vertex_start[batch.part_start]
-        count = np.maximum(np.diff(vertex), 1)
-        x, y = np.ascontiguousarray(batch.vertices.T)
-        sums = [_sums(each, vertex) for each in (x, y, x * x, y * y)]
-        self.mean = sums[0] / count, sums[1] / count
-        spread = (sums[2] + sums[3]) / count - self.mean[0] ** 2 - self.mean[1] ** 2
-        self.size = np.sqrt(np.maximum(spread, 0.0)) + _sums(batch.radius, batch.part_start)
-        optional = [each for each in (batch.bottom, batch.top, trace.yaw) if not np.isnan(each).all()]
-        self.columns = [*sums, self.size, trace.uncertainty, *optional]
-
-    def differ(self, rows: Integers, other: _Shapes, other_rows: Integers) -> Booleans:
-        """Return which of some observations are not those of another trace, in pairs."""
-        differs = np.full(len(rows), len(self.columns) != len(other.columns))
-        for column, beside in zip(self.columns, other.columns, strict=False):
-            one, two = column[rows], beside[other_rows]
-            differs |= (one != two) & ~(np.isnan(one) & np.isnan(two))
-        return differs
-
-
-def _sums(values: Floats, start: Integers) -> Floats:
-    """Return the sum of each ragged row, (R,)."""
-    return np.asarray(np.add.reduceat(values, start[:-1])) if len(start) > 1 else np.empty(0)
-
-
-def _object_diff(
-    name: str,
-    a: Trace,
-    b: Trace,
-    alignment: Alignment,
-    shapes: tuple[_Shapes, _Shapes],
-    both: FootprintBatch,
-) -> ObjectDiff | None:
-    one = a.rows[alignment.a, a.names.index(name)]
-    other = b.rows[alignment.b, b.names.index(name)]
-    differs: Booleans = (one >= 0) != (other >= 0)
-    only_a, only_b = (int(np.count_nonzero(differs & (rows >= 0))) for rows in (one, other))
-    pairs = np.flatnonzero((one >= 0) & (other >= 0))
-    pairs = pairs[shapes[0].differ(one[pairs], shapes[1], other[pairs])]
-    differs[pairs] = True
-    if not differs.any():
-        return None
-    times_ns = a.times_ns[alignment.a]
-    first_ns = int(times_ns[differs.argmax()])
-    if not len(pairs):
-        return ObjectDiff(name, first_ns, None, np.nan, first_ns, 0.0, only_a, only_b)
-    one, other = one[pairs], other[pairs]
-    operands = [Operand(one[:, None]), Operand(other[:, None] + len(a.footprints))]
-    distance = measure(both, operands, [MeasureRequest("signed_distance", 0, 1)])[0]
-    apart = np.flatnonzero(distance > 0.0)
-    x, y = (mine[one] - its[other] for mine, its in zip(shapes[0].mean, shapes[1].mean, strict=True))
-    shift = np.hypot(x, y)
-    farthest = int(distance.argmax())
-    return ObjectDiff(
-        name,
-        first_ns,
-        int(times_ns[pairs[apart[0]]]) if len(apart) else None,
-        float(distance[farthest]),
-        int(times_ns[pairs[farthest]]),
-        float(shift.max()),
-        only_a,
-        only_b,
-    )
-
-
-def _check_units(a: Trace, b: Trace, names: Sequence[str], shapes: tuple[_Shapes, _Shapes]) -> None:
-    """Refuse runs whose common objects are all many times as large in one as in the other."""
-    ratios, example = [], ""
-    for name in names:
-        sizes = [
-            float(np.median(own.size[rows[rows >= 0]])) if (rows >= 0).any() else 0.0
-            for trace, own in zip((a, b), shapes, strict=True)
-            for rows in [trace.rows[:, trace.names.index(name)]]
-        ]
-        if min(sizes) > 0.0:
-            ratios.append(sizes[0] / sizes[1])
-            example = example or f"{name} is {ratios[0]:.3g} times as large in the first"
-    if ratios and (min(ratios) >= _OTHER_UNITS or max(ratios) <= 1.0 / _OTHER_UNITS):
-        raise UsageError(
-            f"the runs seem to be in other units: {example}. Read both in one unit, by a mapping with `scale`"
-        )
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:8]) + (", …" if len(names) > 8 else "") or "none"

@@ -6,17 +6,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-import numpy as np
-
-from spatial_replay.compare.alignment import (
-    Alignment,
-    ObjectDiff,
-    Parting,
-    align_runs,
-    compare_objects,
-    parting_of,
-)
+from spatial_replay.compare.alignment import Alignment, align_runs
 from spatial_replay.compare.decision_diff import DecisionDiff, compare_decisions
+from spatial_replay.compare.movement import ObjectDiff, compare_objects, movement_sentence
+from spatial_replay.compare.run_results import RunSpecDiff, compare_results
 from spatial_replay.errors import UsageError
 from spatial_replay.lazy import Displayed
 from spatial_replay.logs.source import Source
@@ -24,94 +17,14 @@ from spatial_replay.logs.topics import CERTIFICATE
 from spatial_replay.monitor.evaluate import Evaluation, evaluate
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import require_ltlf
-from spatial_replay.monitor.sentences import number_text, reason_sentence
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, LogNames, ReplayOptions, Selection
 from spatial_replay.spec.diagnostics import Diagnostic
-from spatial_replay.spec.formula import Atom, Specification, iter_nodes
-from spatial_replay.spec.walks import other_names
-from spatial_replay.text import Instant, Sentence, counted, json_number
+from spatial_replay.spec.formula import Specification
+from spatial_replay.text import counted, json_number
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
 
 _MOST_LISTED: Final = 12
-
-
-@dataclass(frozen=True, eq=False)
-class RunSpecDiff:
-    """One result in two runs.
-
-    Attributes:
-        a, b: the results.
-        first_ns: the first sample of A with a value of another sign than the one beside it in B, or None.
-        nodes: ids of the deepest nodes whose verdicts differ.
-        parting: where the runs part in its automaton; None if the verdict is the same, or it has none.
-        moved: the objects that the deciding atoms are about, as far as they moved differently.
-    """
-
-    a: SpecResult
-    b: SpecResult
-    first_ns: int | None
-    nodes: tuple[int, ...]
-    parting: Parting | None
-    moved: tuple[ObjectDiff, ...]
-
-    @property
-    def is_flipped(self) -> bool:
-        """Whether the verdict differs."""
-        return self.a.verdict is not self.b.verdict
-
-    @property
-    def is_different(self) -> bool:
-        """Whether the verdict or a final number differs."""
-        one, other = ((each.robustness, each.lower, each.upper) for each in (self.a, self.b))
-        return self.is_flipped or not np.array_equal(one, other, equal_nan=True)
-
-    def sentences(self, starts_ns: tuple[int, int]) -> Iterator[Sentence]:
-        """Yield what differs; times of each run count from its own start."""
-        texts = [f"{each.verdict} ({number_text(each.robustness)})" for each in (self.a, self.b)]
-        yield Sentence(" | ".join(texts) + ("" if self.is_different else ", the same"))
-        if self.first_ns is not None:
-            yield Sentence("the sign of its value differs since ", Instant(self.first_ns, starts_ns[0]))
-        if self.parting is not None:
-            where = self.parting
-            yield Sentence(
-                "they part in the automaton: ",
-                *_entered(where.a_ns, where.a_states, starts_ns[0]),
-                " | ",
-                *_entered(where.b_ns, where.b_states, starts_ns[1]),
-            )
-        for node in self.nodes:
-            yield Sentence(f"brought about by `{self.a.nodes[node].text}`")
-        for which, result, start_ns in zip("AB", (self.a, self.b), starts_ns, strict=True):
-            if self.is_flipped and result.causes and result.causes[0].witness is not None:
-                reason = reason_sentence(result.causes[0].witness, first_ns=start_ns)
-                yield Sentence(f"{which}: ", *reason.parts)
-        if self.moved:
-            names = ", ".join(each.name for each in self.moved)
-            yield Sentence(f"of what it is about, these moved differently: {names}")
-
-    @property
-    def document(self) -> dict[str, Any]:
-        """The same as values for JSON."""
-        parting = self.parting
-        return {
-            "name": self.a.name,
-            "object": self.a.object,
-            "flipped": self.is_flipped,
-            "a": _result_value(self.a),
-            "b": _result_value(self.b),
-            "first_ns": self.first_ns,
-            "nodes": [{"id": node, "text": self.a.nodes[node].text} for node in self.nodes],
-            "parting": None
-            if parting is None
-            else {
-                "a_ns": parting.a_ns,
-                "b_ns": parting.b_ns,
-                "a_states": list(parting.a_states),
-                "b_states": list(parting.b_states),
-            },
-            "moved": [each.name for each in self.moved],
-        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,7 +242,7 @@ def compare_runs(
         objects,
         tuple(sorted(set(a.names) - set(b.names)) + sorted(titles[0] - titles[1])),
         tuple(sorted(set(b.names) - set(a.names)) + sorted(titles[1] - titles[0])),
-        tuple(_spec_diff(one, other, alignment, traces, objects, files) for one, other in results),
+        tuple(compare_results(one, other, alignment, traces, objects, files) for one, other in results),
         compare_decisions(sources),
         not objects and a == b,
         (*a.faults, *b.faults),
@@ -359,96 +272,3 @@ def _paired(evaluations: Sequence[Sequence[Evaluation]]) -> list[tuple[SpecResul
         named = {result.title: result for result in other}
         pairs += [(result, named[result.title]) for result in one if result.title in named]
     return pairs
-
-
-def _spec_diff(
-    one: SpecResult,
-    other: SpecResult,
-    alignment: Alignment,
-    traces: tuple[Trace, Trace],
-    objects: Sequence[ObjectDiff],
-    files: Sequence[Specification],
-) -> RunSpecDiff:
-    moved = {each.name: each for each in objects}
-    nodes = _deepest_flipped(one, other)
-    if not nodes and one.robustness != other.robustness:
-        nodes = (one.witness().path[-1].node,)
-    names = [name for node in nodes for name in sorted(_objects_of(one, node)) if name in moved]
-    return RunSpecDiff(
-        one,
-        other,
-        _first_sign(one, other, alignment, traces),
-        nodes,
-        parting_of(one, other, files) if one.verdict is not other.verdict else None,
-        tuple(moved[name] for name in dict.fromkeys(names)),
-    )
-
-
-def _deepest_flipped(one: SpecResult, other: SpecResult) -> tuple[int, ...]:
-    """Return the nodes with other verdicts that have no such node below."""
-    flipped = {
-        node.id
-        for node, beside in zip(one.nodes, other.nodes, strict=True)
-        if node.verdict is not beside.verdict
-    }
-    if 0 not in flipped:
-        return ()
-    below = {one.nodes[node].parent for node in flipped}
-    # of a conjunction only what brought it about: the way down from the root is flipped, too
-    reached = {0}
-    for node in sorted(flipped):
-        if one.nodes[node].parent in reached:
-            reached.add(node)
-    return tuple(sorted(reached - below))
-
-
-def _objects_of(result: SpecResult, node: int) -> frozenset[str]:
-    formula = next(each for identifier, _, each in iter_nodes(result.formula) if identifier == node)
-    bound = result.evidence.bound(formula)
-    names: set[str] = set(other_names(bound))
-    for _, _, leaf in iter_nodes(bound):
-        if isinstance(leaf, Atom):
-            names |= {getattr(term, "name", "") for term in leaf.terms}
-    return frozenset(names)
-
-
-def _first_sign(
-    one: SpecResult, other: SpecResult, alignment: Alignment, traces: tuple[Trace, Trace]
-) -> int | None:
-    """Return the first sample with a value of another sign than the one beside it."""
-    signs = []
-    for result, trace, chosen in zip((one, other), traces, (alignment.a, alignment.b), strict=True):
-        value = np.full(len(trace), np.nan)
-        value[np.searchsorted(trace.times_ns, result.times_ns)] = result.series[0, 0]
-        signs.append(np.where(np.isnan(value), 0, np.where(value >= 0.0, 1, -1))[chosen])
-    differs = signs[0] != signs[1]
-    return int(traces[0].times_ns[alignment.a[differs.argmax()]]) if differs.any() else None
-
-
-def movement_sentence(each: ObjectDiff, start_ns: int) -> Sentence:
-    """Return since when an object moved differently, and how far the two are apart."""
-    parts: list[str | Instant] = ["differs since ", Instant(each.first_ns, start_ns)]
-    if each.shift:
-        parts.append(f", by up to {number_text(each.shift)}")
-    if each.apart_ns is not None:
-        parts += ["; apart from itself since ", Instant(each.apart_ns, start_ns)]
-        parts += [f", farthest by {number_text(each.greatest)} at ", Instant(each.greatest_ns, start_ns)]
-    for which, count in (("A", each.only_a), ("B", each.only_b)):
-        if count:
-            parts.append(f"; only {which} has it in {counted(count, 'sample')}")
-    return Sentence(*parts)
-
-
-def _entered(time_ns: int | None, states: Sequence[int], start_ns: int) -> tuple[str | Instant, ...]:
-    if time_ns is None:
-        return ("the end of the run",)
-    return f"state {', '.join(map(str, states))} at ", Instant(time_ns, start_ns)
-
-
-def _result_value(result: SpecResult) -> dict[str, Any]:
-    return {
-        "verdict": str(result.verdict),
-        "robustness": json_number(result.robustness),
-        "lower": json_number(result.lower),
-        "upper": json_number(result.upper),
-    }

@@ -7,6 +7,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -42,28 +43,22 @@ def bench_diff(measure: Any) -> None:
     sr.diff_specifications(trace, old, new)
     sr.diff_logs(trace, moved, old)
 
-    def fresh() -> sr.Trace:
-        return replace(trace)
-
-    started = perf_counter()
-    sr.evaluate(old, fresh())
-    evaluation_s = perf_counter() - started
-    measure("one evaluation", lambda own: sr.evaluate(old, own), prepare=fresh, unit="trace", runs=3)
-    measure(
-        "two specifications",
-        lambda own: sr.diff_specifications(own, old, new),
-        prepare=fresh,
-        unit="trace",
-        runs=3,
-        limit_s=1.5 * evaluation_s,
-    )
-    measure(
-        "two runs",
-        lambda pair: sr.diff_logs(*pair, old),
-        prepare=lambda: (replace(trace), replace(moved)),
-        unit="pair",
-        runs=3,
-        limit_s=1.0,
+    # one after the other, so that whatever else runs meanwhile slows all three down alike
+    times_s: dict[str, list[float]] = {"one evaluation": [], "two specifications": [], "two runs": []}
+    for _ in range(5):
+        for name, run in (
+            ("one evaluation", partial(sr.evaluate, old, replace(trace))),
+            ("two specifications", partial(sr.diff_specifications, replace(trace), old, new)),
+            ("two runs", partial(sr.diff_logs, replace(trace), replace(moved), old)),
+        ):
+            started = perf_counter()
+            run()
+            times_s[name].append(perf_counter() - started)
+    for name, taken in times_s.items():
+        measure.quantile(name, taken, 0.5, unit="trace", limit_s=1.0 if name == "two runs" else None)
+    pairs = zip(times_s["two specifications"], times_s["one evaluation"], strict=True)
+    measure.ratio(
+        "specifications to evaluation", float(np.median([one / other for one, other in pairs])), 1.5
     )
 
 
