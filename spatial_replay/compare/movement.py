@@ -25,7 +25,7 @@ _PAIRS_AT_ONCE: Final = 16_384
 """Observations that are compared at once: few enough for the processor's cache."""
 
 _MOST_SIZES: Final = 256
-"""Samples of an object whose size tells its unit."""
+"""Samples of an object that its size is the median of."""
 
 
 @dataclass(frozen=True, slots=True)

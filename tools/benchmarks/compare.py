@@ -43,7 +43,7 @@ def bench_diff(measure: Any) -> None:
     sr.diff_specifications(trace, old, new)
     sr.diff_logs(trace, moved, old)
 
-    # one after the other, so that whatever else runs meanwhile slows all three down alike
+    # one after the other, so that other load on the machine slows all three down alike
     times_s: dict[str, list[float]] = {"one evaluation": [], "two specifications": [], "two runs": []}
     for _ in range(5):
         for name, run in (
