@@ -1,6 +1,7 @@
 """The smallest part of a log that still shows why a verdict is what it is, as a log of its own.
 
-A window of samples is searched whose replay has the verdict, the robustness and the witness of the whole log.
+A window of samples is searched whose replay has the verdict, the robustness and the witness of the whole log,
+and those of the part that settled a violation first.
 No window is measured again: atoms are those of the first replay, except the first few that look back to
 before the window, where a clip has no samples.
 """
@@ -185,6 +186,14 @@ def _chosen(results: Sequence[SpecResult], of: Sequence[str]) -> list[_Kept]:
     return found
 
 
+def _first_causes(kept: Sequence[_Kept]) -> Iterator[_Kept]:
+    """Yield the part of each node that settled its violation: not always the one that its number is of."""
+    for each in kept:
+        first = next(iter(each.result.causes_of(each.node)), None)
+        if first is not None and first.settled_ns is not None and first.node != each.node:
+            yield _Kept(each.result, first.node, each.title)
+
+
 class _Reason(NamedTuple):
     """A result on some samples, as a clip has to repeat it.
 
@@ -278,7 +287,9 @@ class _Search:
         if needs_samples:
             trace = Selection(source, files, options).trace()
         self._parts = [
-            _Part(each, trace, _regions(files, each.result)) for each in kept if len(each.result.times_ns)
+            _Part(each, trace, _regions(files, each.result))
+            for each in (*kept, *_first_causes(kept))
+            if len(each.result.times_ns)
         ]
         self._times_ns = _joined_times([result.times_ns for result in results])
         decided = [part.reason.decided_ns for part in self._parts]

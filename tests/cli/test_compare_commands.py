@@ -158,6 +158,30 @@ def test_a_clip_says_how_small_it_got_and_is_replayed_without_other_files(
     assert said(capsys, *arguments, "--around", "1s")[1].count("61 of 540 samples") == 1
 
 
+def test_a_clip_fails_for_the_reason_that_settled_the_verdict_not_only_with_the_least_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    samples = [sr.Sample(index * 10**9, {}, {"gap": 3.0 - index, "done": -9.0}) for index in range(5)]
+    Path("run.spatial").write_text(
+        "spec safe = G (gap >= 0.5)\nspec deliver = F (done >= 1)\nspec task = safe and deliver\n"
+    )
+    with sr.Recorder("run.mcap") as recorder:
+        for sample in samples:
+            recorder.write(sample)
+    assert said(capsys, "clip", "run.mcap", "--spec", "run.spatial", "-o", "bug.mcap")[0] == 0
+    whole, cut = (
+        sr.evaluate(sr.load_specification("run.spatial"), sr.read_trace(path)).result()
+        for path in ("run.mcap", "bug.mcap")
+    )
+    assert cut.robustness == whole.robustness == -10.0
+    for result in (whole, cut):
+        assert [cause.spec for cause in result.causes] == ["safe", "deliver"]
+        assert result.worst is not None
+        assert result.worst.deciding is not None
+        assert result.worst.deciding.text == "gap >= 0.5"
+
+
 def test_a_verdict_that_needs_the_whole_log_is_said_to(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
