@@ -33,6 +33,9 @@ GRADIENT_MAP = "/plan/gradient_map"
 PLAN_PATH = "/plan/path"
 """Topics that a planner writes; a replay copies them."""
 
+LIBRARY = "spatial-replay"
+"""How our writer names itself in the header of a log."""
+
 METADATA = "spatial_replay"
 """The metadata record that comes first: who wrote the log, from what, with which options."""
 

@@ -23,6 +23,7 @@ from spatial_replay import (
     UsageError,
     read_trace,
 )
+from spatial_replay.cli import run
 from spatial_replay.logs import (
     Channel,
     LogWriter,
@@ -39,6 +40,7 @@ from spatial_replay.logs.topics import OBJECTS, ROBUSTNESS, protobuf_channel
 from spatial_replay.sources import open_source
 
 SAMPLES = protobuf_channel(OBJECTS, ObjectStates)
+JOINTS = Channel("/joints", "json", None)
 
 
 def moving_cup(count, step_ns=400_000_000):
@@ -177,6 +179,25 @@ def test_a_damaged_chunk_costs_its_samples_only(log):
         read_trace(log(bytes(content)))
 
 
+@pytest.mark.parametrize("cut", [0, 60])
+def test_a_missing_checksum_in_a_log_of_ours_is_a_fault(log, cut):
+    trace = moving_cup(12)
+    content = bytearray(log_of(trace))
+    chunks = make_reader(io.BytesIO(bytes(content))).get_summary().chunk_indexes
+    # with a damaged end, too, where the log is read without its index
+    content = content[: len(content) - cut]
+    hit = sorted(chunks, key=lambda chunk: chunk.chunk_start_offset)[1]
+    checksum = hit.chunk_start_offset + 9 + 24
+    content[checksum : checksum + 4] = bytes(4)
+    part = read_trace(log(bytes(content)), allow_damage=True)
+    assert part == trace.take(np.array([0, 1, 2, 6, 7, 8, 9, 10, 11]))
+    assert any("the chunk has no checksum" in fault for fault in part.faults)
+    # others may write none
+    content[:100] = bytes(content[:100]).replace(b"spatial-replay", b"another_writer")
+    whole = read_trace(log(bytes(content)), allow_damage=True)
+    assert (len(whole), bool(whole.faults)) == (12, cut > 0)
+
+
 def test_garbage_in_the_middle_of_a_log_without_summary_costs_what_it_hides(log):
     trace = moving_cup(12)
     content = log_of(trace)
@@ -276,6 +297,25 @@ def test_times_that_repeat_or_disagree_are_faults(log):
     assert part.times_ns.tolist() == [first, third]
     assert "at this time already" in part.faults[0]
     assert f"time_ns is {third}" in part.faults[1]
+
+
+def test_a_copy_of_a_damaged_log_is_sound(log, tmp_path, capsys):
+    trace = moving_cup(6)
+    payloads, times = encode_objects(trace), trace.times_ns.tolist()
+    wrong = [payloads[0], payloads[0], payloads[1], payloads[1], b"\xff\xff", *payloads[3:]]
+    beside = messages(JOINTS, [times[1]] * 2, [b"{}"] * 2)
+    stream = io.BytesIO()
+    with LogWriter(stream) as writer:
+        writer.write_messages(messages(SAMPLES, [times[0], *times[:2], times[1], *times[2:]], wrong))
+        writer.write_messages(beside)
+    (tmp_path / "a.spatial").write_text("G (cup dist cup <= 1)")
+    copy = tmp_path / "copy.mcap"
+    command = ["replay", "--spec", str(tmp_path / "a.spatial")]
+    assert run([*command, str(log(stream.getvalue())), "-o", str(copy)]) == 3
+    assert capsys.readouterr().err.count("at this time already") == 2
+    assert read_trace(copy) == trace.take(np.array([0, 1, 3, 4, 5]))
+    assert run([*command, str(copy)]) == 0
+    assert run(["verify", str(copy)]) == 0
 
 
 @pytest.mark.parametrize(

@@ -162,6 +162,7 @@ class ChunkPlace:
         start_ns, end_ns: log times of its first and last message.
         compressed: whether it is a chunk; else records outside chunks.
         channels: those with messages in it, by the index; None where it does not say.
+        has_checksum: whether a chunk must have a checksum, as those of our own logs do.
     """
 
     offset: int
@@ -170,6 +171,7 @@ class ChunkPlace:
     end_ns: int
     compressed: bool = True
     channels: frozenset[int] | None = None
+    has_checksum: bool = False
 
 
 def chunk_place(offset: int, record: bytes, length: int) -> ChunkPlace:
@@ -212,7 +214,9 @@ def read_records(stream: BinaryIO, place: ChunkPlace) -> bytes:
     content = _decompressed(record[_FIXED_HEAD:begin], record[begin + 8 :], size)
     if len(content) != size:
         raise DamageError(f"the chunk holds {len(content)} bytes instead of {size}")
-    if checksum and zlib.crc32(content) != checksum:
+    if (checksum or place.has_checksum) and zlib.crc32(content) != checksum:
+        if not checksum:
+            raise DamageError("the chunk has no checksum, and every log of ours has one")
         raise DamageError("the chunk's checksum does not fit its content")
     return content
 

@@ -10,7 +10,7 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from heapq import merge
 from types import MappingProxyType
 from typing import BinaryIO
@@ -21,6 +21,7 @@ from mcap.opcode import Opcode
 from spatial_replay.logs.mcap.chunks import MAGIC, RECORD_HEAD, ChunkPlace, DamageError, chunk_place, decoded
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.read_options import FaultList
+from spatial_replay.logs.topics import LIBRARY
 
 _FOOTER_BYTES = RECORD_HEAD.size + 20
 _CHUNK_HEAD_BYTES = 64
@@ -60,15 +61,22 @@ def read_directory(stream: BinaryIO, faults: FaultList, name: str) -> Directory:
     """Read the directory of an MCAP file; what is wrong with the file goes to `faults`."""
     size = stream.seek(0, os.SEEK_END)
     try:
-        return _from_summary(stream, size)
+        directory = _from_summary(stream, size)
     except _NoSummaryError:
-        return _Scan(stream, size, faults, name).directory()
+        directory = _Scan(stream, size, faults, name).directory()
     except DamageError as damage:
         known = len(faults)
         directory = _Scan(stream, size, faults, name).directory()
         if len(faults) == known:
             faults.add(f"{name}: {damage}; the log was read without its index")
-        return directory
+    if _is_own(directory.header):
+        directory.chunks = [replace(place, has_checksum=True) for place in directory.chunks]
+    return directory
+
+
+def _is_own(header: records.Header | None) -> bool:
+    """Return whether we wrote a log: then all of it has checksums, and one that is missing is damage."""
+    return header is not None and header.library == LIBRARY
 
 
 def has_summary(stream: BinaryIO) -> bool:
@@ -106,7 +114,8 @@ def _from_summary(stream: BinaryIO, size: int) -> Directory:
         raise DamageError("the footer points outside the file")
     stream.seek(footer.summary_start)
     section = stream.read(size - tail_bytes - footer.summary_start)
-    if footer.summary_crc and zlib.crc32(section + tail[: _FOOTER_BYTES - 4]) != footer.summary_crc:
+    has_checksum = footer.summary_crc or _is_own(directory.header)
+    if has_checksum and zlib.crc32(section + tail[: _FOOTER_BYTES - 4]) != footer.summary_crc:
         raise DamageError("the summary's checksum does not fit")
     for opcode, body in _iter_bodies(section):
         _take_in(directory, opcode, body)
@@ -320,7 +329,7 @@ def iter_attachments(
             texts = len(record.name.encode()) + len(record.media_type.encode())
             size = _ATTACHMENT_NUMBERS + texts + len(record.data)
             checksum = int.from_bytes(body[size : size + 4], "little")
-            if checksum and zlib.crc32(body[:size]) != checksum:
+            if (checksum or _is_own(directory.header)) and zlib.crc32(body[:size]) != checksum:
                 raise DamageError("an attachment's checksum does not fit")
         except DamageError as damage:
             faults.add(f"{name}: at byte {offset}: {damage}; the attachment is lost")

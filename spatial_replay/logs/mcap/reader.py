@@ -37,7 +37,7 @@ from spatial_replay.logs.mcap.index import (
     iter_metadata,
     read_directory,
 )
-from spatial_replay.logs.messages import BLOCK_SAMPLES, Attachment, Block, Channel, Messages, Schema
+from spatial_replay.logs.messages import BLOCK_SAMPLES, Attachment, Block, Channel, Messages, Schema, select
 from spatial_replay.logs.objects.decode import decode_objects
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, RemoteFile, open_file
@@ -306,7 +306,8 @@ class _BlockDecoder:
         """Decode the samples among some messages."""
         columns = self._columns(messages)
         samples = [number for number, channel in columns.channels.items() if self._is_objects(channel)]
-        own = np.flatnonzero(np.isin(columns.channel, samples))
+        is_own = np.isin(columns.channel, samples)
+        own = np.flatnonzero(is_own)
         times = columns.log_time_ns[own]
         before = np.maximum.accumulate(np.concatenate([[self._latest_ns], times]))
         for time_ns in times[times <= before[:-1]].tolist():
@@ -316,6 +317,10 @@ class _BlockDecoder:
         trace, faults = decode_objects(payloads, columns.log_time_ns[own], concave=self._source.concave)
         for fault in faults:
             self._fault(fault)
+        if len(trace) < int(is_own.sum()):
+            # a copy holds the samples that were read, and is sound
+            read = own[np.isin(columns.log_time_ns[own], trace.times_ns)]
+            columns = select(columns, np.union1d(np.flatnonzero(~is_own), read))
         self.any_sample = self.any_sample or len(trace) > 0
         lost = self._walk.faults.take()
         self.first_fault = self.first_fault or next(iter(lost), None)

@@ -25,7 +25,7 @@ from spatial_replay.logs.mcap.chunks import MAGIC, encoded
 from spatial_replay.logs.mcap.packing import Batch, McapSummary, MessageRange, PackedChunk, pack
 from spatial_replay.logs.messages import Channel, Messages, Schema, messages_of, select
 from spatial_replay.logs.output_file import output_error
-from spatial_replay.logs.topics import OWN_PREFIX
+from spatial_replay.logs.topics import LIBRARY, OWN_PREFIX
 
 CHUNK_BYTES = 128 * 2**10
 """A chunk is closed when it holds this much, uncompressed."""
@@ -69,7 +69,7 @@ class LogWriter:
         stream: BinaryIO,
         *,
         profile: str = "",
-        library: str = "spatial-replay",
+        library: str = LIBRARY,
         clock: Callable[[], float] | None = None,
     ) -> None:
         """Begin a log.
