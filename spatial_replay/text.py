@@ -51,12 +51,15 @@ class Sentence(str):
         return made
 
 
-def counted_from(text: str, first_ns: int) -> str:
-    """Return a text whose times, if it knows them, count from `first_ns`."""
-    if not isinstance(text, Sentence):
-        return text
-    return Sentence(
-        *(Instant(part.time_ns, first_ns) if isinstance(part, Instant) else part for part in text.parts)
+def counted_from(texts: Iterable[str], first_ns: int) -> tuple[str, ...]:
+    """Return texts whose times, where they know them, count from `first_ns`."""
+    return tuple(
+        Sentence(
+            *(Instant(part.time_ns, first_ns) if isinstance(part, Instant) else part for part in text.parts)
+        )
+        if isinstance(text, Sentence)
+        else text
+        for text in texts
     )
 
 

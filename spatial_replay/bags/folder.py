@@ -25,6 +25,7 @@ from spatial_replay.errors import LogError, MissingFileError
 from spatial_replay.logs.mcap.chunks import MAGIC
 from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList
+from spatial_replay.text import Instant, Sentence
 
 METADATA_FILE = "metadata.yaml"
 _ENDINGS = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
@@ -225,9 +226,9 @@ class BagFolder(MessageReader):
     def _unpacked(self, packed: MessageColumns, plain: set[str]) -> MessageColumns:
         payloads: list[bytes] = []
         places: list[int] = []
-        lost: dict[str, list[str]] = {}
+        lost: dict[str, list[Sentence]] = {}
         for place, payload in enumerate(packed.payloads):
-            topic, when = packed.topics[place], f"{packed.log_time_ns[place]} ns"
+            topic, when = packed.topics[place], Instant(int(packed.log_time_ns[place]), 0)
             try:
                 if not payload.startswith(_CDR_BEGIN):
                     payloads.append(unpacked(payload))
@@ -236,15 +237,19 @@ class BagFolder(MessageReader):
                     if topic not in plain:
                         plain.add(topic)
                         self._remarks.add(
-                            f"{self.name}: messages on {topic!r} are plain, the first at {when}, although"
-                            f" {METADATA_FILE} declares them as compressed; they are read as they are"
+                            Sentence(
+                                f"{self.name}: messages on {topic!r} are plain, the first at ",
+                                Sentence(when, f", although {METADATA_FILE} declares them as compressed"),
+                                "; they are read as they are",
+                            )
                         )
                 places.append(place)
             except LogError as error:
-                lost.setdefault(topic, []).append(f"on {topic!r} at {when}: {error}")
+                lost.setdefault(topic, []).append(Sentence(f"on {topic!r} at ", when, f": {error}"))
         for first, *others in lost.values():
-            more = f"; so are {len(others)} more up to {packed.log_time_ns[-1]} ns" if others else ""
-            self._faults.add(f"{self.name}: {first}, and is lost{more}")
+            latest = Instant(int(packed.log_time_ns[-1]), 0)
+            more = Sentence(f"; so are {len(others)} more up to ", latest) if others else ""
+            self._faults.add(Sentence(f"{self.name}: ", first, ", and is lost", more))
         return replace(packed.take(np.array(places, np.int64)), payloads=payloads)
 
 

@@ -26,6 +26,7 @@ from spatial_replay.logs.mcap.reader import ChunkWalk
 from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, open_file
+from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.sample import LATEST_NS
 
 _MESSAGE_FIELDS = 22
@@ -136,22 +137,27 @@ class McapLog(MessageReader):
         self, stream: BinaryIO, rank: int, place: ChunkPlace, wanted: dict[int, str], first: int, last: int
     ) -> MessageColumns:
         """Read the messages in a place; what is lost of them goes to the faults."""
-        span = f"messages between {place.start_ns} and {place.end_ns} ns"
+        span = Sentence("messages between ", Instant(place.start_ns, 0), " and ", Instant(place.end_ns, 0))
         try:
             content = read_records(stream, place)
         except DamageError as damage:
-            self._fault(place, f"{damage}; the {span} are lost")
+            self._fault(place, Sentence(f"{damage}; the ", span, " are lost"))
             return MessageColumns()
         heads, breaks_off = walk_records(content)
         is_message = (heads.opcode == Opcode.MESSAGE) & (heads.end - heads.begin >= _MESSAGE_FIELDS)
         if breaks_off:
-            self._fault(place, f"a record breaks off; of the {span}, {is_message.sum()} could be read")
+            self._fault(
+                place, Sentence("a record breaks off; of the ", span, f", {is_message.sum()} could be read")
+            )
         self._walked += int(is_message.sum())
         beyond = is_message & (heads.log_time > LATEST_NS)
         if beyond.any():
-            self._fault(place, f"{beyond.sum()} of the {span} have a time beyond 2**63 - 1 ns")
+            self._fault(place, Sentence(f"{beyond.sum()} of the ", span, " have a time beyond 2**63 - 1 ns"))
         if len(unknown := set(np.unique(heads.channel[is_message]).tolist()) - self._contents[1].keys()):
-            self._fault(place, f"some of the {span} are of a channel {min(unknown)} that is not declared")
+            self._fault(
+                place,
+                Sentence("some of the ", span, f" are of a channel {min(unknown)} that is not declared"),
+            )
         rows = is_message & np.isin(heads.channel, np.array(list(wanted), np.uint64))
         rows &= (heads.log_time >= first) & (heads.log_time < last)
         bounds = zip((heads.begin[rows] + _MESSAGE_FIELDS).tolist(), heads.end[rows].tolist(), strict=True)
@@ -166,7 +172,7 @@ class McapLog(MessageReader):
         )
 
     def _fault(self, place: ChunkPlace, what: str) -> None:
-        self._faults.add(f"{self.name}: at byte {place.offset}: {what}")
+        self._faults.add(Sentence(f"{self.name}: at byte {place.offset}: ", what))
 
 
 def _topic(channel: Channel, count: int | None) -> Topic:

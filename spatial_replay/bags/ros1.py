@@ -32,6 +32,7 @@ from spatial_replay.bags.topic import Topic
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.chunks import DamageError
 from spatial_replay.logs.messages import Channel, Schema
+from spatial_replay.text import Instant, Sentence
 
 
 class Ros1Bag(MessageReader):
@@ -97,15 +98,15 @@ class Ros1Bag(MessageReader):
         last: int,
     ) -> MessageColumns:
         """Read the messages of a chunk; what is lost of them goes to the faults."""
-        span = f"messages between {chunk.start_ns} and {chunk.end_ns} ns"
+        span = Sentence("messages between ", Instant(chunk.start_ns, 0), " and ", Instant(chunk.end_ns, 0))
         try:
             content = read_chunk(stream, chunk.offset)
         except DamageError as damage:
-            self._fault(chunk, f"{damage}; the {span} are lost")
+            self._fault(chunk, Sentence(f"{damage}; the ", span, " are lost"))
             return MessageColumns()
         table, breaks_off = record_table(content)
         if breaks_off:
-            self._fault(chunk, f"a record breaks off; some of the {span} are lost")
+            self._fault(chunk, Sentence("a record breaks off; some of the ", span, " are lost"))
         try:
             for connection in connections_in(content, table):
                 if wanted.get(connection.number, connection) != connection:
@@ -114,7 +115,7 @@ class Ros1Bag(MessageReader):
             self._fault(chunk, f"{damage}; a connection is described there")
         is_message = table.opcode == MESSAGE
         if (chunk.start_ns, chunk.end_ns) != _span(table.time_ns[is_message]):
-            self._fault(chunk, f"the {span} have other times than the index says")
+            self._fault(chunk, Sentence("the ", span, " have other times than the index says"))
         rows = is_message & np.isin(table.connection, list(wanted))
         rows &= (table.time_ns >= first) & (table.time_ns < last)
         bounds = zip(table.begin[rows].tolist(), table.end[rows].tolist(), strict=True)
@@ -145,7 +146,7 @@ class Ros1Bag(MessageReader):
         )
 
     def _fault(self, chunk: BagChunk, what: str) -> None:
-        self._faults.add(f"{self.name}: at byte {chunk.offset}: {what}")
+        self._faults.add(Sentence(f"{self.name}: at byte {chunk.offset}: ", what))
 
 
 def _span(times_ns: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> tuple[int, int]:

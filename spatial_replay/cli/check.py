@@ -30,7 +30,7 @@ from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import iter_branches, label_of, title_text
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operator_of
 from spatial_replay.spec.tokens import quoted
-from spatial_replay.text import counted, json_number
+from spatial_replay.text import counted, counted_from, json_number
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.plausibility import ThresholdRange
@@ -167,12 +167,17 @@ def _compare_with_log(
 
     numbers, names = LogNumbers(specification), LogNames()
     source = open_source(log, **reading)
+    faults: list[str] = []
+    first_ns: int | None = None
     with progress("samples") as advance:
         for block in reading_only(source).iter_blocks():
             names.add(block.trace)
             numbers.add(block.trace)
-            warn(*block.trace.faults)
+            faults += block.trace.faults
+            if first_ns is None and len(block.trace):
+                first_ns = int(block.trace.times_ns[0])
             advance(len(block.trace))
+    warn(*counted_from(faults, first_ns or 0))
     unknown = names.check(specification, {})
     missing = sum(each.severity == "error" for each in unknown)
     if not strict_names:

@@ -100,7 +100,7 @@ def info(
         with progress("samples") as advance:
             overview = overview_of(open_source(log, **reading), advance)
     faults = tuple(dict.fromkeys((*overview.faults, *(surveyed.faults if surveyed else ()))))
-    remarks = (counted_from(each, overview.start_ns or 0) for each in overview.remarks)
+    faults, remarks = (counted_from(texts, overview.start_ns or 0) for texts in (faults, overview.remarks))
     warn(*dict.fromkeys((*faults, *(surveyed.remarks if surveyed else ()), *remarks)))
     if as_json:
         show_json(_document(overview, surveyed, faults))
@@ -112,9 +112,11 @@ def info(
 def _print_decisions(log: LogFile, as_json: bool) -> int:
     """Print the decisions of a planned run."""
     from spatial_replay.planning.read import read_decisions
+    from spatial_replay.replay import first_sample_ns
+    from spatial_replay.sources.open_log import open_source
 
     recorded = read_decisions(log)
-    warn(*recorded.faults)
+    warn(*counted_from(recorded.faults, first_sample_ns(open_source(log)) if recorded.faults else 0))
     if as_json:
         rows = decision_rows(recorded.decisions)
         document = {"name": log.name, "damaged": bool(recorded.faults), "decisions": rows}

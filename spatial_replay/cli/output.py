@@ -104,6 +104,8 @@ def _numbers(result: SpecResult, first_ns: int) -> str:
         parts.append(f"certain since {time_text(certain_ns, first_ns)}")
     if result.least is not None and result.verdict == "violated":
         parts.append(f"the least robustness is that of `{result.least.name}`")
+    elif result.least_at_ns is not None:
+        parts.append(f"least at {time_text(result.least_at_ns, first_ns)}")
     return ", ".join(parts)
 
 

@@ -10,7 +10,7 @@ from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile
-from spatial_replay.text import counted
+from spatial_replay.text import counted, counted_from
 
 
 @click.command()
@@ -39,6 +39,7 @@ def verify(log: LogFile, source: LogFile | None, decisions: bool, reading: ReadA
     # imported here so that --help stays fast
     from spatial_replay.logs.read_options import ReadOptions
     from spatial_replay.planning.recompute import recompute_decisions
+    from spatial_replay.replay import first_sample_ns
     from spatial_replay.replay.verification import recorded_reading, verify_certificate
     from spatial_replay.sources.open_log import open_source
 
@@ -60,7 +61,7 @@ def verify(log: LogFile, source: LogFile | None, decisions: bool, reading: ReadA
         planned = own if original is None else original
         with progress("samples") as advance:
             recomputed = recompute_decisions(planned, advance)
-        faults += recomputed.faults
+        faults += counted_from(recomputed.faults, first_sample_ns(planned) if recomputed.faults else 0)
         differences += [f"{planned.name}: {each}" for each in recomputed.differences]
         if not recomputed.differences:
             show(

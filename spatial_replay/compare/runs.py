@@ -20,7 +20,7 @@ from spatial_replay.monitor.semantics import require_ltlf
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, LogNames, ReplayOptions, Selection
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
-from spatial_replay.text import counted, json_number
+from spatial_replay.text import counted, counted_from, json_number
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
 
@@ -245,9 +245,13 @@ def compare_runs(
         tuple(compare_results(one, other, alignment, traces, objects, files) for one, other in results),
         compare_decisions(sources),
         not objects and a == b,
-        (*a.faults, *b.faults),
+        (*_faults(a), *_faults(b)),
         traces,
     )
+
+
+def _faults(trace: Trace) -> tuple[str, ...]:
+    return counted_from(trace.faults, int(trace.times_ns[0]))
 
 
 def _evaluated(

@@ -29,7 +29,7 @@ from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
 from spatial_replay.spec.format import format_duration
 from spatial_replay.spec.formula import NamedSpec, Span, Specification
 from spatial_replay.spec.load import parse_specification
-from spatial_replay.text import Instant, Sentence, counted, json_number
+from spatial_replay.text import Instant, Sentence, counted, counted_from, json_number
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
 
@@ -304,7 +304,7 @@ def compare_specifications(
         ),
         removed,
         added,
-        trace.faults,
+        counted_from(trace.faults, int(trace.times_ns[0])),
     )
 
 

@@ -31,6 +31,7 @@ from spatial_replay.mapping.reading_plan import DISORDER_NS, ReadingPlan
 from spatial_replay.mapping.topic_reader import MISFITS, TopicReader
 from spatial_replay.mapping.tracker import Remarks, Tracker
 from spatial_replay.mapping.transforms import HISTORY_NS, FrameTree
+from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.sample import FOREVER, LATEST_NS
 from spatial_replay.trace.trace import Trace
 
@@ -277,7 +278,7 @@ class Assembler:
         return trace
 
     def _add_fault(self, topic: str, log_time_ns: int, what: str) -> None:
-        self._faults.add(f"{self._name}: {topic} at {log_time_ns} ns: {what}")
+        self._faults.add(Sentence(f"{self._name}: {topic} at ", Instant(log_time_ns, 0), f": {what}"))
 
 
 def _columns(messages: Sequence[Message]) -> MessageColumns:

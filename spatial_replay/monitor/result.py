@@ -19,7 +19,7 @@ from spatial_replay.monitor.stream import NEVER, InstanceStream, SeriesBlock
 from spatial_replay.monitor.vacuity import Vacuous, find_vacuous
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.monitor.witness.evidence import Evidence
-from spatial_replay.monitor.witness.witness import Witness, find_witness
+from spatial_replay.monitor.witness.witness import Witness, find_witness, time_of_least
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, NamedSpec, iter_nodes, operator_of
@@ -234,6 +234,11 @@ class SpecResult(Displayed):
         """The part with the least robustness, if that is another than the first cause."""
         return self._least(0, self.causes)
 
+    @property
+    def least_at_ns(self) -> int | None:
+        """When the first cause was worst, if that was later than when it settled the verdict; else None."""
+        return self._least_at_ns(self.causes)
+
     @cached_property
     def worst(self) -> Witness | None:
         """What decided the verdict: the first cause's witness or, of a satisfied result, what settled it.
@@ -331,13 +336,16 @@ class SpecResult(Displayed):
         lower, upper = self.final[node].tolist()
         settled_ns = self.certain_ns(node)
         verdict = final_verdict(lower, upper)
+        least = self._least(node, causes)
+        at_ns = self._least_at_ns(causes) if least is None else None
         return verdict_sentence(
             f"`{self._name_of(node)}`{instance}",
             verdict,
             (lower, upper),
             has_ended=settled_ns is None and verdict is Verdict.VIOLATED and self.can_explain,
             certain_since=None if settled_ns is None else Instant(settled_ns, first_ns),
-            least=self._least(node, causes),
+            least=least,
+            least_at=None if at_ns is None else Instant(at_ns, first_ns),
         )
 
     def _least(self, node: int, causes: Sequence[Cause]) -> LeastPart | None:
@@ -345,6 +353,14 @@ class SpecResult(Displayed):
             return None
         name = self._name_of(node)
         return find_least(self._conjuncts(node), self.values, self.final, causes[0], name)
+
+    def _least_at_ns(self, causes: Sequence[Cause]) -> int | None:
+        first = causes[0] if causes else None
+        if self.leaves is None or first is None or first.witness is None or first.settled_ns is None:
+            return None
+        is_worse = bool(self.final[first.node, 1] < first.witness.upper)
+        of = self.evidence.instance
+        return time_of_least(of, self.leaves, self.times_ns, first.node) if is_worse else None
 
     def _name_of(self, node: int) -> str:
         return self.name if node == 0 else self.nodes[node].name or shortened_formula(self.nodes[node].text)

@@ -83,6 +83,7 @@ def verdict_sentence(
     certain_since: Instant | None = None,
     has_ended: bool = False,
     least: LeastPart | None = None,
+    least_at: Instant | None = None,
 ) -> Sentence:
     """Return a sentence on the verdict of a result as a whole.
 
@@ -92,11 +93,13 @@ def verdict_sentence(
         certain_since: since when it is certain.
         has_ended: whether it was pending until the log ended, and is violated for that.
         least: the part that its number is of, if that is another than the first cause.
+        least_at: when the first cause reaches its number, if that is later than what settled it.
     """
     since = (", certain since ", certain_since) if certain_since is not None else ()
     of = f" (the least robustness is that of `{least.name}`)" if least is not None else ""
+    at = (", least at ", least_at) if least_at is not None else ()
     how = f"{verdict}{_ENDED if has_ended else ''}"
-    return Sentence(f"{title} is {how}: {_robustness(*ends)}", *since, f"{of}.")
+    return Sentence(f"{title} is {how}: {_robustness(*ends)}", *since, *at, f"{of}.")
 
 
 def number_text(number: float) -> str:

@@ -153,8 +153,8 @@ class _Tally:
             self._times[0],
             self._times[-1],
             tuple(names),
-            tuple(self.faults),
+            counted_from(self.faults, self._times[0]),
             self._unreadable,
             tuple(remark for remark in remarks if remark.severity == "error"),
-            tuple(counted_from(each, self._times[0]) for each in self.remarks),
+            counted_from(self.remarks, self._times[0]),
         )

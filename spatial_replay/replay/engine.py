@@ -226,8 +226,8 @@ class Replay:
             first_ns=first_ns,
             start_ns=self._times[0],
             end_ns=self._times[-1],
-            faults=tuple(self._faults),
-            remarks=tuple(counted_from(each, first_ns) for each in self._remarks),
+            faults=counted_from(self._faults, first_ns),
+            remarks=counted_from(self._remarks, first_ns),
             missing=missing,
             unreadable=self._unreadable,
             results=replayed_specs(

@@ -274,8 +274,8 @@ class Evaluated:
             first_ns=loaded.first_ns,
             start_ns=int(times_ns[0]),
             end_ns=int(times_ns[-1]),
-            faults=loaded.faults,
-            remarks=tuple(counted_from(each, loaded.first_ns) for each in loaded.remarks),
+            faults=counted_from(loaded.faults, loaded.first_ns),
+            remarks=counted_from(loaded.remarks, loaded.first_ns),
             missing=loaded.missing,
             unreadable=loaded.inside.unreadable_count,
             results=replayed_specs(

@@ -23,6 +23,7 @@ from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.schemas.Specification_pb2 import Specification, SpecificationResult
 from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import AUTOMATON, ROBUSTNESS, SPECIFICATION
+from spatial_replay.text import counted_from
 
 Quantity: TypeAlias = Literal["value", "now", "lower", "upper"]
 TIME = "time_ns"
@@ -81,15 +82,16 @@ def export_table(
         )
     titles, automata = _titles(source)
     faults: list[str] = []
-    rows = 0
+    rows, first_ns = 0, 0
     with replacing(output, inputs) as stream:
         write = writer(stream, [TIME, SECONDS, *titles.values()], list(automata.values()))
         for table in _iter_tables(source, titles, automata, QUANTITIES.index(quantity), faults):
             write(table)
+            first_ns = first_ns if rows else int(table.times_ns[0])
             rows += len(table.times_ns)
             advance(len(table.times_ns))
         write(None)
-    return rows, len(titles), tuple(faults)
+    return rows, len(titles), counted_from(faults, first_ns)
 
 
 def _iter_series(source: Source) -> Iterator[tuple[list[RobustnessSeries], tuple[str, ...]]]:

@@ -111,12 +111,13 @@ def read_trace(
     blocks = reading_only(source).iter_blocks()
     traces = [replace(block.trace, remarks=block.remarks) for block in blocks]
     trace = Trace.concatenate(traces)
-    if trace.faults and not allow_damage:
+    first_ns = int(trace.times_ns[0]) if len(trace) else 0
+    faults, remarks = counted_from(trace.faults, first_ns), counted_from(trace.remarks, first_ns)
+    if faults and not allow_damage:
         others = count_of(trace.faults) - 1
         more = f"\n… and {others} more" if others else ""
-        raise LogError(f"{trace.faults[0]}{more}; allow_damage=True reads the rest")
-    first_ns = int(trace.times_ns[0]) if len(trace) else 0
-    return replace(trace, remarks=tuple(counted_from(each, first_ns) for each in trace.remarks))
+        raise LogError(f"{faults[0]}{more}; allow_damage=True reads the rest")
+    return replace(trace, remarks=remarks, faults=faults)
 
 
 def _require_path(value: object) -> None:

@@ -186,7 +186,7 @@ def test_a_named_part_is_explained_by_what_settled_it(
 ) -> None:
     assert run(["explain", str(LOG), "--spec", "mission.spatial", "--node", "safe"]) == 1
     assert capsys.readouterr().out.startswith(
-        "`safe` is violated: robustness -0.144867, certain since 5.533 s."
+        "`safe` is violated: robustness -0.144867, certain since 5.533 s, least at 9.767 s."
     )
 
 

@@ -174,7 +174,10 @@ def test_a_damaged_chunk_costs_its_samples_only(log):
     part = read_trace(log(bytes(content)), allow_damage=True)
     assert part == trace.take(np.array([0, 1, 2, 6, 7, 8, 9, 10, 11]))
     assert f"at byte {hit.chunk_start_offset}" in part.faults[0]
-    assert f"between {hit.message_start_time} and {hit.message_end_time} ns" in part.faults[0]
+    first, last = (
+        (each - trace.times_ns[0]) / 1e9 for each in (hit.message_start_time, hit.message_end_time)
+    )
+    assert f"between {first:.3f} s and {last:.3f} s" in part.faults[0]
     with pytest.raises(LogError, match="at byte"):
         read_trace(log(bytes(content)))
 
@@ -348,7 +351,7 @@ def test_a_message_that_is_not_a_sample_is_a_fault(log, change, reported):
     part = read_trace(log(stream.getvalue()), allow_damage=True)
     assert part == trace.take(np.array([0, 2]))
     (fault,) = part.faults
-    assert fault.startswith("run.mcap: sample at 400000000 ns: ")
+    assert fault.startswith("run.mcap: sample at 0.400 s: ")
     assert reported in fault
 
 

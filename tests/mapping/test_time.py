@@ -299,16 +299,16 @@ def test_messages_that_do_not_fit_are_reported_and_skipped() -> None:
     feed = (
         Feed()
         .add("/p", 0, point(0))
-        .add("/p", 1, {"x": 1.0})
-        .add("/p", 2, {"x": "?", "y": 1})
-        .add("/p", 3, point(3))
+        .add("/p", SECOND, {"x": 1.0})
+        .add("/p", 2 * SECOND, {"x": "?", "y": 1})
+        .add("/p", 3 * SECOND, point(3))
     )
     made = make("topics: {/p: {signals: {speed: x}, name: p}}", feed)
-    assert made.trace.times_ns.tolist() == [0, 3]
+    assert made.trace.times_ns.tolist() == [0, 3 * SECOND]
     assert [made.centre(n, "p") for n in (0, 1)] == [(0.0, 0.0), (3.0, 0.0)]
     assert made.trace.signals["speed"].tolist() == [0.0, 3.0]
     assert [fault.partition(":")[0] for fault in made.faults] == ["test.bag"] * 2
-    assert {fault.split()[3] for fault in made.faults} == {"1", "2"}
+    assert {fault.split()[3] for fault in made.faults} == {"1.000", "2.000"}
 
 
 def test_a_first_message_with_an_unusable_name_affects_no_other() -> None:

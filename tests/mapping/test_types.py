@@ -315,7 +315,7 @@ def test_an_outline_that_crosses_itself_makes_only_its_object_unknown() -> None:
     content = {"list": [{"id": 1, "p": [0, 0, 1, 1, 1, 0, 0, 1]}, {"id": 2, "p": [0, 0, 1, 0, 1, 1]}]}
     made = one(content, "objects: 'list[*]', name: 'o{id}', polygon: p")
     assert (made.states("o1"), made.states("o2")) == ("?", "+")
-    assert "/thing at 1000000000 ns: object 'o1': the polygon's boundary crosses" in made.faults[0]
+    assert "/thing at 1.000 s: object 'o1': the polygon's boundary crosses" in made.faults[0]
 
 
 def test_a_name_that_appears_twice_makes_the_object_unknown() -> None:

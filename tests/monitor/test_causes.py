@@ -88,6 +88,15 @@ def test_an_unknown_name_is_a_cause_and_leaves_the_other_specs_their_verdicts() 
         sr.evaluate(sr.parse_specification(text), sr.Trace.from_samples(stopped_robot()), strict_names=True)
 
 
+def test_a_violation_that_grows_later_says_when_it_was_worst() -> None:
+    result = evaluated("spec safe = G (red dist vase >= 0.1)").result()
+    assert (result.violated_at_ns, result.least_at_ns) == (3 * SECOND, 4 * SECOND)
+    assert result.explain().startswith(
+        "`safe` is violated: robustness -0.34, certain since 3.000 s, least at 4.000 s.\n"
+    )
+    assert evaluated("spec charged = G (battery >= 0.2)").result().least_at_ns is None
+
+
 def test_explanations_name_every_cause_and_what_would_have_prevented_it() -> None:
     assert evaluated().explain().splitlines() == [
         "`task` is violated: robustness -7.76, certain since 3.000 s (the least robustness is that of "
@@ -112,7 +121,9 @@ def test_a_result_is_explained_alone_and_a_satisfied_one_by_what_holds() -> None
     evaluation = evaluated("spec safe = G (red dist vase >= 0.1)\nspec far = G (red dist bin >= 0.1)\n")
     texts = [result.explain() for result in evaluation]
     assert evaluation.explain() == "\n\n".join(texts)
-    assert texts[0].startswith("`safe` is violated: robustness -0.34, certain since 3.000 s.\nWhat decides")
+    assert texts[0].startswith(
+        "`safe` is violated: robustness -0.34, certain since 3.000 s, least at 4.000 s."
+    )
     assert texts[1].startswith("`far` is satisfied: robustness 6.66.\nWhat decides is `red")
 
 

@@ -42,6 +42,7 @@ from spatial_replay.logs.objects.decode import decode_objects
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, RemoteFile, open_file
 from spatial_replay.logs.topics import ALL, DERIVED, METADATA, OBJECTS, is_kept
+from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
@@ -205,18 +206,23 @@ class ChunkWalk:
     def _messages(
         self, place: ChunkPlace, records_read: bytes | DamageError, passed_over: frozenset[int]
     ) -> list[RawMessage]:
-        span = f"messages between {place.start_ns} and {place.end_ns} ns"
+        span = Sentence("messages between ", Instant(place.start_ns, 0), " and ", Instant(place.end_ns, 0))
         if isinstance(records_read, DamageError):
-            self._fault(place, f"{records_read}; the {span} are lost")
+            self._fault(place, Sentence(f"{records_read}; the ", span, " are lost"))
             return []
         content = split_records(records_read, passed_over)
         if content.damage:
-            self._fault(place, f"{content.damage}; of the {span}, {len(content.messages)} could be read")
+            self._fault(
+                place,
+                Sentence(f"{content.damage}; of the ", span, f", {len(content.messages)} could be read"),
+            )
         self._take_in(content.declarations)
         channels = self.channels
         usable = [m for m in content.messages if m[1] in channels and m[0] <= LATEST_NS]
         if lost := len(content.messages) - len(usable):
-            self._fault(place, f"{lost} of the {span} have no channel, or a time beyond 2**63 - 1 ns")
+            self._fault(
+                place, Sentence(f"{lost} of the ", span, " have no channel, or a time beyond 2**63 - 1 ns")
+            )
         return usable
 
     def _find_channels(self) -> None:
@@ -245,7 +251,7 @@ class ChunkWalk:
         )
 
     def _fault(self, place: ChunkPlace, what: str) -> None:
-        self.faults.add(f"{self._name}: at byte {place.offset}: {what}")
+        self.faults.add(Sentence(f"{self._name}: at byte {place.offset}: ", what))
 
 
 def _blocks(
@@ -311,7 +317,7 @@ class _BlockDecoder:
         times = columns.log_time_ns[own]
         before = np.maximum.accumulate(np.concatenate([[self._latest_ns], times]))
         for time_ns in times[times <= before[:-1]].tolist():
-            self._fault(f"sample at {time_ns} ns: there is one at this time already")
+            self._fault(Sentence("sample at ", Instant(time_ns, 0), ": there is one at this time already"))
         own, self._latest_ns = own[times > before[:-1]], int(before[-1])
         payloads = [columns.payloads[index] for index in own.tolist()]
         trace, faults = decode_objects(payloads, columns.log_time_ns[own], concave=self._source.concave)
@@ -354,4 +360,4 @@ class _BlockDecoder:
         )
 
     def _fault(self, what: str) -> None:
-        self._walk.faults.add(f"{self._source.name}: {what}")
+        self._walk.faults.add(Sentence(f"{self._source.name}: ", what))

@@ -19,6 +19,7 @@ from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.objects.wire import Bytes, LayoutError, WireTemplate, Words, rows_of
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectState, ObjectStates
+from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.observations import Observations, trace_from_observations
 from spatial_replay.trace.trace import Trace
 
@@ -186,7 +187,7 @@ class _Pieces:
 
 def decode_objects(
     payloads: Sequence[bytes], times_ns: Integers, *, concave: Concave = "decompose"
-) -> tuple[Trace, list[str]]:
+) -> tuple[Trace, list[Sentence]]:
     """Decode ObjectStates messages to a trace.
 
     Args:
@@ -206,7 +207,10 @@ def decode_objects(
         sound = np.ones(len(times_ns), np.bool_)
         sound[list(faults)] = False
         trace = trace.take(np.searchsorted(trace.times_ns, times_ns[sound]))
-    return trace, [f"sample at {times_ns[index]} ns: {what}" for index, what in sorted(faults.items())]
+    return trace, [
+        Sentence("sample at ", Instant(int(times_ns[index]), 0), f": {what}")
+        for index, what in sorted(faults.items())
+    ]
 
 
 def _groups(payloads: Sequence[bytes], faults: dict[int, str]) -> list[_Group]:

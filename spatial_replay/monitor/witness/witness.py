@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.offline import evaluate_offline
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom, deciding_atom
@@ -159,6 +160,13 @@ def find_witness(
         missed_response(found, nodes, done, times_ns) if verdict is Verdict.VIOLATED else None,
         evidence.gaps(deciding.atom) if deciding is not None and deciding.unknown else (),
     )
+
+
+def time_of_least(instance: Instance, leaves: Floats, times_ns: Integers, node: int) -> int:
+    """Return the time of the sample that gives a violated node its robustness on the whole log."""
+    done = evaluate_offline(instance.formula, instance.program.leaves, leaves, times_ns)
+    path = deciding_path(instance.formula, done, times_ns, node, End.HIGH)
+    return int(times_ns[path.steps[-1].sample])
 
 
 def _step(node: int, formula: Formula, time_ns: int) -> WitnessStep:
