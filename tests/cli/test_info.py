@@ -132,6 +132,7 @@ def test_an_mcap_file_without_samples_cannot_be_evaluated_but_is_not_damaged(
         said = capsys.readouterr().err
         assert "no topic '/spatial/objects' in layer.mcap; it has '/spatial/" in said
         assert "'/spatial/robustness'" in said
+        assert "give the log that the layer was made from" in said
 
 
 def test_a_damaged_attachment_is_reported_by_info_and_replay(

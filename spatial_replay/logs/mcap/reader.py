@@ -167,6 +167,11 @@ class McapSource:
         what = f"no topic {OBJECTS!r} in {self.name}; it has {listed}"
         if fault:
             return LogError(f"{what}: {fault}")
+        if METADATA in dict(self.metadata()):
+            remedy = (
+                "no sample was recorded in it, or it is a layer: give the log that the layer was made from"
+            )
+            return UsageError(f"{what}; {remedy}")
         return UsageError(f"{what}; a mapping file says which of them carry objects")
 
 
