@@ -132,6 +132,14 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
     if output.parts and output.parts[0] in _SCHEMES:
         shown = str(output).replace(":/", "://", 1)
         raise UsageError(f"{shown} is an address; write to a file on this machine, and copy that")
+    try:
+        output.lstat()
+    except (FileNotFoundError, NotADirectoryError, PermissionError):
+        # said below, or when it is opened
+        pass
+    except (OSError, ValueError) as error:
+        reason = (getattr(error, "strerror", None) or str(error)).lower()
+        raise UsageError(f"{output} cannot be written: {reason}; give the output another name") from None
     if output.is_dir():
         raise UsageError(f"{output} is a folder; give the name of a file in it")
     if not output.parent.is_dir():

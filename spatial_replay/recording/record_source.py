@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
-from spatial_replay.errors import LogError
+from spatial_replay.errors import LogError, OutputError
 from spatial_replay.logs.mcap.writer import LogWriter
 from spatial_replay.logs.output_file import open_output, refuse_inputs
 from spatial_replay.logs.source import Source, axes_of, read_blocks, reading_options
@@ -74,10 +74,17 @@ def record_source(
     traces = _traces(source, tally)
     # a source without samples raises here, before the output is touched
     first = next(traces)
-    with leaving(output), open_output(output) as stream:
-        about = {"source": source.name, "options": json.dumps(reading_options(source))}
-        about |= axes_of(source).metadata()
-        _record(LogWriter(stream), about, files, chain([first], traces), advance)
+    about = {"source": source.name, "options": json.dumps(reading_options(source))}
+    about |= axes_of(source).metadata()
+    stream = open_output(output)
+    try:
+        with leaving(output), stream:
+            _record(LogWriter(stream), about, files, chain([first], traces), advance)
+    except OutputError:
+        # a disk that is full: half of a log that can be recorded again is worth less than none
+        if output.is_file():
+            output.unlink(missing_ok=True)
+        raise
     return tally.recorded(files)
 
 

@@ -136,6 +136,10 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
     """
     file = log_file(path)
     if not isinstance(file, RemoteFile):
+        try:
+            file.stat()
+        except (OSError, ValueError) as error:
+            raise MissingFileError.of(path, error) from None
         return file
     if not file.version.has_ranges:
         return downloaded(file, "its server does not give parts of files")

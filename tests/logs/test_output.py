@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from spatial_replay import OutputError, UsageError
+from spatial_replay import MissingFileError, OutputError, Recorder, UsageError, read_trace
 from spatial_replay.logs.output_file import open_output, refuse_inputs, replacing
 
 
@@ -58,3 +61,28 @@ def test_nothing_is_written_into_a_log_that_is_a_folder(tmp_path: Path) -> None:
         with pytest.raises(UsageError, match="is an input; write it elsewhere"):
             refuse_inputs(output, [bag])
     refuse_inputs(tmp_path / "bag.mcap", [bag])
+
+
+@pytest.mark.parametrize("name", ["a" * 300, "a\0b"])
+def test_a_name_that_no_file_can_have_is_an_error_of_its_own(tmp_path: Path, name: str) -> None:
+    with pytest.raises(MissingFileError, match=r"too long|null"):
+        read_trace(tmp_path / name)
+    with pytest.raises(UsageError, match="give the output another name"):
+        Recorder(tmp_path / name)
+
+
+def test_a_conversion_that_does_not_fit_on_the_disk_leaves_no_half_log(tmp_path: Path) -> None:
+    with (tmp_path / "tracks.jsonl").open("w") as stream:
+        for tick in range(3_000):
+            box = {"name": "a", "polygon": [[0, 0], [1, 0], [1, 1 + tick]]}
+            stream.write(json.dumps({"time_ns": tick, "objects": [box]}) + "\n")
+    program = (
+        "import resource, signal, sys; from spatial_replay.cli import run;"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN);"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000));"
+        "sys.exit(run(['record', 'tracks', 'tracks.jsonl', '-o', 'run.mcap']))"
+    )
+    command = [sys.executable, "-c", program]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "run.mcap could not be written" in ended.stderr
+    assert not (tmp_path / "run.mcap").exists()
