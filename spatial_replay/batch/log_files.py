@@ -133,7 +133,8 @@ def _nothing(text: str, folder: Path) -> str:
         return f"{text}: no log there; check the pattern"
     if has_magic(text):
         return f"{text}: no log matches this pattern; check it, and the folder it starts from"
-    if (folder / text).is_dir():
+    # unlike a path's own, this test takes names that no file can have
+    if os.path.isdir(folder / text):  # noqa: PTH112
         return f"{text}: no log in this folder; logs end in {', '.join(_ENDINGS)}"
     return f"{text}: no such file; check the path"
 
