@@ -1,7 +1,7 @@
 """Results of batches as a folder of Parquet files: rows by specification, and the table of the last run.
 
     RESULTS/format.json             the version of this layout
-    RESULTS/rows/spec=HASH/*        the rows of everything that was evaluated, by specification
+    RESULTS/rows/spec_hash=HASH/*   the rows of everything that was evaluated, by specification
     RESULTS/last_run.parquet        the table of the last run: its cases, logs and what they failed by
     RESULTS/identities.jsonl        what unchanged logs hold, so that they need not be hashed again
 
@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from spatial_replay.batch.rows import ResultRow
 from spatial_replay.errors import LogError, MissingFileError, OutputError, UsageError
-from spatial_replay.logs.output_file import output_error, replacing
+from spatial_replay.logs.output_file import output_error, refuse_addresses, replacing
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -35,6 +35,8 @@ LAST_RUN: Final = "last_run.parquet"
 IDENTITIES: Final = "identities.jsonl"
 _FORMAT_FILE: Final = "format.json"
 _ROWS: Final = "rows"
+_PARTITION: Final = "spec_hash="
+"""Beginning of the name of a folder, of which readers make a column: another than those in the files."""
 _JOINED: Final = "joined-"
 """Beginning of the name of a file that holds the rows of several keys."""
 _MOST_JOINED: Final = 20_000
@@ -93,7 +95,7 @@ def write_rows(folder: Path, spec_hash: str, key: str, rows: Sequence[ResultRow]
     Raises:
         OutputError: the machine cannot write it.
     """
-    partition = folder / _ROWS / f"spec={spec_hash}"
+    partition = folder / _ROWS / f"{_PARTITION}{spec_hash}"
     try:
         partition.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -123,10 +125,11 @@ class ResultsFolder:
         """Open a folder for a batch; one that does not exist is made.
 
         Raises:
-            UsageError: it holds something else, or results of another version.
+            UsageError: an address; it holds something else, or results of another version.
             OutputError: it cannot be written.
         """
         _pyarrow()
+        refuse_addresses(path)
         try:
             path.mkdir(parents=True, exist_ok=True)
             # a batch that was killed at its very beginning leaves a partial file
@@ -218,7 +221,7 @@ class ResultsFolder:
         Raises:
             OutputError: the machine cannot write them.
         """
-        for partition in sorted((self.path / _ROWS).glob("spec=*")):
+        for partition in sorted((self.path / _ROWS).glob(f"{_PARTITION}*")):
             files = sorted(partition.glob("*.parquet"))
             joined = [file for file in files if file.name.startswith(_JOINED)]
             stored = {key for file in joined for key in _read(file, ["key"]).column("key").to_pylist()}
@@ -253,7 +256,7 @@ class ResultsFolder:
 
     def _files(self) -> list[Path]:
         """Return the files with rows, joined ones first."""
-        files = (self.path / _ROWS).glob("spec=*/*.parquet")
+        files = (self.path / _ROWS).glob(f"{_PARTITION}*/*.parquet")
         return sorted(files, key=lambda file: (not file.name.startswith(_JOINED), file))
 
 
@@ -282,7 +285,7 @@ def _read(file: Path, names: Sequence[str] | None = None) -> pa.Table:
     from pyarrow import parquet
 
     try:
-        # not `read_table`, to which a folder named spec=… is a column, and which takes twice as long
+        # not `read_table`, to which the name of its folder is a column, and which takes twice as long
         with parquet.ParquetFile(file) as opened:
             return opened.read(names, use_threads=False)
     except (OSError, pa.ArrowException) as error:

@@ -129,9 +129,7 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
     Raises:
         UsageError: it is one of the inputs or in one, a folder, or in none.
     """
-    if output.parts and output.parts[0] in _SCHEMES:
-        shown = str(output).replace(":/", "://", 1)
-        raise UsageError(f"{shown} is an address; write to a file on this machine, and copy that")
+    refuse_addresses(output)
     try:
         output.lstat()
     except (FileNotFoundError, NotADirectoryError, PermissionError):
@@ -149,6 +147,17 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
             raise UsageError(f"{output} is an input too and would be lost; give the output another name")
         if each.is_dir() and output.resolve().is_relative_to(each.resolve()):
             raise UsageError(f"{output} lies in the folder {each}, which is an input; write it elsewhere")
+
+
+def refuse_addresses(output: Path) -> None:
+    """Check that an output is on this machine.
+
+    Raises:
+        UsageError: it is an address.
+    """
+    if output.parts and output.parts[0] in _SCHEMES:
+        shown = str(output).replace(":/", "://", 1)
+        raise UsageError(f"{shown} is an address; write to this machine, and copy that")
 
 
 def output_error(output: Path, error: OSError) -> OutputError:

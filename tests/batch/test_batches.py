@@ -95,6 +95,7 @@ def test_a_suite_says_what_passes(fleet: Path) -> None:
         "cases:\n"
         "  - {name: good, logs: 'logs/run-[01].jsonl', at_least: 0.05, requirements: SYS-1}\n"
         "  - {name: bad, logs: [logs/run-2.jsonl, logs/run-3.jsonl], specs: bad.spatial, expect: violated}\n"
+        "  - {name: unseen, logs: logs/run-0.jsonl, specs: ghost.spatial, expect: unknown}\n"
         "  - {name: blind, logs: logs, specs: ghost.spatial, allow_unknown: true}\n"
     )
     Path("bad.spatial").write_text("spec apart = G (cart dist person >= 0.3)")
@@ -111,6 +112,9 @@ def test_a_suite_says_what_passes(fleet: Path) -> None:
     assert "robustness 0.1, expected at least 0.15" in done.out
     Path("suite.yaml").write_text(text.replace(", allow_unknown: true", ""))
     assert batch("suite.yaml").code == 4
+    Path("suite.yaml").write_text(text.replace("specs: bad.spatial, expect: violated", "expect: unknown"))
+    done = batch("suite.yaml")
+    assert (done.code, "violated, expected unknown" in done.out) == (1, True), done.out
     table = sr.read_results("suite.results")
     assert {row["requirement"] for row in table.to_pylist() if row["case"] == "good"} == {"REQ-3", "REQ-4"}
 
@@ -174,6 +178,7 @@ def test_all_errors_of_a_suite_are_reported_at_once_with_their_lines(fleet: Path
         (["logs", "--spec", "gate.spatial", "-o", "gate.spatial"], "is a file; results are a folder"),
         (["logs", "--spec", "gate.spatial", "-o", "logs"], "does not hold the results of a batch"),
         (["logs", "--spec", "gate.spatial", "-o", "old"], "results of format 0"),
+        (["logs", "--spec", "gate.spatial", "-o", "s3://fleet/results"], "s3://fleet/results is an address"),
         (["logs", "--spec", "gate.spatial", "--tolerance", "5%"], "add --baseline"),
         (["logs", "--spec", "gate.spatial", "--baseline", "gone"], "no such folder"),
         (["logs", "--spec", "gate.spatial", "--junit", "gate.spatial"], "is an input too"),
@@ -191,6 +196,7 @@ def test_what_cannot_work_is_refused_with_the_remedy(fleet: Path, arguments: lis
     done = batch(*arguments)
     assert (done.code, message in done.err) == (2, True), done.err
     assert not Path("results").exists()
+    assert not Path("s3:").exists()
     if "missing.mcap" in arguments:
         assert "missing.mcap: no such file" in done.err
 

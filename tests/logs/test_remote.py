@@ -219,7 +219,7 @@ def test_addresses_that_do_not_work_say_what_helps(
         sr.read_trace(server.url("none.mcap"))
     with pytest.raises(UsageError, match="names no file"):
         sr.read_trace("s3://fleet/2026-11/")
-    with pytest.raises(UsageError, match="is an address; write to a file on this machine"):
+    with pytest.raises(UsageError, match="is an address; write to this machine"):
         sr.replay_log(server.url("drive.mcap"), SPEC, output="s3://fleet/out.mcap")
     server.fault = lambda number: 403
     assert run(["info", server.url("drive.mcap?signature=secret")]) == 2
