@@ -20,6 +20,7 @@ from spatial_replay.geometry.measure import Operand
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
+from spatial_replay.monitor.sentences import divisor_of
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import (
     ANY_CLASS,
@@ -50,11 +51,13 @@ class LeafPairs(NamedTuple):
         pairs: of each of the program's leaves; None for one that does not relate two things in one sample.
         below: of each requirement of the formula, its leaves.
         regions: shapes by name.
+        divisors: of each leaf, what `scale` divides its number by.
     """
 
     pairs: tuple[Pair | None, ...]
     below: tuple[LeavesBelow, ...]
     regions: Mapping[str, Outline]
+    divisors: Floats
 
 
 class EvaluatedResult(NamedTuple):
@@ -102,7 +105,8 @@ class Violations(NamedTuple):
         is_shown: (S,), whether there are two points to show it between.
         points: (S, 2, 2), a point of the first of the pair and one of the second.
         top: (S,), the upper end of the higher one, NaN if neither has a height.
-        robustness: (S,), at most 0: of the requirement, or of the atom that settled the violation.
+        robustness: (S,), at most 0: of the requirement, or of the atom that settled the violation; in the
+            unit of the log, where `scale` divides the number of the atom.
     """
 
     result: Integers
@@ -120,7 +124,8 @@ def leaf_pairs(
     """Return what the leaves of an instance relate."""
     below = leaves_below(instance.formula, instance.program.leaves)
     pairs = tuple(_pair(substitute(leaf, instance.bindings)) for leaf in instance.program.leaves)
-    return LeafPairs(pairs, tuple(below[requirement.node] for requirement in requirements), regions)
+    divisors = np.array([divisor_of(leaf) for leaf in instance.program.leaves])
+    return LeafPairs(pairs, tuple(below[requirement.node] for requirement in requirements), regions, divisors)
 
 
 def violated_since(requirements: Sequence[Requirement], block: SeriesBlock, before_ns: Integers) -> Integers:
@@ -192,6 +197,9 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
             at = np.searchsorted(result.block.times_ns, times_ns[here])
             found.leaf[here] = _deciding(result, result.leaf_pairs, requirement[here], at)
             _point_at_settled(result, times_ns, here, found)
+            leaf = found.leaf[here]
+            known = here[leaf >= 0]
+            found.robustness[known] *= result.leaf_pairs.divisors[leaf[leaf >= 0]]
             _locate(result.leaf_pairs, trace, samples, here, found)
     return found
 

@@ -102,6 +102,12 @@ def verdict_sentence(
     return Sentence(f"{title} is {how}: {_robustness(*ends)}", *since, *at, f"{of}.")
 
 
+def verdict_text(verdict: Verdict, robustness: float) -> str:
+    """Return a verdict with its number, as metadata of a log has it: "violated, robustness -0.03"."""
+    number = "not determined" if math.isnan(robustness) else number_text(robustness)
+    return f"{verdict}, robustness {number}"
+
+
 def number_text(number: float) -> str:
     """Return a number with six digits."""
     return f"{number:.{_DIGITS}g}"

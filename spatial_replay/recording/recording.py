@@ -28,9 +28,11 @@ from spatial_replay.logs.topics import (
     METADATA,
     OBJECTS,
     RECORDED_PREFIX,
+    VERDICTS,
     protobuf_channel,
 )
 from spatial_replay.monitor.instances import find_instances
+from spatial_replay.monitor.sentences import verdict_text
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.axes import Axes
@@ -135,6 +137,11 @@ class Recording:
             self._sink.write_messages(self._evaluation.end(self._end_ns))
         layout = self._evaluation.layout(self._topics, self._axes)
         self._sink.add_attachment(layout.name, layout.media_type, layout.data)
+        streams = self._evaluation.streams
+        if self._samples and streams:
+            texts = [verdict_text(each.verdict, float(each.robustness[0])) for each in streams]
+            names = [tree.title for tree in self._evaluation.trees]
+            self._sink.add_metadata(VERDICTS, dict(zip(names, texts, strict=True)))
         self._sink.add_metadata(ENDING, ending)
         hashes = certificate(self._sample_hash, self._message_hash, self._files, self._result_hash)
         self._sink.add_metadata(CERTIFICATE, hashes)

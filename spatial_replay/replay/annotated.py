@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -24,7 +23,7 @@ from spatial_replay.logs.topics import (
     REPLAYED_PREFIX,
     VERDICTS,
 )
-from spatial_replay.monitor.result import SpecResult
+from spatial_replay.monitor.sentences import verdict_text
 from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.replay.kept_messages import KEEP_ALL
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Window
@@ -81,14 +80,11 @@ def run_replay(
         replayed = replay.run(sink.write_messages, layer=layer, advance=advance)
         layout = replay.layout()
         sink.add_attachment(layout.name, layout.media_type, layout.data)
-        sink.add_metadata(VERDICTS, {each.title: _verdict(each) for each in replayed.results})
+        sink.add_metadata(
+            VERDICTS, {each.title: verdict_text(each.verdict, each.robustness) for each in replayed.results}
+        )
         sink.add_metadata(CERTIFICATE, replayed.certificate)
     return replayed
-
-
-def _verdict(result: SpecResult) -> str:
-    robustness = "not determined" if math.isnan(result.robustness) else f"{result.robustness:.6g}"
-    return f"{result.verdict}, robustness {robustness}"
 
 
 def load_files(

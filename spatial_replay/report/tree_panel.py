@@ -12,7 +12,7 @@ from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.specification import unit_of
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.result import SpecResult
-from spatial_replay.monitor.sentences import number_text
+from spatial_replay.monitor.sentences import divisor_of, number_text
 from spatial_replay.monitor.verdict import final_verdict
 from spatial_replay.report.compact import Packing
 from spatial_replay.spec.format import format_formula
@@ -67,6 +67,7 @@ def tree_value(
             "head": _cut(_head(node, relations)),
             "text": _cut(format_formula(node, relations=relations)),
             "unit": unit_of(node, {}),
+            "divisor": divisor_of(node),
             "initial": identifier in initial,
             "verdict": str(final_verdict(*final[identifier].tolist())),
             "value": final_text(float(robustness[identifier]), *final[identifier].tolist()),

@@ -405,6 +405,11 @@ def test_an_arrow_with_its_number_points_at_the_worst_violation():
     assert begin[1] == end[1]
 
 
+def test_the_number_of_an_arrow_is_in_the_unit_of_the_log():
+    [message] = pointed("scale lengths = 4\nspec s = G a closeto[1] b", {"a": box_at(0.0), "b": box_at(9.0)})
+    assert arrow(message)[2] == "-7"
+
+
 def test_the_arrow_of_an_enclosure_shows_what_sticks_out():
     text = "region goal = box(0, 0, 2, 2)\nspec s = G a enclosedin goal"
     [message] = pointed(text, {"a": Footprint.box(1.0, 0.5, 3.5, 1.0)})

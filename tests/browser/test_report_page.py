@@ -160,6 +160,8 @@ def test_the_tree_shows_how_things_stand_at_the_cursor(open_page: Open) -> None:
     expect(mark).to_have_class("mark is-pending")
     assert colour_of(page, mark) != satisfied
     expect(row(page, "plate_first").locator(".number").first).to_have_text(f"{MINUS}0.2802")
+    # what is pending is no violation: its number is grey
+    expect(row(page, "plate_first").locator(".number").first).to_have_class("number is-unknown")
     expect(row(page, "plate_first").locator(".what")).to_contain_text("pending")
 
 

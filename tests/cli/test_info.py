@@ -42,13 +42,16 @@ def test_samples_objects_and_signals_are_listed(log: Path, capsys: pytest.Captur
 def test_an_annotated_log_shows_its_verdicts(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spec, annotated = log.with_name("s.spatial"), log.with_name("out.mcap")
     spec.write_text("spec charged = G (battery >= 0.6)\nspec alone = G (hand dist hand <= 1)\n")
+    recorded = log.with_name("recorded.mcap")
     assert run(["replay", str(log), "--spec", str(spec), "-o", str(annotated)]) == 1
-    capsys.readouterr()
-    assert run(["info", str(annotated)]) == 0
-    said = capsys.readouterr().out
-    assert (
-        "verdicts\n  charged  violated, robustness not determined\n  alone    unknown, robustness not" in said
-    )
+    assert run(["record", "tracks", str(log), "--spec", str(spec), "-o", str(recorded)]) == 0
+    for path in (annotated, recorded):
+        capsys.readouterr()
+        assert run(["info", str(path)]) == 0
+        assert (
+            "verdicts\n  charged  violated, robustness not determined\n  alone    unknown, robustness not"
+            in capsys.readouterr().out
+        )
     assert run(["info", str(annotated), "--json"]) == 0
     metadata = {each["name"]: each["data"] for each in json.loads(capsys.readouterr().out)["metadata"]}
     assert list(metadata["spatial_replay_verdicts"]) == ["charged", "alone"]

@@ -324,7 +324,8 @@ function violationWords(run, time, {result: which, node: index, label, robustnes
 }
 
 function failureWords(part) {
-  const node = atomOf(part), number = node.series[NOW][part.place];
+  // in the unit of the log, as the number beside the arrow
+  const node = atomOf(part), number = node.series[NOW][part.place] * node.divisor;
   const how = number < 0 ? "fails" : "must not hold, and does";
   return [...partWords({...part, node}), ` ${how} by ${numberText(Math.abs(number))} now`];
 }

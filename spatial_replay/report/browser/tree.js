@@ -63,10 +63,11 @@ function showRow(row, run, result, place, isLast) {
     row.words.textContent = ` ${STATUSES[status].words} `;
   }
   const isPresent = place !== null && place < result.samples;
-  showNumber(row.now, isPresent ? node.series[NOW][place] : NaN, !isPresent);
+  const isPending = status === "pending";
+  showNumber(row.now, isPresent ? node.series[NOW][place] : NaN, !isPresent, isPending);
   const hasValue = node.initial && place !== null;
   const at = Math.min(place ?? 0, result.samples - 1);
-  showNumber(row.soFar, hasValue ? node.series[VALUE][at] : NaN, !hasValue);
+  showNumber(row.soFar, hasValue ? node.series[VALUE][at] : NaN, !hasValue, isPending);
   if (hasValue && isLast) row.soFar.title = node.value;
   else row.soFar.title = hasValue && run.settles ? intervalText(node.series[LOWER][at], node.series[UPPER][at]) : "";
 }
@@ -75,8 +76,9 @@ function intervalText(lower, upper) {
   return `final value between ${numberText(lower)} and ${numberText(upper)}`;
 }
 
-function showNumber(made, number, isEmpty) {
+// What is pending is no violation, whatever its sign.
+function showNumber(made, number, isEmpty, isPending) {
   made.textContent = isEmpty ? "" : numberText(number);
-  const sign = isEmpty || Number.isNaN(number) ? "unknown" : signOf(number);
+  const sign = isPending || isEmpty || Number.isNaN(number) ? "unknown" : signOf(number);
   made.className = `number is-${sign}`;
 }
