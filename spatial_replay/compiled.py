@@ -143,7 +143,7 @@ class _Kernel(Generic[_Arguments, _Result]):
         self._element_s: float | None = None
 
     def __call__(self, *arguments: _Arguments.args, **named: _Arguments.kwargs) -> _Result:
-        if self._compiled is not None and _process.only is None:
+        if self._compiled is not None and _process.only != "interpreted":
             return self._compiled(*arguments, **named)
         elements = _CALL + _elements(arguments)
         if not self._may_interpret(elements):

@@ -192,7 +192,8 @@ def _lines(tuning: Tuning) -> Iterator[str]:
     if tuning.conflict is not None:
         names = ", ".join(constant.name for constant in tuning.constants)
         together = "these contradict each other:" if len(tuning.conflict.runs) > 1 else "this one never fits:"
-        yield f"found no values of {names} that fit {runs}; {together}"
+        start = f"no values of {names} exist" if tuning.conflict.is_proven else f"found no values of {names}"
+        yield f"{start} that fit {runs}; {together}"
         yield from (f"  {part}" for part in tuning.conflict.message.split("; "))
         return
     kind = "widest margin" if count[False] else "tightest values"

@@ -40,7 +40,8 @@ def tuning_html(tuning: Tuning) -> Html:
     """Return the values found, or why there are none, and the runs, the closest first."""
     name = element("b", tuning.specification.filename)
     if tuning.conflict is not None:
-        return element("div", name, f": no values fit all runs. {tuning.conflict.message}.")
+        none = "no values fit" if tuning.conflict.is_proven else "found no values that fit"
+        return element("div", name, f": {none} all runs. {tuning.conflict.message}.")
     rows = [
         (each.name, str(each.value), str(each.written), f"{each.low} to {each.high}")
         for each in tuning.constants

@@ -1,7 +1,8 @@
 """Tuning: the constants with which good runs satisfy a specification and bad ones do not.
 
 `varied` is a constant with the values to try, `direction` says which way they loosen the specification,
-`margins` how far each run is from the other verdict, `search` finds the values, `tuned` says what was found.
+`substitution` puts values into formulas, `margins` says how far each run is from the other verdict, `search`
+finds the values, `exact` several of them at once, `tuned` says what was found.
 
 Names are loaded when they are first used.
 """

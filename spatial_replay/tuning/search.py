@@ -17,6 +17,7 @@ from typing import Final
 import numpy as np
 
 from spatial_replay.errors import UsageError
+from spatial_replay.tuning.exact import ExactSearch
 from spatial_replay.tuning.margins import Margins, Point
 
 _PARTS: Final = 1 << 20
@@ -38,11 +39,13 @@ class Found:
         point: where it ended.
         is_held: whether every run has the right verdict there.
         conflict: runs that have not all the right verdict at any point, as far as was searched; () if held.
+        is_proven: whether they have it at no point at all; True if held.
     """
 
     point: Point
     is_held: bool
     conflict: tuple[int, ...] = ()
+    is_proven: bool = True
 
 
 class Search:
@@ -67,6 +70,8 @@ class Search:
             return self._tightest()
         if len(self._steps) == 1 and self._margins.directions[0] is not None:
             return self._widest_of_one()
+        if None not in self._margins.directions:
+            return self._widest_by_boxes()
         return self._widest_of_several()
 
     def holds(self, point: Point) -> bool:
@@ -172,6 +177,39 @@ class Search:
 
     # ------------------------------------------------------------------------------------ several constants
 
+    def _widest_by_boxes(self) -> Found:
+        """Decide exactly over the runs that decide, and add those that turn out to, until none is missing."""
+        exact = ExactSearch(self._margins, self._loosened)
+        deciding = self._worst(self._margins.start, [])
+        while True:
+            good, bad = self._sorted(deciding)
+            found = exact.widest(good, bad)
+            if found.looseness is None:
+                break
+            point = self._climbed(deciding, self._loosened(found.looseness))
+            missing = self._worst(point, deciding) or self._failing(point)[:1]
+            if not missing:
+                return Found(self._centred(point), is_held=True)
+            deciding += missing
+        if found.is_proven:
+            # each run that is left is needed for the contradiction
+            for run in list(deciding):
+                rest = self._sorted([each for each in deciding if each != run])
+                fewer = exact.decide(*rest, 0.0)
+                if fewer.looseness is None and fewer.is_proven:
+                    deciding.remove(run)
+        return Found(self._margins.start, False, tuple(deciding), found.is_proven)
+
+    def _sorted(self, runs: Sequence[int]) -> tuple[list[int], list[int]]:
+        """Return the good ones among runs, and the bad ones."""
+        return [run for run in runs if run in self._good], [run for run in runs if run in self._bad]
+
+    def _failing(self, point: Point) -> list[int]:
+        return [run for run in (*self._good, *self._bad) if not self._margins.holds(run, point)]
+
+    def _loosened(self, looseness: Sequence[int]) -> Point:
+        return tuple(self._numbered(axis, number) for axis, number in enumerate(looseness))
+
     def _widest_of_several(self) -> Found:
         """Optimise over the runs that decide, and add those that turn out to, until none is missing."""
         start = self._margins.start
@@ -184,7 +222,7 @@ class Search:
                 break
             deciding += missing
         if not self.holds(point):
-            return Found(point, is_held=False, conflict=self._conflict(point))
+            return Found(point, is_held=False, conflict=self._conflict(point), is_proven=False)
         return Found(self._centred(point), is_held=True)
 
     def _worst(self, point: Point, known: Sequence[int]) -> list[int]:
@@ -320,16 +358,9 @@ class Search:
         margin = self._margins.margin
         worst = [min(runs, key=lambda run: margin(run, point)) for runs in (self._good, self._bad) if runs]
         for few in (*[[run] for run in worst], worst):
-            best = self._best_for_one(few[0]) if len(few) == 1 else None
-            if not self._all_hold(few, best or self._optimised(few, point)):
+            if not self._all_hold(few, self._optimised(few, point)):
                 return tuple(few)
-        return tuple(run for run in self._good + self._bad if not self._margins.holds(run, point))
-
-    def _best_for_one(self, run: int) -> Point | None:
-        """Return the point with the widest margin of one run, if the constants have directions."""
-        if None in self._margins.directions:
-            return None
-        return self._at([int(run in self._good)] * len(self._steps), 1)
+        return tuple(self._failing(point))
 
     # ---------------------------------------------------------------------------------------------- points
 

@@ -77,10 +77,12 @@ class Conflict:
     Attributes:
         runs: names of the runs that cannot all have the right verdict.
         message: what each of them needs, as far as that is known.
+        is_proven: whether no values exist, rather than that none were found.
     """
 
     runs: tuple[str, ...]
     message: str
+    is_proven: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +218,11 @@ class Tuning(Displayed):
             ],
             "conflict": None
             if self.conflict is None
-            else {"runs": list(self.conflict.runs), "message": self.conflict.message},
+            else {
+                "runs": list(self.conflict.runs),
+                "message": self.conflict.message,
+                "proven": self.conflict.is_proven,
+            },
         }
 
 
@@ -329,7 +335,7 @@ def _conflict(margins: Margins, search: Search, found: Found) -> Conflict:
     more = len(names) - len(parts)
     if more:
         parts.append(f"and {counted(more, 'other run')} likewise")
-    return Conflict(names, "; ".join(parts))
+    return Conflict(names, "; ".join(parts), found.is_proven)
 
 
 def _needs(margins: Margins, search: Search, run: int, is_exact: bool) -> str:

@@ -94,6 +94,16 @@ class VariedConstant:
         decimal = self.decimal(number)
         return float(decimal) if self.written.duration_ns is None else text_of(Duration(int(decimal)))
 
+    def number(self, number: int) -> float:
+        """Return the value of that number, a duration in nanoseconds."""
+        decimal = self.decimal(number)
+        return float(decimal) if self.written.duration_ns is None else int(decimal)
+
+    @property
+    def written_number(self) -> float:
+        """The value in the text, a duration in nanoseconds."""
+        return self.written.value if self.written.duration_ns is None else self.written.duration_ns
+
     def text(self, number: int) -> str:
         """Return the value of that number as written in a text: `70`, `2.5s`."""
         return _text(self.decimal(number), self.written)

@@ -73,7 +73,7 @@ def test_runs_that_contradict_each_other_are_named_with_what_they_need(
     before = (folder / "s.spatial").read_bytes()
     assert tune("--good", "bad/0.jsonl", "--bad", "good/1.jsonl", "bad/1.jsonl", "--write") == 1
     said = capsys.readouterr().out
-    assert "found no values of near that fit 1 good run and 2 bad runs" in said
+    assert "no values of near exist that fit 1 good run and 2 bad runs" in said
     assert "bad/0.jsonl is satisfied only with near >= 5" in said or "0.jsonl is satisfied only" in said
     assert "is violated only with near <= 0.49999" in said
     assert (folder / "s.spatial").read_bytes() == before
@@ -90,6 +90,7 @@ def test_json_has_values_margins_and_conflicts(folder: Path, capsys: pytest.Capt
     assert document["conflict"] == {
         "runs": ["0.jsonl"],
         "message": "0.jsonl is not satisfied with any near from 0 to 0.5",
+        "proven": True,
     }
 
 
@@ -174,3 +175,19 @@ def test_a_template_is_tuned_over_the_objects_of_each_run() -> None:
     text = "const near = 1 in [0, 9]\nspec s(ego) = G (ego dist cup <= near)"
     tuning = sr.tune(sr.parse_specification(text), run_at([3, 2]), run_at([6, 2]), each={"ego": "all"})
     assert tuning.values == {"near": 4.5}
+
+
+def test_a_small_corner_that_fits_is_found_and_its_absence_is_proven() -> None:
+    text = (
+        "const a = 1 in [0, 10]\nconst b = 1 in [0, 10]\nconst soon = 0.5s in [0s, 3s]\n"
+        "spec s = F[0s, soon] (cube dist cup <= a)\nspec t = G (speed <= b)\n"
+    )
+    good = [run_at([9, 5.013, 8, 8], speed=4), run_at([5.02, 9, 9, 9], speed=3)]
+    bad = [run_at([9, 5.03, 8, 8], speed=3), run_at([9, 8, 1, 8], speed=2), run_at([1, 9], speed=4.01)]
+    tuning = sr.tune(sr.parse_specification(text), good, bad)
+    assert tuning.is_found and tuning.margin == pytest.approx(0.005, abs=1e-5)
+    assert tuning.values["a"] == pytest.approx(5.025, abs=1e-3)
+    assert tuning.values["b"] == pytest.approx(4.005, abs=1e-3)
+    refused = sr.tune(sr.parse_specification(text), good, [*bad, run_at([9, 5.012, 8, 8], speed=1)])
+    assert refused.conflict is not None and refused.conflict.is_proven
+    assert set(refused.conflict.runs) == {"good run 1", "bad run 4"}
