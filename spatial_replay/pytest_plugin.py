@@ -40,7 +40,8 @@ class SuiteFile(pytest.File):
     def collect(self) -> Iterable[pytest.Item]:
         """Yield a test for each case, log and spec; faults of the suite end the collection."""
         from spatial_replay.batch.rows import Task
-        from spatial_replay.batch.run import checked_spec_files, found_logs
+        from spatial_replay.batch.run import found_logs
+        from spatial_replay.batch.spec_files import checked_spec_files
         from spatial_replay.batch.suite import load_suite
         from spatial_replay.errors import SpatialReplayError
 

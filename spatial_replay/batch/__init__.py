@@ -1,8 +1,8 @@
 """Many logs: a suite of cases in, rows of results out.
 
-`suite` says what is evaluated, `log_files` finds the logs, `rows` evaluates one log with all its
-specifications, `run` does so for all of them with the processes of `executors`, and `data_set` keeps what
-comes out. The other modules show it.
+`suite` says what is evaluated, `spec_files` checks the specifications, `log_files` finds the logs, `rows`
+evaluates one log with all its specifications, `run` does so for all of them with the processes of `workers`,
+and `data_set` keeps what comes out. The other modules show it.
 
 Names are loaded when they are first used.
 """

@@ -15,8 +15,9 @@ from typing import Any
 import spatial_replay as sr
 from spatial_replay.batch.data_set import ResultsFolder, run_columns
 from spatial_replay.batch.rows import Task, rows_from_task
-from spatial_replay.batch.run import read_specification_text, run_batch
+from spatial_replay.batch.run import run_batch
 from spatial_replay.batch.run_table import worst_rows
+from spatial_replay.batch.spec_files import read_specification_text
 from spatial_replay.batch.suite import Suite
 from spatial_replay.batch.workers import LocalProcesses, ThisProcess, Workers
 from spatial_replay.logs.source import MemorySource
