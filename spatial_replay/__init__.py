@@ -44,12 +44,8 @@ if TYPE_CHECKING:
     from spatial_replay.compare.movement import ObjectDiff
     from spatial_replay.compare.run_results import RunSpecDiff
     from spatial_replay.compare.runs import LogDiff
-    from spatial_replay.compare.specifications import (
-        FirstDifference,
-        SpecDiff,
-        SpecificationDiff,
-        TextPlace,
-    )
+    from spatial_replay.compare.spec_diff import FirstDifference, SpecDiff, TextPlace
+    from spatial_replay.compare.specifications import SpecificationDiff
     from spatial_replay.compare.trees import Edit
     from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
     from spatial_replay.monitor.causes import Cause, LeastPart
@@ -197,12 +193,8 @@ __getattr__, __dir__ = loaded_when_used(
         "compare.movement": ("ObjectDiff",),
         "compare.run_results": ("RunSpecDiff",),
         "compare.runs": ("LogDiff",),
-        "compare.specifications": (
-            "FirstDifference",
-            "SpecDiff",
-            "SpecificationDiff",
-            "TextPlace",
-        ),
+        "compare.spec_diff": ("FirstDifference", "SpecDiff", "TextPlace"),
+        "compare.specifications": ("SpecificationDiff",),
         "compare.trees": ("Edit",),
         "geometry.footprint": ("ConvexPart", "Footprint", "TrackedObject"),
         "monitor.causes": ("Cause", "LeastPart"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from spatial_replay.annotate.automaton_state import AutomatonRun
 from spatial_replay.automata.compile import automaton
 from spatial_replay.errors import NoAutomatonError, UsageError
-from spatial_replay.geometry.arrays import Integers
+from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.diagnostics import nearest_hint
@@ -159,7 +160,12 @@ def _event(results: Sequence[tuple[SpecResult, SpecResult]], name: str) -> Knot:
         names += [node.name for node in one.nodes if node.name is not None]
         if name not in names:
             continue
-        times = [_first_change(result, name) for result in (one, other)]
+        # the value of a spec without temporal operators is that of the first sample, and stays
+        pairs = [
+            [_first_change(result.times_ns, series(result.node(name))) for result in (one, other)]
+            for series in (attrgetter("value"), attrgetter("now"))
+        ]
+        times = next((pair for pair in pairs if None not in pair), pairs[0])
         for which, time_ns in zip("AB", times, strict=True):
             if time_ns is None:
                 raise UsageError(
@@ -171,12 +177,11 @@ def _event(results: Sequence[tuple[SpecResult, SpecResult]], name: str) -> Knot:
     raise UsageError(f"no spec is named {name!r} to align by; {known}; or give time or progress")
 
 
-def _first_change(result: SpecResult, name: str) -> int | None:
-    value = result.node(name).value
-    known = np.flatnonzero(~np.isnan(value))
-    holds = value[known] >= 0.0
+def _first_change(times_ns: Integers, values: Floats) -> int | None:
+    known = np.flatnonzero(~np.isnan(values))
+    holds = values[known] >= 0.0
     turned = np.flatnonzero(holds != holds[0]) if len(known) else known
-    return int(result.times_ns[known[turned[0]]]) if len(turned) else None
+    return int(times_ns[known[turned[0]]]) if len(turned) else None
 
 
 class _Visit(NamedTuple):

@@ -10,170 +10,29 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, Final, NamedTuple
-
-import numpy as np
+from typing import Any, Final
 
 from spatial_replay.compare.edit_cause import EditOutcome, EditOutcomes, find_cause
-from spatial_replay.compare.trees import Edit, TreeDiff, compare_trees, unify_regions
+from spatial_replay.compare.shared_names import unify_regions
+from spatial_replay.compare.spec_diff import SpecDiff, TextPlace
+from spatial_replay.compare.trees import Edit, TreeDiff, compare_trees
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.lazy import Displayed
 from spatial_replay.logs.source import Source
 from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import require_ltlf
-from spatial_replay.monitor.sentences import number_text, reason_sentence
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, LogNames, ReplayOptions, Selection
 from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
 from spatial_replay.spec.format import format_duration
 from spatial_replay.spec.formula import NamedSpec, Span, Specification
 from spatial_replay.spec.load import parse_specification
-from spatial_replay.text import Instant, Sentence, counted, counted_from, json_number
+from spatial_replay.text import counted, counted_from
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
 
 _MOST_CONSTANTS: Final = 32
 """Changed constants of a file that edits are traced back to."""
-
-
-class TextPlace(NamedTuple):
-    """A line of a specification file, from 1."""
-
-    filename: str
-    line: int
-    text: str
-
-
-class FirstDifference(NamedTuple):
-    """The first sample with another value of a result, and both values (NaN: not determined)."""
-
-    time_ns: int
-    old: float
-    new: float
-
-
-@dataclass(frozen=True, eq=False)
-class SpecDiff(Displayed):
-    """One spec before and after the edit, or one object's instance of a template.
-
-    Attributes:
-        name: in the new file; `old_name` in the old one.
-        old, new: its results over the log.
-        edits: between the two formulas, named specs within them included.
-        cause: the edits that changed the verdict or, if that stayed, the robustness; none if both stayed.
-            Making only these gives the new outcome, making all others the old one.
-        alone: for each edit of the cause, the outcome with that edit only.
-        old_places, new_places: the lines of the two texts, by edit.
-    """
-
-    name: str
-    old_name: str
-    old: SpecResult
-    new: SpecResult
-    edits: tuple[Edit, ...]
-    cause: tuple[Edit, ...]
-    alone: tuple[EditOutcome, ...]
-    old_places: Mapping[Edit, TextPlace]
-    new_places: Mapping[Edit, TextPlace]
-
-    @property
-    def is_flipped(self) -> bool:
-        """Whether the verdict changed."""
-        return self.old.verdict is not self.new.verdict
-
-    @property
-    def is_different(self) -> bool:
-        """Whether the verdict or a final number changed."""
-        return not EditOutcome.of(self.old).same_as(EditOutcome.of(self.new))
-
-    @cached_property
-    def first(self) -> FirstDifference | None:
-        """The first sample with another value; None if there is none."""
-        if self.old.times_ns.shape != self.new.times_ns.shape:
-            return None
-        one, other = self.old.series[0, 0], self.new.series[0, 0]
-        differs = np.flatnonzero((one != other) & ~(np.isnan(one) & np.isnan(other)))
-        if not len(differs):
-            return None
-        at = int(differs[0])
-        return FirstDifference(int(self.old.times_ns[at]), float(one[at]), float(other[at]))
-
-    @property
-    def title(self) -> str:
-        """Its name with the object that it is about, and its old name if that was another."""
-        title = self.name if self.old.object is None else f"{self.name}({self.old.object})"
-        return title if self.name == self.old_name else f"{title} (was {self.old_name})"
-
-    def sentences(self, first_ns: int) -> Iterator[Sentence]:
-        """Yield what changed, one sentence each, with times counted from `first_ns`."""
-        yield Sentence(f"{_outcome_text(self.old)} → {_outcome_text(self.new)}")
-        if self.first is not None:
-            values = f"{number_text(self.first.old)} → {number_text(self.first.new)}"
-            yield Sentence("first differs at ", Instant(self.first.time_ns, first_ns), f": {values}")
-        for edit, alone in zip(self.cause, self.alone, strict=True):
-            yield Sentence(f"because: {edit}, in `{edit.spec}`")
-            yield from (Sentence(f"  {each}") for each in self._lines_of(edit))
-            outcome = f"{alone.verdict}, robustness {number_text(alone.robustness)}"
-            yield Sentence(f"  with this edit alone: {outcome}")
-        if len(self.cause) > 1:
-            yield Sentence(f"it takes these {len(self.cause)} edits together")
-        if self.is_flipped and self.new.causes and self.new.causes[0].witness is not None:
-            yield reason_sentence(self.new.causes[0].witness, first_ns=first_ns)
-        others = [edit for edit in self.edits if edit not in self.cause]
-        for edit in others[:_MOST_LISTED]:
-            what = "edited, too" if self.cause else "edited, without effect on the result"
-            yield Sentence(f"{what}: {edit}")
-        if len(others) > _MOST_LISTED:
-            yield Sentence(f"and {counted(len(others) - _MOST_LISTED, 'other edit')}")
-
-    def _lines_of(self, edit: Edit) -> Iterator[str]:
-        for sign, places in (("-", self.old_places), ("+", self.new_places)):
-            if edit in places:
-                place = places[edit]
-                yield f"{sign} {place.filename}:{place.line}: {place.text}"
-
-    @property
-    def document(self) -> dict[str, Any]:
-        """The same as values for JSON."""
-        first = self.first
-        return {
-            "name": self.name,
-            "old_name": self.old_name,
-            "object": self.old.object,
-            "flipped": self.is_flipped,
-            "old": EditOutcome.of(self.old).document,
-            "new": EditOutcome.of(self.new).document,
-            "first_difference": None
-            if first is None
-            else {"time_ns": first.time_ns, "old": json_number(first.old), "new": json_number(first.new)},
-            "cause": [
-                {**self._edit_value(edit), "alone": alone.document}
-                for edit, alone in zip(self.cause, self.alone, strict=True)
-            ],
-            "edits": [self._edit_value(edit) for edit in self.edits],
-        }
-
-    def _edit_value(self, edit: Edit) -> dict[str, Any]:
-        old, new = self.old_places.get(edit), self.new_places.get(edit)
-        return {
-            "kind": edit.kind,
-            "spec": edit.spec,
-            "subject": edit.subject,
-            "old": edit.old,
-            "new": edit.new,
-            "old_nodes": list(edit.old_nodes),
-            "new_nodes": list(edit.new_nodes),
-            "old_line": None if old is None else old.line,
-            "new_line": None if new is None else new.line,
-        }
-
-    def __repr__(self) -> str:
-        return f"<{self.title}: {_outcome_text(self.old)} → {_outcome_text(self.new)}>"
-
-
-_MOST_LISTED: Final = 8
-"""Edits without effect that are listed; JSON has all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -451,7 +310,3 @@ def _places(edits: Sequence[Edit], file: Specification, *, is_old: bool) -> Iter
 def _defining_line(lines: Sequence[str], statement: str, name: str) -> int | None:
     pattern = re.compile(rf'\s*{statement}\s+"?{re.escape(name)}"?\s*=')
     return next((number for number, line in enumerate(lines, 1) if pattern.match(line)), None)
-
-
-def _outcome_text(result: SpecResult) -> str:
-    return f"{result.verdict} ({number_text(result.robustness)})"

@@ -9,19 +9,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, Literal, TypeAlias
 
+from spatial_replay.compare.shared_names import without_group_name, without_group_names
 from spatial_replay.spec.format import format_bound, format_formula, format_term
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
-    Earlier,
-    Enlarged,
     Formula,
     Group,
-    Measurement,
-    Outline,
     Quantified,
     RegionName,
     Span,
@@ -32,7 +28,7 @@ from spatial_replay.spec.formula import (
     operands_of,
     operator_of,
 )
-from spatial_replay.spec.walks import base_of, iter_terms, map_leaves, map_terms
+from spatial_replay.spec.walks import base_of, iter_terms
 
 EditKind: TypeAlias = Literal[
     "constant", "region", "group", "definition", "replaced", "added", "removed", "moved", "renamed"
@@ -137,26 +133,6 @@ def compare_trees(old: Formula, new: Formula, name: str) -> TreeDiff:
     return comparison.finished(merged)
 
 
-def unify_regions(
-    formulas: Sequence[Formula], regions: Mapping[str, Outline], others: Mapping[str, Outline]
-) -> tuple[list[Formula], dict[str, Outline]]:
-    """Rename the regions of some formulas that others have with another shape; texts stay.
-
-    Returns:
-        The formulas, and the regions of both.
-    """
-    renamed: dict[str, str] = {}
-    joined = dict(others)
-    for name, outline in regions.items():
-        if others.get(name, outline) != outline:
-            own = f"{name} (before)"
-            while own in others or own in regions:
-                own += "'"
-            renamed[name] = own
-        joined[renamed.get(name, name)] = outline
-    return [_with_regions(formula, renamed) for formula in formulas], joined
-
-
 @dataclass(frozen=True, slots=True)
 class _Place:
     """A node with its id, the spec that it is in, and its depth."""
@@ -205,9 +181,10 @@ class _Comparison:
             case Truth():
                 key = node.value
             case Atom():
-                key = (node.relation, node.expression)
+                key = (node.relation, without_group_names(node.expression))
             case Quantified():
-                key = (node.quantifier, node.variables, node.group, self.meaning(node.body))
+                group = without_group_name(node.group)
+                key = (node.quantifier, node.variables, group, self.meaning(node.body))
             case Boolean(operator="spec"):
                 return self.meaning(node.operands[0])
             case Boolean(operator="and" | "or" | "xor" | "<->"):
@@ -304,8 +281,7 @@ class _Comparison:
                 self._align_names(one, other)
 
     def _pairwise(self, old: _Place, new: _Place) -> tuple[_Merged, ...]:
-        pairs = zip(old.operands, new.operands, strict=True)
-        return tuple([self.align(one, other) for one, other in pairs])
+        return tuple([self.align(*pair) for pair in zip(old.operands, new.operands, strict=True)])
 
     def _is_among(self, place: _Place, operands: Sequence[_Place]) -> bool:
         return any(self.meaning(place.node) == self.meaning(each.node) for each in operands)
@@ -422,35 +398,3 @@ def _renumbered(merged: _Merged, numbers: Mapping[int, int]) -> _Merged:
     operands = tuple(_renumbered(operand, numbers) for operand in merged.operands)
     edit = None if merged.edit is None else numbers[merged.edit]
     return replace(merged, edit=edit, operands=operands)
-
-
-def _with_regions(formula: Formula, renamed: Mapping[str, str]) -> Formula:
-    if not renamed:
-        return formula
-    match formula:
-        case Truth():
-            return formula
-        case Atom():
-            expression = map_leaves(formula.expression, partial(_leaf_with_regions, renamed=renamed))
-            terms = tuple(_term_with_regions(term, renamed) for term in formula.terms)
-            return replace(formula, expression=expression, terms=terms)
-        case Quantified():
-            return replace(formula, body=_with_regions(formula.body, renamed))
-        case _:
-            operands = tuple(_with_regions(each, renamed) for each in formula.operands)
-            return replace(formula, operands=operands)
-
-
-def _leaf_with_regions(leaf: Any, renamed: Mapping[str, str]) -> Any:
-    if not isinstance(leaf, Measurement):
-        return leaf
-    return map_terms(leaf, partial(_term_with_regions, renamed=renamed))
-
-
-def _term_with_regions(term: Term, renamed: Mapping[str, str]) -> Term:
-    if isinstance(term, RegionName):
-        return RegionName(renamed.get(term.name, term.name))
-    if not isinstance(term, (Earlier, Enlarged)):
-        return term
-    inner: Any = _term_with_regions(term.term, renamed)
-    return replace(term, term=inner)

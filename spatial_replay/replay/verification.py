@@ -13,6 +13,7 @@ from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import CERTIFICATE, METADATA
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.replay.annotated import load_files, run_replay
+from spatial_replay.replay.clipped_source import CLIP_METADATA, clipped_source
 from spatial_replay.replay.kept_messages import KEEP_ALL
 from spatial_replay.replay.selection import ReplayOptions, Window
 from spatial_replay.spec.formula import Specification
@@ -78,6 +79,11 @@ def verify_certificate(
         raise UsageError(
             f"{log.name} is a layer without samples; give the log that it was made from: --source SOURCE"
         )
+    keep = None if source is None else _kept(about, options)
+    clip = metadata.get(CLIP_METADATA, {})
+    # a replay of a clip has its record, too, but was made from all of the clip
+    if source is not None and clip and clip.get("source") == about.get("source"):
+        source, keep = clipped_source(source, clip), None
     replayed = run_replay(
         log if source is None else source,
         _files(log),
@@ -85,7 +91,7 @@ def verify_certificate(
             Window(**{name: options[name] for name in _WINDOW if name in options}),
             options.get("each", {}),
             _semantics(about),
-            keep=None if source is None else _kept(about, options),
+            keep=keep,
         ),
         advance=advance,
     )

@@ -152,6 +152,11 @@ def test_a_clip_says_how_small_it_got_and_is_replayed_without_other_files(
     (push,) = json.loads(out)["specifications"]
     assert {node["name"]: node["robustness"] for node in push["nodes"]}["gaps"] == pytest.approx(-0.00484626)
     assert said(capsys, "verify", "bug.mcap")[0] == 0
+    assert said(capsys, "verify", "bug.mcap", "--source", "push.mcap")[0] == 0
+    assert said(capsys, "verify", "bug.mcap", "--source", "table.jsonl")[0] != 0
+    # a replay of a clip was made from all of it
+    assert said(capsys, "replay", "bug.mcap", "-o", "again.mcap")[0] == 1
+    assert said(capsys, "verify", "again.mcap", "--source", "bug.mcap")[0] == 0
     before = Path("bug.mcap").read_bytes()
     said(capsys, *arguments)
     assert Path("bug.mcap").read_bytes() == before
@@ -227,3 +232,7 @@ def test_a_clip_of_a_bag_keeps_what_was_valid_before_it(
     code, out, _ = said(capsys, "clip", *arguments, "-o", "small.mcap", "--topics", "/a")
     info = json.loads(said(capsys, "info", "small.mcap", "--json")[1])
     assert "/words" not in {each["topic"] for each in info["topics"]}
+    for name in ("bug.mcap", "small.mcap"):
+        # the last messages before the clip are cut out again, too
+        source = ("--source", "drive.bag", "--mapping", "drive.yaml")
+        assert said(capsys, "verify", name, *source)[0] == 0

@@ -14,7 +14,8 @@ import spatial_replay as sr
 from laws.strategies_monitor import HEADER, WORDS, recordings, specifications
 from laws.strategies_spec import formula_texts
 from spatial_replay import NamedSpec, Specification
-from spatial_replay.compare.trees import compare_trees, unify_regions
+from spatial_replay.compare.shared_names import unify_regions
+from spatial_replay.compare.trees import compare_trees
 from spatial_replay.spec.formula import Formula
 
 OTHER_HEADER = HEADER.replace("box(-2, -2, 3, 2)", "box(-1, -2, 3, 1)")

@@ -1,0 +1,147 @@
+"""Diffs of recorded and planned runs, of runs at different speeds, and of regions and groups."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+import spatial_replay as sr
+from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanDecision
+
+
+def blocks(data: Path, name: str) -> tuple[sr.Trace, str]:
+    """Every fifth sample of a recording of the paper, and its specification."""
+    trace = sr.read_trace(data / "paper" / f"{name}.jsonl.gz")
+    text = json.loads((data / "paper" / "expected.json").read_text())[name]["spec"]
+    return trace.take(np.arange(0, len(trace), 5)), text
+
+
+def test_a_goal_that_moved_is_named_with_the_node_that_no_longer_holds(data_folder: Path) -> None:
+    trace, text = blocks(data_folder, "blocks_moving_passage")
+    old = sr.parse_specification(text)
+    moved = sr.parse_specification(text.replace("(250, 350), (50, 350)", "(250, 250), (50, 250)"))
+    diff = sr.diff_specifications(trace, old, moved).spec("blocks")
+    assert (str(diff.old.verdict), str(diff.new.verdict)) == ("satisfied", "violated")
+    (cause,) = diff.cause
+    assert (cause.kind, cause.subject, cause.spec) == ("region", "redGoal", "reach")
+    assert cause.new == "red1 enclosedin redGoal"
+    assert diff.new_places[cause].text.startswith("region redGoal")
+    again = text.replace("region redGoal", "region  redGoal").replace("(250, 350)", "(250.0, 350)")
+    assert sr.diff_specifications(trace, old, sr.parse_specification(again)).is_empty
+
+
+def test_blocks_that_miss_their_goals_are_named_with_the_nodes_they_fail(data_folder: Path) -> None:
+    trace, text = blocks(data_folder, "blocks_moving_passage")
+    other, _ = blocks(data_folder, "blocks_move_violation")
+    (spec,) = sr.diff_logs(trace, other, sr.parse_specification(text)).specs
+    assert spec.is_flipped
+    assert "F (red1 enclosedin redGoal)" in [spec.a.nodes[node].text for node in spec.nodes]
+    assert {each.name for each in spec.moved} == {"red1", "red2", "green1", "green2"}
+
+
+ROUND = """\
+spec near = cup dist plate <= 1
+spec away = F ((cup dist plate <= 1) and F (cup dist plate >= 4))
+"""
+
+
+def drive(speed: float, waits_s: int = 0) -> sr.Trace:
+    """A cup that waits, comes to a plate and leaves it; a sample each second."""
+    plate = sr.Footprint.box(0, 0, 1, 1)
+    ways = np.concatenate([np.zeros(waits_s), np.arange(0.0, 16.0 + speed / 2, speed)])
+    return sr.Trace.from_samples(
+        sr.Sample(10**9 * second, {"plate": plate, "cup": sr.Footprint.box(x, 0, x + 1, 1)})
+        for second, x in enumerate((np.abs(8.0 - ways) + 1.25).tolist())
+    )
+
+
+def test_runs_of_different_speeds_are_aligned_by_their_progress() -> None:
+    fast, slow = drive(1.0), drive(0.5)
+    specification = sr.parse_specification(ROUND.splitlines()[1])
+    (by_time,) = sr.diff_logs(fast, slow, specification).objects
+    by_progress = sr.diff_logs(fast, slow, specification, align="progress")
+    assert by_progress.alignment is not None
+    assert len(by_progress.alignment.knots) >= 3
+    assert by_time.shift > 5.0
+    # between two changes of state the cup moves evenly, so that each sample has its counterpart
+    assert all(each.shift <= 1.0 for each in by_progress.objects)
+    assert not by_progress.is_empty
+
+
+def test_runs_are_aligned_by_an_event() -> None:
+    early, late = drive(1.0), drive(1.0, waits_s=7)
+    specification = sr.parse_specification(ROUND)
+    (by_time,) = sr.diff_logs(early, late, specification).objects
+    by_event = sr.diff_logs(early, late, specification, align="near")
+    assert by_time.shift > 5.0
+    assert by_event.objects == ()
+    assert by_event.alignment is not None
+    ((a_ns, b_ns),) = by_event.alignment.knots
+    assert b_ns - a_ns == 7 * 10**9
+
+
+def with_another_decision(log: Path, copy: Path) -> Path:
+    """A copy of a planned run whose second decision has another reason, and another map of one object."""
+    numbers: dict[int, int] = {}
+    with log.open("rb") as stream, copy.open("wb") as output:
+        writer = Writer(output)
+        writer.start()
+        for schema, channel, message in make_reader(stream).iter_messages():
+            if channel.id not in numbers:
+                assert schema is not None
+                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
+                numbers[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, schema_id
+                )
+            payload = message.data
+            if channel.topic == "/plan/decision":
+                decision = PlanDecision.FromString(payload)
+                if decision.number == 1:
+                    decision.reason = f"differently: {decision.reason}"
+                    decision.considered[0].candidates[0].map_sha256 = b"another"
+                payload = decision.SerializeToString()
+            writer.add_message(numbers[channel.id], message.log_time, payload, message.publish_time)
+        writer.finish()
+    return copy
+
+
+def test_of_planned_runs_the_first_decision_that_differs_is_named_with_its_maps(tmp_path: Path) -> None:
+    run = Path(__file__).resolve().parents[2] / "recordings" / "push.mcap"
+    diff = sr.diff_logs(run, with_another_decision(run, tmp_path / "other.mcap"))
+    assert not diff.objects
+    assert diff.decision is not None
+    assert diff.decision.number == 1
+    assert diff.decision.b == f"differently: {diff.decision.a}"
+    assert len(diff.decision.maps) == 1
+    assert "decision 1 is the first that differs" in repr(diff)
+    same = sr.diff_logs(run, run)
+    assert same.decision is None
+    assert same.is_empty
+
+
+def test_squares_are_told_apart_by_their_corners_alone() -> None:
+    # one square turned into another: centre, spread and every sum over the corners stay
+    corners = [(5, 0), (0, 5), (-5, 0), (0, -5)], [(3, 4), (-4, 3), (-3, -4), (4, -3)]
+    one, other = (
+        sr.Trace.from_samples([sr.Sample(0, {"tile": sr.Footprint.polygon(each)})]) for each in corners
+    )
+    (tile,) = sr.diff_logs(one, other).objects
+    assert tile.name == "tile"
+    assert tile.shift == 0.0
+    assert tile.greatest < 0.0
+
+
+def test_a_group_under_another_name_is_the_same_group() -> None:
+    text = "group NAME = red, green\nspec clear = G (NAME dist blue >= 1)"
+    boxes = {name: sr.Footprint.box(x, 0, x + 1, 1) for name, x in (("red", 0), ("green", 2), ("blue", 5))}
+    trace = sr.Trace.from_samples([sr.Sample(0, boxes)])
+    old, new = (sr.parse_specification(text.replace("NAME", name)) for name in ("reds", "obstacles"))
+    diff = sr.diff_specifications(trace, old, new)
+    assert diff.is_empty, diff
+    fewer = sr.parse_specification(text.replace("red, green", "red").replace("NAME", "reds"))
+    edits = [edit for spec in sr.diff_specifications(trace, old, fewer).specs for edit in spec.edits]
+    assert [(edit.kind, edit.subject) for edit in edits] == [("group", "reds")]
