@@ -121,12 +121,14 @@ def _draw_curves(surface: Surface, ax: Axes) -> None:
 def _draw_colours(surface: Surface, ax: Axes) -> None:
     least = _finite(surface.least)
     most = float(np.abs(least).max()) or 1.0
+    # margins far below 0 would fade what fits, which is often little above
+    most = min(most, 3 * float(least.max())) if least.max() > 0 else most
     mesh = ax.pcolormesh(
         surface.x, surface.y, least, cmap=signed_colours(), vmin=-most, vmax=most, shading="nearest"
     )
     figure = ax.get_figure(root=True)
     if figure is not None:
-        figure.colorbar(mesh, ax=ax, label="least margin")
+        figure.colorbar(mesh, ax=ax, label="least margin", extend="min" if least.min() < -most else "neither")
     for (_, is_good), margins in list(zip(surface.runs, surface.margins, strict=True))[:_MOST_LINES]:
         if min(margins.shape) > 1 and margins.min() < 0.0 <= margins.max():
             ax.contour(
