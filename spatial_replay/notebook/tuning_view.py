@@ -124,7 +124,14 @@ def _draw_colours(surface: Surface, ax: Axes) -> None:
     # margins far below 0 would fade what fits, which is often little above
     most = min(most, 3 * float(least.max())) if least.max() > 0 else most
     mesh = ax.pcolormesh(
-        surface.x, surface.y, least, cmap=signed_colours(), vmin=-most, vmax=most, shading="nearest"
+        surface.x,
+        surface.y,
+        least,
+        cmap=signed_colours(),
+        vmin=-most,
+        vmax=most,
+        alpha=0.6,
+        shading="nearest",
     )
     figure = ax.get_figure(root=True)
     if figure is not None:
