@@ -112,7 +112,9 @@ def _latched(source: Source, start_ns: int) -> Messages:
 def _messages_before(source: Source, end_ns: int) -> Iterator[Messages]:
     if isinstance(source, McapSource):
         with source.open_walk() as walk:
-            if {channel.topic for channel in walk.channels.values()} <= {OBJECTS}:
+            topics = {channel.topic for channel in walk.channels.values()} - {OBJECTS}
+            # with samples alone, and what is derived from them, there is nothing to look for
+            if not any(map(source.is_wanted, topics)):
                 return
     for block in read_blocks(source, None, end_ns):
         yield _between(block.messages, 0, end_ns)
