@@ -141,6 +141,11 @@ def test_a_window_is_played_as_a_replay_writes_it(window: Window, is_recorded: b
     assert played(player, 0, times_ns) == expected
 
 
+def apart(messages: list[tuple[str, int, bytes]]) -> list[tuple[str, int, bytes]]:
+    """Messages by time, ours after others: in a file they have chunks of their own, in either order."""
+    return sorted(messages, key=lambda message: (message[1], message[0].startswith("/spatial/")))
+
+
 def test_external_messages_are_played_and_sent_again_after_a_seek(tmp_path: Path) -> None:
     source = open_source(ROOT / "recordings/push.mcap")
     file = sr.load_specification(ROOT / "recordings/push.spatial")
@@ -150,7 +155,7 @@ def test_external_messages_are_played_and_sent_again_after_a_seek(tmp_path: Path
     player = Playback(LoadedLog(source, [file]).evaluate())
     middle_ns = (player.start_ns + player.end_ns) // 2
     steps = range(player.start_ns, player.end_ns, 333_333_333)
-    assert played(player, 0, steps) == whole
+    assert apart(played(player, 0, steps)) == apart(whole)
     found = sent(player.seek(middle_ns))
     others = {topic for topic in content.topics() if topic.startswith("/plan/")}
     assert others
@@ -181,12 +186,12 @@ def test_a_playback_starts_at_the_first_sample_with_the_messages_before_it(tmp_p
     assert [data for topic, _, data in found if topic == "/words"] == [b"2"]
     assert {SPECIFICATION, OBJECTS, ROBUSTNESS, SCENE} <= {topic for topic, *_ in found}
     found += sent(player.advance_to(player.end_ns))
-    assert found[1:] == [each for each in expected if each[1] >= player.start_ns]
+    assert apart(found[1:]) == apart([each for each in expected if each[1] >= player.start_ns])
 
 
 def test_the_end_of_the_log_comes_last_and_once(tmp_path: Path) -> None:
     source = open_source(talking(tmp_path / "talking.mcap"))
-    expected = annotated(source, tmp_path / "annotated.mcap")
+    expected = apart(annotated(source, tmp_path / "annotated.mcap"))
     assert [(topic, time_ns) for topic, time_ns, _ in expected[-3:]] == [
         ("/words", COUNT * STEP_NS),
         (EVENTS, COUNT * STEP_NS),
