@@ -79,7 +79,7 @@ class LocalProcesses:
                 with _pool(1) as pool:
                     yield from _results(pool, work, iter([task]), 1, again)
                 if again:
-                    yield task, WorkerLost(f"its process ended twice while it was evaluated{_MEMORY}")
+                    yield task, WorkerLost(f"its process ended while it was evaluated by itself{_MEMORY}")
 
 
 _MEMORY: Final = "; is there memory enough for it?"

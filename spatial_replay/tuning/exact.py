@@ -23,7 +23,7 @@ _CONTRACTION: Final = 4
 """Halvings by which a side of a box is cut in one turn."""
 
 
-class Decision(NamedTuple):
+class Feasibility(NamedTuple):
     """Whether some runs all have a margin at some point.
 
     Attributes:
@@ -61,7 +61,7 @@ class ExactSearch:
             tuple(name for part in several for name in part.results),
         )
 
-    def widest(self, good: Sequence[int], bad: Sequence[int]) -> Decision:
+    def widest(self, good: Sequence[int], bad: Sequence[int]) -> Feasibility:
         """Return the point of the widest margin of some runs, if at any point all have the right verdict."""
         found = self.decide(good, bad, 0.0)
         if found.looseness is None:
@@ -86,9 +86,9 @@ class ExactSearch:
                 is_proven &= tried.is_proven
             else:
                 best, low = tried.looseness, max(level, self._least((*good, *bad), tried.looseness))
-        return Decision(best, is_proven)
+        return Feasibility(best, is_proven)
 
-    def decide(self, good: Sequence[int], bad: Sequence[int], level: float) -> Decision:
+    def decide(self, good: Sequence[int], bad: Sequence[int], level: float) -> Feasibility:
         """Return a point at which some runs have at least a margin, or whether there is none."""
         numbers = list(self._steps)
         uncovered = list(bad)
@@ -96,10 +96,10 @@ class ExactSearch:
             for axis in part.axes:
                 numbers[axis] = self._tightest(good, numbers, axis, level, part)
             if not all(self._holds(run, numbers, level, part.results) for run in good):
-                return Decision(None)
+                return Feasibility(None)
             uncovered = [run for run in uncovered if not self._holds(run, numbers, level, part.results)]
         if not self._joint.axes:
-            return Decision(None if uncovered else tuple(numbers))
+            return Feasibility(None if uncovered else tuple(numbers))
         return self._in_boxes(good, uncovered, numbers, level)
 
     def _tightest(
@@ -120,13 +120,13 @@ class ExactSearch:
 
     def _in_boxes(
         self, good: Sequence[int], bad: Sequence[int], numbers: Sequence[int], level: float
-    ) -> Decision:
+    ) -> Feasibility:
         low = _with(numbers, self._joint.axes, 0)
         boxes = [(low, list(numbers))]
         most = self._margins.evaluations + _MOST_EVALUATIONS
         for _ in range(_MOST_BOXES):
             if not boxes:
-                return Decision(None)
+                return Feasibility(None)
             if self._margins.evaluations > most:
                 break
             low, high = boxes.pop()
@@ -138,13 +138,13 @@ class ExactSearch:
             self._contract(bad, high, low, level)
             for corner in (low, high):
                 if all(self._holds(run, corner, level, self._joint.results) for run in (*good, *bad)):
-                    return Decision(tuple(corner))
+                    return Feasibility(tuple(corner))
             axis = max(self._joint.axes, key=lambda axis: self._share(axis, low, high))
             if high[axis] > low[axis]:
                 middle = (low[axis] + high[axis]) // 2
                 boxes.append((_with(low, [axis], middle + 1), list(high)))
                 boxes.append((list(low), _with(high, [axis], middle)))
-        return Decision(None, is_proven=not boxes)
+        return Feasibility(None, is_proven=not boxes)
 
     def _share(self, axis: int, low: Sequence[int], high: Sequence[int]) -> float:
         return (high[axis] - low[axis]) / self._steps[axis]

@@ -123,7 +123,7 @@ def test_of_planned_runs_the_first_decision_that_differs_is_named_with_its_maps(
     assert same.is_empty
 
 
-def test_squares_are_told_apart_by_their_corners_alone() -> None:
+def test_squares_differ_by_their_corners_alone() -> None:
     # one square turned into another: centre, spread and every sum over the corners stay
     corners = [(5, 0), (0, 5), (-5, 0), (0, -5)], [(3, 4), (-4, 3), (-3, -4), (4, -3)]
     one, other = (
