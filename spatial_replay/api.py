@@ -327,7 +327,7 @@ def evaluate_logs(
         logs: a suite file (.yaml), which says all the rest; or logs: files, folders, patterns such as
             "nightly/**/*.mcap", addresses.
         specifications: the specification files, unless `logs` is a suite.
-        output: the folder of results, made if need be.
+        output: the folder of results, made if need be, or the address of one, as "s3://bucket/results".
         jobs: how many processes evaluate; a program that gives more than 1 needs the guard
             `if __name__ == "__main__":`, as for every process pool.
         dask: the address of a Dask scheduler, whose workers evaluate instead.
@@ -365,7 +365,7 @@ def evaluate_logs(
     else:
         files = [specifications] if isinstance(specifications, str | PathLike) else specifications
         suite = Suite.of_logs([fspath(log) for log in named], [Path(file) for file in files], conditions)
-    return run_batch(suite, Path(output), workers_of(jobs, dask), fail_on=frozenset(fail_on))
+    return run_batch(suite, output, workers_of(jobs, dask), fail_on=frozenset(fail_on))
 
 
 def read_results(folder: PathName) -> pa.Table:
@@ -377,7 +377,7 @@ def read_results(folder: PathName) -> pa.Table:
     """
     from spatial_replay.batch.data_set import ResultsFolder
 
-    return ResultsFolder.open(Path(folder)).read_run()
+    return ResultsFolder.open(folder).read_run()
 
 
 def verify(log: PathName, source: PathName | None = None, **reading: Unpack[Reading]) -> Verified:

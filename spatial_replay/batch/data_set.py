@@ -1,4 +1,4 @@
-"""Results of batches as a folder of Parquet files: rows by specification, and the table of the last run.
+"""Results of batches as Parquet files: rows by specification, and the table of the last run.
 
     RESULTS/format.json             the version of this layout
     RESULTS/rows/spec_hash=HASH/*   the rows of everything that was evaluated, by specification
@@ -6,25 +6,31 @@
     RESULTS/identities.jsonl        what unchanged logs hold, so that they need not be hashed again
 
 The rows of one log under one specification have a key, which is a hash of all they depend on. A worker
-writes them as one file named after the key, under another name first, so a file is whole or not there. When a
-run ends, small files are joined into larger ones. A run that is killed between writing and removing leaves
-rows of one key in two files; they are equal, and readers take the first.
+writes them as one file named after the key, which is whole or not there. When a run ends, small files are
+joined into larger ones. A run that is killed between writing and removing leaves rows of one key in two
+files; they are equal, and readers take the first.
+
+RESULTS is a folder on this machine, or in a bucket. There, identities are not kept, and there is no lock,
+which a killed batch would leave behind: two batches at once lose no rows, because a file is removed only
+after another one holds its rows.
 """
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
+import io
 import json
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
-from pathlib import Path
+from os import PathLike
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Final
 
+from spatial_replay.batch.result_files import LocalFolder, ResultFiles, result_files
 from spatial_replay.batch.rows import ResultRow
-from spatial_replay.errors import LogError, MissingFileError, OutputError, UsageError
-from spatial_replay.logs.output_file import output_error, refuse_addresses, replacing
+from spatial_replay.errors import LogError, MissingFileError, UsageError
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -89,26 +95,23 @@ def table_of(rows: Mapping[str, Sequence[ResultRow]]) -> pa.Table:
     return _pyarrow().Table.from_pylist(values, schema=columns())
 
 
-def write_rows(folder: Path, spec_hash: str, key: str, rows: Sequence[ResultRow]) -> None:
+def write_rows(files: ResultFiles, spec_hash: str, key: str, rows: Sequence[ResultRow]) -> None:
     """Write the rows of one key as one file, which appears when it is whole.
 
     Raises:
-        OutputError: the machine cannot write it.
+        OutputError: it cannot be written.
     """
-    partition = folder / _ROWS / f"{_PARTITION}{spec_hash}"
-    try:
-        partition.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise output_error(partition, error) from error
     # it is joined with others soon: what makes searching fast would take longer than the rest
-    _write(partition / f"{key}.parquet", table_of({key: rows}), use_dictionary=False, write_statistics=False)
+    data = _encoded(table_of({key: rows}), use_dictionary=False, write_statistics=False)
+    files.write(f"{_ROWS}/{_PARTITION}{spec_hash}/{key}.parquet", data)
 
 
-def _write(path: Path, table: pa.Table, **options: Any) -> None:
+def _encoded(table: pa.Table, **options: Any) -> bytes:
     from pyarrow import parquet
 
-    with replacing(path) as stream:
-        parquet.write_table(table, stream, compression="zstd", **options)
+    stream = io.BytesIO()
+    parquet.write_table(table, stream, compression="zstd", **options)
+    return stream.getvalue()
 
 
 class ResultsFolder:
@@ -117,46 +120,42 @@ class ResultsFolder:
     Only the process that has it `locked` writes to it, and its workers, which `write_rows`.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, files: ResultFiles) -> None:
+        self._files = files
+        self.location: str = files.location
 
     @classmethod
-    def create(cls, path: Path) -> ResultsFolder:
+    def create(cls, path: str | PathLike[str]) -> ResultsFolder:
         """Open a folder for a batch; one that does not exist is made.
 
         Raises:
-            UsageError: an address; it holds something else, or results of another version.
+            UsageError: it holds something else, or results of another version.
             OutputError: it cannot be written.
+            MissingFileError, RemoteError: a bucket cannot be read.
         """
         _pyarrow()
-        refuse_addresses(path)
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            # a batch that was killed at its very beginning leaves a partial file
-            is_new = all(each.name.endswith(".partial") for each in path.iterdir())
-        except FileExistsError:
-            raise UsageError(f"{path} is a file; results are a folder, give it another name") from None
-        except OSError as error:
-            raise output_error(path, error) from error
-        if is_new:
-            with replacing(path / _FORMAT_FILE) as stream:
-                stream.write(json.dumps({"spatial_replay_results": FORMAT}).encode() + b"\n")
+        files = result_files(path)
+        if not files.exists():
+            files.write(_FORMAT_FILE, json.dumps({"spatial_replay_results": FORMAT}).encode() + b"\n")
         return cls.open(path)
 
     @classmethod
-    def open(cls, path: Path) -> ResultsFolder:
+    def open(cls, path: str | PathLike[str]) -> ResultsFolder:
         """Open the results of an earlier run.
 
         Raises:
             MissingFileError: there is no such folder.
             UsageError: it does not hold results, or those of another version.
+            RemoteError: a bucket cannot be read.
         """
         _pyarrow()
-        if not path.is_dir():
-            raise MissingFileError(f"{path}: no such folder; give the results of a batch")
+        files = result_files(path)
+        if not files.exists():
+            raise MissingFileError(f"{path}: no such folder, or an empty one; give the results of a batch")
         try:
-            version = json.loads((path / _FORMAT_FILE).read_text("utf-8"))["spatial_replay_results"]
-        except (OSError, ValueError, LookupError, TypeError):
+            (data,) = files.read([_FORMAT_FILE])
+            version = json.loads(data)["spatial_replay_results"]
+        except (MissingFileError, ValueError, LookupError, TypeError):
             raise UsageError(
                 f"{path} does not hold the results of a batch; give those, or an empty or new folder"
             ) from None
@@ -165,34 +164,32 @@ class ResultsFolder:
                 f"{path} holds results of format {version!s:.20}, and this version writes format {FORMAT}; "
                 "give another folder, and the batch evaluates all logs into it"
             )
-        return cls(path)
+        return cls(files)
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other batches from writing here, and remove what killed ones have left.
+        """Keep other batches from writing here, unless it is in a bucket.
 
         Raises:
             UsageError: another batch is running.
         """
-        with (self.path / _FORMAT_FILE).open("rb") as stream:
-            try:
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                raise UsageError(
-                    f"another batch is writing to {self.path}; wait for it, or give another folder"
-                ) from None
-            for partial in [*self.path.glob(".*.partial"), *self.path.glob(f"{_ROWS}/*/.*.partial")]:
-                partial.unlink(missing_ok=True)
+        if isinstance(self._files, LocalFolder):
+            with self._files.locked(_FORMAT_FILE):
+                yield
+        else:
             yield
+
+    @property
+    def identities(self) -> Path | None:
+        """The file of identities; None in a bucket, where other machines have other files of one path."""
+        return self._files.path / IDENTITIES if isinstance(self._files, LocalFolder) else None
 
     def keys(self) -> set[str]:
         """Return the keys whose rows are stored."""
-        found = set[str]()
-        for file in self._files():
-            if file.name.startswith(_JOINED):
-                found.update(_read(file, ["key"]).column("key").to_pylist())
-            else:
-                found.add(file.stem)
+        joined, single = self._row_files()
+        found = {_key_of(name) for name in single}
+        for table in self._tables(joined, ["key"]):
+            found.update(table.column("key").to_pylist())
         return found
 
     def rows(self, wanted: set[str] | None = None) -> pa.Table:
@@ -201,46 +198,54 @@ class ResultsFolder:
         Args:
             wanted: keys; None for all.
         """
-        pa = _pyarrow()
         tables, taken = [], set[str]()
-        for file in self._files():
-            if not file.name.startswith(_JOINED) and (
-                file.stem in taken or (wanted is not None and file.stem not in wanted)
-            ):
-                continue
-            table = _read(file)
+        joined, single = self._row_files()
+        for table in self._tables(joined):
             keys = table.column("key").to_pylist()
             own = {key for key in keys if key not in taken and (wanted is None or key in wanted)}
             taken |= own
             tables.append(table if len(own) == len(set(keys)) else table.filter([key in own for key in keys]))
-        return pa.concat_tables(tables) if tables else columns().empty_table()
+        fresh = {_key_of(name): name for name in single}
+        tables += self._tables(
+            [name for key, name in fresh.items() if key not in taken and (wanted is None or key in wanted)]
+        )
+        return _pyarrow().concat_tables(tables) if tables else columns().empty_table()
 
     def join_files(self) -> None:
         """Join small files into larger ones; call it while `locked`.
 
         Raises:
-            OutputError: the machine cannot write them.
+            OutputError: they cannot be written.
         """
-        for partition in sorted((self.path / _ROWS).glob(f"{_PARTITION}*")):
-            files = sorted(partition.glob("*.parquet"))
-            joined = [file for file in files if file.name.startswith(_JOINED)]
-            stored = {key for file in joined for key in _read(file, ["key"]).column("key").to_pylist()}
-            single = [file for file in files if not file.name.startswith(_JOINED)]
-            fresh = [file for file in single if file.stem not in stored]
+        partitions: dict[str, tuple[list[str], list[str]]] = defaultdict(lambda: ([], []))
+        for kind, names in enumerate(self._row_files()):
+            for name in names:
+                partitions[str(PurePosixPath(name).parent)][kind].append(name)
+        for partition, (joined, single) in sorted(partitions.items()):
+            if not single:
+                continue
+            stored = {
+                key for table in self._tables(joined, ["key"]) for key in table.column("key").to_pylist()
+            }
+            fresh = [name for name in single if _key_of(name) not in stored]
             if len(fresh) > 1:
                 for begin in range(0, len(fresh), _MOST_JOINED):
-                    _join(fresh[begin : begin + _MOST_JOINED], partition)
-            with _removing(partition):
-                for file in single if len(fresh) > 1 else set(single) - set(fresh):
-                    file.unlink()
+                    self._join(fresh[begin : begin + _MOST_JOINED], partition)
+            self._files.remove(single if len(fresh) > 1 else sorted(set(single) - set(fresh)))
+
+    def _join(self, names: Sequence[str], partition: str) -> None:
+        table = _pyarrow().concat_tables(list(self._tables(names)))
+        # named after what it holds, so that joining the same files twice gives one file
+        digest = hashlib.sha256("".join(map(_key_of, names)).encode()).hexdigest()[:32]
+        self._files.write(f"{partition}/{_JOINED}{digest}.parquet", _encoded(table))
 
     def write_run(self, table: pa.Table) -> None:
         """Write the table of a run, whole or not at all.
 
         Raises:
-            OutputError: the machine cannot write it.
+            OutputError: it cannot be written.
         """
-        _write(self.path / LAST_RUN, table)
+        self._files.write(LAST_RUN, _encoded(table))
 
     def read_run(self) -> pa.Table:
         """Return the table of the last run that ended.
@@ -249,50 +254,50 @@ class ResultsFolder:
             UsageError: none has.
             LogError: its file is damaged.
         """
-        file = self.path / LAST_RUN
-        if not file.exists():
-            raise UsageError(f"no run has ended in {self.path} so far; run the batch again, and it goes on")
-        return _read(file)
+        try:
+            (table,) = self._tables([LAST_RUN])
+        except MissingFileError:
+            raise UsageError(
+                f"no run has ended in {self._files} so far; run the batch again, and it goes on"
+            ) from None
+        return table
 
-    def _files(self) -> list[Path]:
-        """Return the files with rows, joined ones first."""
-        files = (self.path / _ROWS).glob(f"{_PARTITION}*/*.parquet")
-        return sorted(files, key=lambda file: (not file.name.startswith(_JOINED), file))
+    def _row_files(self) -> tuple[list[str], list[str]]:
+        """Return the names of the files with the rows of several keys, and of those with one."""
+        names = [
+            name
+            for name in self._files.names(_ROWS)
+            if name.startswith(f"{_ROWS}/{_PARTITION}") and name.endswith(".parquet")
+        ]
+        joined = [name for name in names if _key_of(name).startswith(_JOINED)]
+        return joined, [name for name in names if not _key_of(name).startswith(_JOINED)]
+
+    def _tables(self, names: Sequence[str], columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
+        """Read tables; they were written by us, since nothing else belongs in the folder.
+
+        Raises:
+            LogError: one is damaged.
+        """
+        pa = _pyarrow()
+        from pyarrow import parquet
+
+        for name, data in zip(names, self._files.read(names), strict=True):
+            try:
+                # not `read_table`, which takes twice as long
+                with parquet.ParquetFile(pa.BufferReader(data)) as opened:
+                    table = opened.read(columns, use_threads=False)
+            except (OSError, pa.ArrowException) as error:
+                reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+                raise LogError(
+                    f"{self._files}/{name} cannot be read: {reason}; "
+                    "delete it, and the batch evaluates it again"
+                ) from None
+            yield table
 
 
-def _join(files: Sequence[Path], partition: Path) -> None:
-    table = _pyarrow().concat_tables([_read(file) for file in files])
-    # named after what it holds, so that joining the same files twice gives one file
-    name = hashlib.sha256("".join(file.stem for file in files).encode()).hexdigest()[:32]
-    _write(partition / f"{_JOINED}{name}.parquet", table)
-
-
-@contextmanager
-def _removing(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(f"{folder}: a file could not be removed: {error.strerror}") from error
-
-
-def _read(file: Path, names: Sequence[str] | None = None) -> pa.Table:
-    """Read a table; one written by us, since nothing else belongs in the folder.
-
-    Raises:
-        LogError: it is damaged.
-    """
-    pa = _pyarrow()
-    from pyarrow import parquet
-
-    try:
-        # not `read_table`, to which the name of its folder is a column, and which takes twice as long
-        with parquet.ParquetFile(file) as opened:
-            return opened.read(names, use_threads=False)
-    except (OSError, pa.ArrowException) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise LogError(
-            f"{file} cannot be read: {reason}; delete it, and the batch evaluates it again"
-        ) from None
+def _key_of(name: str) -> str:
+    """Return the key whose rows a file holds."""
+    return PurePosixPath(name).stem
 
 
 def _pyarrow() -> Any:

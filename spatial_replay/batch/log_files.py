@@ -16,7 +16,8 @@ from spatial_replay.errors import LogError, SpatialReplayError, UsageError
 from spatial_replay.logs.mcap.chunks import MAGIC
 from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.output_file import replacing
-from spatial_replay.logs.remote import RemoteFile, is_address, log_file, matching_addresses
+from spatial_replay.logs.remote import RemoteFile, is_address, log_file
+from spatial_replay.logs.remote_folder import matching_addresses
 from spatial_replay.logs.topics import CERTIFICATE
 from spatial_replay.text import counted
 
@@ -149,11 +150,13 @@ class Identities:
     One object belongs to one batch; `save` keeps what it knows for the next one.
     """
 
-    def __init__(self, file: Path) -> None:
-        """Read what an earlier batch has left; a file that is damaged is ignored."""
+    def __init__(self, file: Path | None) -> None:
+        """Read what an earlier batch has left; a file that is damaged is ignored. None remembers nothing."""
         self._file = file
         self._known: dict[str, str] = {}
         self._used: dict[str, str] = {}
+        if file is None:
+            return
         try:
             for line in file.read_text("utf-8").splitlines():
                 state, identity = json.loads(line)
@@ -172,7 +175,7 @@ class Identities:
         Raises:
             OutputError: the machine cannot write them.
         """
-        if self._used == self._known:
+        if self._file is None or self._used == self._known:
             return
         with replacing(self._file) as stream:
             for item in sorted(self._used.items()):

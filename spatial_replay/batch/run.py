@@ -8,12 +8,13 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 from spatial_replay import __version__
-from spatial_replay.batch.data_set import FORMAT, IDENTITIES, ResultsFolder, run_columns, table_of, write_rows
+from spatial_replay.batch.data_set import FORMAT, ResultsFolder, run_columns, table_of, write_rows
 from spatial_replay.batch.log_files import FoundLog, Identities, find_logs
+from spatial_replay.batch.result_files import result_files
 from spatial_replay.batch.rows import (
     ResultRow,
     Task,
@@ -92,7 +93,7 @@ def workers_of(jobs: int, dask: str | None = None) -> Workers:
 
 def run_batch(
     suite: Suite,
-    results: Path,
+    results: str | PathLike[str],
     workers: Workers,
     *,
     fail_on: frozenset[str] = frozenset(),
@@ -103,7 +104,7 @@ def run_batch(
     """Evaluate what is new, and return and store the results of all logs of a suite.
 
     Args:
-        results: the folder of results, made if need be.
+        results: the folder of results or its address, made if need be.
         fail_on: "vacuous" and "unknown": what fails although the case allows it.
         threads: how many logs are hashed at once.
         begin: called with the number of logs to evaluate.
@@ -118,7 +119,7 @@ def run_batch(
     logs = found_logs(suite)
     folder = ResultsFolder.create(results)
     with folder.locked():
-        identities = Identities(folder.path / IDENTITIES)
+        identities = Identities(folder.identities)
         paths = list(dict.fromkeys(log.path for several in logs for log in several))
         known = dict(zip(paths, identities.of(paths, threads), strict=True))
         identities.save()
@@ -127,7 +128,7 @@ def run_batch(
         tasks = list(_tasks(wanted, stored))
         begin(len(tasks))
         errors: dict[str, tuple[ResultRow, ...]] = {}
-        work = partial(evaluate_and_store, folder.path.resolve())
+        work = partial(evaluate_and_store, folder.location)
         for task, result in workers.results(work, tasks):
             errors |= _errors(task, result)
             advance(1)
@@ -138,14 +139,14 @@ def run_batch(
     return BatchResult(table, len(paths), len({task.task.log for task in tasks}), tuple(wanted))
 
 
-def evaluate_and_store(folder: Path, stored: StoredTask) -> dict[str, tuple[ResultRow, ...]]:
+def evaluate_and_store(folder: str, stored: StoredTask) -> dict[str, tuple[ResultRow, ...]]:
     """Evaluate a task and store its rows; errors are returned by key, and not stored: they may pass."""
-    errors = {}
+    errors, files = {}, result_files(folder)
     for rows, key, spec_hash in zip(rows_from_task(stored.task), stored.keys, stored.hashes, strict=True):
         if any(row.error is not None for row in rows):
             errors[key] = rows
         else:
-            write_rows(folder, spec_hash, key, rows)
+            write_rows(files, spec_hash, key, rows)
     return errors
 
 
@@ -163,7 +164,8 @@ def _require_shared(folder: ResultsFolder, tasks: Sequence[StoredTask], errors: 
     missing = {key for task in tasks for key in task.keys if key not in errors}
     if missing and not missing <= folder.keys():
         raise UsageError(
-            f"the workers' rows are not in {folder.path}: they see another disk; give a folder that all share"
+            f"the workers' rows are not in {folder.location}: they see another disk; "
+            "give a folder that all share"
         )
 
 

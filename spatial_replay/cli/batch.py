@@ -85,11 +85,11 @@ _CONDITIONS = (
 class BatchOutputs:
     """Where results go, and what they are compared with."""
 
-    output: Path | None
+    output: str | None
     junit: Path | None
     html: Path | None
     json_file: str | None
-    baseline: Path | None
+    baseline: str | None
     tolerance: str | None
     update_baseline: bool
 
@@ -99,8 +99,8 @@ _OUTPUTS = (
         "-o",
         "--output",
         metavar="RESULTS",
-        type=click.Path(path_type=Path),
-        help="Folder of results, which another run goes on with.  [default: results, or SUITE.results]",
+        help="Folder of results, also in a bucket, which another run goes on with.  "
+        "[default: results, or SUITE.results]",
     ),
     click.option("--junit", metavar="FILE", type=click.Path(path_type=Path), help="JUnit report to write."),
     click.option(
@@ -113,7 +113,6 @@ _OUTPUTS = (
     click.option(
         "--baseline",
         metavar="RESULTS",
-        type=click.Path(path_type=Path),
         help="Results of an earlier run: what got worse than there, or is gone, fails.",
     ),
     click.option("--tolerance", metavar="T", help="With --baseline: how much worse passes, as 5% or 0.02."),
@@ -163,7 +162,7 @@ def batch(
         raise UsageError("--jobs is for this machine, and a cluster has its own; remove --jobs or --dask")
     suite = _suite(logs, conditions, reading)
     folder = outputs.output or (
-        Path("results") if suite.path is None else suite.folder / f"{suite.name}.results"
+        "results" if suite.path is None else str(suite.folder / f"{suite.name}.results")
     )
     tolerance, before = _baseline(outputs)
     _check_outputs(outputs, suite)
@@ -276,6 +275,7 @@ def _baseline(outputs: BatchOutputs) -> tuple[Tolerance, pa.Table | None]:
     """Return the tolerance, and the table of the baseline if there is one."""
     from spatial_replay.batch.baseline import Tolerance
     from spatial_replay.batch.data_set import ResultsFolder
+    from spatial_replay.batch.result_files import result_files
 
     if outputs.baseline is None:
         if outputs.tolerance is not None or outputs.update_baseline:
@@ -284,12 +284,12 @@ def _baseline(outputs: BatchOutputs) -> tuple[Tolerance, pa.Table | None]:
         return Tolerance(), None
     with naming_option("--tolerance"):
         tolerance = Tolerance.parse(outputs.tolerance or "0")
-    if outputs.update_baseline and not outputs.baseline.exists():
+    if outputs.update_baseline and not result_files(outputs.baseline).exists():
         return tolerance, None
     return tolerance, ResultsFolder.open(outputs.baseline).read_run()
 
 
-def _run(suite: Suite, folder: Path, workers: Workers, fail_on: frozenset[str], threads: int) -> BatchResult:
+def _run(suite: Suite, folder: str, workers: Workers, fail_on: frozenset[str], threads: int) -> BatchResult:
     from spatial_replay.batch.run import run_batch
 
     with ExitStack() as stack:
@@ -326,7 +326,7 @@ def _write_pages(
         )
 
 
-def _print(result: BatchResult, folder: Path) -> None:
+def _print(result: BatchResult, folder: str) -> None:
     known = result.logs - result.evaluated
     news = f"{result.evaluated:,} evaluated now, {known:,} known" if known else "all evaluated now"
     show(f"{counted(result.logs, 'log')}, {headline(result.table)} ({news})")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -15,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("folder", metavar="RESULTS", type=click.Path(path_type=Path))
+@click.argument("folder", metavar="RESULTS")
 @click.option(
     "--worst", metavar="N", type=click.IntRange(min=0), default=10, help="Rows to show.  [default: 10]"
 )
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     "--by", type=click.Choice(["spec", "log"]), default="spec", show_default=True, help="What to sum up by."
 )
 @click.option("--json", "json_file", metavar="FILE|-", help="Rows to write, as JSON objects, one a line.")
-def results(folder: Path, worst: int, where: str | None, by: By, json_file: str | None) -> None:
+def results(folder: str, worst: int, where: str | None, by: By, json_file: str | None) -> None:
     """Show what the last run of a batch found: totals, and the worst results with their reasons.
 
     EXPR compares columns with texts and numbers: == != < <= > >=, "text" in COLUMN, and, or, not, none.

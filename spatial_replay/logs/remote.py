@@ -11,7 +11,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import timedelta
-from fnmatch import fnmatchcase
 from os import PathLike, fspath
 from pathlib import Path
 from threading import Lock
@@ -30,7 +29,7 @@ _CREDENTIALS: Final = {
 }
 """What helps where access is denied, by the scheme of an address."""
 
-_WEB: Final = ("http", "https")
+WEB_SCHEMES: Final = ("http", "https")
 
 _TAIL_BYTES: Final = 2**19
 """Bytes at the end of a file that are read first: the index of a log of a gigabyte mostly fits."""
@@ -71,31 +70,6 @@ def local_files(paths: Iterable[str | PathLike[str]]) -> list[Path]:
     return [Path(each) for each in paths if not is_address(each)]
 
 
-def matching_addresses(pattern: str) -> list[str]:
-    """Return the addresses of a bucket or container that fit a pattern, in order.
-
-    Args:
-        pattern: such as "s3://fleet/2026-11/*.mcap"; an end in "/" stands for everything below.
-
-    Raises:
-        UsageError: a web server cannot list its files.
-        MissingFileError, RemoteError: the bucket cannot be read.
-    """
-    scheme, _, rest = pattern.partition("://")
-    if scheme in _WEB:
-        raise UsageError(f"{pattern}: web servers do not list their files; give each address")
-    bucket, _, key = rest.partition("/")
-    begin = min((key.find(sign) for sign in "*?[" if sign in key), default=len(key))
-    fixed, wanted = key[:begin].rpartition("/")[0], key + "*" if key.endswith("/") or not key else key
-    obstore = _obstore()
-    try:
-        listed = obstore.list(_store(scheme, bucket), fixed or None)
-        keys = sorted(each["path"] for some in listed for each in some)
-    except (OSError, ValueError, obstore.exceptions.BaseError) as error:
-        raise _failure(f"{scheme}://{bucket}", scheme, error) from None
-    return [f"{scheme}://{bucket}/{key}" for key in keys if fnmatchcase(key, wanted)]
-
-
 @dataclass(frozen=True, slots=True)
 class FileVersion:
     """What identifies the content of a remote file.
@@ -126,7 +100,7 @@ class RemoteFile(PathLike[str]):
         parts = urlsplit(address)
         self._scheme = parts.scheme
         self._address = address
-        if self._scheme in _WEB:
+        if self._scheme in WEB_SCHEMES:
             # what follows the path may be a signature, which is a secret
             self._shown = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
             self._key, bucket, name = "", address, unquote(parts.path).rpartition("/")[2]
@@ -139,8 +113,8 @@ class RemoteFile(PathLike[str]):
                 f"{self._shown} names no file; give the address of one log, such as s3://bucket/run.mcap"
             )
         self.name = name
-        self._obstore = _obstore()
-        self._store = _store(self._scheme, bucket)
+        self._obstore = obstore_library()
+        self._store = open_store(self._scheme, bucket)
         self._held = HeldBytes()
         self._lock, self._opening = Lock(), Lock()
         self._version: FileVersion | None = None
@@ -244,7 +218,7 @@ class RemoteFile(PathLike[str]):
         try:
             yield from map(bytes, self._get({}).stream(min_chunk_size=2**20))
         except self._obstore.exceptions.BaseError as error:
-            raise _failure(self._shown, self._scheme, error) from None
+            raise store_failure(self._shown, self._scheme, error) from None
 
     def _opened(self) -> FileVersion:
         """Read the end and the beginning."""
@@ -296,7 +270,7 @@ class RemoteFile(PathLike[str]):
                 error = failure
             # requests are repeated by the library, answers that break off here
             if attempt == _ATTEMPTS:
-                raise _failure(self._shown, self._scheme, error) from None
+                raise store_failure(self._shown, self._scheme, error) from None
         raise AssertionError
 
     def _get(self, options: dict[str, Any]) -> Any:
@@ -308,7 +282,7 @@ class RemoteFile(PathLike[str]):
         except exceptions.PreconditionError:
             raise self._changed() from None
         except (OSError, ValueError, exceptions.BaseError) as error:
-            raise _failure(self._shown, self._scheme, error) from None
+            raise store_failure(self._shown, self._scheme, error) from None
 
     @staticmethod
     def _versioned(meta: Any, *, has_ranges: bool = True) -> FileVersion:
@@ -335,7 +309,12 @@ def file_size(file: LogFile) -> int:
     return file.size if isinstance(file, RemoteFile) else file.stat().st_size
 
 
-def _obstore() -> Any:
+def obstore_library() -> Any:
+    """Return obstore.
+
+    Raises:
+        UsageError: it is not installed.
+    """
     try:
         import obstore
         import obstore.exceptions
@@ -345,26 +324,35 @@ def _obstore() -> Any:
     return obstore
 
 
-def _store(scheme: str, bucket: str) -> Any:
-    stores = _obstore().store
+def open_store(scheme: str, bucket: str) -> Any:
+    """Return the store of a bucket or container, or of the address of a web server; nothing is read yet.
+
+    Raises:
+        RemoteError: it cannot be one.
+    """
+    stores = obstore_library().store
     options: dict[str, Any] = {"client_options": _CLIENT, "retry_config": _RETRIES}
     made = {"s3": stores.S3Store, "gs": stores.GCSStore, "az": stores.AzureStore}.get(scheme)
     try:
         return made(bucket, **options) if made else stores.HTTPStore.from_url(bucket, **options)
-    except (ValueError, _obstore().exceptions.BaseError) as error:
-        raise _failure(f"{scheme}://{bucket.partition('?')[0].rpartition('/')[2]}", scheme, error) from None
+    except (ValueError, obstore_library().exceptions.BaseError) as error:
+        raise store_failure(
+            f"{scheme}://{bucket.partition('?')[0].rpartition('/')[2]}", scheme, error
+        ) from None
 
 
-def _failure(shown: str, scheme: str, error: Exception) -> SpatialReplayError:
-    """Return the error for an address that cannot be read, with what helps."""
-    exceptions = _obstore().exceptions
+def store_failure(shown: str, scheme: str, error: Exception, done: str = "read") -> SpatialReplayError:
+    """Return the error for an address that cannot be read or written, with what helps."""
+    exceptions = obstore_library().exceptions
     if isinstance(error, FileNotFoundError):
         return MissingFileError(f"{shown}: there is no such file; check the address")
     if isinstance(error, (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError)):
         return MissingFileError(f"{shown}: access denied; {_CREDENTIALS[scheme]}")
     text = str(error).partition("\n")[0].strip()
+    if "404 " in text:
+        return MissingFileError(f"{shown}: there is no such bucket; check the address")
     if "416 " in text:
         return RemoteError(f"{shown} is empty; give a log with at least one sample")
     reason = fspath(text).rpartition(" - ")[2].partition(": <")[0].rstrip(":")
-    remedy = "the address" if scheme in _WEB else f"the credentials: {_CREDENTIALS[scheme]}"
-    return RemoteError(f"{shown} cannot be read: {reason}; check the network and {remedy}")
+    remedy = "the address" if scheme in WEB_SCHEMES else f"the credentials: {_CREDENTIALS[scheme]}"
+    return RemoteError(f"{shown} cannot be {done}: {reason}; check the network and {remedy}")

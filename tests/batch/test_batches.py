@@ -6,11 +6,14 @@ import json
 import shutil
 from importlib.resources import files
 from pathlib import Path
+from urllib.request import Request, urlopen
+from xml.etree import ElementTree
 
 import pytest
 
 import spatial_replay as sr
 from batch.fleet import GATE, batch, command, write_fleet, write_log
+from logs.servers import s3_server
 
 DISTANCES = [0.5, 0.4, 0.2, 0.1]
 
@@ -176,9 +179,9 @@ def test_all_errors_of_a_suite_are_reported_at_once_with_their_lines(fleet: Path
         (["empty", "--spec", "gate.spatial"], "no log in this folder"),
         (["logs"], "give a specification with --spec FILE"),
         (["logs", "--spec", "gate.spatial", "-o", "gate.spatial"], "is a file; results are a folder"),
+        (["logs", "--spec", "gate.spatial", "-o", "https://h/results"], "give a folder of a bucket"),
         (["logs", "--spec", "gate.spatial", "-o", "logs"], "does not hold the results of a batch"),
         (["logs", "--spec", "gate.spatial", "-o", "old"], "results of format 0"),
-        (["logs", "--spec", "gate.spatial", "-o", "s3://fleet/results"], "s3://fleet/results is an address"),
         (["logs", "--spec", "gate.spatial", "--tolerance", "5%"], "add --baseline"),
         (["logs", "--spec", "gate.spatial", "--baseline", "gone"], "no such folder"),
         (["logs", "--spec", "gate.spatial", "--junit", "gate.spatial"], "is an input too"),
@@ -196,7 +199,6 @@ def test_what_cannot_work_is_refused_with_the_remedy(fleet: Path, arguments: lis
     done = batch(*arguments)
     assert (done.code, message in done.err) == (2, True), done.err
     assert not Path("results").exists()
-    assert not Path("s3:").exists()
     if "missing.mcap" in arguments:
         assert "missing.mcap: no such file" in done.err
 
@@ -316,3 +318,58 @@ def test_every_key_of_suites_is_documented_and_the_published_schema_is_that_of_t
     assert [key for key in [*schema["properties"], *case] if f"`{key}`" not in page] == []
     packaged = (files("spatial_replay.batch") / "suite.schema.json").read_text()
     assert json.loads(packaged) == schema
+
+
+def test_results_in_a_bucket_are_kept_gone_on_with_searched_and_compared(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate = ["logs", "--spec", "gate.spatial"]
+    with s3_server("fleet", monkeypatch) as server:
+        assert (done := batch(*gate, "-o", "s3://fleet/nightly/")).code == 1, done.err
+        assert "wrote s3://fleet/nightly" in done.out
+        here = sr.evaluate_logs("logs", "gate.spatial", output="results").table
+        there = sr.read_results("s3://fleet/nightly")
+        assert there.drop(["seconds"]).equals(here.drop(["seconds"]))
+        # small files are joined there, too
+        assert [name.partition("/")[0] for name in _names(server)] == [
+            "format.json",
+            "last_run.parquet",
+            "rows",
+        ]
+
+        write_log(Path("logs/run-4.jsonl"), 0.05)
+        assert sr.evaluate_logs("logs", "gate.spatial", output="s3://fleet/nightly", jobs=2).evaluated == 1
+        assert sr.evaluate_logs("logs", "gate.spatial", output="s3://fleet/nightly").evaluated == 0
+        assert command("results", "s3://fleet/nightly").out.startswith("10 results: 7 satisfied, 3 violated")
+        for wrong, message in (("fleet/none", "no such folder"), ("none/none", "no such bucket")):
+            assert (done := command("results", f"s3://{wrong}")).code == 2
+            assert f"s3://{wrong}: " in done.err and message in done.err
+
+        compared = ["-o", "s3://fleet/nightly", "--baseline", "s3://fleet/main"]
+        assert batch(*gate, *compared, "--update-baseline").out.endswith("wrote s3://fleet/main\n")
+        write_log(Path("logs/run-0.jsonl"), 0.35)
+        assert "run-0.jsonl: apart is satisfied with robustness 0.05; it was" in batch(*gate, *compared).out
+
+        # rows cannot be written: nothing of them is there, and no table of a run
+        deny = {
+            "Effect": "Deny",
+            "Principal": "*",
+            "Action": "s3:PutObject",
+            "Resource": "arn:aws:s3:::fleet/day/rows/*",
+        }
+        policy = json.dumps({"Version": "2012-10-17", "Statement": [deny]}).encode()
+        as_json = {"Content-Type": "application/json"}
+        urlopen(Request(f"{server}/fleet?policy", policy, as_json, method="PUT")).close()
+        done = batch(*gate, "-o", "s3://fleet/day")
+        assert done.code == 70
+        assert "s3://fleet/day/rows/" in done.err and "access denied; set AWS_ACCESS_KEY_ID" in done.err
+        assert _names(server, "day") == ["format.json"]
+        urlopen(Request(f"{server}/fleet?policy", method="DELETE")).close()
+        assert batch(*gate, "-o", "s3://fleet/day").code == 1
+
+
+def _names(server: str, folder: str = "nightly") -> list[str]:
+    """Return what the server itself lists in a folder of results."""
+    with urlopen(f"{server}/fleet?list-type=2&prefix={folder}/") as answer:
+        keys = ElementTree.fromstring(answer.read()).iterfind(".//{*}Key")
+    return sorted(str(key.text).removeprefix(f"{folder}/") for key in keys)

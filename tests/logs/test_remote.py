@@ -5,15 +5,11 @@ from __future__ import annotations
 import io
 import os
 import shutil
-import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from urllib.request import Request, urlopen
 
 import numpy as np
 import pytest
@@ -22,13 +18,14 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 import spatial_replay as sr
+from logs.servers import free_port, running, s3_server
 from logs.web_server import WebServer, serving
 from spatial_replay import LogError, MissingFileError, UsageError
 from spatial_replay.cli import run
 from spatial_replay.errors import RemoteError
 from spatial_replay.logs import Channel, LogWriter, Messages, Schema
 from spatial_replay.logs.byte_ranges import joined_ranges
-from spatial_replay.logs.remote import matching_addresses
+from spatial_replay.logs.remote_folder import matching_addresses
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 SPEC = sr.parse_specification("G (cup dist plate >= 0.1)")
@@ -237,45 +234,14 @@ def test_without_obstore_an_address_says_what_to_install(tmp_path: Path) -> None
     assert "pip install 'spatial-replay[remote]'" in done.stderr
 
 
-def _free_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
-
-
-@contextmanager
-def _running(command: list[str], port: int) -> Iterator[None]:
-    """Run a server until the end of the block; it answers when the block begins."""
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        try:
-            for _ in range(600):
-                with socket.socket() as probe:
-                    if probe.connect_ex(("127.0.0.1", port)) == 0:
-                        break
-                time.sleep(0.05)
-            yield
-        finally:
-            process.terminate()
-
-
 def test_a_bucket_of_an_s3_server_is_listed_and_read(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("moto.server")
-    import obstore
-    from obstore.store import S3Store
+    monkeypatch.setenv("SPATIAL_REPLAY_CACHE", str(tmp_path))
+    with s3_server("fleet", monkeypatch):
+        import obstore
+        from obstore.store import S3Store
 
-    port = _free_port()
-    for name, value in {
-        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}",
-        "AWS_ACCESS_KEY_ID": "key",
-        "AWS_SECRET_ACCESS_KEY": "secret",
-        "AWS_REGION": "us-east-1",
-        "SPATIAL_REPLAY_CACHE": str(tmp_path),
-    }.items():
-        monkeypatch.setenv(name, value)
-    with _running([sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)], port):
-        urlopen(Request(f"http://127.0.0.1:{port}/fleet", method="PUT")).close()
         bucket = S3Store("fleet", client_options={"allow_http": True})
         obstore.put(bucket, "2026-11/drive 1+2.mcap", log.read_bytes())
         obstore.put(bucket, "2026-11/table.jsonl", (RECORDINGS / "table.jsonl").read_bytes())
@@ -290,7 +256,7 @@ def test_a_bucket_of_an_s3_server_is_listed_and_read(
 
 @pytest.mark.skipif(shutil.which("nginx") is None, reason="nginx is not installed")
 def test_nginx_serves_a_log_in_parts(log: Path, tmp_path: Path) -> None:
-    port = _free_port()
+    port = free_port()
     places = "".join(
         f"{kind}_temp_path {tmp_path / kind};"
         for kind in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
@@ -302,7 +268,7 @@ def test_nginx_serves_a_log_in_parts(log: Path, tmp_path: Path) -> None:
     # nginx's workers give up the rights of the user who starts them
     user = ["-g", "user root;"] if os.getuid() == 0 else []
     command = ["nginx", "-c", f"{tmp_path}/nginx.conf", "-e", f"{tmp_path}/error.log", *user]
-    with _running(command, port):
+    with running(command, port):
         replayed = sr.replay_log(
             f"http://127.0.0.1:{port}/drive.mcap", SPEC, start_ns=10**9, end_ns=2 * 10**9
         )

@@ -89,7 +89,7 @@ def bench_results(bench: Any) -> None:
         results.write_run(pa.table(columns, schema=schema))
         bench.measure(
             f"worst ten of {ROWS:,} rows",
-            lambda _: worst_rows(ResultsFolder.open(results.path).read_run(), 10),
+            lambda _: worst_rows(ResultsFolder.open(results.location).read_run(), 10),
             unit="search",
             runs=5,
             limit_s=1.0,
