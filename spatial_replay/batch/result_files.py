@@ -27,7 +27,7 @@ class LocalFolder:
         Raises:
             UsageError: it is a file.
         """
-        refuse_addresses(path)
+        refuse_addresses(path, "give it as a text: a path joins its slashes")
         if path.exists() and not path.is_dir():
             raise UsageError(f"{path} is a file; results are a folder, give that")
         self.path: Final = path

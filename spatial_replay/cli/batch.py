@@ -161,9 +161,9 @@ def batch(
     if dask is not None and jobs is not None:
         raise UsageError("--jobs is for this machine, and a cluster has its own; remove --jobs or --dask")
     suite = _suite(logs, conditions, reading)
-    folder = outputs.output or (
-        "results" if suite.path is None else str(suite.folder / f"{suite.name}.results")
-    )
+    folder = outputs.output
+    if folder is None:
+        folder = "results" if suite.path is None else str(suite.folder / f"{suite.name}.results")
     tolerance, before = _baseline(outputs)
     _check_outputs(outputs, suite)
     threads = jobs or os.cpu_count() or 1

@@ -149,7 +149,7 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
             raise UsageError(f"{output} lies in the folder {each}, which is an input; write it elsewhere")
 
 
-def refuse_addresses(output: Path) -> None:
+def refuse_addresses(output: Path, remedy: str = "write to this machine, and copy that") -> None:
     """Check that an output is on this machine.
 
     Raises:
@@ -157,7 +157,7 @@ def refuse_addresses(output: Path) -> None:
     """
     if output.parts and output.parts[0] in _SCHEMES:
         shown = str(output).replace(":/", "://", 1)
-        raise UsageError(f"{shown} is an address; write to this machine, and copy that")
+        raise UsageError(f"{shown} is an address; {remedy}")
 
 
 def output_error(output: Path, error: OSError) -> OutputError:
