@@ -1,7 +1,8 @@
 """Compile every kernel ahead of time, for images and for machines that start often.
 
 Kernels are compiled for the types of their arguments, so the way to compile them all is to do a little of
-everything: record, replay, explain, plan, read a bag. The tasks are shared among the processor's cores.
+everything: record, replay, explain, plan, compare, read a bag. The tasks are shared among the processor's
+cores.
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ from pathlib import Path
 from types import MappingProxyType
 
 from spatial_replay.bags.ros1_index import record_table
+from spatial_replay.compare.runs import diff_sources
 from spatial_replay.compiled import cache_folder, compile_ahead
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.logs.source import MemorySource
 from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.monitor import Monitor
 from spatial_replay.recording.recorder import Recorder
@@ -102,6 +105,12 @@ def _evaluate_as_the_paper() -> None:
         monitor.update(sample)
 
 
+def _compare() -> None:
+    samples = _samples()
+    runs = [MemorySource(Trace.from_samples(each)) for each in (samples, samples[1:])]
+    diff_sources((runs[0], runs[1]))
+
+
 def _read_bag() -> None:
     record_table(b"\0" * 8)
 
@@ -113,6 +122,7 @@ TASKS: Mapping[str, Callable[[], None]] = MappingProxyType(
         "monitor": _monitor,
         "plan": warm_up_planner,
         "paper": _evaluate_as_the_paper,
+        "compare": _compare,
         "bag": _read_bag,
     }
 )

@@ -135,7 +135,8 @@ def test_the_log_is_calm_about_what_is_pending_and_about_parts_that_need_not_hol
         assert "fail" not in facts["message"].split(":")[0]
         if "vacuous" in facts or facts["verdict"] == "unknown":
             continue
-        is_late = run.result.verdict == "violated" and time_ns >= (settled_ns or run.replayed.end_ns)
+        since_ns = run.replayed.end_ns if settled_ns is None else settled_ns
+        is_late = run.result.verdict == "violated" and time_ns >= since_ns
         assert level == Log.INFO or (is_late and facts["verdict"] == "violated")
 
 
