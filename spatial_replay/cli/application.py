@@ -14,6 +14,7 @@ import traceback
 from collections.abc import Iterable, Sequence
 from enum import IntEnum
 from importlib import import_module
+from types import FrameType
 from typing import NoReturn
 
 import click
@@ -102,11 +103,25 @@ def application() -> None:
 
 def main() -> NoReturn:
     """Run the program and exit."""
-    # a request to terminate cleans up as Ctrl-C does
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # a request to terminate cleans up as Ctrl-C does; a shell's background jobs ignore the latter
+    signal.signal(signal.SIGTERM, _interrupt)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
     # little of a short run is garbage, and looking for it a hundred times takes a twentieth of the run
     gc.set_threshold(50_000, 20, 20)
     sys.exit(run())
+
+
+class _Interruption(KeyboardInterrupt):
+    """An interruption that can be caught for good.
+
+    Once a plain KeyboardInterrupt has passed through an `exec`, as of a dataclass that is being made, the
+    interpreter ends the process by SIGINT, whoever caught it.
+    """
+
+
+def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
+    raise _Interruption
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
