@@ -107,8 +107,7 @@ def test_memory_does_not_grow_with_the_samples():
     tracemalloc.start()
     try:
         memory = [memory_after(0, begin + 200)]
-        for first in range(begin + 200, begin + 1400, 300):
-            memory.append(memory_after(first, first + 300))
+        memory += [memory_after(first, first + 300) for first in range(begin + 200, begin + 1400, 300)]
     finally:
         tracemalloc.stop()
     # a table that doubles takes memory once, what is kept of every sample takes it every time
