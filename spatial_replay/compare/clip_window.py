@@ -223,12 +223,11 @@ def _same(one: _Reason | None, other: _Reason) -> bool:
 
 
 def _joined_times(times_ns: Sequence[Integers]) -> Integers:
-    longest = max(times_ns, key=len)
-    return (
-        longest
-        if all(len(each) == len(longest) for each in times_ns)
-        else np.unique(np.concatenate(times_ns))
-    )
+    first = times_ns[0]
+    # objects of a template may come one after the other, each for as many samples
+    if all(np.array_equal(each, first) for each in times_ns):
+        return first
+    return np.unique(np.concatenate(times_ns))
 
 
 def _regions(files: Sequence[Specification], result: SpecResult) -> Mapping[str, Outline]:

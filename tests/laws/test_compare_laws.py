@@ -7,11 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 
 import spatial_replay as sr
-from laws.strategies_monitor import HEADER, WORDS, recordings, specifications
+from laws.strategies_monitor import HEADER, WORDS, Recording, recordings, specifications
 from laws.strategies_spec import formula_texts
 from spatial_replay import NamedSpec, Specification
 from spatial_replay.compare.shared_names import unify_regions
@@ -94,7 +94,15 @@ def test_runs_differ_unless_they_are_equal(recording, other, text):
         assert numbers_of(spec.b) == numbers_of(sr.evaluate(specification, another).result())
 
 
+ONE_AFTER_THE_OTHER = Recording(
+    tuple(
+        sr.Sample(second * 10**9, {name: sr.Footprint.box(0, 0, 1, 1)}) for second, name in enumerate("aabb")
+    )
+)
+
+
 @settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+@example(sr.parse_specification("spec s(ego) = ego ovlp ego"), ONE_AFTER_THE_OTHER)
 @given(specification=specifications(), recording=recordings(max_size=7))
 def test_a_clip_has_the_verdicts_the_robustness_and_the_witnesses_of_the_log(specification, recording):
     # a log holds what is unreadable as numbers that are not finite, which these observations do not have
