@@ -107,12 +107,12 @@ def test_memory_does_not_grow_with_the_samples():
     tracemalloc.start()
     try:
         memory = [memory_after(0, begin + 200)]
-        memory += [memory_after(first, first + 300) for first in range(begin + 200, begin + 1400, 300)]
+        memory += [memory_after(first, first + 200) for first in range(begin + 200, begin + 800, 200)]
     finally:
         tracemalloc.stop()
     # a table that doubles takes memory once, what is kept of every sample takes it every time
     growth = min(after - before for before, after in itertools.pairwise(memory))
-    assert growth < 300 * 60  # an object kept of every sample would take more
+    assert growth < 200 * 60  # an object kept of every sample would take more
 
 
 def test_nodes_are_read_one_by_one_or_as_numbers():
