@@ -13,7 +13,8 @@ from spatial_replay.compare.clips import Clip, cut_clip
 from spatial_replay.compare.runs import LogDiff, diff_sources
 from spatial_replay.compare.specifications import SpecificationDiff, diff_over_source
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.remote import local_files
+from spatial_replay.logs.downloads import local_copy
+from spatial_replay.logs.remote import LogFile, local_files, log_file, sendable
 from spatial_replay.logs.source import MemorySource, Source
 from spatial_replay.logs.topics import MAPPED
 from spatial_replay.monitor.semantics import Semantics
@@ -297,14 +298,14 @@ def tune(
             raise UsageError("constants are for files; give parse_specification(text, constants=…) its own")
         file = specification
     else:
-        (file,) = load_specifications([Path(specification)], constants=constants)
+        (file,) = load_specifications([local_copy(specification)], constants=constants)
     runs = load_runs(_logs(good), _logs(bad), lambda path: read_trace(path, **reading))
     return tune_runs(file, runs, dict(vary or {}), each=each, seed=seed)
 
 
-def _logs(logs: Log | Sequence[Log]) -> list[Path | Trace]:
+def _logs(logs: Log | Sequence[Log]) -> list[LogFile | Trace]:
     listed = [logs] if isinstance(logs, Trace | str | PathLike) else list(logs)
-    return [each if isinstance(each, Trace) else Path(each) for each in listed]
+    return [each if isinstance(each, Trace) else log_file(each) for each in listed]
 
 
 def evaluate_logs(
@@ -326,7 +327,7 @@ def evaluate_logs(
     Args:
         logs: a suite file (.yaml), which says all the rest; or logs: files, folders, patterns such as
             "nightly/**/*.mcap", addresses.
-        specifications: the specification files, unless `logs` is a suite.
+        specifications: the specification files or their addresses, unless `logs` is a suite.
         output: the folder of results, made if need be, or the address of one, as "s3://bucket/results".
         jobs: how many processes evaluate; a program that gives more than 1 needs the guard
             `if __name__ == "__main__":`, as for every process pool.
@@ -349,7 +350,7 @@ def evaluate_logs(
     named = [logs] if isinstance(logs, str | PathLike) else list(logs)
     mapping = reading.get("mapping")
     conditions = Conditions(
-        mapping=None if mapping is None else Path(mapping),
+        mapping=None if mapping is None else sendable(mapping),
         reading=tuple(sorted((name, value) for name, value in reading.items() if name != "mapping")),
         each=tuple(sorted((each or {}).items())),
         semantics=semantics,
@@ -364,7 +365,7 @@ def evaluate_logs(
         suite = load_suite(named[0])
     else:
         files = [specifications] if isinstance(specifications, str | PathLike) else specifications
-        suite = Suite.of_logs([fspath(log) for log in named], [Path(file) for file in files], conditions)
+        suite = Suite.of_logs([fspath(log) for log in named], [sendable(file) for file in files], conditions)
     return run_batch(suite, output, workers_of(jobs, dask), fail_on=frozenset(fail_on))
 
 
@@ -435,7 +436,7 @@ def _files(
 ) -> list[Specification]:
     """Return the specifications to evaluate, in the order in which they are given."""
     named = _listed(specifications)
-    paths = [Path(each) for each in named if not isinstance(each, Specification)]
+    paths = [local_copy(each) for each in named if not isinstance(each, Specification)]
     if constants and named and not paths:
         raise UsageError("constants are for files; give parse_specification(text, constants=…) its own")
     loaded = iter(load_files(paths, source, constants=constants) if paths or not named else [])
@@ -448,7 +449,7 @@ def _distinct(named: Sequence[Specification | PathName]) -> list[Specification |
     """Return specifications and paths, each path once."""
     chosen: list[Specification | Path] = []
     for each in named:
-        one = each if isinstance(each, Specification) else Path(each)
+        one = each if isinstance(each, Specification) else local_copy(each)
         if isinstance(one, Specification) or one not in chosen:
             chosen.append(one)
     return chosen

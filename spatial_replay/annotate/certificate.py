@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from spatial_replay import __version__
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Messages
+from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.trace import ABSENT, Trace
@@ -193,17 +194,31 @@ def specifications_json(files: Sequence[Specification]) -> str:
     return json.dumps([{"name": file.filename, "sha256": digest} for file, digest in listed])
 
 
-def certificate(
-    samples: SampleHash, messages: MessageHash, files: Sequence[Specification], results: ResultHash
-) -> Mapping[str, str]:
-    """Return the certificate of a finished evaluation."""
-    return {
-        "samples_sha256": samples.hexdigest(),
-        "messages_sha256": messages.hexdigest(),
-        "specification_sha256": specification_sha256(files),
-        "results_sha256": results.hexdigest(),
-        "spatial_replay_version": __version__,
-    }
+class EvaluationHashes:
+    """The hashes of an evaluation: of its samples, of the messages beside them, and of its results."""
+
+    def __init__(self, names: Sequence[tuple[str, str | None]]) -> None:
+        """Start before the first sample; each result has a name and, of a template, an object."""
+        hashing = Hashing()
+        self._samples, self._messages = SampleHash(hashing), MessageHash(hashing)
+        self._results = ResultHash(names, hashing)
+
+    def add(self, trace: Trace, own: Messages, results: Sequence[SeriesBlock]) -> None:
+        """Take in the next samples, the log's own messages, and the numbers of each result."""
+        self._samples.add(trace)
+        self._messages.add(own)
+        for index, block in enumerate(results):
+            self._results.add(index, block.series)
+
+    def certificate(self, files: Sequence[Specification]) -> Mapping[str, str]:
+        """Return the certificate of the evaluation, once it is finished."""
+        return {
+            "samples_sha256": self._samples.hexdigest(),
+            "messages_sha256": self._messages.hexdigest(),
+            "specification_sha256": specification_sha256(files),
+            "results_sha256": self._results.hexdigest(),
+            "spatial_replay_version": __version__,
+        }
 
 
 def _integers(values: Integers) -> NDArray[np.generic]:

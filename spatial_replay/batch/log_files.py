@@ -5,28 +5,30 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from glob import glob, has_magic
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from spatial_replay.batch.suite import LogPattern
+from spatial_replay.batch.workers import ThisProcess, WorkerLost, Workers
 from spatial_replay.errors import LogError, SpatialReplayError, UsageError
 from spatial_replay.logs.mcap.chunks import MAGIC
 from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.output_file import replacing
-from spatial_replay.logs.remote import RemoteFile, is_address, log_file
+from spatial_replay.logs.remote import BAG_METADATA, RemoteFile, is_address, log_file
 from spatial_replay.logs.remote_folder import matching_addresses
 from spatial_replay.logs.topics import CERTIFICATE
+from spatial_replay.sources.open_log import bag_files_at
 from spatial_replay.text import counted
 
 _ENDINGS: Final = (".mcap", ".bag", ".db3", ".jsonl", ".jsonl.gz", ".csv", ".xml")
 """Of logs in a folder; any other file has to be named."""
-_BAG: Final = "metadata.yaml"
-"""What makes a folder one log: a ROS 2 bag."""
 _MOST_LOGS: Final = 2_000_000
 _MOST_FAULTS: Final = 100
+_TOGETHER: Final = 16
+"""Logs that are hashed as one task."""
 _HASHED_WHOLE: Final = 16 * 2**20
 """Bytes up to which hashing a log takes no longer than reading its certificate."""
 
@@ -88,7 +90,7 @@ def _logs_of(text: str, folder: Path) -> Iterator[FoundLog]:
             yield _found(path, folder)
         elif has_magic(text):
             for name in sorted(glob(text, root_dir=folder, recursive=True)):  # noqa: PTH207 - absolute ones, too
-                if (folder / name).is_file() or (folder / name / _BAG).is_file():
+                if (folder / name).is_file() or (folder / name / BAG_METADATA).is_file():
                     yield _found(folder / name, folder)
     except (OSError, ValueError):
         # a name that cannot be one, such as one with a null character
@@ -102,18 +104,25 @@ def _logs_at(address: str) -> Iterator[FoundLog]:
     if address.startswith(("http://", "https://")) or not (is_folder or has_magic(address)):
         yield FoundLog(str(log_file(address)), address)
         return
-    for each in matching_addresses(address):
-        if not is_folder or each.lower().endswith(_ENDINGS):
+    found = matching_addresses(address)
+    bags = {each.removesuffix(BAG_METADATA) for each in found if each.endswith(f"/{BAG_METADATA}")}
+    for each in found:
+        folder = each[: each.rfind("/") + 1]
+        if folder in bags:
+            # a ROS 2 bag is one log, where its metadata is in the order
+            if each == folder + BAG_METADATA:
+                yield FoundLog(folder, folder)
+        elif not is_folder or each.lower().endswith(_ENDINGS):
             yield FoundLog(each, each)
 
 
 def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
     """Yield the logs in a folder: bags, and files with the ending of a log."""
-    if (path / _BAG).is_file():
+    if (path / BAG_METADATA).is_file():
         yield _found(path, folder)
         return
     for parent, folders, names in os.walk(path):
-        if _BAG in names:
+        if BAG_METADATA in names:
             yield _found(Path(parent), folder)
             folders.clear()
             continue
@@ -164,10 +173,27 @@ class Identities:
         except (OSError, ValueError):
             self._known.clear()
 
-    def of(self, paths: Iterable[str], threads: int = 1) -> list[str | None]:
-        """Return the identity of each log; None if it cannot be read."""
-        with ThreadPoolExecutor(threads, "identities") as pool:
-            return list(pool.map(self._of_one, paths))
+    def of(self, paths: Sequence[str], workers: Workers) -> dict[str, str | None]:
+        """Return the identity of each log; None if it cannot be read.
+
+        Args:
+            workers: they read the logs that are not known.
+        """
+        states = {path: None if is_address(path) else _state(path) for path in paths}
+        unknown = [path for path, state in states.items() if state is None or state not in self._known]
+        groups = [tuple(unknown[begin : begin + _TOGETHER]) for begin in range(0, len(unknown), _TOGETHER)]
+        # few are read sooner than a process begins
+        at_work = ThisProcess() if len(groups) == 1 else workers
+        found: dict[str, str | None] = {}
+        for group, identities in at_work.results(identities_of, groups):
+            found |= dict.fromkeys(group) if isinstance(identities, WorkerLost) else identities
+        known = {path: found[path] if path in found else self._known[states[path] or ""] for path in paths}
+        self._used = {
+            state: identity
+            for path, identity in known.items()
+            if identity is not None and (state := states[path]) is not None
+        }
+        return known
 
     def save(self) -> None:
         """Write the identities that were asked for.
@@ -181,16 +207,19 @@ class Identities:
             for item in sorted(self._used.items()):
                 stream.write(json.dumps(item).encode() + b"\n")
 
-    def _of_one(self, path: str) -> str | None:
-        try:
-            if is_address(path):
-                return _version_at(path)
-            state = _state(path)
-            if state not in self._used:
-                self._used[state] = self._known.get(state) or _identity(path)
-            return self._used[state]
-        except (OSError, ValueError, SpatialReplayError):
-            return None
+
+def identities_of(paths: tuple[str, ...]) -> dict[str, str | None]:
+    """Return the identity of each log; None if it cannot be read."""
+    at_once = _TOGETHER if any(map(is_address, paths)) else 1
+    with ThreadPoolExecutor(at_once, "identities") as pool:
+        return dict(zip(paths, pool.map(_identity, paths), strict=True))
+
+
+def _identity(path: str) -> str | None:
+    try:
+        return _version_at(path) if is_address(path) else _hash_of_log(path)
+    except (OSError, ValueError, SpatialReplayError):
+        return None
 
 
 def _files_of(path: str) -> list[Path]:
@@ -199,14 +228,21 @@ def _files_of(path: str) -> list[Path]:
     return sorted(each for each in whole.iterdir() if each.is_file()) if whole.is_dir() else [whole]
 
 
-def _state(path: str) -> str:
-    """Return a hash of the path, size and time of a log's files: equal while they are unchanged."""
-    states = [(str(each.resolve()), each.stat()) for each in _files_of(path)]
+def _state(path: str) -> str | None:
+    """Return a hash of the path, size and time of a log's files: equal while they are unchanged.
+
+    Returns:
+        None if they cannot be read.
+    """
+    try:
+        states = [(os.path.realpath(each), each.stat()) for each in _files_of(path)]
+    except (OSError, ValueError):
+        return None
     text = json.dumps([(name, state.st_size, state.st_mtime_ns) for name, state in states])
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
 
-def _identity(path: str) -> str:
+def _hash_of_log(path: str) -> str:
     files = _files_of(path)
     if len(files) == 1 and Path(path).is_file():
         return _certified(files[0]) or _hash_of(files[0])
@@ -222,7 +258,12 @@ def _version_at(address: str) -> str:
     Raises:
         UsageError, RemoteError: it cannot be read.
     """
-    file = RemoteFile(address)
+    file = log_file(address)
+    assert isinstance(file, RemoteFile)
+    if file.name == BAG_METADATA:
+        versions = [(str(each), each.current_version()) for each in bag_files_at(file)]
+        states = [(name, version.size, version.tag) for name, version in versions]
+        return f"version:{hashlib.sha256(json.dumps(states).encode()).hexdigest()}"
     version = file.current_version()
     if version.tag is not None:
         text = json.dumps([str(file), version.size, version.tag])

@@ -92,6 +92,10 @@ class LocalFolder:
         for parent, _, names in os.walk(folder):
             yield from (f"{parent}/{name}" for name in names if not name.endswith(_PARTIAL))
 
+    def own_file(self, name: str) -> Path | None:
+        """Return the place of a file that is about this machine's files."""
+        return self.path / name
+
     @contextmanager
     def locked(self, name: str) -> Iterator[None]:
         """Keep other batches from writing here, by a lock on a file, and remove what killed ones have left.
@@ -111,7 +115,20 @@ class LocalFolder:
             yield
 
 
-ResultFiles: TypeAlias = LocalFolder | RemoteFolder
+class BucketFolder(RemoteFolder):
+    """A folder in a bucket. Many machines write to it, so it has no lock, and nothing about files of one."""
+
+    def own_file(self, name: str) -> Path | None:
+        """Return None: files of one path differ from machine to machine."""
+        return None
+
+    @contextmanager
+    def locked(self, name: str) -> Iterator[None]:
+        """Let others write, too: a batch that is killed could not take a lock back."""
+        yield
+
+
+ResultFiles: TypeAlias = LocalFolder | BucketFolder
 
 
 def result_files(folder: str | PathLike[str]) -> ResultFiles:
@@ -120,4 +137,4 @@ def result_files(folder: str | PathLike[str]) -> ResultFiles:
     Raises:
         UsageError: neither a folder nor the address of one, or obstore is not installed.
     """
-    return RemoteFolder(fspath(folder)) if is_address(folder) else LocalFolder(Path(folder))
+    return BucketFolder(fspath(folder)) if is_address(folder) else LocalFolder(Path(folder))

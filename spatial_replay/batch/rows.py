@@ -131,7 +131,7 @@ def rows_from_task(task: Task) -> tuple[tuple[ResultRow, ...], ...]:
     try:
         files = parsed_specifications(task.specs, task.conditions)
         source, options = opened_task(task, files)
-        replay = Replay(source, files, options, keep_leaves=True)
+        replay = Replay(source, files, options, keep_leaves=True, certify=False)
         replayed = replay.run()
         rows = [_rows_of_file(replay, replayed, file, index) for index, file in enumerate(files)]
     except Exception as error:  # one log must not end a batch

@@ -5,11 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from spatial_replay import __version__
 from spatial_replay.batch.data_set import FORMAT, ResultsFolder, run_columns, table_of, write_rows
@@ -97,7 +97,6 @@ def run_batch(
     workers: Workers,
     *,
     fail_on: frozenset[str] = frozenset(),
-    threads: int = 1,
     begin: Callable[[int], None] = lambda tasks: None,
     advance: Callable[[int], None] = lambda tasks: None,
 ) -> BatchResult:
@@ -106,7 +105,6 @@ def run_batch(
     Args:
         results: the folder of results or its address, made if need be.
         fail_on: "vacuous" and "unknown": what fails although the case allows it.
-        threads: how many logs are hashed at once.
         begin: called with the number of logs to evaluate.
         advance: called with 1 for each log that is done.
 
@@ -121,52 +119,49 @@ def run_batch(
     with folder.locked():
         identities = Identities(folder.identities)
         paths = list(dict.fromkeys(log.path for several in logs for log in several))
-        known = dict(zip(paths, identities.of(paths, threads), strict=True))
+        known = identities.of(paths, workers)
         identities.save()
         wanted = _wanted(suite, files, logs, known)
         stored = folder.keys()
         tasks = list(_tasks(wanted, stored))
         begin(len(tasks))
         errors: dict[str, tuple[ResultRow, ...]] = {}
-        work = partial(evaluate_and_store, folder.location)
+        work, joined = partial(evaluate_and_store, folder.location), folder.joined_rows()
         for task, result in workers.results(work, tasks):
-            errors |= _errors(task, result)
+            for key, spec_hash, rows in _rows_of(task, result):
+                if isinstance(rows, bytes):
+                    joined.add(spec_hash, key, rows)
+                else:
+                    errors[key] = rows
             advance(1)
-        _require_shared(folder, tasks, errors)
+        joined.finish()
         folder.join_files()
         table = _table(wanted, folder, errors, fail_on)
         folder.write_run(table)
     return BatchResult(table, len(paths), len({task.task.log for task in tasks}), tuple(wanted))
 
 
-def evaluate_and_store(folder: str, stored: StoredTask) -> dict[str, tuple[ResultRow, ...]]:
-    """Evaluate a task and store its rows; errors are returned by key, and not stored: they may pass."""
-    errors, files = {}, result_files(folder)
-    for rows, key, spec_hash in zip(rows_from_task(stored.task), stored.keys, stored.hashes, strict=True):
-        if any(row.error is not None for row in rows):
-            errors[key] = rows
-        else:
-            write_rows(files, spec_hash, key, rows)
-    return errors
+StoredRows: TypeAlias = tuple[ResultRow, ...] | bytes
+"""The rows of one key: those with an error, or what `write_rows` has returned."""
 
 
-def _errors(
-    stored: StoredTask, result: dict[str, tuple[ResultRow, ...]] | WorkerLost
-) -> dict[str, tuple[ResultRow, ...]]:
-    """Return the rows with errors, by key."""
-    if not isinstance(result, WorkerLost):
-        return result
-    return dict(zip(stored.keys, error_rows(stored.task, str(result), "machine"), strict=True))
+def evaluate_and_store(folder: str, stored: StoredTask) -> tuple[StoredRows, ...]:
+    """Evaluate a task and store its rows, for each of its keys; errors are not stored: they may pass."""
+    files = result_files(folder)
+    evaluated = zip(rows_from_task(stored.task), stored.keys, stored.hashes, strict=True)
+    return tuple(
+        rows if any(row.error is not None for row in rows) else write_rows(files, spec_hash, key, rows)
+        for rows, key, spec_hash in evaluated
+    )
 
 
-def _require_shared(folder: ResultsFolder, tasks: Sequence[StoredTask], errors: Collection[str]) -> None:
-    """Check that what workers on other machines have written is here."""
-    missing = {key for task in tasks for key in task.keys if key not in errors}
-    if missing and not missing <= folder.keys():
-        raise UsageError(
-            f"the workers' rows are not in {folder.location}: they see another disk; "
-            "give a folder that all share"
-        )
+def _rows_of(
+    stored: StoredTask, result: tuple[StoredRows, ...] | WorkerLost
+) -> Iterator[tuple[str, str, StoredRows]]:
+    """Return the rows of a task, with the key and the specification of each."""
+    if isinstance(result, WorkerLost):
+        result = error_rows(stored.task, str(result), "machine")
+    return zip(stored.keys, stored.hashes, result, strict=True)
 
 
 def found_logs(suite: Suite) -> list[list[FoundLog]]:
@@ -190,7 +185,7 @@ def _wanted(
     suite: Suite,
     files: Sequence[Sequence[SpecFile]],
     logs: Sequence[Sequence[FoundLog]],
-    identities: dict[str, str | None],
+    identities: Mapping[str, str | None],
 ) -> list[Wanted]:
     wanted = []
     for case, own, several in zip(suite.cases, files, logs, strict=True):

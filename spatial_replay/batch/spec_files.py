@@ -11,6 +11,8 @@ from typing import Any, Final
 from spatial_replay.batch.rows import parsed_specifications, spec_lines
 from spatial_replay.batch.suite import Case, Suite
 from spatial_replay.errors import SpecificationError, UsageError
+from spatial_replay.logs.downloads import local_copy
+from spatial_replay.logs.remote import RemoteFile, log_file
 from spatial_replay.mapping.mapping_file import load_mapping
 from spatial_replay.monitor.instances import Choice
 from spatial_replay.spec.format import format_specification
@@ -44,7 +46,7 @@ def checked_spec_files(suite: Suite) -> list[tuple[SpecFile, ...]]:
         SpecificationError: specifications with errors.
         UsageError: files that cannot be used, templates without objects.
     """
-    texts: dict[Path, SpecificationText] = {}
+    texts: dict[Path | str, SpecificationText] = {}
     files: list[tuple[SpecFile, ...]] = []
     diagnoses: dict[str, Any] = {}
     faults: dict[str, None] = {}
@@ -73,15 +75,15 @@ def checked_spec_files(suite: Suite) -> list[tuple[SpecFile, ...]]:
     return files
 
 
-def read_specification_text(path: Path) -> SpecificationText:
-    """Read the text of a specification, with its errors.
+def read_specification_text(path: Path | str) -> SpecificationText:
+    """Read the text of a specification at a path or an address, with its errors.
 
     Raises:
         MissingFileError, UsageError, SpecificationError: see `load_specification`.
     """
     from spatial_replay.spec.load import load_specification
 
-    return SpecificationText(load_specification(path).source, path.name)
+    return SpecificationText(load_specification(local_copy(path)).source, log_file(path).name)
 
 
 def _spec_file(name: str, text: SpecificationText, parsed: Specification) -> SpecFile:
@@ -90,7 +92,10 @@ def _spec_file(name: str, text: SpecificationText, parsed: Specification) -> Spe
     return SpecFile(name, text, digest, tuple(spec_lines(parsed).items()))
 
 
-def _shown(path: Path, folder: Path) -> str:
+def _shown(file: Path | str, folder: Path) -> str:
+    path = log_file(file)
+    if isinstance(path, RemoteFile):
+        return str(path)
     return (path.relative_to(folder) if path.is_relative_to(folder) else path).as_posix()
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final, TypeAlias, TypeVar, cast
 
 from spatial_replay.errors import UsageError
+from spatial_replay.logs.remote import is_address
 from spatial_replay.mapping.checked_yaml import checked_document, read_yaml_text
 from spatial_replay.mapping.yaml_document import Document, Place
 from spatial_replay.monitor.semantics import Semantics
@@ -35,7 +36,7 @@ class Conditions:
     """How logs are read, and how specifications are evaluated over them.
 
     Attributes:
-        mapping: the mapping file, or None.
+        mapping: the mapping file or its address, or None.
         reading: further keyword arguments of `open_source`.
         start, end: the window, as people write times; None for the whole log.
         every: every `every`th sample is evaluated.
@@ -46,7 +47,7 @@ class Conditions:
         profile: relation profile of specifications without a `use` line.
     """
 
-    mapping: Path | None = None
+    mapping: Path | str | None = None
     reading: Pairs[Any] = ()
     start: str | None = None
     end: str | None = None
@@ -118,13 +119,13 @@ class Case:
     Attributes:
         name: unique in its suite.
         logs: relative paths are relative to the suite's folder.
-        specs: the specification files.
+        specs: the specification files, or their addresses.
         requirements: ids of requirements that the case is about; a spec can have one of its own.
     """
 
     name: str
     logs: tuple[LogPattern, ...]
-    specs: tuple[Path, ...]
+    specs: tuple[Path | str, ...]
     conditions: Conditions = DEFAULT_CONDITIONS
     expectation: Expectation = DEFAULT_EXPECTATION
     requirements: tuple[str, ...] = ()
@@ -150,7 +151,7 @@ class Suite:
     def of_logs(
         cls,
         logs: Sequence[str],
-        specs: Sequence[Path],
+        specs: Sequence[Path | str],
         conditions: Conditions = DEFAULT_CONDITIONS,
         expectation: Expectation = DEFAULT_EXPECTATION,
     ) -> Suite:
@@ -204,9 +205,9 @@ def _case(entry: Mapping[str, Any], places: _LogPlaces, folder: Path) -> Case:
     return Case(
         name=entry["name"],
         logs=tuple(LogPattern(log, places.place(n)) for n, log in enumerate(_listed(entry["logs"]))),
-        specs=tuple(folder / spec for spec in dict.fromkeys(_listed(entry["specs"]))),
+        specs=tuple(_file(spec, folder) for spec in dict.fromkeys(_listed(entry["specs"]))),
         conditions=Conditions(
-            mapping=None if mapping is None else folder / mapping,
+            mapping=None if mapping is None else _file(mapping, folder),
             reading=tuple((key, entry[key]) for key in _READING if key in entry),
             start=None if start is None else str(start),
             end=None if end is None else str(end),
@@ -261,8 +262,13 @@ def _wrong_values(entry: Mapping[str, Any], place: Place, folder: Path) -> Itera
         ((*place, "specs", n), spec) for n, spec in enumerate(specs if isinstance(specs, list) else [specs])
     ]
     for where, name in named:
-        if isinstance(name, str) and name and not _is_file(folder / name):
+        if isinstance(name, str) and name and not is_address(name) and not _is_file(folder / name):
             yield where, f"there is no file {name[:200]!r}; paths are relative to the suite's file"
+
+
+def _file(name: str, folder: Path) -> Path | str:
+    """Return the path of a file of a suite, or its address."""
+    return name if is_address(name) else folder / name
 
 
 def _is_file(path: Path) -> bool:

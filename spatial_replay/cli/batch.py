@@ -20,23 +20,19 @@ from spatial_replay.cli.batch_output import (
     write_json_lines,
 )
 from spatial_replay.cli.options import (
-    ReadArguments,
+    ConditionArguments,
     add_options,
-    choices_option,
-    constants_option,
+    condition_options,
     fail_on_option,
     gather,
     naming_option,
     objects_by_parameter,
-    profile_option,
-    reading_options,
     semantics_option,
-    specs_option,
-    strict_names_option,
 )
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, warn
 from spatial_replay.errors import UsageError
+from spatial_replay.logs.remote import local_files, sendable
 from spatial_replay.text import counted
 
 if TYPE_CHECKING:
@@ -51,34 +47,6 @@ if TYPE_CHECKING:
 _WORST = 10
 _MOST_WARNINGS = 5
 _MOST_DIFFERENCES = 20
-
-
-@dataclass(frozen=True, slots=True)
-class BatchConditions:
-    """What a suite says, given on the command line."""
-
-    specs: tuple[Path, ...]
-    start: str | None
-    end: str | None
-    every: int
-    choices: tuple[str, ...]
-    constants: Mapping[str, float | str]
-    semantics: Semantics
-    strict_names: bool
-    profile: str | None
-
-
-_CONDITIONS = (
-    specs_option("Specification file; repeat for several."),
-    click.option("--from", "start", metavar="T", help="Start at the first sample at or after T."),
-    click.option("--to", "end", metavar="T", help="End with the last sample before T."),
-    click.option("--every", metavar="N", type=click.IntRange(min=1), default=1, help="Use every Nth sample."),
-    choices_option,
-    constants_option,
-    semantics_option,
-    strict_names_option,
-    profile_option,
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +90,8 @@ _OUTPUTS = (
 
 @click.command()
 @click.argument("logs", metavar="SUITE.yaml|LOG...", nargs=-1, required=True)
-@lambda command: add_options(_CONDITIONS, reading_options(gather("conditions", BatchConditions, command)))
+@condition_options
+@semantics_option
 @lambda command: add_options(_OUTPUTS, gather("outputs", BatchOutputs, command))
 @click.option(
     "--jobs", metavar="N", type=click.IntRange(min=1), help="Processes.  [default: one for each core]"
@@ -131,8 +100,8 @@ _OUTPUTS = (
 @fail_on_option
 def batch(
     logs: tuple[str, ...],
-    conditions: BatchConditions,
-    reading: ReadArguments,
+    conditions: ConditionArguments,
+    semantics: Semantics,
     outputs: BatchOutputs,
     jobs: int | None,
     dask: str | None,
@@ -160,15 +129,14 @@ def batch(
 
     if dask is not None and jobs is not None:
         raise UsageError("--jobs is for this machine, and a cluster has its own; remove --jobs or --dask")
-    suite = _suite(logs, conditions, reading)
+    suite = _suite(logs, conditions, semantics)
     folder = outputs.output
     if folder is None:
         folder = "results" if suite.path is None else str(suite.folder / f"{suite.name}.results")
     tolerance, before = _baseline(outputs)
     _check_outputs(outputs, suite)
-    threads = jobs or os.cpu_count() or 1
-    workers = workers_of(threads, dask)
-    result = _run(suite, folder, workers, fail_on, threads)
+    workers = workers_of(jobs or os.cpu_count() or 1, dask)
+    result = _run(suite, folder, workers, fail_on)
     inputs = _inputs(suite)
     pages = {} if outputs.html is None else _write_pages(result, outputs.html, suite, workers)
     if outputs.junit is not None:
@@ -194,7 +162,7 @@ def batch(
     return code
 
 
-def _suite(logs: tuple[str, ...], given: BatchConditions, reading: ReadArguments) -> Suite:
+def _suite(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantics) -> Suite:
     """Return the suite that is named, or that the logs and options make up.
 
     Raises:
@@ -202,16 +170,17 @@ def _suite(logs: tuple[str, ...], given: BatchConditions, reading: ReadArguments
     """
     from spatial_replay.batch.suite import Conditions, Suite, load_suite
 
+    reading = given.reading
     own = {name: value for name, value in reading.items() if name != "mapping"}
     changed = {name: value for name, value in own.items() if value != _READING_DEFAULTS[name]}
     conditions = Conditions(
-        mapping=reading["mapping"],
+        mapping=None if reading["mapping"] is None else sendable(reading["mapping"]),
         reading=tuple(sorted(changed.items())),
         start=given.start,
         end=given.end,
         every=given.every,
         each=tuple(sorted(objects_by_parameter(given.choices).items())),
-        semantics=given.semantics,
+        semantics=semantics,
         strict_names=given.strict_names,
         constants=tuple(sorted(given.constants.items())),
         profile=given.profile,
@@ -225,7 +194,8 @@ def _suite(logs: tuple[str, ...], given: BatchConditions, reading: ReadArguments
         for option, text in (("--from", given.start), ("--to", given.end)):
             if text is not None:
                 _check_time(option, text)
-        return Suite.of_logs(logs, tuple(dict.fromkeys(given.specs)), conditions)
+        specs = dict.fromkeys(map(sendable, given.specs))
+        return Suite.of_logs(logs, tuple(specs), conditions)
     if len(logs) > 1:
         raise UsageError(f"{suites[0]} is a suite, which names its logs; give it alone")
     if given.specs or conditions != Conditions():
@@ -256,7 +226,7 @@ def _inputs(suite: Suite) -> list[Path]:
     mappings = [case.conditions.mapping for case in suite.cases]
     specs = [spec for case in suite.cases for spec in case.specs]
     own = [] if suite.path is None else [suite.path]
-    return [*own, *dict.fromkeys([*specs, *(each for each in mappings if each is not None)])]
+    return local_files([*own, *dict.fromkeys([*specs, *(each for each in mappings if each is not None)])])
 
 
 def _check_outputs(outputs: BatchOutputs, suite: Suite) -> None:
@@ -289,7 +259,7 @@ def _baseline(outputs: BatchOutputs) -> tuple[Tolerance, pa.Table | None]:
     return tolerance, ResultsFolder.open(outputs.baseline).read_run()
 
 
-def _run(suite: Suite, folder: str, workers: Workers, fail_on: frozenset[str], threads: int) -> BatchResult:
+def _run(suite: Suite, folder: str, workers: Workers, fail_on: frozenset[str]) -> BatchResult:
     from spatial_replay.batch.run import run_batch
 
     with ExitStack() as stack:
@@ -300,7 +270,6 @@ def _run(suite: Suite, folder: str, workers: Workers, fail_on: frozenset[str], t
                 folder,
                 workers,
                 fail_on=fail_on,
-                threads=threads,
                 begin=lambda tasks: steps.append(stack.enter_context(progress("logs", tasks))),
                 advance=lambda tasks: steps[0](tasks),
             )

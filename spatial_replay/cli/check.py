@@ -12,6 +12,7 @@ import click
 
 from spatial_replay.cli.findings import Form, show_findings
 from spatial_replay.cli.options import (
+    InputPath,
     LogPath,
     ReadArguments,
     constants_option,
@@ -40,7 +41,7 @@ _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
 
 
 @click.command()
-@click.argument("specification", metavar="SPEC", type=click.Path(path_type=Path))
+@click.argument("specification", metavar="SPEC", type=InputPath())
 @click.option(
     "--log",
     type=LogPath(),

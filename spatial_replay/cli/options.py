@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict, TypeVar
@@ -14,6 +14,7 @@ import click
 
 from spatial_replay.cli.terminal import show_diagnostics, warn
 from spatial_replay.errors import UsageError
+from spatial_replay.logs.downloads import local_copy
 from spatial_replay.logs.remote import LogFile, is_address, local_files, log_file
 from spatial_replay.text import counted, nearest_hint
 from spatial_replay.trace.time_points import time_point_from_text
@@ -68,6 +69,15 @@ class LogPath(click.Path):
         return log_file(value) if is_address(value) else super().convert(value, param, ctx)
 
 
+class InputPath(LogPath):
+    """A path of a small file, or its address, of which a copy on this machine is taken."""
+
+    def convert(
+        self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
+    ) -> Any:
+        return local_copy(value) if is_address(value) else super().convert(value, param, ctx)
+
+
 def output_option(text: str, *, required: bool = False) -> Callable[[_Command], _Command]:
     """Return the option `-o FILE`, with its help."""
     return click.option("-o", "--output", type=_OutputFile(path_type=Path), required=required, help=text)
@@ -78,11 +88,13 @@ def log_output_option(text: str) -> Callable[[_Command], _Command]:
     return click.option("-o", "--output", type=_LogOutput(path_type=Path), required=True, help=text)
 
 
-def specs_option(text: str) -> Callable[[_Command], _Command]:
-    """Return the repeatable option `--spec SPEC`, with its help."""
-    return click.option(
-        "--spec", "specs", metavar="SPEC", multiple=True, type=click.Path(path_type=Path), help=text
-    )
+def specs_option(text: str, kind: click.ParamType | None = None) -> Callable[[_Command], _Command]:
+    """Return the repeatable option `--spec SPEC`, with its help.
+
+    Args:
+        kind: of its values; by default, of an address a copy is taken.
+    """
+    return click.option("--spec", "specs", metavar="SPEC", multiple=True, type=kind or InputPath(), help=text)
 
 
 def _read_constants(
@@ -162,8 +174,9 @@ def gather(name: str, values: Callable[..., Any], command: Callable[..., Any]) -
 
     @wraps(command)
     def gathered(**arguments: Any) -> Any:
-        fields = {field: arguments.pop(field) for field in values.__annotations__}
-        return command(**{name: values(**fields)}, **arguments)
+        own = [field.name for field in fields(values)] if is_dataclass(values) else values.__annotations__
+        taken = {name: arguments.pop(name) for name in own}
+        return command(**{name: values(**taken)}, **arguments)
 
     return gathered
 
@@ -178,7 +191,7 @@ def add_options(options: Sequence[_Option], command: Callable[..., Any]) -> Call
 class ReadArguments(TypedDict):
     """How to read a log: the keyword arguments of `open_source`."""
 
-    mapping: Path | None
+    mapping: LogFile | None
     on_time_jump: Literal["error", "split"]
     rate: float | None
     lost: Literal["drop", "keep"]
@@ -190,7 +203,7 @@ _READING = (
     click.option(
         "--mapping",
         metavar="FILE",
-        type=click.Path(path_type=Path),
+        type=LogPath(),
         help="Mapping file (YAML): which topics of an external log carry which objects.",
     ),
     click.option(
@@ -229,10 +242,9 @@ def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class EvaluationArguments:
-    """What to evaluate, as given on the command line."""
+class ConditionArguments:
+    """What to evaluate over logs, and how to read these, as given on the command line."""
 
-    log: LogFile
     specs: tuple[Path, ...]
     start: str | None
     end: str | None
@@ -242,6 +254,13 @@ class EvaluationArguments:
     strict_names: bool
     profile: str | None
     reading: ReadArguments
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationArguments(ConditionArguments):
+    """What to evaluate over one log."""
+
+    log: LogFile
 
     @property
     def inputs(self) -> tuple[Path, ...]:
@@ -269,9 +288,7 @@ choices_option = click.option(
     help="Objects to evaluate a template for: one class, or VAR=all.",
 )
 
-_EVALUATION = (
-    click.argument("log", type=LogPath()),
-    specs_option("Specification file; repeat for several.  [default: those in the log]"),
+_CONDITIONS = (
     click.option("--from", "start", metavar="T", help="Start at the first sample at or after T."),
     click.option("--to", "end", metavar="T", help="End with the last sample before T."),
     click.option(
@@ -290,7 +307,17 @@ _EVALUATION = (
 
 def evaluation_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add LOG and the options that say what to evaluate; the command takes them as `request`."""
-    return add_options(_EVALUATION, reading_options(gather("request", EvaluationArguments, command)))
+    log = click.argument("log", type=LogPath())
+    specs = specs_option("Specification file; repeat for several.  [default: those in the log]")
+    gathered = reading_options(gather("request", EvaluationArguments, command))
+    return add_options((log, specs, *_CONDITIONS), gathered)
+
+
+def condition_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options that say what to evaluate over many logs; the command takes them as `conditions`."""
+    specs = specs_option("Specification file; repeat for several.", LogPath())
+    gathered = reading_options(gather("conditions", ConditionArguments, command))
+    return add_options((specs, *_CONDITIONS), gathered)
 
 
 @dataclass(frozen=True, slots=True)

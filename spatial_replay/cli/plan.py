@@ -10,6 +10,7 @@ import click
 
 from spatial_replay.cli.application import exit_code_from_verdicts
 from spatial_replay.cli.options import (
+    InputPath,
     constants_option,
     load_spec_options,
     log_output_option,
@@ -54,7 +55,7 @@ def planning_command(scenario: str) -> click.Command:
     @click.option(
         "--spec",
         metavar="SPEC",
-        type=click.Path(path_type=Path),
+        type=InputPath(),
         help="Specification to plan for.  [default: the scenario's own]",
     )
     @click.option("--of", metavar="NAME", help="Result to plan for, if SPEC has several.")

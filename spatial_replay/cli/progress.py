@@ -73,6 +73,7 @@ class _Bar:
             self._shown.update(self._shown.task_ids[0], description=self._description, completed=self._done)
 
     def _appear(self) -> None:
+        # there is one bar at a time: that of the work as a whole
         self._shown = _started(self._description, self._total, self._done)
         # the work went on while the bar was made
         self._update()
@@ -85,12 +86,16 @@ class _Bar:
             self._shown.stop()
 
 
-def _started(label: str, total: int | None, done: int) -> Progress:
+def _started(label: str, total: int | None, done: int) -> Progress | None:
     # importing rich would take a quarter of the time of `--help`
     from rich.console import Console
+    from rich.errors import LiveError
     from rich.progress import Progress
 
     shown = Progress(console=Console(stderr=True), transient=True)
     shown.add_task(label, total=total, completed=done)
-    shown.start()
+    try:
+        shown.start()
+    except LiveError:
+        return None
     return shown

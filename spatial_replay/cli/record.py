@@ -11,6 +11,7 @@ import click
 
 from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import (
+    LogPath,
     ReadArguments,
     add_options,
     constants_option,
@@ -25,6 +26,7 @@ from spatial_replay.cli.options import (
 )
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show
+from spatial_replay.logs.remote import LogFile
 from spatial_replay.text import counted
 from spatial_replay.trace.time_points import duration_ns_from_text
 
@@ -171,14 +173,14 @@ for _scenario in SCENARIOS:
 
 
 @record.command()
-@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("file", type=LogPath())
 @log_output_option("Log to write (MCAP).")
 @specs_option("Specification to evaluate while recording; repeat for several.")
 @constants_option
 @profile_option
 @reading_options
 def tracks(
-    file: Path,
+    file: LogFile,
     output: Path,
     specs: tuple[Path, ...],
     constants: Mapping[str, float | str],

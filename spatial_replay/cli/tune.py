@@ -10,6 +10,7 @@ import click
 
 from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import (
+    LogPath,
     ReadArguments,
     choices_option,
     constants_option,
@@ -23,6 +24,8 @@ from spatial_replay.cli.options import (
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, show_diagnostics, show_json
 from spatial_replay.errors import UsageError
+from spatial_replay.logs.downloads import local_copy
+from spatial_replay.logs.remote import LogFile, is_address
 from spatial_replay.text import counted
 
 if TYPE_CHECKING:
@@ -81,7 +84,7 @@ def _read_ranges(
     "--spec",
     "spec",
     metavar="SPEC",
-    type=click.Path(path_type=Path),
+    type=LogPath(),
     required=True,
     help="Specification file.",
 )
@@ -89,14 +92,14 @@ def _read_ranges(
     "--good",
     metavar="LOG...",
     multiple=True,
-    type=click.Path(path_type=Path),
+    type=LogPath(),
     help="Runs that have to satisfy it.",
 )
 @click.option(
     "--bad",
     metavar="LOG...",
     multiple=True,
-    type=click.Path(path_type=Path),
+    type=LogPath(),
     help="Runs that have to violate it.",
 )
 @click.option(
@@ -123,9 +126,9 @@ def _read_ranges(
 @profile_option
 @reading_options
 def tune(
-    spec: Path,
-    good: tuple[Path, ...],
-    bad: tuple[Path, ...],
+    spec: LogFile,
+    good: tuple[LogFile, ...],
+    bad: tuple[LogFile, ...],
     ranges: dict[str, tuple[Value, Value] | None],
     write: bool,
     output: Path | None,
@@ -159,7 +162,11 @@ def tune(
 
     if not good:
         raise UsageError("there is no good run to satisfy; give at least one: --good LOG")
-    (file,) = load_spec_options([spec], profile, constants)
+    if write and is_address(spec):
+        raise UsageError(
+            f"--write changes {spec}, which is an address; copy it to this machine, and give that"
+        )
+    (file,) = load_spec_options([local_copy(spec)], profile, constants)
     show_diagnostics(file.warnings)
     if output is not None:
         if output.suffix.lower() not in _PICTURES:
@@ -170,7 +177,7 @@ def tune(
         tuning = tune_runs(file, runs, ranges, each=objects_by_parameter(choices), seed=seed, advance=advance)
     changed: tuple[str, ...] = ()
     if write and tuning.is_found:
-        changed = write_constants(spec, plain_values(tuning.specification), profile=profile)
+        changed = write_constants(local_copy(spec), plain_values(tuning.specification), profile=profile)
     if output is not None:
         _write_picture(tuning, output)
     if as_json:

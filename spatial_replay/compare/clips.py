@@ -9,6 +9,7 @@ from pathlib import Path
 
 from spatial_replay.compare.clip_window import ClipSearch, chosen_nodes
 from spatial_replay.errors import UsageError
+from spatial_replay.logs.remote import RemoteFile
 from spatial_replay.logs.source import Source
 from spatial_replay.monitor.semantics import require_ltlf
 from spatial_replay.replay.annotated import run_replay
@@ -119,6 +120,8 @@ def cut_clip(
 
 
 def _size_of(source: Source) -> int | None:
-    """Return the size of a log on this machine that is one file."""
+    """Return the size of a log that is one file."""
     path = getattr(source, "path", None)
+    if isinstance(path, RemoteFile):
+        return path.size
     return path.stat().st_size if isinstance(path, Path) and path.is_file() else None

@@ -6,11 +6,13 @@ own tools do (AWS_ACCESS_KEY_ID, GOOGLE_SERVICE_ACCOUNT, AZURE_STORAGE_ACCOUNT_N
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import timedelta
+from functools import lru_cache
 from os import PathLike, fspath
 from pathlib import Path
 from threading import Lock
@@ -29,6 +31,11 @@ _CREDENTIALS: Final = {
 }
 """What helps where access is denied, by the scheme of an address."""
 
+_SETTINGS: Final = ("AWS_", "GOOGLE_", "AZURE_")
+"""How the names of the environment variables begin that the services' libraries read."""
+
+BAG_METADATA: Final = "metadata.yaml"
+"""The file that makes a folder a ROS 2 bag, and lists its other files."""
 WEB_SCHEMES: Final = ("http", "https")
 
 _TAIL_BYTES: Final = 2**19
@@ -54,15 +61,28 @@ def is_address(path: object) -> bool:
     )
 
 
+def is_web(file: PathLike[str]) -> bool:
+    """Return whether a file is at the address of a web server."""
+    return fspath(file).startswith(("http://", "https://"))
+
+
 def log_file(path: str | PathLike[str]) -> LogFile:
-    """Return the file of a path or an address.
+    """Return the file of a path or an address; a folder at an address is a ROS 2 bag, known by its metadata.
 
     Raises:
         UsageError: an address without a name, or obstore is not installed.
     """
     if isinstance(path, RemoteFile):
         return path
-    return RemoteFile(str(path)) if is_address(path) else Path(path)
+    if not is_address(path):
+        return Path(path)
+    address = fspath(path)
+    return RemoteFile(f"{address}{BAG_METADATA}" if address.endswith("/") else address)
+
+
+def sendable(path: str | PathLike[str]) -> Path | str:
+    """Return a file as other processes take it: the text of an address opens nothing."""
+    return fspath(path) if is_address(path) else Path(path)
 
 
 def local_files(paths: Iterable[str | PathLike[str]]) -> list[Path]:
@@ -327,9 +347,18 @@ def obstore_library() -> Any:
 def open_store(scheme: str, bucket: str) -> Any:
     """Return the store of a bucket or container, or of the address of a web server; nothing is read yet.
 
+    A process has one store for each bucket, whose connections are used again.
+
     Raises:
         RemoteError: it cannot be one.
     """
+    settings = tuple(sorted(each for each in os.environ.items() if each[0].startswith(_SETTINGS)))
+    return _store(scheme, bucket, settings)
+
+
+@lru_cache(maxsize=32)
+def _store(scheme: str, bucket: str, settings: tuple[tuple[str, str], ...]) -> Any:
+    """Return the store of a bucket, which reads these settings from the environment."""
     stores = obstore_library().store
     options: dict[str, Any] = {"client_options": _CLIENT, "retry_config": _RETRIES}
     made = {"s3": stores.S3Store, "gs": stores.GCSStore, "az": stores.AzureStore}.get(scheme)

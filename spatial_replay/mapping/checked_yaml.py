@@ -8,10 +8,11 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 from spatial_replay.errors import MissingFileError, UsageError
+from spatial_replay.logs.downloads import local_copy
+from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.yaml_document import LARGEST_TEXT, Document, Place, document_from_text
 from spatial_replay.text import nearest_hint
 
@@ -19,7 +20,7 @@ _MOST_FAULTS = 100
 
 
 def read_yaml_text(path: str | PathLike[str], largest: int = LARGEST_TEXT) -> str:
-    """Read a text file, and of one that is too large only its beginning.
+    """Read a text file, also at an address, and of one that is too large only its beginning.
 
     Args:
         largest: size in bytes; no more than one byte beyond it is read.
@@ -29,7 +30,7 @@ def read_yaml_text(path: str | PathLike[str], largest: int = LARGEST_TEXT) -> st
         UsageError: it is not UTF-8.
     """
     try:
-        with Path(path).open("rb") as stream:
+        with local_copy(path).open("rb") as stream:
             data = stream.read(largest + 1)
     except (OSError, ValueError) as error:
         raise MissingFileError.of(path, error) from None
@@ -37,7 +38,7 @@ def read_yaml_text(path: str | PathLike[str], largest: int = LARGEST_TEXT) -> st
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise UsageError(f"{Path(path).name}:{line}: a byte is not UTF-8; give a text file") from None
+        raise UsageError(f"{log_file(path).name}:{line}: a byte is not UTF-8; give a text file") from None
 
 
 def checked_document(

@@ -14,11 +14,11 @@ from functools import cache
 from importlib.resources import files
 from math import pi
 from os import PathLike
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, cast
 
 from spatial_replay.errors import UsageError
+from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.checked_yaml import checked_document, read_yaml_text
 from spatial_replay.mapping.field_paths import FieldPath, NameTemplate
 from spatial_replay.mapping.model import (
@@ -47,14 +47,14 @@ _SIGNAL_KEYS = frozenset({"signals", "max_age", "clock", "stamp", "optional"})
 
 
 def load_mapping(path: str | PathLike[str]) -> LogMapping:
-    """Load a mapping file.
+    """Load a mapping file, from a path or an address.
 
     Raises:
         MissingFileError: there is no such file.
         UsageError: the file is not a valid mapping; all errors are listed.
     """
     text = read_yaml_text(path)
-    return parse_mapping(text, Path(path).name)
+    return parse_mapping(text, log_file(path).name)
 
 
 def parse_mapping(text: str, name: str = "mapping") -> LogMapping:

@@ -8,14 +8,7 @@ from collections.abc import Mapping, Sequence
 from spatial_replay import __version__
 from spatial_replay.annotate.annotated_evaluation import AnnotatedEvaluation
 from spatial_replay.annotate.automaton_state import SpecAutomaton
-from spatial_replay.annotate.certificate import (
-    Hashing,
-    MessageHash,
-    ResultHash,
-    SampleHash,
-    certificate,
-    specifications_json,
-)
+from spatial_replay.annotate.certificate import EvaluationHashes, specifications_json
 from spatial_replay.annotate.specification import logged_specifications, specification_attachments
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.messages import Messages, Sink, merge, messages_of
@@ -69,9 +62,7 @@ class Recording:
         )
         self._samples = self._messages = self._end_ns = 0
         self._topics: set[str] = set()
-        hashing = Hashing()
-        self._sample_hash, self._message_hash = SampleHash(hashing), MessageHash(hashing)
-        self._result_hash = ResultHash([(tree.name, tree.object) for tree in self._evaluation.trees], hashing)
+        self._hashes = EvaluationHashes([(tree.name, tree.object) for tree in self._evaluation.trees])
         sink.add_metadata(METADATA, _metadata(files, about or {}))
         if self._evaluation.trees:
             sink.add_metadata(AUTOMATA, self._evaluation.automata_metadata())
@@ -120,10 +111,7 @@ class Recording:
         if len(own):
             self._end_ns = max(self._end_ns, int(own.log_time_ns[-1]))
         self._samples += len(trace)
-        self._sample_hash.add(trace)
-        self._message_hash.add(own)
-        for index, stretch in enumerate(stretches):
-            self._result_hash.add(index, stretch.series)
+        self._hashes.add(trace, own, stretches)
 
     def end(self, *, interrupted: bool = False, dropped: int = 0, messages_dropped: int = 0) -> None:
         """Write what follows the last sample; the certificate is that of a replay of the log.
@@ -143,8 +131,7 @@ class Recording:
             names = [tree.title for tree in self._evaluation.trees]
             self._sink.add_metadata(VERDICTS, dict(zip(names, texts, strict=True)))
         self._sink.add_metadata(ENDING, ending)
-        hashes = certificate(self._sample_hash, self._message_hash, self._files, self._result_hash)
-        self._sink.add_metadata(CERTIFICATE, hashes)
+        self._sink.add_metadata(CERTIFICATE, self._hashes.certificate(self._files))
 
     def break_off(self, *, dropped: int = 0, messages_dropped: int = 0) -> None:
         """Write the end of a log whose last samples could not be written: it has no certificate."""

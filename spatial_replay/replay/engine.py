@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from spatial_replay.annotate.annotated_evaluation import AnnotatedEvaluation
-from spatial_replay.annotate.certificate import Hashing, MessageHash, ResultHash, SampleHash, certificate
+from spatial_replay.annotate.certificate import EvaluationHashes
 from spatial_replay.annotate.specification import (
     ReportedTree,
     logged_specifications,
@@ -59,7 +59,7 @@ class Replayed:
         unreadable: how many observations have no usable value: a number is not finite, or too old.
         results: one per spec and object.
         vacuous: templates without instances; what decided nothing within a result is in its own `vacuous`.
-        certificate: hashes of what went in and came out.
+        certificate: hashes of what went in and came out; empty if none was asked for.
         semantics: the semantics of the formulas.
     """
 
@@ -98,6 +98,7 @@ class Replay:
         *,
         keep_series: bool = False,
         keep_leaves: bool = False,
+        certify: bool = True,
         show: Callable[[SceneFrames], None] = lambda frames: None,
     ) -> None:
         """Prepare; templates read the source once to find their objects.
@@ -105,6 +106,7 @@ class Replay:
         Args:
             keep_series: keep every sample's numbers in memory.
             keep_leaves: keep every sample's atoms in memory, for witnesses and signals.
+            certify: hash what is read and what comes out, which takes about as long as evaluating it.
             show: takes what the messages of the scene show.
 
         Raises:
@@ -125,9 +127,9 @@ class Replay:
         self.trees = self._evaluation.trees
         self._keep_series, self._keep_leaves = keep_series, keep_leaves
         self._kept: list[list[SeriesBlock]] = [[] for _ in self.trees]
-        hashing = Hashing()
-        self._sample_hash, self._message_hash = SampleHash(hashing), MessageHash(hashing)
-        self._result_hash = ResultHash([(tree.name, tree.object) for tree in self.trees], hashing)
+        self._hashes = (
+            EvaluationHashes([(tree.name, tree.object) for tree in self.trees]) if certify else None
+        )
         self._faults: list[str] = []
         self._remarks: list[str] = []
         self._topics: set[str] = set()
@@ -159,7 +161,9 @@ class Replay:
             stretches = self._evaluation.extend(trace)
             self._traces.add(trace)
             inside = self._selection.inside(trace)
-            own = self._selection.own_messages(block, self._encoded)
+            own = Messages()
+            if write is not None or self._hashes is not None:
+                own = self._selection.own_messages(block, self._encoded)
             self._encoded += len(self._selection.inside(block.trace))
             self._remarks += block.remarks
             if not layer:
@@ -201,10 +205,9 @@ class Replay:
             self._times = [*self._times[:1], int(trace.times_ns[0]), int(trace.times_ns[-1])]
         if len(own):
             self._end_ns = max(self._end_ns, int(own.log_time_ns[-1]))
-        self._sample_hash.add(trace)
-        self._message_hash.add(own)
+        if self._hashes is not None:
+            self._hashes.add(trace, own, stretches)
         for index, stretch in enumerate(stretches):
-            self._result_hash.add(index, stretch.series)
             if self._keep_series or self._keep_leaves:
                 self._kept[index].append(self._kept_part(stretch))
 
@@ -239,9 +242,7 @@ class Replay:
                 has_leaves=self._keep_leaves,
             ),
             vacuous=idle_templates(self.files, self.trees),
-            certificate=certificate(
-                self._sample_hash, self._message_hash, self._written_files, self._result_hash
-            ),
+            certificate={} if self._hashes is None else self._hashes.certificate(self._written_files),
             semantics=options.semantics,
         )
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from os import PathLike
@@ -12,10 +14,11 @@ from pathlib import Path
 from reprlib import repr as shortened
 from types import MappingProxyType
 from typing import NamedTuple
+from urllib.parse import quote
 
-from spatial_replay.errors import LogError, MissingFileError, UsageError
+from spatial_replay.errors import LogError, MissingFileError, RemoteError, UsageError
 from spatial_replay.geometry.footprint import Concave
-from spatial_replay.logs.downloads import downloaded
+from spatial_replay.logs.downloads import downloaded, downloaded_folder
 from spatial_replay.logs.formats.commonroad import is_scenario, iter_scenario
 from spatial_replay.logs.formats.csv_tracks import COLUMNS, iter_csv
 from spatial_replay.logs.formats.drone import FRAMES_A_SECOND, is_annotations, iter_annotations
@@ -24,7 +27,7 @@ from spatial_replay.logs.mcap.chunks import MAGIC
 from spatial_replay.logs.mcap.index import has_summary
 from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.read_options import Lost, OnTimeJump, ReadOptions, count_of
-from spatial_replay.logs.remote import LogFile, RemoteFile, log_file
+from spatial_replay.logs.remote import BAG_METADATA, LogFile, RemoteFile, is_web, log_file
 from spatial_replay.logs.source import IterTraces, Source, TrackSource, reading_only
 from spatial_replay.text import counted_from
 from spatial_replay.trace.axes import Axes
@@ -135,6 +138,8 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
         LogError: the file is too large to be downloaded.
     """
     file = log_file(path)
+    if isinstance(file, RemoteFile) and (metadata := bag_metadata_at(file)) is not None:
+        return downloaded_bag(metadata)
     if not isinstance(file, RemoteFile):
         try:
             file.stat()
@@ -149,6 +154,59 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
         if not has_summary(stream):
             return downloaded(file, "it has no index, so all of it is read")
     return file
+
+
+def bag_metadata_at(file: RemoteFile) -> RemoteFile | None:
+    """Return the metadata of the ROS 2 bag whose folder is at an address; None if that is a file.
+
+    Raises:
+        MissingFileError, RemoteError: there is neither.
+    """
+    if file.name == BAG_METADATA:
+        return file
+    try:
+        _ = file.version
+    except MissingFileError:
+        # a folder, written without the slash
+        inside = RemoteFile(f"{os.fspath(file)}/{BAG_METADATA}")
+        with suppress(MissingFileError, RemoteError):
+            _ = inside.version
+            return inside
+        raise
+    return None
+
+
+def bag_files_at(metadata: RemoteFile) -> list[RemoteFile]:
+    """Return the files of a ROS 2 bag at an address: its metadata, and those that this lists.
+
+    Raises:
+        LogError: the metadata cannot be used.
+        MissingFileError, RemoteError: it cannot be read.
+    """
+    from spatial_replay.bags.metadata import LARGEST_METADATA, bag_metadata_from_text
+
+    folder = os.fspath(metadata).removesuffix(BAG_METADATA)
+    try:
+        listed = bag_metadata_from_text(metadata.read(0, LARGEST_METADATA + 1).decode()).files
+    except MissingFileError as error:
+        raise MissingFileError(
+            f"{error}; a ROS 2 bag is the address of its folder, and any other log that of one file, such as "
+            "s3://bucket/run.mcap"
+        ) from None
+    except (LogError, UnicodeDecodeError) as error:
+        raise LogError(f"{metadata} cannot be used: {error}; copy the bag to this machine") from None
+    if is_web(metadata):
+        listed = tuple(map(quote, listed))
+    return [metadata, *(RemoteFile(folder + name) for name in listed)]
+
+
+def downloaded_bag(metadata: RemoteFile) -> Path:
+    """Return the folder with a copy of the ROS 2 bag at an address; see `downloaded`."""
+    shown = str(metadata).removesuffix(BAG_METADATA)
+    name = shown.rstrip("/").rpartition("/")[2].strip(".") or "bag"
+    return downloaded_folder(
+        bag_files_at(metadata), name, shown, "the files of a ROS 2 bag are read together"
+    )
 
 
 def is_bag_folder(path: Path) -> bool:

@@ -13,6 +13,7 @@ import numpy as np
 
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.geometry.arrays import Floats
+from spatial_replay.logs.remote import LogFile
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance, find_instances
@@ -46,9 +47,9 @@ class LabelledRun:
 
 
 def load_runs(
-    good: Sequence[Path | Trace],
-    bad: Sequence[Path | Trace],
-    read: Callable[[Path], Trace],
+    good: Sequence[LogFile | Trace],
+    bad: Sequence[LogFile | Trace],
+    read: Callable[[LogFile], Trace],
     advance: Callable[[int], None] = lambda runs: None,
 ) -> list[LabelledRun]:
     """Read runs; a file gives its name; if two files have the same, all are named with their folders.
@@ -60,25 +61,34 @@ def load_runs(
     Raises:
         UsageError: a log that is good and bad.
     """
-    paths = [each for each in (*good, *bad) if isinstance(each, Path)]
-    both = {each.resolve() for each in good if isinstance(each, Path)} & {
-        each.resolve() for each in bad if isinstance(each, Path)
-    }
+    files = [each for each in (*good, *bad) if not isinstance(each, Trace)]
+    names_of_good, names_of_bad = _names(good), _names(bad)
+    both = names_of_good.keys() & names_of_bad.keys()
     if both:
-        names = ", ".join(sorted(each.name for each in both))
+        names = ", ".join(sorted(names_of_good[each] for each in both))
         raise UsageError(f"{names} cannot be good and bad at once; leave it out of one of them")
-    has_own_names = len({each.name for each in paths}) == len(paths)
+    has_own_names = len({each.name for each in files}) == len(files)
     runs = []
     for is_good, logs in ((True, good), (False, bad)):
         for number, log in enumerate(logs, 1):
             if isinstance(log, Trace):
                 name, trace = f"{'good' if is_good else 'bad'} run {number}", log
             else:
-                name = log.name if has_own_names else log.as_posix()
+                name = log.name if has_own_names else _place(log)
                 trace = read(log)
                 advance(1)
             runs.append(LabelledRun(name, is_good, trace))
     return runs
+
+
+def _names(logs: Sequence[LogFile | Trace]) -> dict[Path | str, str]:
+    """Return the names of files by their places."""
+    files = [each for each in logs if not isinstance(each, Trace)]
+    return {each.resolve() if isinstance(each, Path) else _place(each): each.name for each in files}
+
+
+def _place(file: LogFile) -> str:
+    return file.as_posix() if isinstance(file, Path) else str(file)
 
 
 class Robustness(NamedTuple):

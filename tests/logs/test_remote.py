@@ -112,7 +112,19 @@ def test_a_window_with_images_moves_little_more_than_its_chunks(server: WebServe
 
 @pytest.mark.parametrize(
     "command",
-    ["replay", "info", "explain", "verify", "export -o out.csv", "report -o out.html", "check SPEC --log"],
+    [
+        "replay",
+        "info",
+        "explain",
+        "verify",
+        "export -o out.csv",
+        "report -o out.html",
+        "check SPEC --log",
+        "clip -o out.mcap",
+        "diff --spec SPEC --spec SPEC",
+        "tune --spec SPEC --vary least=0:2 --good",
+        "record tracks -o out.mcap",
+    ],
     ids=lambda command: command.split()[0],
 )
 def test_every_command_that_takes_a_log_takes_an_address(
@@ -124,7 +136,7 @@ def test_every_command_that_takes_a_log_takes_an_address(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("s.spatial").write_text("G (cup dist plate >= 0.1)")
+    Path("s.spatial").write_text("const least = 0.1\nspec apart = G (cup dist plate >= least)")
     name, *options = command.replace("SPEC", "s.spatial").split()
     said = []
     for each in (str(log), server.url("drive.mcap")):
@@ -147,6 +159,49 @@ def test_an_external_log_at_an_address_is_read_with_its_mapping(data_folder: Pat
         there, here = (sr.read_trace(each, mapping=mapping) for each in (server.url(bag.name), bag))
     assert there.times_ns.tolist() == here.times_ns.tolist()
     assert there.footprints.vertices.tolist() == here.footprints.vertices.tolist()
+
+
+TURTLES = """\
+topics:
+  /turtle1/pose: {name: a, position: [x, y], shape: {disc: 0.5}}
+  /turtle2/pose: {name: b, position: [x, y], shape: {disc: 0.5}}
+sample: {topic: /turtle1/pose}
+"""
+
+
+@pytest.mark.parametrize("bag", ["two_turtles_mcap", "two_turtles_sqlite3"])
+def test_a_ros2_bag_at_an_address_is_its_folder_and_its_mapping_and_specification_have_addresses(
+    bag: str,
+    data_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setenv("SPATIAL_REPLAY_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    files = {"t.yaml": TURTLES.encode(), "near.spatial": b"spec near = F (a dist b <= 2)"}
+    for name, content in files.items():
+        Path(name).write_bytes(content)
+    folder = data_folder / "bags" / bag
+    served = {f"{bag}/{each.name}": each.read_bytes() for each in folder.iterdir() if each.is_file()}
+    with serving({**files, **served}) as server:
+        here = ["replay", str(folder), "--mapping", "t.yaml", "--spec", "near.spatial"]
+        there = ["--mapping", server.url("t.yaml"), "--spec", server.url("near.spatial")]
+        code = run(here)
+        said = capsys.readouterr()
+        for address in (f"{bag}/", bag):
+            assert run(["replay", server.url(address), *there]) == code
+            assert capsys.readouterr().out == said.out
+        # the second time, the copies are there
+        assert caplog.text.count("downloading") == 1
+        results = ["batch", server.url(f"{bag}/"), *there, "-o", "results", "--jobs", "1"]
+        for news in ("all evaluated now", "1 known"):
+            assert run(results) == code
+            assert news in capsys.readouterr().out
+        del server.files[f"{bag}/metadata.yaml"]
+        assert run(["info", server.url(f"{bag}/")]) == 2
+        assert "there is no such file" in capsys.readouterr().err
 
 
 def test_a_log_that_is_not_read_in_parts_is_downloaded_once_for_each_version(
@@ -215,7 +270,9 @@ def test_addresses_that_do_not_work_say_what_helps(
     with pytest.raises(MissingFileError, match="there is no such file; check the address"):
         sr.read_trace(server.url("none.mcap"))
     with pytest.raises(UsageError, match="names no file"):
-        sr.read_trace("s3://fleet/2026-11/")
+        sr.read_trace("s3://fleet")
+    with pytest.raises(MissingFileError, match="bag is the address of its folder"):
+        sr.read_trace(server.url("2026-11/"))
     with pytest.raises(UsageError, match="is an address; write to this machine"):
         sr.replay_log(server.url("drive.mcap"), SPEC, output="s3://fleet/out.mcap")
     server.fault = lambda number: 403
