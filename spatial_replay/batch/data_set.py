@@ -44,7 +44,7 @@ _PARTITION: Final = "spec_hash="
 """Beginning of the name of a folder, of which readers make a column: another than those in the files."""
 _JOINED: Final = "joined-"
 """Beginning of the name of a file that holds the rows of several keys."""
-_MOST_JOINED: Final = 2_000
+_MOST_JOINED: Final = 500
 """Keys in one file, at most: joining holds that many in memory."""
 
 

@@ -88,7 +88,7 @@ def log_output_option(text: str) -> Callable[[_Command], _Command]:
     return click.option("-o", "--output", type=_LogOutput(path_type=Path), required=True, help=text)
 
 
-def specs_option(text: str, kind: click.ParamType | None = None) -> Callable[[_Command], _Command]:
+def specs_option(text: str, kind: click.Path | None = None) -> Callable[[_Command], _Command]:
     """Return the repeatable option `--spec SPEC`, with its help.
 
     Args:
