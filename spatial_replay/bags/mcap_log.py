@@ -22,7 +22,7 @@ from spatial_replay.bags.topic import Topic, is_latched
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.chunks import ChunkPlace, DamageError, plan_places, read_records, walk_records
 from spatial_replay.logs.mcap.index import Directory, iter_attachments, iter_metadata, read_directory
-from spatial_replay.logs.mcap.reader import ChunkWalk
+from spatial_replay.logs.mcap.reader import ChunkWalk, recovery_remarks
 from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, open_file
@@ -41,6 +41,7 @@ class McapLog(MessageReader):
         super().__init__(path)
         self._file = path
         self._walked, self._walked_all = 0, False
+        self._is_remarked = False
 
     @cached_property
     def _contents(self) -> tuple[Directory, dict[int, Channel]]:
@@ -65,6 +66,15 @@ class McapLog(MessageReader):
             _topic(channel, None if counts is None else counts.get(number, 0))
             for number, channel in sorted(channels.items())
         )
+
+    @property
+    def profile(self) -> str:
+        header = self._contents[0].header
+        return header.profile if header else ""
+
+    def take_remarks(self) -> tuple[str, ...]:
+        is_first, self._is_remarked = not self._is_remarked, True
+        return recovery_remarks(self.name, self.metadata()) if is_first else ()
 
     @property
     def channel_topics(self) -> frozenset[str]:

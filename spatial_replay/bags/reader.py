@@ -36,6 +36,11 @@ class MessageReader(ABC):
         """The topics that the log declares, by name."""
 
     @property
+    def profile(self) -> str:
+        """Return how an MCAP log with its messages names their origin."""
+        return {"ROS 1 bag": "ros1", "ROS 2 bag": "ros2"}.get(self.kind, "")
+
+    @property
     def _distribution(self) -> str | None:
         """The ROS release that the log names, for types that it does not define."""
         return None

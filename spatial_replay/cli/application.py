@@ -46,6 +46,7 @@ COMMANDS: dict[str, str] = {
     "info": "Show what a log contains.",
     "plan": "Plan a run in a simulated world.",
     "record": "Record a run as a log.",
+    "recover": "Save all that can be read of a damaged log.",
     "replay": "Evaluate specifications over a log.",
     "report": "Write an HTML report of a run.",
     "results": "Show what a batch found.",
@@ -121,10 +122,10 @@ def main() -> NoReturn:
 
 
 class _Interruption(KeyboardInterrupt):
-    """An interruption that can be caught for good.
+    """An interruption that stays caught.
 
     Once a plain KeyboardInterrupt has passed through an `exec`, as of a dataclass that is being made, the
-    interpreter ends the process by SIGINT, whoever caught it.
+    interpreter ends the process by SIGINT, even if it is caught.
     """
 
 

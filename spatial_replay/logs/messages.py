@@ -170,11 +170,13 @@ def _joined(arrays: Sequence[Integers]) -> Integers:
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """A file in a log."""
+    """A file in a log; its times are 0 where they are not known."""
 
     name: str
     media_type: str
     data: bytes = field(repr=False)
+    log_time_ns: int = 0
+    create_time_ns: int = 0
 
 
 class Sink(Protocol):

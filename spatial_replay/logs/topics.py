@@ -45,6 +45,9 @@ ENDING = "spatial_replay_ending"
 CERTIFICATE = "spatial_replay_certificate"
 """The metadata record that comes last: hashes of inputs and results."""
 
+RECOVERY = "spatial_replay_recovery"
+"""The metadata record of a log that was recovered from a damaged one: what is missing in it."""
+
 VERDICTS = "spatial_replay_verdicts"
 """The metadata record with the verdict and robustness of each result of a replay."""
 

@@ -75,12 +75,11 @@ def open_source(
     if isinstance(path, Path) and is_bag_folder(path):
         options.refuse_except(_MESSAGES, "ROS 2 bag", path.name)
         return _open_messages(path, "ROS 2 bag", options)
-    head = _head(path)
-    for kind, format_ in FORMATS.items():
-        if format_.recognise(head):
-            options.refuse_except(format_.options, kind, path.name)
-            return format_.open(path, kind, options)
-    if not head:
+    kind = format_of(path)
+    if kind is not None:
+        options.refuse_except(FORMATS[kind].options, kind, path.name)
+        return FORMATS[kind].open(path, kind, options)
+    if not _head(path):
         raise LogError(f"{path.name} is empty; give a log with at least one sample")
     raise LogError(f"{path.name} is not a log in a known format; known formats are {', '.join(FORMATS)}")
 
@@ -207,6 +206,16 @@ def downloaded_bag(metadata: RemoteFile) -> Path:
     return downloaded_folder(
         bag_files_at(metadata), name, shown, "the files of a ROS 2 bag are read together"
     )
+
+
+def format_of(path: LogFile) -> str | None:
+    """Return the name of a file's format, or None if it is in none of the known ones.
+
+    Raises:
+        MissingFileError: the file cannot be opened.
+    """
+    head = _head(path)
+    return next((kind for kind, each in FORMATS.items() if each.recognise(head)), None)
 
 
 def is_bag_folder(path: Path) -> bool:

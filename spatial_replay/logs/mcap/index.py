@@ -22,6 +22,7 @@ from spatial_replay.logs.mcap.chunks import MAGIC, RECORD_HEAD, ChunkPlace, Dama
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.topics import LIBRARY
+from spatial_replay.text import Instant, Sentence
 
 _FOOTER_BYTES = RECORD_HEAD.size + 20
 _CHUNK_HEAD_BYTES = 64
@@ -216,16 +217,23 @@ class _Scan:
             except DamageError as damage:
                 gaps += 1
                 following = self._next_chunk(sound) if gaps < _MOST_GAPS else None
-                lost = (following or self._size) - position
-                where = f"{self._name}: at byte {position}"
-                self._faults.add(f"{where}: {damage}; {max(lost, 0)} bytes cannot be read")
+                self._lose(position, following, damage)
                 if following is None:
                     break
-                position = following
+                position = following.offset
             if self._directory.chunks and self._directory.chunks[-1].compressed:
                 sound = max(sound, self._directory.chunks[-1].offset + self._directory.chunks[-1].length)
         self._end_loose()
         return self._directory
+
+    def _lose(self, position: int, following: ChunkPlace | None, damage: DamageError) -> None:
+        """Report the bytes from a position to the next chunk as lost, with the times around them."""
+        lost = max(0, (following.offset if following else self._size) - position)
+        known = [place.end_ns for place in (*self._directory.chunks, self._loose) if place]
+        after = (" after ", Instant(max(known), 0)) if known else ()
+        before = (" and" * bool(known) + " before ", Instant(following.start_ns, 0)) if following else ()
+        what = f"{self._name}: at byte {position}: {damage}; {lost} bytes"
+        self._faults.add(Sentence(what, *after, *before, " cannot be read"))
 
     def _record(self, position: int) -> int:
         """Take in the record at a position; return where the next one begins."""
@@ -283,8 +291,8 @@ class _Scan:
             self._directory.chunks.append(self._loose)
             self._loose = None
 
-    def _next_chunk(self, position: int) -> int | None:
-        """Return where the next chunk begins that is consistent in itself, from a position on."""
+    def _next_chunk(self, position: int) -> ChunkPlace | None:
+        """Return the next chunk that is consistent in itself, from a position on."""
         overlap = _BEFORE_COMPRESSION + _CHUNK_HEAD_BYTES
         while position < self._size:
             self._stream.seek(position)
@@ -295,10 +303,9 @@ class _Scan:
                 if opcode != Opcode.CHUNK or position + place + RECORD_HEAD.size + length > self._size:
                     continue
                 try:
-                    chunk_place(position + place, record, RECORD_HEAD.size + length)
+                    return chunk_place(position + place, record, RECORD_HEAD.size + length)
                 except DamageError:
                     continue
-                return position + place
             position += _STRIDE
         return None
 
@@ -334,7 +341,7 @@ def iter_attachments(
         except DamageError as damage:
             faults.add(f"{name}: at byte {offset}: {damage}; the attachment is lost")
             continue
-        yield Attachment(record.name, record.media_type, record.data)
+        yield Attachment(record.name, record.media_type, record.data, record.log_time, record.create_time)
 
 
 def iter_metadata(

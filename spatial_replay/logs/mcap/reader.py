@@ -41,7 +41,7 @@ from spatial_replay.logs.messages import BLOCK_SAMPLES, Attachment, Block, Chann
 from spatial_replay.logs.objects.decode import decode_objects
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, RemoteFile, open_file
-from spatial_replay.logs.topics import ALL, DERIVED, METADATA, OBJECTS, is_kept
+from spatial_replay.logs.topics import ALL, DERIVED, METADATA, OBJECTS, RECOVERY, is_kept
 from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.sample import LATEST_NS
@@ -93,8 +93,9 @@ class McapSource:
                 raise self._without_objects(walk, fault)
             if not decoder.any_sample and window == (0, AFTER_ALL_NS) and fault is not None:
                 raise LogError(f"{self.name} holds no sample: {fault}")
-            if rest:
-                yield Block(replace(Trace.from_samples(()), faults=rest))
+            remarks = recovery_remarks(self.name, self.metadata())
+            if rest or remarks:
+                yield Block(replace(Trace.from_samples(()), faults=rest), remarks=remarks)
 
     def iter_payloads(self, topic: str) -> Iterator[tuple[list[bytes], tuple[str, ...]]]:
         """Yield the payloads of one topic in order, in lists of bounded size, each with what was lost."""
@@ -173,6 +174,22 @@ class McapSource:
             )
             return UsageError(f"{what}; {remedy}")
         return UsageError(f"{what}; a mapping file says which of them carry objects")
+
+
+def is_samples(channel: Channel) -> bool:
+    """Return whether the messages of a channel are samples of ours."""
+    schema = channel.schema.name if channel.schema else ""
+    return (channel.topic, channel.encoding, schema) == (OBJECTS, "protobuf", _SAMPLES)
+
+
+def recovery_remarks(name: str, metadata: Sequence[tuple[str, Mapping[str, str]]]) -> tuple[str, ...]:
+    """Return what to say about a log that was recovered from a damaged one."""
+    return tuple(
+        f"{name} was recovered from {data.get('source', 'a damaged log')}:"
+        f" {data.get('losses', 'how much is missing is not known')}"
+        for record, data in metadata
+        if record == RECOVERY
+    )
 
 
 class ChunkWalk:
@@ -338,15 +355,13 @@ class _BlockDecoder:
         return Block(replace(trace, faults=lost), columns)
 
     def _is_objects(self, channel: Channel) -> bool:
-        if channel.topic != OBJECTS:
-            return False
+        if channel.topic != OBJECTS or is_samples(channel):
+            return channel.topic == OBJECTS
         schema = channel.schema.name if channel.schema else "none"
-        if (channel.encoding, schema) != ("protobuf", _SAMPLES):
-            raise LogError(
-                f"{self._source.name}: {OBJECTS!r} has messages of the schema {schema!r}, encoded as"
-                f" {channel.encoding!r}; give {_SAMPLES} in protobuf"
-            )
-        return True
+        raise LogError(
+            f"{self._source.name}: {OBJECTS!r} has messages of the schema {schema!r}, encoded as"
+            f" {channel.encoding!r}; give {_SAMPLES} in protobuf"
+        )
 
     def _columns(self, messages: list[RawMessage]) -> Messages:
         declared = self._walk.channels.items()

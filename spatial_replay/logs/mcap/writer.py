@@ -136,11 +136,13 @@ class LogWriter:
         offset, length = self._write_record(records.Metadata(name, dict(data)))
         self._summary.metadata.append(records.MetadataIndex(offset=offset, length=length, name=name))
 
-    def add_attachment(self, name: str, media_type: str, data: bytes, *, log_time_ns: int = 0) -> None:
-        """Add an attachment, after closing the chunk; its time of creation is left open."""
+    def add_attachment(
+        self, name: str, media_type: str, data: bytes, *, log_time_ns: int = 0, create_time_ns: int = 0
+    ) -> None:
+        """Add an attachment, after closing the chunk; its times are left open unless given."""
         self.flush()
         about: dict[str, Any] = {
-            "create_time": 0,
+            "create_time": create_time_ns,
             "log_time": log_time_ns,
             "name": name,
             "media_type": media_type,

@@ -1,0 +1,295 @@
+"""Recover damaged logs: the whole of what can be read, as an MCAP log with an index and a list of losses."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from spatial_replay.bags.columns import MessageColumns
+from spatial_replay.bags.mcap_log import McapLog
+from spatial_replay.bags.open import open_messages
+from spatial_replay.bags.reader import MessageReader
+from spatial_replay.bags.ros1 import Ros1Bag
+from spatial_replay.errors import LogError, UsageError
+from spatial_replay.geometry.arrays import Integers
+from spatial_replay.logs.mcap.reader import is_samples
+from spatial_replay.logs.mcap.writer import LogWriter
+from spatial_replay.logs.messages import Channel, Messages, select
+from spatial_replay.logs.objects.decode import decode_objects
+from spatial_replay.logs.output_file import refuse_inputs, replacing
+from spatial_replay.logs.read_options import FaultList
+from spatial_replay.logs.remote import LogFile, local_files
+from spatial_replay.logs.topics import ENDING, METADATA, RECOVERY
+from spatial_replay.sources.open_log import format_of, is_bag_folder, readable_file
+from spatial_replay.text import Instant, Sentence, counted, counted_from
+
+_MOST_GAPS = 1_000
+"""Gaps among samples that are listed; the samples in later ones are counted in the last one listed."""
+_BY_ENDING: Mapping[str, type[MessageReader]] = {".mcap": McapLog, ".bag": Ros1Bag}
+"""Readers of files whose first bytes are damaged."""
+
+
+@dataclass(frozen=True, slots=True)
+class SampleGap:
+    """Samples of a recording that are missing, by their numbers.
+
+    Attributes:
+        first, last: of those that are missing; counted from 0.
+        after_ns, before_ns: times of the samples around them; None where there is none.
+    """
+
+    first: int
+    last: int
+    after_ns: int | None
+    before_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Recovery:
+    """What was saved of a log, and what is missing.
+
+    Attributes:
+        name: of the damaged log.
+        start_ns, end_ns: log times of the first and the last message that was saved.
+        saved: how many messages of each topic.
+        missing: how many more the log declares, of topics of which it does; a log without an index declares
+            nothing.
+        spans: from when to when something is missing, as far as that is known.
+        samples: the gaps among its samples, if it is a recording of ours.
+        faults: all that is damaged, each with its place; times count from the first message.
+        remarks: what is worth knowing although nothing was lost.
+    """
+
+    name: str
+    start_ns: int
+    end_ns: int
+    saved: Mapping[str, int]
+    missing: Mapping[str, int]
+    spans: tuple[tuple[int, int], ...]
+    samples: tuple[SampleGap, ...]
+    faults: tuple[str, ...]
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def messages(self) -> int:
+        """How many messages were saved."""
+        return sum(self.saved.values())
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether nothing is missing."""
+        return not self.faults
+
+    @property
+    def losses(self) -> str:
+        """What is missing, in a clause."""
+        samples = sum(gap.last - gap.first + 1 for gap in self.samples)
+        messages = sum(self.missing.values())
+        if messages and samples:
+            return f"{counted(messages, 'message')} are missing, {counted(samples, 'sample')} among them"
+        if messages or samples:
+            return f"{counted(messages or samples, 'message' if messages else 'sample')} are missing"
+        return "how much is missing is not known"
+
+    def metadata(self) -> dict[str, str]:
+        """Return the metadata record with what is missing."""
+        return {
+            "source": self.name,
+            "losses": self.losses,
+            "spans_ns": json.dumps(self.spans),
+            "samples": json.dumps([[gap.first, gap.last] for gap in self.samples]),
+            "messages": json.dumps(dict(sorted(self.missing.items()))),
+            "faults": json.dumps(self.faults),
+        }
+
+
+def recover_log(
+    log: str | PathLike[str],
+    output: str | PathLike[str],
+    advance: Callable[[int], object] = lambda messages: None,
+) -> Recovery:
+    """Write all that can be read of a log to an MCAP log with an index.
+
+    Messages are copied byte for byte, in the order of their time, with their topics, types, numbers and
+    times; so are metadata and attachments. Samples of ours that cannot be used, or repeat a time, are left
+    out. What is missing is in the result and in a metadata record of the output. An output in which nothing
+    is missing gets no such record: recovered again, it gives the same bytes.
+
+    Args:
+        log: MCAP, ours or external; a ROS 1 bag; a file or a folder of a ROS 2 bag.
+        output: replaces a file of that name when it is complete.
+        advance: called with the number of messages of each step.
+
+    Raises:
+        UsageError: the log is a text file, or the output is an input.
+        MissingFileError: there is no such log.
+        LogError: nothing in it can be read.
+        OutputError: the output cannot be written.
+    """
+    inputs, output = local_files([log]), Path(output)
+    refuse_inputs(output, inputs)
+    reader, faults = _opened(readable_file(log))
+    try:
+        topics = reader.topics()
+    except LogError as error:
+        raise LogError(f"nothing of {reader.name} can be recovered: {error}") from None
+    names = {topic.name for topic in topics}
+    channels, metadata = reader.channels(names), reader.metadata()
+    begun = [each for each in metadata if each[0] != RECOVERY]
+    earlier = [data for name, data in metadata if name == RECOVERY]
+    saved = Counter[str]()
+    samples = _Samples(reader.name, channels, dict(metadata), faults)
+    with replacing(output, inputs) as stream, LogWriter(stream, profile=reader.profile) as writer:
+        for name, data in begun:
+            writer.add_metadata(name, data)
+        for attachment in reader.attachments():
+            writer.add_attachment(
+                attachment.name,
+                attachment.media_type,
+                attachment.data,
+                log_time_ns=attachment.log_time_ns,
+                create_time_ns=attachment.create_time_ns,
+            )
+        times: list[int] = []
+        for columns in reader.iter_columns(names):
+            messages = samples.usable(_messages(columns, channels))
+            writer.write_messages(messages)
+            for number, count in zip(*np.unique(messages.channel, return_counts=True), strict=True):
+                saved[channels[int(number)].topic] += int(count)
+            if len(messages):
+                times = [*times[:1], int(messages.log_time_ns[0]), int(messages.log_time_ns[-1])]
+            advance(len(columns))
+        reader.move_faults(faults)
+        if not times:
+            reason = next(iter(faults.take()), "it has none")
+            raise LogError(f"no message of {reader.name} can be recovered: {reason}")
+        recovery = Recovery(
+            reader.name,
+            start_ns=times[0],
+            end_ns=times[-1],
+            saved={name: saved[name] for name in sorted(names)},
+            missing={
+                topic.name: topic.count - saved[topic.name]
+                for topic in topics
+                if topic.count is not None and topic.count > saved[topic.name]
+            },
+            spans=(),
+            samples=(),
+            faults=counted_from(faults.take(last=True), times[0]),
+            remarks=counted_from(reader.take_remarks(), times[0]),
+        )
+        if not recovery.is_whole:
+            recovery = replace(recovery, spans=_spans(recovery.faults), samples=samples.gaps())
+        for record in [*earlier, *([] if recovery.is_whole else [recovery.metadata()])]:
+            writer.add_metadata(RECOVERY, record)
+    return recovery
+
+
+def _opened(file: LogFile) -> tuple[MessageReader, FaultList]:
+    """Return a reader of a log, also if its first bytes are damaged, with the faults so far."""
+    faults = FaultList()
+    if isinstance(file, Path) and is_bag_folder(file):
+        return open_messages(file), faults
+    kind = format_of(file)
+    if kind is not None and not kind.endswith(("MCAP", "bag")):
+        raise UsageError(
+            f"{file.name} is a {kind}, a text file without an index; to write what can be read of it as a"
+            " log: spatial-replay record tracks"
+        )
+    reader = _BY_ENDING.get(Path(file.name).suffix.lower())
+    if kind is None and reader is not None:
+        faults.add(f"{file.name}: at byte 0: its first bytes are not those of a {reader.kind} log")
+        return reader(file), faults
+    return open_messages(file), faults
+
+
+def _messages(columns: MessageColumns, channels: Mapping[int, Channel]) -> Messages:
+    return Messages(
+        channels,
+        columns.channel,
+        columns.sequence,
+        columns.log_time_ns,
+        columns.publish_time_ns,
+        columns.payloads,
+    )
+
+
+def _spans(faults: Sequence[str]) -> tuple[tuple[int, int], ...]:
+    """Return from when to when something was lost, of faults that know it, in order."""
+    known = [
+        [part.time_ns for part in fault.parts if isinstance(part, Instant)]
+        for fault in faults
+        if isinstance(fault, Sentence)
+    ]
+    return tuple(sorted({(min(times), max(times)) for times in known if times}))
+
+
+class _Samples:
+    """Tells usable samples of ours from others, and finds gaps in their numbers."""
+
+    def __init__(
+        self,
+        name: str,
+        channels: Mapping[int, Channel],
+        metadata: Mapping[str, Mapping[str, str]],
+        faults: FaultList,
+    ) -> None:
+        self._name = name
+        self._faults = faults
+        self._own = [number for number, channel in channels.items() if is_samples(channel)]
+        # a replay of a part of a log keeps the numbers of its samples
+        is_recording = metadata.get(METADATA, {}).get("written_by") == "record"
+        self._last = -1 if is_recording else None
+        self._declared = metadata.get(ENDING, {}).get("samples", "") if is_recording else ""
+        self._last_ns = -1
+        self._gaps: list[SampleGap] = []
+
+    def usable(self, messages: Messages) -> Messages:
+        """Return messages without samples that cannot be decoded, or repeat a time."""
+        is_own = np.isin(messages.channel, self._own)
+        own = np.flatnonzero(is_own)
+        if not len(own):
+            return messages
+        times = messages.log_time_ns[own]
+        before = np.maximum.accumulate(np.concatenate([[self._last_ns], times]))[:-1]
+        for time_ns in times[times <= before].tolist():
+            self._fault(Sentence("sample at ", Instant(time_ns, 0), ": there is one at this time already"))
+        own = own[times > before]
+        times = messages.log_time_ns[own]
+        trace, faults = decode_objects([messages.payloads[row] for row in own.tolist()], times)
+        for fault in faults:
+            self._fault(fault)
+        own = own[np.isin(times, trace.times_ns)]
+        self._find_gaps(messages.sequence[own], messages.log_time_ns[own])
+        is_own[own] = False
+        return select(messages, np.flatnonzero(~is_own)) if is_own.any() else messages
+
+    def gaps(self) -> tuple[SampleGap, ...]:
+        """Return the gaps, with the one between the last sample and as many as the recording declares."""
+        if self._declared.isdecimal() and self._last is not None:
+            self._gap(self._last + 1, int(self._declared) - 1, None)
+        return tuple(self._gaps)
+
+    def _find_gaps(self, numbers: Integers, times_ns: Integers) -> None:
+        for number, time_ns in zip(numbers.tolist(), times_ns.tolist(), strict=True):
+            if self._last is not None:
+                self._gap(self._last + 1, number - 1, time_ns)
+            self._last, self._last_ns = number, time_ns
+
+    def _gap(self, first: int, last: int, before_ns: int | None) -> None:
+        if first > last:
+            return
+        after_ns = None if self._last_ns < 0 else self._last_ns
+        if len(self._gaps) < _MOST_GAPS:
+            self._gaps.append(SampleGap(first, last, after_ns, before_ns))
+        else:
+            self._gaps[-1] = replace(self._gaps[-1], last=last, before_ns=before_ns)
+
+    def _fault(self, what: Sentence) -> None:
+        self._faults.add(Sentence(f"{self._name}: ", what))
