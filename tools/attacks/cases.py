@@ -1,0 +1,164 @@
+"""Cases of an attack: drawn from a seed, run one after the other, kept as files where they find something.
+
+A case is JSON: what it takes to run it again. `draw` makes one, `run` runs it and says what is wrong.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import resource
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from hashlib import sha256
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Protocol
+
+Case = dict[str, Any]
+
+MOST_MEMORY_BYTES = 500 * 10**6
+"""What a process under attack may hold at most."""
+
+
+@dataclass
+class Outcome:
+    """What came of a case.
+
+    Attributes:
+        problems: what is wrong, each in a sentence; none if all is as it should be.
+        counts: figures that are added up over cases.
+        worst: figures of which the greatest counts.
+    """
+
+    problems: list[str] = field(default_factory=list)
+    counts: dict[str, int] = field(default_factory=dict)
+    worst: dict[str, float] = field(default_factory=dict)
+
+    def take_in(self, other: Outcome) -> None:
+        """Add the figures of another outcome."""
+        for name, count in other.counts.items():
+            self.counts[name] = self.counts.get(name, 0) + count
+        for name, figure in other.worst.items():
+            self.worst[name] = max(self.worst.get(name, 0.0), figure)
+
+
+class Attack(Protocol):
+    """A source of cases.
+
+    Attributes:
+        name: as it is given on the command line.
+        most_cpu_s: the processor time that a case may take; None for no limit.
+    """
+
+    name: str
+    most_cpu_s: float | None
+
+    def draw(self, rng: random.Random) -> Case:
+        """Return a case."""
+
+    def run(self, case: Case, folder: Path) -> Outcome:
+        """Run a case in an empty folder."""
+
+    def kept(self, case: Case, folder: Path) -> Case:
+        """Return the case as it is kept, independent of how cases are drawn."""
+
+    def ready(self) -> None:
+        """Prepare what the first case would otherwise pay for."""
+
+
+def run_case(attack: Attack, case: Case, *, is_timed: bool) -> Outcome:
+    """Run a case in a folder of its own.
+
+    Args:
+        is_timed: whether processor time and memory count; a case that takes too long is run twice.
+    """
+    outcome, cpu_s = _timed(attack, case)
+    limit = attack.most_cpu_s
+    if is_timed and limit is not None and cpu_s > limit:
+        cpu_s = min(cpu_s, _timed(attack, case)[1])
+        if cpu_s > limit:
+            outcome.problems.append(f"it takes {cpu_s:.1f} s of processor time; the limit is {limit:.0f} s")
+    outcome.worst["cpu_s"] = cpu_s
+    if is_timed:
+        held = memory_bytes()
+        outcome.worst["memory_mb"] = held / 1e6
+        if held > MOST_MEMORY_BYTES:
+            outcome.problems.append(f"the process holds {held / 1e6:.0f} MB")
+    return outcome
+
+
+def memory_bytes() -> int:
+    """Return the most memory that this process has held."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def _timed(attack: Attack, case: Case) -> tuple[Outcome, float]:
+    with TemporaryDirectory(prefix="campaign-") as folder:
+        began_s = time.process_time()
+        try:
+            outcome = attack.run(case, Path(folder))
+        # whatever an attack raises is a finding
+        except Exception as error:
+            outcome = Outcome([f"{type(error).__name__}: {error}"])
+        return outcome, time.process_time() - began_s
+
+
+def run_cases(
+    attack: Attack,
+    seed: str,
+    *,
+    goes_on: Callable[[int], bool],
+    findings: Path | None = None,
+    current: Path | None = None,
+    is_timed: bool = False,
+) -> Outcome:
+    """Run cases; the outcome has the problems of all of them.
+
+    Args:
+        seed: with the number of a case, it determines the case.
+        goes_on: called with the number of cases so far.
+        findings: a folder for cases that found something.
+        current: a file with the case that is running, for a parent that outlives this process.
+    """
+    total = Outcome(counts={"cases": 0, "findings": 0})
+    attack.ready()
+    for number in _counting(goes_on):
+        case = attack.draw(random.Random(f"{attack.name} {seed} {number}"))
+        if current is not None:
+            current.write_text(json.dumps(case))
+        outcome = run_case(attack, case, is_timed=is_timed)
+        total.take_in(outcome)
+        total.counts["cases"] += 1
+        if outcome.problems:
+            total.counts["findings"] += 1
+            total.problems += outcome.problems
+            if findings is not None:
+                keep(attack, case, outcome.problems, findings)
+    return total
+
+
+def _counting(goes_on: Callable[[int], bool]) -> Iterator[int]:
+    number = 0
+    while goes_on(number):
+        yield number
+        number += 1
+
+
+def keep(attack: Attack, case: Case, problems: list[str], findings: Path) -> Path:
+    """Write a case as a file that a test replays."""
+    with TemporaryDirectory(prefix="campaign-") as folder:
+        text = json.dumps(
+            {"attack": attack.name, "found": problems, "case": attack.kept(case, Path(folder))}, indent=1
+        )
+    findings.mkdir(parents=True, exist_ok=True)
+    path = findings / f"{attack.name}-{sha256(text.encode()).hexdigest()[:10]}.json"
+    path.write_text(text + "\n")
+    return path
+
+
+def read_finding(path: Path) -> tuple[str, Case]:
+    """Return the name of an attack and its case, as `keep` wrote them."""
+    document = json.loads(path.read_text())
+    return document["attack"], document["case"]
