@@ -16,6 +16,7 @@ from spatial_replay.cli.options import (
     evaluation_options,
     open_inputs,
     output_option,
+    semantics_option,
 )
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, show_diagnostics, show_json, warn
@@ -25,6 +26,7 @@ from spatial_replay.logs.remote import LogFile, local_files
 if TYPE_CHECKING:
     from spatial_replay.compare.runs import LogDiff
     from spatial_replay.compare.specifications import SpecificationDiff
+    from spatial_replay.monitor.semantics import Semantics
 
 
 @click.command()
@@ -40,8 +42,14 @@ if TYPE_CHECKING:
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 @output_option("Page to write (HTML), with both under one time cursor.")
+@semantics_option
 def diff(
-    request: EvaluationArguments, other: LogFile | None, align: str, as_json: bool, output: Path | None
+    request: EvaluationArguments,
+    other: LogFile | None,
+    align: str,
+    as_json: bool,
+    output: Path | None,
+    semantics: Semantics,
 ) -> int:
     """Compare two versions of a specification over a log, or two logs.
 
@@ -52,7 +60,7 @@ def diff(
     Of two logs: which objects moved differently and since when, what that did to each spec, and the first
     decision of the planner that differs.
 
-    Exits with 0 if nothing differs, otherwise with 1.
+    Exits with 0 if nothing differs but names of specs, otherwise with 1.
 
     \b
     Examples:
@@ -67,7 +75,10 @@ def diff(
         refuse_output(output, _inputs(request, other))
     if other is None and align != "time":
         raise UsageError("--align applies to two logs; give the second one")
-    found = _of_specifications(request, output) if other is None else _of_logs(request, other, align, output)
+    if other is None:
+        found: SpecificationDiff | LogDiff = _of_specifications(request, output, semantics)
+    else:
+        found = _of_logs(request, other, align, output, semantics)
     if as_json:
         show_json(found.document)
     else:
@@ -80,7 +91,9 @@ def diff(
     return most_severe([code, ExitCode.DAMAGED]) if found.faults else code
 
 
-def _of_specifications(request: EvaluationArguments, output: Path | None) -> SpecificationDiff:
+def _of_specifications(
+    request: EvaluationArguments, output: Path | None, semantics: Semantics
+) -> SpecificationDiff:
     from spatial_replay.compare.specifications import diff_over_source
     from spatial_replay.report.comparison_page import write_comparison
 
@@ -96,7 +109,7 @@ def _of_specifications(request: EvaluationArguments, output: Path | None) -> Spe
             names = ", ".join(file.filename for file in recorded.files)
             raise UsageError(f"{inputs.source.name} has several specifications: {names}; give OLD, too")
         files.insert(0, recorded.files[0])
-    options = inputs.options()
+    options = inputs.options(semantics)
     with progress("samples") as advance:
         found = diff_over_source(inputs.source, files[0], files[-1], options, advance=advance)
         if output is not None:
@@ -105,14 +118,16 @@ def _of_specifications(request: EvaluationArguments, output: Path | None) -> Spe
     return found
 
 
-def _of_logs(request: EvaluationArguments, other: LogFile, align: str, output: Path | None) -> LogDiff:
+def _of_logs(
+    request: EvaluationArguments, other: LogFile, align: str, output: Path | None, semantics: Semantics
+) -> LogDiff:
     from spatial_replay.compare.runs import diff_sources
     from spatial_replay.report.comparison_page import write_comparison
 
     first = open_inputs(request, can_do_without=True)
     second = open_inputs(replace(request, log=other), known=first.files, can_do_without=True)
     sources, files = (first.source, second.source), first.files or second.files
-    options = first.options(), second.options()
+    options = first.options(semantics), second.options(semantics)
     with progress("samples") as advance:
         found = diff_sources(sources, files, options, align=align, advance=advance)
         if output is not None:

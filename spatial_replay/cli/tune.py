@@ -203,8 +203,10 @@ def _lines(tuning: Tuning) -> Iterator[str]:
         yield f"{start} that fit {runs}; {together}"
         yield from (f"  {part}" for part in tuning.conflict.message.split("; "))
         return
-    kind = "widest margin" if count[False] else "tightest values"
+    kind = ("widest margin" if tuning.is_widest else "margin") if count[False] else "tightest values"
     yield f"{kind} for {runs}: {tuning.margin:.6g}" if count[False] else f"{kind} for {runs}"
+    if not tuning.is_widest:
+        yield "  as far as was searched: a narrower range may hold a wider margin"
     rows = [_row(constant) for constant in tuning.constants]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:

@@ -14,6 +14,7 @@ from spatial_replay.automata.compile import automaton
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.result import SpecResult
+from spatial_replay.monitor.semantics import require_ltlf
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.formula import Specification
@@ -90,6 +91,7 @@ def align_runs(
     if align != "progress":
         return _alignment("event", align, [_event(results, align)], a, b)
     for one, other in results:
+        require_ltlf(one.semantics, "the progress of an automaton")
         paths = [_path(result, files) for result in (one, other)]
         if paths[0] is None or paths[1] is None:
             continue
@@ -193,7 +195,7 @@ class _Visit(NamedTuple):
 
 def _path(result: SpecResult, files: Sequence[Specification]) -> list[_Visit] | None:
     """Return the states of a run, each as often as it is entered; None without an automaton."""
-    if result.leaves is None or not len(result.times_ns):
+    if result.leaves is None or not len(result.times_ns) or result.semantics != "ltlf":
         return None
     file = next((file for file in files if any(each.formula is result.formula for each in file.specs)), None)
     if file is None:

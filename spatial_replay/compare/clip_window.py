@@ -23,12 +23,13 @@ from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.offline import evaluate_offline
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.result import SpecResult
-from spatial_replay.monitor.verdict import Verdict, final_verdict
+from spatial_replay.monitor.verdict import final_verdict
 from spatial_replay.monitor.witness.path import End, deciding_path
 from spatial_replay.replay.selection import ReplayOptions, Selection
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.formula import Outline, Specification
 from spatial_replay.trace.trace import ABSENT, Trace, window_of
+from spatial_replay.tuning.number_search import last_that_holds
 
 
 class KeptNode(NamedTuple):
@@ -60,7 +61,7 @@ def chosen_nodes(results: Sequence[SpecResult], of: Sequence[str]) -> list[KeptN
 def _first_causes(kept: Sequence[KeptNode]) -> Iterator[KeptNode]:
     """Yield the part of each node that settled its violation: not always the one that its number is of."""
     for each in kept:
-        first = next(iter(each.result.causes_of(each.node)), None)
+        first = each.result.first_cause(each.node)
         if first is not None and first.settled_ns is not None and first.node != each.node:
             yield KeptNode(each.result, first.node, each.title)
 
@@ -134,7 +135,7 @@ class _Part:
             float(end[0]) + 0.0 for wide in (True, False) for end in done.ends(self._node, wide=wide)
         )
         verdict = final_verdict(*ends[:2])
-        end = {Verdict.SATISFIED: End.LOW, Verdict.VIOLATED: End.HIGH}.get(verdict, End.OPEN)
+        end = End.of(verdict)
         steps = deciding_path(self._result.formula, done, times_ns, self._node, end).steps
         return _Reason(ends, tuple(step.node for step in steps), int(times_ns[steps[-1].sample]))
 
@@ -192,23 +193,11 @@ class ClipSearch:
             step = max(2 * step, 1)
 
     def _cut(self, outer: int, inner: int, holds: Callable[[int], bool]) -> int:
-        """Return an end near the inner one that holds: at doubling distances first, then by halves."""
-        direction = 1 if inner >= outer else -1
-        fails, step, at = None, 0, inner
-        while step < abs(inner - outer) and not holds(at):
-            fails, step = at, max(2 * step, 1)
-            at = inner - direction * step
-        if step >= abs(inner - outer):
-            at = outer
-        if fails is None:
-            return at
-        while abs(fails - at) > 1:
-            middle = (fails + at) // 2
-            if holds(middle):
-                at = middle
-            else:
-                fails = middle
-        return at
+        """Return an end near the inner one that holds; the outer one does, and windows near it cost most."""
+        if inner == outer or holds(inner):
+            return inner
+        towards = 1 if outer > inner else -1
+        return last_that_holds(inner, outer - towards, lambda at: not holds(at)) + towards
 
     def _holds(self, first: int, last: int) -> bool:
         """Say whether a window has every result, for the same reason."""

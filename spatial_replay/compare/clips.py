@@ -14,7 +14,7 @@ from spatial_replay.logs.source import Source
 from spatial_replay.monitor.semantics import require_ltlf
 from spatial_replay.replay.annotated import run_replay
 from spatial_replay.replay.clipped_source import clipped_source
-from spatial_replay.replay.engine import Replayed
+from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.replay.kept_messages import KEEP_ALL
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Window
 from spatial_replay.spec.formula import Specification
@@ -25,7 +25,7 @@ class Clip:
     """A clip that was written.
 
     Attributes:
-        whole, replayed: the replay of the log, and that of the clip.
+        whole, replayed: the replay of the log, without a certificate, and that of the clip.
         start_ns, end_ns: times of the first and the last sample of the clip.
         kept: the titles of the results, and names of specs within them, that are as in the log.
         source_bytes, clip_bytes: sizes of the files; None for a log that is not one file here.
@@ -86,7 +86,7 @@ def cut_clip(
         raise UsageError("a clip keeps every sample; leave out --every")
     require_ltlf(options.semantics, "a clip")
     first_pass = replace(options, keep=())
-    whole = run_replay(source, files, first_pass, keep_leaves=True, advance=advance)
+    whole = Replay(source, files, first_pass, keep_leaves=True, certify=False).run(advance=advance)
     chosen = chosen_nodes(whole.results, of)
     search = ClipSearch(source, files, first_pass, chosen, around_ns)
     start_ns, end_ns = search.window()

@@ -12,6 +12,7 @@ from spatial_replay.compare.trees import TreeDiff
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.offline import evaluate_offline, new_leaves
 from spatial_replay.monitor.online.codes import in_channels
+from spatial_replay.monitor.paper.evaluator import PaperRun
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.formula import Atom, Formula, Quantified
@@ -53,6 +54,7 @@ class EditOutcomes:
     def __init__(self, one: SpecResult, other: SpecResult, diff: TreeDiff) -> None:
         self._diff = diff
         self._times_ns = one.times_ns
+        self._semantics = one.semantics
         self._rows: dict[Atom | Quantified, Floats] = {}
         blocks = [(each, each.leaves) for each in (one, other) if each.leaves is not None]
         channels = max((len(leaves) for _, leaves in blocks), default=0)
@@ -76,6 +78,11 @@ class EditOutcomes:
         shape = next(iter(self._rows.values())).shape if self._rows else (1, len(self._times_ns))
         rows = [self._rows[leaf] for leaf in leaves]
         columns = np.stack(rows, axis=1) if rows else np.empty((shape[0], 0, shape[1]))
+        if self._semantics == "paper":
+            run = PaperRun(formula, leaves)
+            run.extend(columns, self._times_ns)
+            value = float(run.final[0, 0])
+            return EditOutcome(final_verdict(value, value), value, value, value)
         done = evaluate_offline(formula, leaves, columns, self._times_ns)
         lower, upper = (float(end[0]) + 0.0 for end in done.ends(0))
         least, greatest = (float(end[0]) + 0.0 for end in done.ends(0, wide=False))

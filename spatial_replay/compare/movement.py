@@ -1,4 +1,4 @@
-"""Who moved differently in two aligned runs: since when, and how far each object is from itself."""
+"""Who moved differently in two aligned runs, and how far each object is from itself; signals that differ."""
 
 from __future__ import annotations
 
@@ -51,6 +51,53 @@ class ObjectDiff:
     only_b: int
 
 
+@dataclass(frozen=True, slots=True)
+class SignalDiff:
+    """One signal in two aligned runs.
+
+    Attributes:
+        first_ns: the first sample of A in which its value is not that in B.
+        greatest: the greatest difference of two known values, at `greatest_ns`; NaN where there are none.
+        ratio: how many times as large the median of its magnitudes is in B; NaN if one of them is 0.
+    """
+
+    name: str
+    first_ns: int
+    greatest: float
+    greatest_ns: int
+    ratio: float
+
+    @property
+    def has_other_unit(self) -> bool:
+        """Whether it seems to be in another unit in B: percent instead of parts, millimetres for metres."""
+        return self.ratio >= _OTHER_UNITS or self.ratio <= 1.0 / _OTHER_UNITS
+
+
+def compare_signals(a: Trace, b: Trace, alignment: Alignment) -> tuple[SignalDiff, ...]:
+    """Return the common signals with other values."""
+    times_ns = a.times_ns[alignment.a]
+    diffs = []
+    for name in sorted(set(a.signals) & set(b.signals)):
+        one, other = a.signals[name][alignment.a], b.signals[name][alignment.b]
+        differs = (one != other) & ~(np.isnan(one) & np.isnan(other))
+        if not differs.any():
+            continue
+        known = np.flatnonzero(~(np.isnan(one) | np.isnan(other)))
+        apart = np.abs(other - one)
+        farthest = int(known[apart[known].argmax()]) if len(known) else None
+        sizes = [float(np.median(np.abs(each[known]))) if len(known) else 0.0 for each in (one, other)]
+        diffs.append(
+            SignalDiff(
+                name,
+                int(times_ns[differs.argmax()]),
+                np.nan if farthest is None else float(apart[farthest]),
+                int(times_ns[differs.argmax() if farthest is None else farthest]),
+                sizes[1] / sizes[0] if min(sizes) > 0.0 else np.nan,
+            )
+        )
+    return tuple(diffs)
+
+
 def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDiff, ...]:
     """Return the common objects that moved differently: those apart first come first, then the farthest.
 
@@ -60,7 +107,7 @@ def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDif
     names = sorted(set(a.names) & set(b.names))
     if not names and (a.names or b.names):
         raise UsageError(
-            f"the runs have no object in common: {_listed(a.names)}; {_listed(b.names)}. "
+            f"the runs have no object in common: A has {_listed(a.names)}; B has {_listed(b.names)}. "
             "Map the same things to the same names"
         )
     _check_units(a, b, names)
@@ -180,7 +227,8 @@ def _check_units(a: Trace, b: Trace, names: Sequence[str]) -> None:
         one, other = _size(a, name), _size(b, name)
         if min(one, other) > 0.0:
             ratios.append(one / other)
-            example = example or f"{name} is {ratios[0]:.3g} times as large in the first"
+            times, which = (ratios[0], "A") if ratios[0] > 1.0 else (1.0 / ratios[0], "B")
+            example = example or f"{name} is {times:,.0f} times as large in {which}"
     if ratios and (min(ratios) >= _OTHER_UNITS or max(ratios) <= 1.0 / _OTHER_UNITS):
         raise UsageError(
             f"the runs seem to be in other units: {example}. Read both in one unit, by a mapping with `scale`"
@@ -214,4 +262,15 @@ def movement_sentence(each: ObjectDiff, start_ns: int) -> Sentence:
     for which, count in (("A", each.only_a), ("B", each.only_b)):
         if count:
             parts.append(f"; only {which} has it in {counted(count, 'sample')}")
+    return Sentence(*parts)
+
+
+def signal_sentence(each: SignalDiff, start_ns: int) -> Sentence:
+    """Return since when a signal has other values, by how much, and whether its unit may be another."""
+    parts: list[str | Instant] = ["differs since ", Instant(each.first_ns, start_ns)]
+    if each.greatest > 0.0:
+        parts += [f", by up to {number_text(each.greatest)} at ", Instant(each.greatest_ns, start_ns)]
+    if each.has_other_unit:
+        times, which = (each.ratio, "B") if each.ratio > 1.0 else (1.0 / each.ratio, "A")
+        parts.append(f"; {times:,.0f} times as large in {which}: it may be in another unit there")
     return Sentence(*parts)

@@ -111,8 +111,8 @@ def compare_results(
     """
     moved = {each.name: each for each in objects}
     nodes = _deepest_flipped(one, other)
-    if not nodes and one.robustness != other.robustness:
-        nodes = (one.witness().path[-1].node,)
+    if not nodes and one.can_explain and one.robustness != other.robustness:
+        nodes = (one.deciding_node(),)
     names = [name for node in nodes for name in sorted(_objects_of(one, node)) if name in moved]
     return RunSpecDiff(
         one,

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from spatial_replay.compare.alignment import Alignment, align_runs
 from spatial_replay.compare.decision_diff import DecisionDiff, compare_decisions
-from spatial_replay.compare.movement import ObjectDiff, compare_objects, movement_sentence
+from spatial_replay.compare.movement import (
+    ObjectDiff,
+    SignalDiff,
+    compare_objects,
+    compare_signals,
+    movement_sentence,
+    signal_sentence,
+)
 from spatial_replay.compare.run_results import RunSpecDiff, compare_results
-from spatial_replay.errors import UsageError
 from spatial_replay.lazy import Displayed
 from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import CERTIFICATE
 from spatial_replay.monitor.evaluate import Evaluation, evaluate
 from spatial_replay.monitor.result import SpecResult
-from spatial_replay.monitor.semantics import require_ltlf
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, LogNames, ReplayOptions, Selection
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
@@ -38,7 +44,8 @@ class LogDiff(Displayed):
         is_certified: whether the certificates say that samples and messages are equal; nothing else was read.
         alignment: how samples correspond; None if nothing differs.
         objects: those that moved differently, the first apart first.
-        only_a, only_b: objects that one run never has, and results of templates for them.
+        signals: those with other values, in the order of their names.
+        only_a, only_b: objects and signals that one run never has, and results of templates for them.
         specs: results of both runs.
         decision: the first decision that differs; None if none does, or the runs were not planned.
         has_equal_samples: whether all samples are equal.
@@ -54,6 +61,7 @@ class LogDiff(Displayed):
     is_certified: bool
     alignment: Alignment | None
     objects: tuple[ObjectDiff, ...]
+    signals: tuple[SignalDiff, ...]
     only_a: tuple[str, ...]
     only_b: tuple[str, ...]
     specs: tuple[RunSpecDiff, ...]
@@ -86,6 +94,10 @@ class LogDiff(Displayed):
             yield f"  {each.name}: {movement_sentence(each, start_ns)}"
         if len(self.objects) > _MOST_LISTED:
             yield f"  and {counted(len(self.objects) - _MOST_LISTED, 'other object')} moved differently"
+        for signal in self.signals[:_MOST_LISTED]:
+            yield f"  {signal.name}: {signal_sentence(signal, start_ns)}"
+        if len(self.signals) > _MOST_LISTED:
+            yield f"  and {counted(len(self.signals) - _MOST_LISTED, 'other signal')} with other values"
         for which, names in (("A", self.only_a), ("B", self.only_b)):
             if names:
                 yield f"  only in {which}: {', '.join(names[:_MOST_LISTED])}"
@@ -131,6 +143,16 @@ class LogDiff(Displayed):
                 }
                 for each in self.objects
             ],
+            "signals": [
+                {
+                    "name": each.name,
+                    "first_ns": each.first_ns,
+                    "greatest_difference": json_number(each.greatest),
+                    "greatest_ns": each.greatest_ns,
+                    "ratio": json_number(each.ratio),
+                }
+                for each in self.signals
+            ],
             "only_a": list(self.only_a),
             "only_b": list(self.only_b),
             "specifications": [each.document for each in self.specs],
@@ -155,18 +177,19 @@ def diff_sources(
 
     Args:
         options: how each log is evaluated.
+        align: "time" since the first sample, "progress" of the first spec with an automaton, or the name of a
+            spec, whose first change of sign in each run is the event.
         advance: called with the number of samples of each block that is read.
 
     Raises:
-        UsageError: what `compare_runs` raises. LogError: a log cannot be read.
+        UsageError: no sample in a run, no common object, other units, nothing to align by.
+        LogError: a log cannot be read.
         SpecificationError: names that a log never has, if names are strict.
     """
-    for own in options:
-        require_ltlf(own.semantics, "a diff")
     is_whole = all(each.window.is_whole for each in options)
     if is_whole and align == "time" and same_by_certificate(*sources):
         names = sources[0].name, sources[1].name
-        return LogDiff(*names, (0, 0), (0, 0), True, None, (), (), (), (), None, True, ())
+        return LogDiff(*names, (0, 0), (0, 0), True, None, (), (), (), (), (), None, True, ())
     selections = [
         Selection(source, tuple(files), replace(each, keep=()))
         for source, each in zip(sources, options, strict=True)
@@ -179,10 +202,7 @@ def diff_sources(
         known = LogNames()
         known.add(trace)
         missing += selection.missing_names(known)
-    windows = [(each.window.start_ns, each.window.end_ns) for each in options]
-    diff = compare_runs(
-        sources, traces, files, align=align, each=options[0].each, windows_ns=(windows[0], windows[1])
-    )
+    diff = _compare(sources, traces, files, options, align)
     return replace(diff, missing=tuple(dict.fromkeys(missing)))
 
 
@@ -198,39 +218,33 @@ def same_by_certificate(one: Source, other: Source) -> bool:
 _CERTIFIED: Final = ("samples_sha256", "messages_sha256")
 
 
-def compare_runs(
+def _compare(
     sources: tuple[Source, Source],
     traces: tuple[Trace, Trace],
-    files: Sequence[Specification] = (),
-    *,
-    align: str = "time",
-    each: Mapping[str, str] | None = None,
-    windows_ns: tuple[tuple[int, int], tuple[int, int]] = ((0, FOREVER), (0, FOREVER)),
+    files: Sequence[Specification],
+    options: tuple[ReplayOptions, ReplayOptions],
+    align: str,
 ) -> LogDiff:
     """Compare two runs and what specifications say of them.
 
     Args:
         traces: their samples.
-        align: "time" since the first sample, "progress" of the first spec with an automaton, or the name of a
-            spec, whose first change of sign in each run is the event.
-        each: for each parameter of a template, the objects that it stands for.
-        windows_ns: of each run, from which time to before which specs are evaluated.
-
-    Raises:
-        UsageError: no sample in a run, no common object, other units, nothing to align by.
     """
-    for source, trace in zip(sources, traces, strict=True):
-        if not len(trace):
-            raise UsageError(
-                f"{source.name} has no sample in the requested window; there is nothing to compare"
-            )
     a, b = traces
-    evaluations = [
-        _evaluated(trace, files, each, window) for trace, window in zip(traces, windows_ns, strict=True)
-    ]
+    times_ns = a.times_ns, b.times_ns
+    # all three measure for most of their time, which leaves the interpreter to the others
+    with ThreadPoolExecutor(2, "comparing") as threads:
+        waiting = [
+            threads.submit(_evaluated, trace, files, own) for trace, own in zip(traces, options, strict=True)
+        ]
+        if align == "time":
+            alignment = align_runs(times_ns, (), files, align)
+            objects = compare_objects(a, b, alignment)
+        evaluations = [each.result() for each in waiting]
     results = _paired(evaluations)
-    alignment = align_runs((a.times_ns, b.times_ns), results, files, align)
-    objects = compare_objects(a, b, alignment)
+    if align != "time":
+        alignment = align_runs(times_ns, results, files, align)
+        objects = compare_objects(a, b, alignment)
     titles = [{result.title for evaluation in own for result in evaluation} for own in evaluations]
     return LogDiff(
         sources[0].name,
@@ -240,8 +254,9 @@ def compare_runs(
         False,
         alignment,
         objects,
-        tuple(sorted(set(a.names) - set(b.names)) + sorted(titles[0] - titles[1])),
-        tuple(sorted(set(b.names) - set(a.names)) + sorted(titles[1] - titles[0])),
+        compare_signals(a, b, alignment),
+        _only_in(a, b, titles[0] - titles[1]),
+        _only_in(b, a, titles[1] - titles[0]),
         tuple(compare_results(one, other, alignment, traces, objects, files) for one, other in results),
         compare_decisions(sources),
         not objects and a == b,
@@ -250,21 +265,25 @@ def compare_runs(
     )
 
 
+def _only_in(one: Trace, other: Trace, titles: set[str]) -> tuple[str, ...]:
+    names = sorted(set(one.names) - set(other.names)) + sorted(set(one.signals) - set(other.signals))
+    return (*names, *sorted(titles))
+
+
 def _faults(trace: Trace) -> tuple[str, ...]:
     return counted_from(trace.faults, int(trace.times_ns[0]))
 
 
-def _evaluated(
-    trace: Trace, files: Sequence[Specification], each: Mapping[str, str] | None, window_ns: tuple[int, int]
-) -> list[Evaluation]:
+def _evaluated(trace: Trace, files: Sequence[Specification], options: ReplayOptions) -> list[Evaluation]:
     parameters = [{spec.parameter for spec in file.results} for file in files]
     return [
         evaluate(
             file,
             trace,
-            start_ns=window_ns[0],
-            end_ns=window_ns[1],
-            each={name: choice for name, choice in (each or {}).items() if name in own},
+            semantics=options.semantics,
+            start_ns=options.window.start_ns,
+            end_ns=min(options.window.end_ns, FOREVER),
+            each={name: choice for name, choice in options.each.items() if name in own},
         )
         for file, own in zip(files, parameters, strict=True)
     ]

@@ -87,7 +87,10 @@ class SpecDiff(Displayed):
 
     def sentences(self, first_ns: int) -> Iterator[Sentence]:
         """Yield what changed, one sentence each, with times counted from `first_ns`."""
-        yield Sentence(f"{_outcome_text(self.old)} → {_outcome_text(self.new)}")
+        outcome = _outcome_text(self.old)
+        yield Sentence(
+            f"{outcome} → {_outcome_text(self.new)}" if self.is_different else f"{outcome}, the same"
+        )
         if self.first is not None:
             values = f"{number_text(self.first.old)} → {number_text(self.first.new)}"
             yield Sentence("first differs at ", Instant(self.first.time_ns, first_ns), f": {values}")
@@ -102,8 +105,8 @@ class SpecDiff(Displayed):
             yield reason_sentence(self.new.causes[0].witness, first_ns=first_ns)
         others = [edit for edit in self.edits if edit not in self.cause]
         for edit in others[:_MOST_LISTED]:
-            what = "edited, too" if self.cause else "edited, without effect on the result"
-            yield Sentence(f"{what}: {edit}")
+            what = "edited, too: " if self.cause else "edited, without effect on the result: "
+            yield Sentence(f"{'' if edit.kind == 'renamed' else what}{edit}")
         if len(others) > _MOST_LISTED:
             yield Sentence(f"and {counted(len(others) - _MOST_LISTED, 'other edit')}")
 

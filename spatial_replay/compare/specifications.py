@@ -21,7 +21,7 @@ from spatial_replay.lazy import Displayed
 from spatial_replay.logs.source import Source
 from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.result import SpecResult
-from spatial_replay.monitor.semantics import require_ltlf
+from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, LogNames, ReplayOptions, Selection
 from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
 from spatial_replay.spec.format import format_duration
@@ -61,8 +61,9 @@ class SpecificationDiff(Displayed):
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing differs: no formula, no verdict, no number."""
-        return not (self.removed or self.added or any(each.edits or each.is_different for each in self.specs))
+        """Whether nothing differs: no formula, new names aside, no verdict, no number."""
+        is_edited = any(edit.kind != "renamed" for each in self.specs for edit in each.edits)
+        return not (self.removed or self.added or is_edited or any(each.is_different for each in self.specs))
 
     def spec(self, name: str) -> SpecDiff:
         """Return the first diff of a spec, by its new name.
@@ -119,11 +120,12 @@ def compare_specifications(
     start_ns: int = 0,
     end_ns: int = FOREVER,
     each: Mapping[str, str] | None = None,
+    semantics: Semantics = "ltlf",
 ) -> SpecificationDiff:
     """Evaluate two versions of a specification over a trace, and find what changed the results.
 
     Args:
-        start_ns, end_ns, each: as for `evaluate`.
+        start_ns, end_ns, each, semantics: as for `evaluate`.
 
     Raises:
         UsageError: no spec has a counterpart, another parameter of a template, or what `evaluate` raises.
@@ -139,6 +141,7 @@ def compare_specifications(
         evaluate(
             Specification(specs, file.profile, regions, filename=file.filename),
             trace,
+            semantics=semantics,
             start_ns=start_ns,
             end_ns=min(end_ns, FOREVER),
             each=each,
@@ -184,7 +187,6 @@ def diff_over_source(
         UsageError: what that raises, no sample in the window. LogError: the log cannot be read.
         SpecificationError: names that the log never has, if names are strict.
     """
-    require_ltlf(options.semantics, "a diff")
     selection = Selection(source, (old, new), replace(options, keep=()))
     trace = selection.trace(advance)
     if not len(selection.inside(trace)):
@@ -194,7 +196,14 @@ def diff_over_source(
     missing = selection.missing_names(names)
     window = options.window
     diff = compare_specifications(
-        old, new, trace, log=source.name, start_ns=window.start_ns, end_ns=window.end_ns, each=options.each
+        old,
+        new,
+        trace,
+        log=source.name,
+        start_ns=window.start_ns,
+        end_ns=window.end_ns,
+        each=options.each,
+        semantics=options.semantics,
     )
     return replace(diff, missing=missing)
 
@@ -223,9 +232,9 @@ def _paired(
                 added.remove(other)
                 break
     if not pairs:
-        names = [", ".join(spec.name for spec in file.specs) for file in (old, new)]
+        names = [f"{file.filename} has {', '.join(spec.name for spec in file.specs)}" for file in (old, new)]
         raise UsageError(
-            f"{old.filename} and {new.filename} have no spec in common: {names[0]}; {names[1]}. "
+            f"{old.filename} and {new.filename} have no spec in common: {'; '.join(names)}. "
             "Give what is to be compared one name"
         )
     for one, other in pairs:

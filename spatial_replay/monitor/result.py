@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,13 +12,14 @@ from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
 from spatial_replay.lazy import Displayed
 from spatial_replay.monitor.causes import Cause, Conjunct, LeastPart, conjuncts_of, find_causes, find_least
-from spatial_replay.monitor.offline import full_signal, window_signal
+from spatial_replay.monitor.offline import evaluate_offline, full_signal, window_signal
 from spatial_replay.monitor.semantics import Semantics, require_ltlf
 from spatial_replay.monitor.sentences import cause_sentences, sentences_of, verdict_sentence
 from spatial_replay.monitor.stream import NEVER, InstanceStream, SeriesBlock
 from spatial_replay.monitor.vacuity import Vacuous, find_vacuous
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.monitor.witness.evidence import Evidence
+from spatial_replay.monitor.witness.path import End, deciding_path
 from spatial_replay.monitor.witness.witness import Witness, find_witness, time_of_least
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_formula
@@ -222,12 +223,17 @@ class SpecResult(Displayed):
 
     def causes_of(self, node: int) -> tuple[Cause, ...]:
         """Return why a node is violated or unknown, as `causes` does for the root."""
+        return self._causes(node, self._settled_witness)
+
+    def first_cause(self, node: int) -> Cause | None:
+        """Return the first of `causes_of` a node, without its witness: no sample is read for it."""
+        return next(iter(self._causes(node, lambda node, settled_ns: None)), None)
+
+    def _causes(self, node: int, witness: Callable[[int, int | None], Witness | None]) -> tuple[Cause, ...]:
         if final_verdict(*self.final[node].tolist()) is Verdict.SATISFIED:
             return ()
         named = {**self.evidence.instance.named, self.name: self.spec}
-        return find_causes(
-            self._conjuncts(node), self.values, self.final, self.settled_ns, self._settled_witness, named
-        )
+        return find_causes(self._conjuncts(node), self.values, self.final, self.settled_ns, witness, named)
 
     @property
     def least(self) -> LeastPart | None:
@@ -301,6 +307,18 @@ class SpecResult(Displayed):
         if not 0 <= identifier < len(self.final):
             raise UsageError(f"no node has the id {identifier}; they go from 0 to {len(self.final) - 1}")
         return find_witness(self.evidence, leaves, self.times_ns, identifier)
+
+    def deciding_node(self) -> int:
+        """Return the id of the node that decides the verdict, as `witness` does, which looks into more.
+
+        Raises:
+            UsageError: under the paper's semantics.
+        """
+        leaves = self._leaves("what decides a verdict")
+        done = evaluate_offline(self.formula, self.evidence.instance.program.leaves, leaves, self.times_ns)
+        lower, upper = (float(end[0]) + 0.0 for end in done.ends(0))
+        end = End.of(final_verdict(lower, upper))
+        return deciding_path(self.formula, done, self.times_ns, 0, end).steps[-1].node
 
     def explain(self, *, first_ns: int | None = None) -> str:
         """Explain the verdict in sentences, one a line, as the command `explain` prints them.

@@ -54,7 +54,11 @@ def tuning_html(tuning: Tuning) -> Html:
     left_out = len(closest) - len(runs)
     return element(
         "div",
-        element("div", name, f": margin {tuning.margin:.6g}"),
+        element(
+            "div",
+            name,
+            f": margin {tuning.margin:.6g}{'' if tuning.is_widest else ', as far as was searched'}",
+        ),
         table(["constant", "value", "as written", "every value that fits"], rows),
         table(["run", "is", "verdict", "robustness"], runs),
         quiet(f"… and {counted(left_out, 'run')} more") if left_out else Html(""),

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from spatial_replay import __version__
-from spatial_replay.compare.movement import movement_sentence
+from spatial_replay.compare.movement import movement_sentence, signal_sentence
 from spatial_replay.compare.runs import LogDiff
 from spatial_replay.compare.specifications import SpecificationDiff
 from spatial_replay.logs.output_file import replacing
@@ -74,6 +74,7 @@ def comparison_page(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunRepor
             panel("verdicts", "What differs", *_changes(diff, (a.first_ns, b.first_ns))),
             panel("scene-a", labels[0]),
             panel("scene-b", labels[1]),
+            *_decision_panels(diff, labels),
             panel("timeline", "Over time"),
             id="main",
             tabindex="-1",
@@ -109,13 +110,14 @@ def _changes(diff: SpecificationDiff | LogDiff, first_ns: tuple[int, int]) -> It
     """Yield each change: its headline, and its sentences with their times as links."""
     if diff.is_empty:
         yield element("p", "Nothing differs.")
-        return
     if isinstance(diff, SpecificationDiff):
         for each in diff.specs:
             if each.edits or each.is_different:
                 yield _change(each.title, each.new.verdict, list(each.sentences(diff.first_ns)), first_ns)
         for names, where in ((diff.removed, diff.old), (diff.added, diff.new)):
             yield from (element("p", text(f"{name}: only in {where.filename}")) for name in names)
+        return
+    if diff.is_empty:
         return
     for spec in diff.specs:
         yield _change(spec.a.title, spec.b.verdict, list(spec.sentences(diff.starts_ns)), first_ns)
@@ -124,6 +126,12 @@ def _changes(diff: SpecificationDiff | LogDiff, first_ns: tuple[int, int]) -> It
     ]
     if moved:
         yield _change("who moved differently", None, moved, first_ns)
+    if diff.signals:
+        signals = [
+            Sentence(f"{each.name}: ", *signal_sentence(each, diff.starts_ns[0]).parts)
+            for each in diff.signals
+        ]
+        yield _change("signals with other values", None, signals, first_ns)
     for which, names in (("A", diff.only_a), ("B", diff.only_b)):
         if names:
             yield element("p", text(f"Only in {which}: {', '.join(names)}"))
@@ -133,6 +141,14 @@ def _changes(diff: SpecificationDiff | LogDiff, first_ns: tuple[int, int]) -> It
         found += [f"gradient maps that differ: {', '.join(decision.maps)}"] if decision.maps else []
         title = f"decision {decision.number} is the first that differs"
         yield _change(title, None, [Sentence(each) for each in found], first_ns)
+
+
+def _decision_panels(diff: SpecificationDiff | LogDiff, labels: tuple[str, str]) -> list[Html]:
+    """Return places for the first decision that differs, of both runs, with its gradient maps."""
+    if isinstance(diff, SpecificationDiff) or diff.decision is None:
+        return []
+    names = zip(("decision-a", "decision-b"), labels, strict=True)
+    return [panel(name, text(f"{label}: decision {diff.decision.number}")) for name, label in names]
 
 
 def _change(
@@ -181,7 +197,7 @@ def _pairs(
                 for knot in diff.alignment.knots
             ]
         apart = [each.apart_ns for each in diff.objects if each.apart_ns is not None]
-        first_ns = min(apart, default=None)
+        first_ns = min(apart, default=None if diff.decision is None else diff.decision.a_ns)
         for run_spec in diff.specs:
             titles = run_spec.a.title, run_spec.b.title
             nodes += _node_pairs(run_spec.a.title, titles, (run_spec.a, run_spec.b), places)
@@ -189,8 +205,13 @@ def _pairs(
         "labels": list(labels),
         "knots": knots,
         "nodes": nodes,
+        "decision": _decision_number(diff),
         "first": None if first_ns is None else (first_ns - a.first_ns) / 1e9,
     }
+
+
+def _decision_number(diff: SpecificationDiff | LogDiff) -> int | None:
+    return None if isinstance(diff, SpecificationDiff) or diff.decision is None else diff.decision.number
 
 
 _Places: TypeAlias = Mapping[str, tuple[int, Mapping[int, int]]]

@@ -2,7 +2,7 @@
 
 `varied` is a constant with the values to try, `direction` says which way they loosen the specification,
 `substitution` puts values into formulas, `margins` says how far each run is from the other verdict, `search`
-finds the values, `exact` several of them at once, `tuned` says what was found.
+finds the values, `exact` several of them at once, both with `number_search`; `tuned` says what was found.
 
 Names are loaded when they are first used.
 """

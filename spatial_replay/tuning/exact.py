@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final, NamedTuple
 
 from spatial_replay.tuning.margins import Margins, Point
+from spatial_replay.tuning.number_search import last_before
 
 _MOST_EVALUATIONS: Final = 8_000
 """Evaluations of runs for one decision, or for one widest margin; past them it counts as undecided."""
@@ -108,14 +110,9 @@ class ExactSearch:
         """Return the least number of an axis from which on good runs hold; all steps if one never does."""
         number = 0
         for run in good:
-            low, high = number, self._steps[axis]
-            if self._holds(run, _with(numbers, [axis], low), level, part.results):
-                continue
-            while high - low > 1:
-                middle = (low + high) // 2
-                holds = self._holds(run, _with(numbers, [axis], middle), level, part.results)
-                low, high = (low, middle) if holds else (middle, high)
-            number = high
+            holds = partial(self._holds_at, run, numbers, axis, level, part.results)
+            if not holds(number):
+                number = last_before(self._steps[axis], number, holds)
         return number
 
     def _in_boxes(
@@ -173,6 +170,11 @@ class ExactSearch:
 
     def _holds(self, run: int, numbers: Sequence[int], level: float, results: Sequence[str]) -> bool:
         return self._margins.holds(run, self._point_of(numbers), level, results)
+
+    def _holds_at(
+        self, run: int, numbers: Sequence[int], axis: int, level: float, results: Sequence[str], number: int
+    ) -> bool:
+        return self._holds(run, _with(numbers, [axis], number), level, results)
 
     def _is_invalid(self, runs: Sequence[int], numbers: Sequence[int]) -> bool:
         # such as a window whose ends are reversed; beyond, the verdict may be right again

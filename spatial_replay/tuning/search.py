@@ -12,6 +12,7 @@ import math
 import random
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -19,12 +20,12 @@ import numpy as np
 from spatial_replay.errors import UsageError
 from spatial_replay.tuning.exact import ExactSearch
 from spatial_replay.tuning.margins import Margins, Point
+from spatial_replay.tuning.number_search import evolve, last_before, last_that_holds
 
 _PARTS: Final = 1 << 20
 """Steps by which all constants together are tightened."""
-_ROUNDS, _GENERATIONS, _CANDIDATES = 6, 15, 6
-"""Bounds of the search over several constants: rounds of adding runs, generations in a round, and candidates
-of a generation for each constant."""
+_ROUNDS: Final = 6
+"""The most rounds of adding runs to those that decide."""
 _MOST_LINES, _SECANTS = 64, 24
 """The most lines of the grid that are all looked at, and the most steps on one of them."""
 _FAR: Final = 1e12
@@ -39,7 +40,7 @@ class Found:
         point: where it ended.
         is_held: whether every run has the right verdict there.
         conflict: runs that have not all the right verdict at any point, as far as was searched; () if held.
-        is_proven: whether they have it at no point at all; True if held.
+        is_proven: whether they have it at no point at all; if held, whether no other point is better.
     """
 
     point: Point
@@ -168,12 +169,11 @@ class Search:
         number = 0
         for run in runs:
             if not self._margins.holds(run, at(number)):
-                low, high = number, most
-                while high - low > 1:
-                    middle = (low + high) // 2
-                    low, high = (low, middle) if self._margins.holds(run, at(middle)) else (middle, high)
-                number = high
+                number = last_before(most, number, partial(self._holds_at, run, at))
         return number
+
+    def _holds_at(self, run: int, at: Callable[[int], Point], number: int, least: float = 0.0) -> bool:
+        return self._margins.holds(run, at(number), least)
 
     # ------------------------------------------------------------------------------------ several constants
 
@@ -189,7 +189,7 @@ class Search:
             point = self._climbed(deciding, self._loosened(found.looseness))
             missing = self._worst(point, deciding) or self._failing(point)[:1]
             if not missing:
-                return Found(self._centred(point), is_held=True)
+                return Found(self._centred(point), is_held=True, is_proven=found.is_proven)
             deciding += missing
         if found.is_proven:
             # each run that is left is needed for the contradiction
@@ -223,7 +223,7 @@ class Search:
             deciding += missing
         if not self.holds(point):
             return Found(point, is_held=False, conflict=self._conflict(point), is_proven=False)
-        return Found(self._centred(point), is_held=True)
+        return Found(self._centred(point), is_held=True, is_proven=False)
 
     def _worst(self, point: Point, known: Sequence[int]) -> list[int]:
         """Return the good and the bad run of the least margin, if it is less than that of the known runs."""
@@ -255,30 +255,8 @@ class Search:
             for numbers in itertools.product(*(range(size + 1) for size in sizes)):
                 look(numbers)
         else:
-            self._evolve(look, sizes, [start[other] for other in others])
+            evolve(look, sizes, [start[other] for other in others], self._seed)
         return self._climbed(runs, best[1])
-
-    def _evolve(
-        self, cost: Callable[[Sequence[int]], float], sizes: Sequence[int], start: Sequence[int]
-    ) -> None:
-        """Let SciPy look for numbers, from 0 to some sizes, of the least cost."""
-        try:
-            from scipy.optimize import differential_evolution
-        except ImportError:
-            remedy = "pip install 'spatial-replay[tune]'"
-            raise UsageError(
-                f"tuning several constants needs SciPy, which is not installed: {remedy}"
-            ) from None
-        differential_evolution(
-            lambda shares: cost([round(share * size) for share, size in zip(shares, sizes, strict=True)]),
-            [(0.0, 1.0)] * len(sizes),
-            rng=np.random.default_rng(self._seed),
-            x0=[number / size for number, size in zip(start, sizes, strict=True)],
-            init="sobol",
-            popsize=_CANDIDATES,
-            maxiter=_GENERATIONS,
-            polish=False,
-        )
 
     @property
     def _line_axis(self) -> int | None:
@@ -391,13 +369,9 @@ class Search:
         is_looser = (end > point[axis]) == (self._margins.directions[axis] == 1)
         # where the specification is invalid, one good run shows it as well as all
         for run in [*self._bad, *self._good[:1]] if is_looser else self._good:
-            if not self._margins.holds(run, self._with(point, axis, end), least):
-                inside, outside = point[axis], end
-                while abs(outside - inside) > 1:
-                    middle = (inside + outside) // 2
-                    holds = self._margins.holds(run, self._with(point, axis, middle), least)
-                    inside, outside = (middle, outside) if holds else (inside, middle)
-                end = inside
+            holds = partial(self._holds_at, run, partial(self._with, point, axis), least=least)
+            if not holds(end):
+                end = last_before(point[axis], end, holds)
         return end
 
     def _edge(self, point: Point, axis: int, towards: int, least: float) -> int:
@@ -416,16 +390,4 @@ class Search:
                     return False
             return True
 
-        inside, size = point[axis], 1
-        outside = inside
-        while inside != end and inside == outside:
-            outside = min(inside + size, end) if towards > 0 else max(inside - size, end)
-            if holds(outside):
-                inside, size = outside, 2 * size
-        while abs(outside - inside) > 1:
-            middle = (inside + outside) // 2
-            if holds(middle):
-                inside = middle
-            else:
-                outside = middle
-        return inside
+        return last_that_holds(point[axis], end, holds)

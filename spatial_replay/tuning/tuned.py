@@ -121,6 +121,8 @@ class Tuning(Displayed):
         margin: the least margin of all runs.
         runs: every run, in the order given.
         conflict: why nothing was found, or None.
+        is_widest: whether other values are known to have no wider margin, or to be no tighter: not if the
+            search ran out of evaluations, nor if it tried values of a constant without a direction.
         specification: the specification with the values, its comments and layout kept.
     """
 
@@ -129,6 +131,7 @@ class Tuning(Displayed):
     margin: float
     runs: tuple[RunMargin, ...]
     conflict: Conflict | None
+    is_widest: bool
     specification: Specification
     _margins: Margins = field(repr=False)
     _point: Point = field(repr=False)
@@ -137,6 +140,12 @@ class Tuning(Displayed):
     def values(self) -> dict[str, Value]:
         """The values by name, as `parse_specification` takes them."""
         return {constant.name: constant.value for constant in self.constants}
+
+    def __repr__(self) -> str:
+        if self.conflict is not None:
+            return f"<Tuning: {self.conflict.message}>"
+        values = ", ".join(f"{name} = {value}" for name, value in self.values.items())
+        return f"<Tuning of {counted(len(self.runs), 'run')}: {values}; margin {self.margin:.6g}>"
 
     def surface(self, *names: str, points: int = 25) -> Surface:
         """Compute the margins over one or two constants; without names over the first two.
@@ -193,6 +202,7 @@ class Tuning(Displayed):
         return {
             "found": self.is_found,
             "margin": json_number(self.margin),
+            "widest": self.is_widest,
             "constants": [
                 {
                     "name": each.name,
@@ -321,6 +331,7 @@ def _tuning(specification: Specification, margins: Margins, search: Search, foun
         min(run.margin for run in listed),
         tuple(listed),
         None if found.is_held else _conflict(margins, search, found),
+        found.is_held and found.is_proven,
         margins.specification(found.point) or specification,
         margins,
         found.point,

@@ -11,6 +11,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 import spatial_replay as sr
+from compare.planned_runs import with_another_decision
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 HOSTILE = "</script><img src=x onerror=alert(1)>"
@@ -59,3 +60,23 @@ def test_a_run_that_starts_later_is_shown_beside_the_other(page: Page, tmp_path:
     expect(page.locator(".now")).to_contain_text("0.000 s")
     readings = page.locator(".legend-entry .number")
     assert readings.nth(1).inner_text() != "?"
+
+
+def test_the_decisions_that_differ_stand_side_by_side_with_their_maps(page: Page, tmp_path: Path) -> None:
+    run = RECORDINGS / "push.mcap"
+    diff = sr.diff_logs(
+        run, with_another_decision(run, tmp_path / "other.mcap"), output=tmp_path / "diff.html"
+    )
+    assert diff.decision is not None
+    assert diff.decision.a_ns is not None
+    page.goto((tmp_path / "diff.html").as_uri())
+    expect(page.locator("html[data-ready]")).to_have_count(1)
+    seconds = (diff.decision.a_ns - diff.starts_ns[0]) / 1e9
+    expect(page.locator(".now")).to_contain_text(f"{seconds:.3f} s")
+    for side in ("#decision-a", "#decision-b"):
+        expect(page.locator(f"{side} .candidate canvas").first).to_be_visible()
+        assert page.locator(f"{side} .candidate").count() == page.locator("#decision-a .candidate").count()
+    expect(page.locator("#decision-b")).to_contain_text("differently:")
+    page.get_by_role("button", name="To the first sample").click()
+    page.locator("#decision-b .decision-title").click()
+    expect(page.locator(".now")).to_contain_text(f"{seconds:.3f} s")

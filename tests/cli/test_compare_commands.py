@@ -54,6 +54,34 @@ def test_what_is_equal_differs_in_nothing(capsys: pytest.CaptureFixture[str]) ->
     assert (code, out.splitlines()[1:]) == (0, ["  the same 300 samples"])
 
 
+@pytest.mark.usefixtures("folder")
+def test_new_names_alone_are_listed_and_are_no_difference(capsys: pytest.CaptureFixture[str]) -> None:
+    text = Path("table.spatial").read_text()
+    Path("renamed.spatial").write_text(text.replace("table_set", "table_laid"))
+    files = ("table.jsonl", "--spec", "table.spatial", "--spec", "renamed.spatial")
+    code, out, _ = said(capsys, "diff", *files)
+    assert code == 0
+    assert "table_laid (was table_set): satisfied (0.0248667), the same" in out
+    assert "    renamed table_set to table_laid" in out
+    assert json.loads(said(capsys, "diff", *files, "--json")[1])["same"]
+
+
+@pytest.mark.usefixtures("folder")
+def test_the_edit_that_flips_a_verdict_by_the_papers_semantics_is_named(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    Path("old.spatial").write_text("const near = 0.08\nspec near_plate = F G (spoon dist plate <= near)")
+    Path("new.spatial").write_text("const near = 0.01\nspec near_plate = F G (spoon dist plate <= near)")
+    files = ("table.jsonl", "--spec", "old.spatial", "--spec", "new.spatial", "--semantics", "paper")
+    code, out, _ = said(capsys, "diff", *files, "-o", "diff.html")
+    assert code == 1
+    assert "because: constant near: `spoon dist plate <= 0.08` to `spoon dist plate <= 0.01`" in out
+    runs = ("table.jsonl", "table.jsonl", "--spec", "old.spatial", "--semantics", "paper")
+    assert said(capsys, "diff", *runs)[0] == 0
+    code, _, err = said(capsys, "diff", *runs, "--align", "progress")
+    assert (code, "not defined under the semantics 'paper'" in err) == (2, True)
+
+
 MOVED = 0.5
 
 

@@ -6,11 +6,9 @@ import json
 from pathlib import Path
 
 import numpy as np
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
 import spatial_replay as sr
-from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanDecision
+from compare.planned_runs import with_another_decision
 
 
 def blocks(data: Path, name: str) -> tuple[sr.Trace, str]:
@@ -84,31 +82,6 @@ def test_runs_are_aligned_by_an_event() -> None:
     assert b_ns - a_ns == 7 * 10**9
 
 
-def with_another_decision(log: Path, copy: Path) -> Path:
-    """A copy of a planned run whose second decision has another reason, and another map of one object."""
-    numbers: dict[int, int] = {}
-    with log.open("rb") as stream, copy.open("wb") as output:
-        writer = Writer(output)
-        writer.start()
-        for schema, channel, message in make_reader(stream).iter_messages():
-            if channel.id not in numbers:
-                assert schema is not None
-                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
-                numbers[channel.id] = writer.register_channel(
-                    channel.topic, channel.message_encoding, schema_id
-                )
-            payload = message.data
-            if channel.topic == "/plan/decision":
-                decision = PlanDecision.FromString(payload)
-                if decision.number == 1:
-                    decision.reason = f"differently: {decision.reason}"
-                    decision.considered[0].candidates[0].map_sha256 = b"another"
-                payload = decision.SerializeToString()
-            writer.add_message(numbers[channel.id], message.log_time, payload, message.publish_time)
-        writer.finish()
-    return copy
-
-
 def test_of_planned_runs_the_first_decision_that_differs_is_named_with_its_maps(tmp_path: Path) -> None:
     run = Path(__file__).resolve().parents[2] / "recordings" / "push.mcap"
     diff = sr.diff_logs(run, with_another_decision(run, tmp_path / "other.mcap"))
@@ -121,6 +94,22 @@ def test_of_planned_runs_the_first_decision_that_differs_is_named_with_its_maps(
     same = sr.diff_logs(run, run)
     assert same.decision is None
     assert same.is_empty
+
+
+def test_signals_with_other_values_are_listed_and_other_units_noticed() -> None:
+    def run(values: list[float]) -> sr.Trace:
+        cup = sr.Footprint.box(0, 0, 1, 1)
+        return sr.Trace.from_samples(
+            sr.Sample(second * 10**9, {"cup": cup}, {"battery": value, "speed": 1.0})
+            for second, value in enumerate(values)
+        )
+
+    levels = [0.9, 0.8, 0.7]
+    (battery,) = sr.diff_logs(run(levels), run([0.9, 0.8, 0.4])).signals
+    assert (battery.name, battery.first_ns, battery.greatest) == ("battery", 2 * 10**9, 0.7 - 0.4)
+    diff = sr.diff_logs(run(levels), run([100 * level for level in levels]))
+    assert not diff.is_empty
+    assert "100 times as large in B: it may be in another unit there" in repr(diff)
 
 
 def test_squares_differ_by_their_corners_alone() -> None:

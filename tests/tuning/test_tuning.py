@@ -191,3 +191,19 @@ def test_a_small_corner_that_fits_is_found_and_its_absence_is_proven() -> None:
     refused = sr.tune(sr.parse_specification(text), good, [*bad, run_at([9, 5.012, 8, 8], speed=1)])
     assert refused.conflict is not None and refused.conflict.is_proven
     assert set(refused.conflict.runs) == {"good run 1", "bad run 4"}
+
+
+def test_a_margin_that_may_not_be_the_widest_is_said_to(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "s.spatial").write_text(
+        "const near = 2 in [0, 10]\nconst twice = near * 2\n"
+        "spec amid = G (cube dist cup >= near) and G (cube dist cup <= twice)\n"
+    )
+    for name, distances in (("in", [6, 5, 6]), ("out", [9, 3, 6])):
+        write_tracks(run_at(distances), folder / f"{name}.jsonl")
+    assert tune("--good", "in.jsonl", "--bad", "out.jsonl") == 0
+    assert "as far as was searched" in capsys.readouterr().out
+    tuning = sr.tune("s.spatial", "in.jsonl", "out.jsonl")
+    assert not tuning.is_widest
+    assert repr(tuning) == f"<Tuning of 2 runs: near = {tuning.values['near']}; margin {tuning.margin:.6g}>"

@@ -6,7 +6,7 @@ import json
 import os
 import tempfile
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -15,7 +15,11 @@ from typing import Any
 import numpy as np
 
 import spatial_replay as sr
+from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.logs.messages import BLOCK_SAMPLES, Block
+from spatial_replay.recording import record_source
 
+SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 SAMPLES = 100_000
 LONG = 1_000_000
 
@@ -62,20 +66,49 @@ def bench_diff(measure: Any) -> None:
     )
 
 
-def _long_run() -> Iterator[sr.Sample]:
-    for index in range(LONG):
-        x = 3.0 + np.cos(index / 1000.0) - (2.5 if index == LONG // 3 else 0.0)
-        objects = {"robot": sr.Footprint.box(0, 0, 1, 1), "person": sr.Footprint.box(x, 0, x + 0.5, 0.5)}
-        yield sr.Sample(index * 10_000_000, objects)
+@dataclass(frozen=True)
+class Passing:
+    """A source of a robot and a person who comes too near to it in one sample, made block by block."""
+
+    samples: int
+    name: str = "passing"
+    kind: str = "generated"
+    metadata: tuple[Any, ...] = ()
+    attachments: tuple[Any, ...] = ()
+
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        for begin in range(0, self.samples, BLOCK_SAMPLES):
+            yield Block(self._trace(np.arange(begin, min(begin + BLOCK_SAMPLES, self.samples))))
+
+    def _trace(self, samples: np.ndarray[Any, Any]) -> sr.Trace:
+        x = 3.0 + np.cos(samples / 1000.0) - np.where(samples == self.samples // 3, 2.5, 0.0)
+        person = [np.stack([x + right, np.full(len(x), up)], -1) for right, up in 0.5 * SQUARE]
+        robot = np.broadcast_to(SQUARE, (len(x), 4, 2))
+        count = 2 * len(samples)
+        return sr.Trace(
+            times_ns=samples * 10_000_000,
+            names=("person", "robot"),
+            rows=np.arange(count).reshape(-1, 2),
+            footprints=FootprintBatch(
+                part_start=np.arange(count + 1),
+                vertex_start=4 * np.arange(count + 1),
+                vertices=np.stack([np.stack(person, 1), robot], 1).reshape(-1, 2),
+                radius=np.zeros(count),
+                bottom=np.full(count, np.nan),
+                top=np.full(count, np.nan),
+            ),
+            yaw=np.full(count, np.nan),
+            uncertainty=np.zeros(count),
+            class_code=np.zeros(count, np.int64),
+            classes=(None,),
+        )
 
 
 def bench_clip(measure: Any) -> None:
     """A violated distance over a log of a million samples."""
     with tempfile.TemporaryDirectory() as folder:
         log, output = Path(folder, "run.mcap"), Path(folder, "bug.mcap")
-        with sr.Recorder(log) as recorder:
-            for sample in _long_run():
-                recorder.write(sample)
+        record_source(Passing(LONG), log)
         specification = sr.parse_specification("spec apart = G (robot dist person >= 0.5)")
         measure(
             "a million samples",

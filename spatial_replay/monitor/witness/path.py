@@ -17,6 +17,7 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.offline import OfflineNodes
+from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.monitor.witness.unfinished import UnfinishedNodes, is_closed
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import (
@@ -47,6 +48,11 @@ class End(Enum):
     LOW = "low"
     HIGH = "high"
     OPEN = "open"
+
+    @classmethod
+    def of(cls, verdict: Verdict) -> End:
+        """Return the end that decides a verdict."""
+        return {Verdict.SATISFIED: cls.LOW, Verdict.VIOLATED: cls.HIGH}.get(verdict, cls.OPEN)
 
     @property
     def turned(self) -> End:

@@ -124,7 +124,7 @@ def find_witness(
     done = evaluate(instance.formula, instance.program.leaves, leaves, times_ns)
     lower, upper = (float(end[0]) + 0.0 for end in done.ends(node))
     verdict = verdict_of(lower, upper)
-    end = {Verdict.SATISFIED: End.LOW, Verdict.VIOLATED: End.HIGH}.get(verdict, End.OPEN)
+    end = End.of(verdict)
     nodes = [evidence.bound(formula) for _, _, formula in iter_nodes(instance.formula)]
 
     def follow(end: End) -> tuple[DecidingPath, tuple[WitnessStep, ...], DecidingAtom | None]:

@@ -13,6 +13,13 @@ function makeComparison([a, b, pairs]) {
   makeTransport(clock, a.events);
   makeScene(clock, "scene-a");
   makeScene(other, "scene-b");
+  if (pairs.decision !== null) {
+    const fromB = {
+      run: other.run, pause: () => clock.pause(), seek: (time) => clock.seek(beside(pairs.knots, time, 1, 0)),
+    };
+    makeDecisionOf(clock, "decision-a", pairs.decision);
+    makeDecisionOf(fromB, "decision-b", pairs.decision);
+  }
   makeCurvesOfBoth(clock, other, pairs);
   clock.on("time", () => other.seek(beside(pairs.knots, clock.time, 0, 1)));
   for (const time of document.querySelectorAll(".change [data-time-ns]")) {
@@ -26,6 +33,18 @@ function makeComparison([a, b, pairs]) {
   const first = pairs.first;
   clock.seek(first === null ? clock.end : first);
   document.documentElement.dataset.ready = "true";
+}
+
+// The decision of a run that is not that of the other, with all its candidates and maps.
+function makeDecisionOf(clock, name, number) {
+  const decision = clock.run.decisions[number];
+  if (!decision) {
+    body(name).append(element("p", {}, "The run has no such decision."));
+    return;
+  }
+  const card = makeDecision(clock, decision);
+  for (const details of card.querySelectorAll("details")) details.open = true;
+  body(name).append(element("ol", {class: "cards"}, card));
 }
 
 // The time in one run that stands beside a time in the other; outside the knots both go equally fast.
