@@ -73,6 +73,7 @@ class Annotator:
             requirements_of(tree.formula, tree.object, settles=semantics == "ltlf") for tree in trees
         ]
         self._since_ns = [np.full(len(own), LATEST_NS) for own in self._requirements]
+        self._automata = [each.automaton for each in automata]
         self._names = [[node.name for _, _, node in iter_nodes(tree.formula)] for tree in trees]
         self._leaf_pairs = [
             leaf_pairs(instance, requirements, files[tree.file].regions)
@@ -146,7 +147,9 @@ class Annotator:
     def specification(self) -> bytes:
         """Return the message of the specifications and the trees of their results."""
         propositions = [() if run is None else run.propositions for run in self._runs]
-        return encode_specification(self._files, self._trees, propositions=propositions)
+        return encode_specification(
+            self._files, self._trees, propositions=propositions, automata=self._automata
+        )
 
     def _robustness(self, blocks: Sequence[SeriesBlock]) -> Messages:
         """Return one message per sample and result."""

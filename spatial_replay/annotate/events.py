@@ -76,13 +76,13 @@ class PeriodText(NamedTuple):
     """A period in words: the leaf that gives its number, "" if none does, and a sentence.
 
     Attributes:
-        witness_ns: when the leaf had that number, if that is known.
+        decided: that leaf with its node and its time, of a verdict where that is known.
     """
 
     period: Period
     witness: str
     sentence: str
-    witness_ns: int | None = None
+    decided: DecidingLeaf | None = None
 
 
 class EncodedEvent(NamedTuple):
@@ -189,16 +189,16 @@ class EventReporter:
 
     def _event(self, change: Change, block: SeriesBlock) -> EncodedEvent:
         reported, after, before = self._reported[change.node], change.after, change.before
-        time_ns, witness_ns = int(block.times_ns[change.sample]), None
+        time_ns, settled = int(block.times_ns[change.sample]), None
         if self._history is not None and self._history.is_complete and after.code in _VERDICTS:
             series, verdict = block.series[:, :, change.sample], _VERDICTS[after.code]
             settled = self._history.settled(reported.node, series, time_ns, verdict)
-            witness, because, witness_ns = self._settled(settled, time_ns)
+            witness, because = self._settled(settled, time_ns)
             if change.node == 0 and verdict is Verdict.VIOLATED:
                 self.settled = SettledViolation(time_ns, settled)
         else:
             witness = because = self._words(self._deciding_leaf(change.node, after, block))
-        now = PeriodText(after, witness, change_sentence(reported.title, after, because), witness_ns)
+        now = PeriodText(after, witness, change_sentence(reported.title, after, because), settled)
         past = None
         if before is not None:
             past = self._past(before, after.start_ns, self._deciding_leaf(change.node, before, block))
@@ -208,16 +208,16 @@ class EventReporter:
         reported, before = self._reported[node], self._states.period(node)
         lower, upper = final[reported.node].tolist()
         verdict = final_verdict(lower, upper)
-        low, witness, because, witness_ns = verdict is not Verdict.VIOLATED, "", "", None
+        low, witness, because, decided = verdict is not Verdict.VIOLATED, "", "", None
         if self._history is not None and self._history.is_complete:
             decided = self._history.finished(reported.node, self._values, final)
-            witness, because, witness_ns = self._settled(decided, last_ns)
+            witness, because = self._settled(decided, last_ns)
         elif verdict is not Verdict.UNKNOWN:
             found = self._leaf_finder.find_leaf(reported.node, final, low=low, wide=self._settles)
             witness = because = self._words(found)
         after = Period(_ENDED[verdict], last_ns, last_ns, lower if low else upper, OF_CURRENT)
         sentence = end_sentence(reported.title, verdict, (lower, upper), because)
-        now = PeriodText(after, witness, sentence, witness_ns)
+        now = PeriodText(after, witness, sentence, decided)
         past = None
         if before.code != START and before.start_ns < last_ns:
             past = self._past(before, last_ns, self._carried[node, OF_CURRENT])
@@ -231,10 +231,10 @@ class EventReporter:
     def _encoded(
         self, reported: ReportedNode, time_ns: int, now: PeriodText, past: PeriodText | None
     ) -> EncodedEvent:
-        period, witness, sentence, witness_ns = now
+        period, witness, sentence, decided = now
         facts = self._facts(reported) | self._facts_of(period, witness, "")
-        if witness_ns is not None:
-            facts["witness_ns"] = str(witness_ns)
+        if decided is not None:
+            facts |= {"witness_node": str(decided.node), "witness_ns": str(decided.time_ns)}
         if past is not None:
             before, sentence = past.period, f"{sentence} {past.sentence}"
             facts |= self._facts_of(before, past.witness, "_before")
@@ -265,15 +265,15 @@ class EventReporter:
         )
         return EncodedEvent(time_ns, *(each.SerializeToString(deterministic=True) for each in (event, log)))
 
-    def _settled(self, found: DecidingLeaf | None, now_ns: int) -> tuple[str, str, int | None]:
-        """Return what decided in words, the same with how long ago, and its time; nothing for None."""
+    def _settled(self, found: DecidingLeaf | None, now_ns: int) -> tuple[str, str]:
+        """Return what decided in words, and the same with how long ago; nothing for None."""
         if found is None:
-            return "", "", None
+            return "", ""
         missed, before_ns = found.missed, now_ns - found.time_ns
         words = self._words(LeafValue(found.leaf, found.number), past=before_ns > 0)
         ago = f" ({time_text(before_ns)} earlier)" if before_ns else ""
         response = f"`{missed.condition}` held, but `{missed.response}` did not: " if missed else ""
-        return words, f"{response}{words}{ago}", found.time_ns
+        return words, f"{response}{words}{ago}"
 
     def _words(self, found: LeafValue | None, *, past: bool = False) -> str:
         """Return a leaf and its number in words; "" for none."""

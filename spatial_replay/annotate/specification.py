@@ -34,6 +34,7 @@ from spatial_replay.spec.formula import (
 from spatial_replay.spec.relations import RELATION_NAMES
 
 if TYPE_CHECKING:
+    from spatial_replay.automata.automaton import Automaton
     from spatial_replay.logs.schemas.Specification_pb2 import SpecificationResult
 
 DIMENSIONLESS = "1"
@@ -90,12 +91,14 @@ def encode_specification(
     trees: Sequence[ReportedTree],
     signal_units: Mapping[str, str] | None = None,
     propositions: Sequence[Sequence[int]] | None = None,
+    automata: Sequence[Automaton | None] = (),
 ) -> bytes:
     """Return the message with the specifications of a log; equal arguments give equal bytes.
 
     Args:
         signal_units: units of the log's signals, where known.
         propositions: of each tree, the nodes that are propositions of its automaton.
+        automata: of each tree, its automaton.
     """
     # imported here since an evaluation without messages needs no message types
     from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
@@ -112,6 +115,9 @@ def encode_specification(
         result = message.results.add(name=tree.name, object=tree.object or "", file=tree.file)
         result.propositions.extend(propositions[index] if propositions is not None else ())
         _add_nodes(result, tree.formula, RELATION_NAMES | files[tree.file].relations, signal_units or {})
+        own = automata[index] if automata else None
+        if own is not None:
+            _add_automaton(result, own)
     return message.SerializeToString(deterministic=True)
 
 
@@ -146,6 +152,26 @@ def _add_nodes(
         )
         if parent is not None:
             node.parent = parent
+
+
+def _add_automaton(result: SpecificationResult, automaton: Automaton) -> None:
+    from spatial_replay.automata.drawing import draw_automaton
+
+    drawing = draw_automaton(automaton)
+    result.automaton.summary = drawing.summary
+    result.automaton.left_out = drawing.left_out
+    for state in drawing.states:
+        result.automaton.states.add(
+            number=state.number,
+            about=state.about,
+            column=state.column,
+            row=state.row,
+            accepting=state.is_accepting,
+            can_reject=not state.is_won,
+            distance=state.distance,
+        )
+    for move in drawing.moves:
+        result.automaton.moves.add(source=move.source, target=move.target, guard=move.guard)
 
 
 def _atom_unit(expression: Expression, signal_units: Mapping[str, str]) -> str:

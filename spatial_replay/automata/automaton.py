@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
@@ -89,12 +89,17 @@ class Automaton(Displayed):
     @cached_property
     def can_accept(self) -> frozenset[int]:
         """The states from which acceptance has not been lost; the others are traps."""
-        return self._leading_to(self.accepting)
+        return frozenset(self.distances)
+
+    @cached_property
+    def distances(self) -> Mapping[int, int]:
+        """For each state from which acceptance has not been lost, how many samples it takes at least."""
+        return self._distances(self._ends(self.accepting))
 
     @cached_property
     def can_reject(self) -> frozenset[int]:
         """The states from which a run can still end in violation; the others accept permanently."""
-        return self._leading_to(frozenset(self.states) - self.accepting)
+        return frozenset(self._distances(self._ends(frozenset(self.states) - self.accepting)))
 
     def step(self, state: int, symbol: Sequence[bool]) -> int:
         """Return the state after a sample.
@@ -232,11 +237,9 @@ class Automaton(Displayed):
                     waiting.append(source)
         return distances
 
-    def _leading_to(self, goal: frozenset[int]) -> frozenset[int]:
-        """Return the states from which the end of a run can be in the goal."""
-        if not self.has_returns:
-            goal -= {self.initial}
-        return frozenset(self._distances(goal))
+    def _ends(self, states: frozenset[int]) -> frozenset[int]:
+        """Return those of some states in which a run can end."""
+        return states if self.has_returns else states - {self.initial}
 
     def _check(self, state: int, symbol: Sequence[object]) -> None:
         self._check_state(state)

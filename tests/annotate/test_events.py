@@ -204,6 +204,7 @@ def test_what_is_pending_is_decided_by_the_end(tmp_path):
         "sign": "negative",
         "robustness": "-1.0",
         "witness": "`battery >= 0` failed by 1",
+        "witness_node": "1",
         "witness_ns": "1100000000",
         "verdict_before": "pending",
         "sign_before": "negative",

@@ -81,6 +81,7 @@ class SpecificationResult(google.protobuf.message.Message):
     FILE_FIELD_NUMBER: builtins.int
     NODES_FIELD_NUMBER: builtins.int
     PROPOSITIONS_FIELD_NUMBER: builtins.int
+    AUTOMATON_FIELD_NUMBER: builtins.int
     name: builtins.str
     """Name of the specification."""
     object: builtins.str
@@ -97,6 +98,10 @@ class SpecificationResult(google.protobuf.message.Message):
         there is no automaton.
         """
 
+    @property
+    def automaton(self) -> global___AutomatonDrawing:
+        """Its automaton; absent if it has none."""
+
     def __init__(
         self,
         *,
@@ -105,12 +110,121 @@ class SpecificationResult(google.protobuf.message.Message):
         file: builtins.int | None = ...,
         nodes: collections.abc.Iterable[global___Node] | None = ...,
         propositions: collections.abc.Iterable[builtins.int] | None = ...,
+        automaton: global___AutomatonDrawing | None = ...,
     ) -> None: ...
-    def HasField(self, field_name: typing.Literal["_file", b"_file", "file", b"file"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_file", b"_file", "file", b"file", "name", b"name", "nodes", b"nodes", "object", b"object", "propositions", b"propositions"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["_file", b"_file", "automaton", b"automaton", "file", b"file"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_file", b"_file", "automaton", b"automaton", "file", b"file", "name", b"name", "nodes", b"nodes", "object", b"object", "propositions", b"propositions"]) -> None: ...
     def WhichOneof(self, oneof_group: typing.Literal["_file", b"_file"]) -> typing.Literal["file"] | None: ...
 
 global___SpecificationResult = SpecificationResult
+
+@typing.final
+class AutomatonDrawing(google.protobuf.message.Message):
+    """An automaton as it is drawn: of a large one, the states nearest to the start."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    SUMMARY_FIELD_NUMBER: builtins.int
+    STATES_FIELD_NUMBER: builtins.int
+    MOVES_FIELD_NUMBER: builtins.int
+    LEFT_OUT_FIELD_NUMBER: builtins.int
+    summary: builtins.str
+    """Its size, in words."""
+    left_out: builtins.int
+    """How many states are not drawn."""
+    @property
+    def states(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___AutomatonNode]: ...
+    @property
+    def moves(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___AutomatonMove]: ...
+    def __init__(
+        self,
+        *,
+        summary: builtins.str = ...,
+        states: collections.abc.Iterable[global___AutomatonNode] | None = ...,
+        moves: collections.abc.Iterable[global___AutomatonMove] | None = ...,
+        left_out: builtins.int = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["left_out", b"left_out", "moves", b"moves", "states", b"states", "summary", b"summary"]) -> None: ...
+
+global___AutomatonDrawing = AutomatonDrawing
+
+@typing.final
+class AutomatonNode(google.protobuf.message.Message):
+    """A state of an automaton."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    NUMBER_FIELD_NUMBER: builtins.int
+    ABOUT_FIELD_NUMBER: builtins.int
+    COLUMN_FIELD_NUMBER: builtins.int
+    ROW_FIELD_NUMBER: builtins.int
+    ACCEPTING_FIELD_NUMBER: builtins.int
+    CAN_REJECT_FIELD_NUMBER: builtins.int
+    DISTANCE_FIELD_NUMBER: builtins.int
+    number: builtins.int
+    about: builtins.str
+    """The verdict of a run that ends there, and whether it can change, in words."""
+    column: builtins.float
+    """Its place in a drawing, in columns and rows: columns follow the moves, rows lie around 0."""
+    row: builtins.float
+    accepting: builtins.bool
+    """Whether a run that ends there is accepted."""
+    can_reject: builtins.bool
+    """Whether a run that came there can still be rejected."""
+    distance: builtins.int
+    """How many samples it takes at least to come to be accepted; absent if that is lost."""
+    def __init__(
+        self,
+        *,
+        number: builtins.int | None = ...,
+        about: builtins.str = ...,
+        column: builtins.float | None = ...,
+        row: builtins.float | None = ...,
+        accepting: builtins.bool = ...,
+        can_reject: builtins.bool = ...,
+        distance: builtins.int | None = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["_column", b"_column", "_distance", b"_distance", "_number", b"_number", "_row", b"_row", "column", b"column", "distance", b"distance", "number", b"number", "row", b"row"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_column", b"_column", "_distance", b"_distance", "_number", b"_number", "_row", b"_row", "about", b"about", "accepting", b"accepting", "can_reject", b"can_reject", "column", b"column", "distance", b"distance", "number", b"number", "row", b"row"]) -> None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_column", b"_column"]) -> typing.Literal["column"] | None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_distance", b"_distance"]) -> typing.Literal["distance"] | None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_number", b"_number"]) -> typing.Literal["number"] | None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_row", b"_row"]) -> typing.Literal["row"] | None: ...
+
+global___AutomatonNode = AutomatonNode
+
+@typing.final
+class AutomatonMove(google.protobuf.message.Message):
+    """A move of an automaton from a state to another one, or to itself."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    SOURCE_FIELD_NUMBER: builtins.int
+    TARGET_FIELD_NUMBER: builtins.int
+    GUARD_FIELD_NUMBER: builtins.int
+    source: builtins.int
+    target: builtins.int
+    guard: builtins.str
+    """The condition, in words."""
+    def __init__(
+        self,
+        *,
+        source: builtins.int | None = ...,
+        target: builtins.int | None = ...,
+        guard: builtins.str = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["_source", b"_source", "_target", b"_target", "source", b"source", "target", b"target"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_source", b"_source", "_target", b"_target", "guard", b"guard", "source", b"source", "target", b"target"]) -> None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_source", b"_source"]) -> typing.Literal["source"] | None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_target", b"_target"]) -> typing.Literal["target"] | None: ...
+
+global___AutomatonMove = AutomatonMove
 
 @typing.final
 class Node(google.protobuf.message.Message):
