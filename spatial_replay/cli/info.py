@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,7 @@ from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import LogPath, ReadArguments, reading_options
 from spatial_replay.cli.output import decision_lines, decision_rows
 from spatial_replay.cli.progress import progress
-from spatial_replay.cli.terminal import show, show_file, show_json, warn
+from spatial_replay.cli.terminal import show, show_bytes, show_file, show_json, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.text import counted, counted_from, escaped
@@ -36,7 +37,7 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump"})
 
 
 @click.command()
-@click.argument("log", type=LogPath())
+@click.argument("log", type=LogPath(), required=False)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 @click.option("--suggest-mapping", is_flag=True, help="Print a first mapping file (YAML) instead.")
 @click.option("--decisions", is_flag=True, help="Print the decisions of a planned run instead.")
@@ -48,14 +49,18 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump"})
     help="Print the recorded specification as it was written instead; NAME: of which file or spec.",
 )
 @click.option("--layout", is_flag=True, help="Print the layout to import in a viewer instead.")
+@click.option(
+    "--panel", is_flag=True, help="Print the extension with panels for viewers instead; it is for every log."
+)
 @reading_options
 def info(
-    log: LogFile,
+    log: LogFile | None,
     as_json: bool,
     suggest_mapping: bool,
     decisions: bool,
     specification: str | None,
     layout: bool,
+    panel: bool,
     reading: ReadArguments,
 ) -> int:
     """Show what a log contains: samples, objects, signals, topics, attachments.
@@ -73,7 +78,14 @@ def info(
       spatial-replay info push.mcap --decisions
       spatial-replay info annotated.mcap --specification > used.spatial
       spatial-replay info annotated.mcap --layout > layout.json
+      spatial-replay info --panel > spatial-replay.foxe
     """
+    if panel:
+        if log is not None or any((as_json, suggest_mapping, decisions, layout, specification is not None)):
+            raise UsageError("--panel prints the extension, which is the same for every log; remove the rest")
+        return _print_panel()
+    if log is None:
+        raise click.MissingParameter(param_hint="'LOG'", param_type="argument")
     if layout or specification is not None:
         what = "layout" if layout else "specification"
         if as_json or suggest_mapping or decisions or (layout and specification is not None):
@@ -139,6 +151,12 @@ def _print_layout(log: LogFile) -> int:
     raise UsageError(
         f"{source.name} has no layout; logs written by spatial-replay record or replay -o have one"
     )
+
+
+def _print_panel() -> int:
+    """Print the extension for Foxglove and Lichtblick."""
+    show_bytes(resources.files("spatial_replay.annotate").joinpath("spatial-replay.foxe").read_bytes())
+    return ExitCode.SATISFIED
 
 
 def _print_specification(log: LogFile, name: str) -> int:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import click
 
+from spatial_replay.errors import UsageError
 from spatial_replay.text import escaped
 
 if TYPE_CHECKING:
@@ -59,6 +60,17 @@ def show_file(text: str) -> None:
     if sys.stdout.isatty():
         text = "\n".join(escaped(line, "\t") for line in text.splitlines()) + "\n"
     click.echo(text, nl=not text.endswith("\n"))
+
+
+def show_bytes(content: bytes) -> None:
+    """Print a file that is no text.
+
+    Raises:
+        UsageError: to a terminal, which would show it as noise.
+    """
+    if sys.stdout.isatty():
+        raise UsageError("this is no text: redirect it to a file, as `… > spatial-replay.foxe`")
+    click.echo(content, nl=False)
 
 
 def show_diagnostics(diagnostics: Iterable[Diagnosis]) -> None:

@@ -53,8 +53,9 @@ function key(entries) {
   }));
 }
 
+// In a viewer, colours are those of the panels.
 function colour(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+  return getComputedStyle(document.querySelector(".spatial-replay") ?? document.documentElement).getPropertyValue(`--${name}`).trim();
 }
 
 // A canvas that is as sharp as the screen, with units of CSS pixels; draws again whenever its size changes.

@@ -29,28 +29,29 @@ function makeTree(clock) {
   });
 }
 
-function branch(node, rows) {
-  const row = makeRow(node);
+function branch(node, rows, hasIntervals = false) {
+  const row = makeRow(node, hasIntervals);
   rows.push(row);
   if (!node.children.length) return element("li", {}, element("div", {class: "row leaf"}, ...row.parts));
-  const children = element("ul", {}, ...node.children.map((child) => branch(child, rows)));
+  const children = element("ul", {}, ...node.children.map((child) => branch(child, rows, hasIntervals)));
   return element("li", {}, element("details", {open: true},
     element("summary", {class: "row"}, ...row.parts), children));
 }
 
-function makeRow(node) {
+function makeRow(node, hasIntervals) {
   const row = {
     node,
     sign: mark("unknown"),
     words: element("span", {class: "hidden"}),
     soFar: element("span", {class: "number"}),
+    interval: hasIntervals ? element("span", {class: "number quiet"}) : null,
     now: element("span", {class: "number"}),
     status: null,
   };
   const what = element("span", {class: "what", title: node.text}, row.sign,
     node.name ? element("b", {}, node.name) : null, node.name ? " " : null,
     element("code", {}, node.head), row.words);
-  row.parts = [what, row.soFar, row.now];
+  row.parts = [what, row.soFar, row.interval, row.now];
   return row;
 }
 
@@ -68,6 +69,10 @@ function showRow(row, run, result, place, isLast) {
   const hasValue = node.initial && place !== null;
   const at = Math.min(place ?? 0, result.samples - 1);
   showNumber(row.soFar, hasValue ? node.series[VALUE][at] : NaN, !hasValue, isPending);
+  if (row.interval) {
+    const [lower, upper] = [node.series[LOWER][at], node.series[UPPER][at]];
+    row.interval.textContent = hasValue && lower < upper ? `${numberText(lower)} … ${numberText(upper)}` : "";
+  }
   if (hasValue && isLast) row.soFar.title = node.value;
   else row.soFar.title = hasValue && run.settles ? intervalText(node.series[LOWER][at], node.series[UPPER][at]) : "";
 }

@@ -75,15 +75,10 @@ function makeEvents(clock) {
     place.append(element("p", {}, "No verdict changed, nor any sign for long enough to count."));
     return;
   }
-  const rows = events.map((event) => {
-    const row = element("button", {type: "button", class: "event", onclick: () => {
-      clock.pause();
-      goTo(clock, event);
-    }}, mark(event.status), element("time", {}, secondsText(event.time)),
-    element("span", {class: "hidden"}, STATUSES[event.status].words),
-    element("span", {class: "sentence"}, ...withCode(event.parts)));
-    return row;
-  });
+  const rows = events.map((event) => eventRow(event, () => {
+    clock.pause();
+    goTo(clock, event);
+  }));
   const list = element("ol", {class: "list"}, ...rows.map((row) => element("li", {}, row)));
   place.append(list);
   const starts = events.map((event) => event.time);
@@ -97,6 +92,13 @@ function makeEvents(clock) {
     rows[now].setAttribute("aria-current", "true");
     keepInSight(list, rows[now].parentElement);
   });
+}
+
+function eventRow(event, choose) {
+  return element("button", {type: "button", class: "event", onclick: choose},
+    mark(event.status), element("time", {}, secondsText(event.time)),
+    element("span", {class: "hidden"}, STATUSES[event.status].words),
+    element("span", {class: "sentence"}, ...withCode(event.parts)));
 }
 
 // Scrolls a list, and nothing around it, so that one of its rows shows.

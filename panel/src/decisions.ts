@@ -1,0 +1,248 @@
+// The panel of a planner's decisions: candidates, the chosen map, and the edges given up.
+
+import {
+  element, inShort, keepInSight, makeDecision, numberText, printable, secondsText,
+  type DrawnClock, type DrawnDecision, type DrawnMap, type DrawnTarget,
+} from "report-drawing";
+import { createElement, type ReactElement } from "react";
+
+import { wide, type DecisionMessage, type GridMessage, type TargetMessage } from "./messages";
+import type { Cursor, View, Viewer } from "./viewer";
+
+const DECISION = "/plan/decision";
+const MAP = "/plan/gradient_map";
+/** Cells of all maps that are kept: 16 MiB. */
+const MOST_CELLS = 1 << 22;
+const MOST_GUARDS = 4;
+const KINDS = ["", "execute", "hold", "wait", "no path"];
+
+interface Decision {
+  readonly time: number;
+  readonly message: DecisionMessage;
+}
+
+interface Owner {
+  readonly edge: number;
+  readonly candidate: number;
+  readonly turn: number;
+}
+
+export class DecisionsView implements View {
+  readonly topics = [DECISION, MAP];
+  readonly body = element("div", { class: "panel-body decisions" });
+  private readonly card = element("ol", { class: "cards" });
+  private readonly pruned = element("div", { class: "tasks" });
+  private readonly list = element("ol", { class: "list" });
+  private readonly clock: DrawnClock;
+  /** By number; with its outcome once that is known. */
+  private readonly decisions = new Map<number, Decision>();
+  private readonly maps = new Map<number, GridMessage>();
+  private readonly mapsByTime = new Map<number, GridMessage[]>();
+  private cells = 0;
+  private mapsRead = 0;
+  private rows = new Map<number, HTMLElement>();
+  private shown = "";
+  private listed = -1;
+
+  constructor(viewer: Viewer) {
+    this.clock = {
+      run: {
+        settles: true, results: [], numbers: (values) => values,
+        palette: { positive: "#0072b2", negative: "#d55e00", neutral: "#8c8c8c", curves: [] },
+      },
+      view: [0, 0], time: 0, seek: (time) => viewer.seek(time), pause: () => undefined,
+    };
+    this.body.append(this.card, this.pruned,
+      element("details", { open: true }, element("summary", {}, "All decisions"), this.list));
+  }
+
+  specify(): void {
+    // decisions name what they are about
+  }
+
+  reset(topic: string): void {
+    if (topic === DECISION) this.decisions.clear();
+    else this.forgetMaps();
+    [this.shown, this.listed] = ["", -1];
+  }
+
+  take(topic: string, time: number, message: unknown, isOfRange: boolean): void {
+    if (topic === MAP) {
+      this.takeMap(time, message as GridMessage, isOfRange);
+      return;
+    }
+    const decision = message as DecisionMessage;
+    const number = decision.number ?? 0;
+    const known = this.decisions.get(number);
+    if (known?.message.outcome && !decision.outcome) return;
+    this.decisions.set(number, { time, message: decision });
+    this.listed = -1;
+  }
+
+  show(cursor: Cursor): void {
+    const ordered = this.ordered;
+    this.showList(ordered);
+    let here: Decision | undefined;
+    for (const each of ordered) if (each.time <= cursor.time + 1e-9) here = each;
+    const maps = here ? this.mapsOf(here) : [];
+    const shown = here ? JSON.stringify([here.message.number ?? 0, Boolean(here.message.outcome), maps.length]) : "";
+    if (shown === this.shown) return;
+    this.rows.get(JSON.parse(this.shown || "[-1]")[0])?.removeAttribute("aria-current");
+    this.shown = shown;
+    this.body.dataset.decision = here ? String(here.message.number ?? 0) : "";
+    if (!here) {
+      this.card.replaceChildren(element("li", { class: "quiet" }, ordered.length ? "Before the first decision." : ""));
+      this.pruned.replaceChildren();
+      return;
+    }
+    const made = makeDecision(this.clock, drawnOf(here, maps));
+    for (const each of made.querySelectorAll("details")) each.open = true;
+    this.card.replaceChildren(made);
+    this.pruned.replaceChildren(...givenUp(here.message));
+    const row = this.rows.get(here.message.number ?? 0);
+    row?.setAttribute("aria-current", "true");
+    if (row) keepInSight(this.list, row.parentElement!);
+  }
+
+  head(): ReactElement {
+    const count = this.decisions.size;
+    if (!count) return createElement("p", { className: "note" }, "No decisions here: open the log of a planned run.");
+    return createElement("div", { className: "panel-head" }, createElement("b", null, `${count} decision${count === 1 ? "" : "s"}`));
+  }
+
+  private get ordered(): Decision[] {
+    return [...this.decisions.values()].sort((a, b) => (a.message.number ?? 0) - (b.message.number ?? 0));
+  }
+
+  private showList(ordered: readonly Decision[]): void {
+    if (this.listed === ordered.length) return;
+    this.listed = ordered.length;
+    this.shown = "";
+    this.rows = new Map(ordered.map((each) => [each.message.number ?? 0, element("button", {
+      type: "button", class: "event", onclick: () => this.clock.seek(each.time),
+    }, element("span", {}), element("time", {}, secondsText(each.time)),
+    element("span", { class: "sentence" }, inShort(drawnOf(each, []))))]));
+    this.list.replaceChildren(...[...this.rows.values()].map((row) => element("li", {}, row)));
+  }
+
+  private forgetMaps(): void {
+    this.maps.clear();
+    this.mapsByTime.clear();
+    this.cells = this.mapsRead = 0;
+  }
+
+  /** Keeps a map; of too many, those of chosen targets. A range has all maps, so that the count is the number. */
+  private takeMap(time: number, message: GridMessage, isOfRange: boolean): void {
+    const number = this.mapsRead;
+    if (isOfRange) this.mapsRead += 1;
+    else if (this.mapsRead) return;
+    const cells = message.row_stride ? Math.floor(message.data.length / message.row_stride) * message.column_count : 0;
+    const isChosen = isOfRange && this.isChosen(number);
+    if (this.cells + cells > (isChosen ? 2 : 1) * MOST_CELLS) return;
+    this.cells += cells;
+    if (isOfRange) this.maps.set(number, message);
+    else this.mapsByTime.set(time, [...(this.mapsByTime.get(time) ?? []), message]);
+    this.shown = "";
+  }
+
+  private isChosen(number: number): boolean {
+    for (const { message } of this.decisions.values()) {
+      for (const { candidates } of message.considered) {
+        if (candidates.some((each) => each.chosen && each.maps.some((map) => (map.number ?? 0) === number))) return true;
+      }
+    }
+    return false;
+  }
+
+  /** Returns the maps of a decision: by their numbers or, of a live source, by its time, in order. */
+  private mapsOf(decision: Decision): DrawnMap[] {
+    const owners = new Map<number, Owner>();
+    decision.message.considered.forEach(({ candidates }, edge) => candidates.forEach(({ maps }, candidate) => {
+      for (const map of maps) owners.set(map.number ?? 0, { edge, candidate, turn: map.turn ?? 0 });
+    }));
+    const live = this.mapsByTime.get(decision.time) ?? [];
+    const found: DrawnMap[] = [];
+    [...owners].sort(([a], [b]) => a - b).forEach(([number, owner], place) => {
+      const grid = this.maps.get(number) ?? (live.length === owners.size ? live[place] : undefined);
+      const drawn = grid && drawnMap(grid, owner, decision.message);
+      if (drawn) found.push(drawn);
+    });
+    return found;
+  }
+}
+
+function drawnMap(grid: GridMessage, owner: Owner, decision: DecisionMessage): DrawnMap | null {
+  const { column_count: columns, cell_stride: cell, row_stride: row, data } = grid;
+  const rows = row ? Math.floor(data.length / row) : 0;
+  const offset = grid.fields.find((field) => field.name.startsWith("robustness"))?.offset ?? cell;
+  if (!rows || !columns || cell * columns > row || offset + 4 > cell) return null;
+  const bytes = new DataView(data.buffer, data.byteOffset, data.byteLength);
+  const values = new Float32Array(rows * columns);
+  let scale = 0;
+  for (let y = 0; y < rows; y++) {
+    for (let x = 0; x < columns; x++) {
+      const number = values[y * columns + x] = bytes.getFloat32(y * row + x * cell + offset, true);
+      if (Number.isFinite(number)) scale = Math.max(scale, Math.abs(number));
+    }
+  }
+  const { x = 0, y = 0 } = grid.pose?.position ?? {};
+  const high: [number, number] = [x + columns * (grid.cell_size?.x ?? 0), y + rows * (grid.cell_size?.y ?? 0)];
+  if (![x, y, ...high].every(Number.isFinite) || high[0] <= x || high[1] <= y) return null;
+  const candidate = decision.considered[owner.edge]!.candidates[owner.candidate]!;
+  const turned = candidate.maps.length > 1 ? `, turned by ${degrees(owner.turn)}` : "";
+  const target = candidate.target && (candidate.target.turn ?? 0) === owner.turn ? drawnTarget(candidate.target) : null;
+  const isLast = owner.edge === decision.considered.length - 1;
+  return {
+    columns, low: [x, y], high, scale, values, edge: owner.edge, candidate: owner.candidate, target,
+    title: printable(candidate.object) + turned,
+    chosen: Boolean(decision.target && isLast && candidate.chosen && target),
+  };
+}
+
+function drawnOf({ time, message }: Decision, maps: DrawnMap[]): DrawnDecision {
+  const last = message.considered[message.considered.length - 1];
+  return {
+    number: message.number ?? 0, time, specification: printable(message.specification), kind: KINDS[message.kind] ?? "",
+    states: [...message.states], reason: printable(message.reason), maps,
+    target: message.target ? drawnTarget(message.target) : null,
+    outcome: !message.outcome ? null : {
+      time: time + Number(wide(message.outcome.end_ns) - wide(message.time_ns)) / 1e9, succeeded: message.outcome.succeeded ?? false, reason: printable(message.outcome.reason),
+      states: [...message.outcome.states],
+    },
+    edges: message.considered.map((edge) => ({
+      path: [...edge.path], aim: edge === last && !edge.pruned, progress: guards(edge.progress),
+      constraints: guards(edge.constraints), pruned: printable(edge.pruned),
+      candidates: edge.candidates.map((each) => ({
+        object: printable(each.object), best: each.best === -Infinity ? "nowhere free" : numberText(each.best ?? NaN),
+        status: each.rejected ? "rejected" : each.chosen ? "chosen" : "possible", rejected: printable(each.rejected),
+        target: each.target ? drawnTarget(each.target) : null,
+      })),
+    })),
+  };
+}
+
+function guards(found: readonly { readonly text: string }[]): string[] {
+  const more = found.length > MOST_GUARDS ? [`and ${found.length - MOST_GUARDS} more`] : [];
+  return [...found.slice(0, MOST_GUARDS).map((each) => printable(each.text)), ...more];
+}
+
+function drawnTarget(target: TargetMessage): DrawnTarget {
+  const { x = NaN, y = NaN, turn = 0 } = target;
+  const way = Array.from(target.waypoints);
+  const isDrawn = [x, y, ...way].every(Number.isFinite);
+  return {
+    object: printable(target.object), at: isDrawn ? [x, y] : null, way: isDrawn ? way : [],
+    words: `(${numberText(x)}, ${numberText(y)})${turn ? `, turned by ${degrees(turn)}` : ""}`,
+    robustness: numberText(target.robustness ?? NaN),
+  };
+}
+
+function degrees(radians: number): string {
+  return `${Number((radians * 180 / Math.PI).toPrecision(3))}°`;
+}
+
+function givenUp(message: DecisionMessage): HTMLElement[] {
+  if (!message.pruned.length) return [];
+  return [element("h3", {}, "Edges given up so far"), element("ul", {}, ...message.pruned.map((edge) => element("li", {},
+    element("b", {}, `${edge.source ?? 0} → ${edge.target ?? 0}`), ` ${printable(edge.reason)}`)))];
+}

@@ -1,0 +1,121 @@
+// The results of a specification's message, which of them a panel shows, and what has happened to them.
+
+import { printable, type DrawnEvent, type Status } from "report-drawing";
+
+import {
+  nanoseconds, titleOf, type EventMessage, type ResultMessage, type SpecificationMessage,
+} from "./messages";
+import type { Viewer } from "./viewer";
+
+export const EVENTS = "/spatial/events";
+
+/** A change, with the time at which it is confirmed: before that, no one knows of it. */
+export interface Event extends DrawnEvent {
+  readonly node: number;
+  readonly verdict: string;
+  readonly known: number;
+  /** The atom that decided, if the event is a verdict. */
+  readonly witness: number | null;
+}
+
+/** Which result is shown: the reader's choice or, without one, the one that went worst. */
+export class Results {
+  files: SpecificationMessage["files"] = [];
+  all: readonly ResultMessage[] = [];
+  events: Event[] = [];
+  private chosen: string | null;
+
+  constructor(private readonly viewer: Viewer) {
+    const { result } = viewer.state;
+    this.chosen = typeof result === "string" ? result : null;
+  }
+
+  specify(message: SpecificationMessage): void {
+    this.files = message.files;
+    this.all = message.results;
+  }
+
+  get titles(): string[] {
+    return this.all.map((each) => printable(titleOf(each.name, each.object)));
+  }
+
+  /** The place of the result that is shown; 0 without any. */
+  get place(): number {
+    const found = this.all.findIndex((each) => titleOf(each.name, each.object) === this.chosen);
+    if (found >= 0) return found;
+    const verdicts = this.all.map((each) => this.verdict(each, Infinity));
+    return Math.max(0, ["violated", "unknown"].map((bad) => verdicts.indexOf(bad)).find((place) => place >= 0) ?? 0);
+  }
+
+  get shown(): ResultMessage | undefined {
+    return this.all[this.place];
+  }
+
+  choose(place: number): void {
+    const result = this.all[place];
+    if (!result) return;
+    this.chosen = titleOf(result.name, result.object);
+    this.viewer.save({ result: this.chosen });
+  }
+
+  find(name: string, object: string | undefined): number {
+    return this.all.findIndex((each) => each.name === name && each.object === (object ?? ""));
+  }
+
+  takeEvent(time: number, message: EventMessage): void {
+    const facts = new Map(message.metadata.map((each) => [each.key, each.value]));
+    const start = message.start_time ? this.viewer.seconds(nanoseconds(message.start_time)) : time;
+    const event: Event = {
+      time: start,
+      known: message.end_time ? this.viewer.seconds(nanoseconds(message.end_time)) : time,
+      status: statusOfEvent(facts),
+      specification: facts.get("specification") ?? "",
+      object: facts.get("object"),
+      parts: printable(facts.get("message") ?? "").split("`"),
+      node: Number(facts.get("node") ?? 0),
+      verdict: facts.has("vacuous") ? "" : facts.get("verdict") ?? "",
+      witness: facts.has("witness_node") ? Number(facts.get("witness_node")) : null,
+    };
+    const isSame = (each: Event) => each.known === event.known && each.node === event.node && each.time === event.time
+      && each.specification === event.specification && each.object === event.object && each.status === event.status;
+    let place = this.events.length;
+    while (place && this.events[place - 1]!.time > event.time) place -= 1;
+    for (let before = place - 1; before >= 0 && this.events[before]!.time === event.time; before--) {
+      if (isSame(this.events[before]!)) return;
+    }
+    this.events.splice(place, 0, event);
+  }
+
+  /** Returns the newest event of a result that is known at a time. */
+  newest(result: ResultMessage, time: number): Event | null {
+    let newest: Event | null = null;
+    for (const each of this.events) {
+      const isOfResult = each.node === 0 && each.verdict && each.specification === result.name
+        && (each.object ?? "") === result.object;
+      if (isOfResult && each.known <= time && (!newest || each.known >= newest.known)) newest = each;
+    }
+    return newest;
+  }
+
+  verdict(result: ResultMessage, time: number): string {
+    return this.newest(result, time)?.verdict ?? "pending";
+  }
+
+  /** Returns the nodes as they are written in their file; what a `def` stands for, in canonical form. */
+  written(result: ResultMessage): string[] {
+    const source = Array.from(this.files[result.file ?? 0]?.source ?? "");
+    const spans = result.nodes.map((node) => `${node.span_start ?? 0} ${node.span_end ?? 0}`);
+    return result.nodes.map((node, index) => {
+      const isExpanded = index > 0 && spans[index] === spans[node.parent ?? 0];
+      const text = isExpanded ? "" : source.slice(node.span_start ?? 0, node.span_end ?? 0).join("");
+      return printable(text || node.text).replace(/\s+/g, " ");
+    });
+  }
+}
+
+function statusOfEvent(facts: Map<string, string>): Status {
+  if (facts.has("vacuous")) return "vacuous";
+  const verdict = facts.get("verdict");
+  if (verdict === "satisfied" || verdict === "violated" || verdict === "unknown") return verdict;
+  return facts.get("sign") === "positive" ? "holding" : "pending";
+}

@@ -1,0 +1,311 @@
+"""The extension's panels in a page that stands for a viewer: right at any time, in either viewer."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+import re
+from collections.abc import Callable, Iterator, Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+from playwright.sync_api import Browser, Page, expect
+
+import spatial_replay as sr
+from browser.viewer_page import extension_files, write_viewer_page
+from spatial_replay.cli import run
+from spatial_replay.monitor.result import SpecResult
+from spatial_replay.planning.read import read_decisions
+
+RECORDINGS = Path(__file__).parent.parent.parent / "recordings"
+MINUS = "\N{MINUS SIGN}"
+SEEKS = 100
+
+Open = Callable[..., Page]
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
+    """Annotated logs, each beside its viewer page."""
+    folder = tmp_path_factory.mktemp("panels")
+    made = {name: folder / f"{name}.mcap" for name in ("table", "push")}
+    table, edited = str(RECORDINGS / "table.jsonl"), str(RECORDINGS / "table_edited.spatial")
+    assert run(["replay", table, "--spec", edited, "-o", str(made["table"])]) == 1
+    assert run(["replay", str(RECORDINGS / "push.mcap"), "-o", str(made["push"])]) == 0
+    for path in made.values():
+        write_viewer_page(path, path.with_suffix(".html"))
+    return made
+
+
+@pytest.fixture
+def open_panel(browser: Browser, logs: Mapping[str, Path]) -> Iterator[Open]:
+    """Opens a panel over a log; a test fails if something is written to the console."""
+    opened: list[Page] = []
+    problems: list[str] = []
+
+    def open_one(
+        log: str,
+        panel: str,
+        api: str = "foxglove",
+        state: Mapping[str, Any] | None = None,
+        logs: Mapping[str, Path] = logs,
+    ) -> Page:
+        page = browser.new_page(viewport={"width": 700, "height": 800})
+        opened.append(page)
+        page.on("console", lambda message: problems.append(message.text))
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.goto(logs[log].with_suffix(".html").as_uri())
+        page.evaluate(
+            """async ([panel, api, state]) => {
+                window.viewer = new Viewer(CODE, MESSAGES, api);
+                await viewer.show(`spatial-replay ${panel}`, document.getElementById("panel"), state);
+            }""",
+            [panel, api, state],
+        )
+        return page
+
+    yield open_one
+    for page in opened:
+        # every call of a panel was answered
+        assert page.evaluate("viewer.open") == 0
+        page.close()
+    assert problems == []
+
+
+def seek(page: Page, time_ns: int, call: str = "viewer.seek(time)") -> None:
+    sec, nsec = divmod(time_ns, 10**9)
+    page.evaluate(f"([sec, nsec]) => {{ const time = {{sec, nsec}}; {call}; }}", [sec, nsec])
+
+
+ROWS = """() => [...document.querySelectorAll(".tree .row")].map((row) => [
+    row.querySelector(".mark").className.split("is-")[1],
+    ...[...row.querySelectorAll(".number")].map((each) => each.textContent)])"""
+
+
+@pytest.fixture(scope="module")
+def results() -> list[SpecResult]:
+    """What Python says of the table."""
+    trace = sr.read_trace(RECORDINGS / "table.jsonl")
+    return list(sr.evaluate(sr.load_specification(RECORDINGS / "table_edited.spatial"), trace).results)
+
+
+def states_of(log: Path) -> Iterator[tuple[int, list[int]]]:
+    """The states of the run after each sample."""
+    with log.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        for _, _, message, decoded in reader.iter_decoded_messages(topics=["/spatial/automaton"]):
+            yield message.log_time, list(decoded.states)
+
+
+def approx(number: float) -> Any:
+    """As many digits as are shown; None for what is not determined."""
+    return None if math.isnan(number) else pytest.approx(number, rel=1e-3)
+
+
+def number_text(number: float) -> str:
+    return f"{number:.4g}".replace("-", MINUS)
+
+
+def number_of(text: str) -> float | None:
+    if text in ("", "?"):
+        return None
+    return float(text.replace(MINUS, "-").replace("∞", "inf"))
+
+
+@pytest.mark.parametrize("api", ["foxglove", "lichtblick"])
+def test_after_a_jump_anywhere_the_tree_shows_the_numbers_of_that_sample(
+    open_panel: Open, results: list[SpecResult], api: str
+) -> None:
+    page = open_panel("table", "specification", api)
+    chosen = random.Random(7)
+    for turn in range(SEEKS if api == "foxglove" else 5):
+        result = results[turn % len(results)]
+        page.locator("select").select_option(label=result.name)
+        sample = chosen.randrange(len(result.times_ns))
+        # between samples it is the one before that counts
+        seek(page, int(result.times_ns[sample]) + chosen.choice([0, 1_000_000]))
+        page.evaluate("viewer.settled()")
+        rows = page.evaluate(ROWS)
+        assert len(rows) == len(result.series)
+        for (_, so_far, interval, now), numbers in zip(rows, result.series[:, :, sample], strict=True):
+            value, present, lower, upper = numbers.tolist()
+            assert number_of(now) == approx(present)
+            assert so_far == "" or number_of(so_far) == approx(value)
+            ends = [number_of(each) for each in interval.split(" … ")] if interval else []
+            assert ends in ([], [approx(lower), approx(upper)])
+        path = [int(each) for each in page.locator(".panel-body").get_attribute("data-deciding").split()]
+        assert path[0] == 0
+        if result.verdict == "satisfied" and sample < len(result.times_ns) - 1:
+            # the number of the root is that of the atom at the end of the path, in one of the samples so far
+            value, seen = result.series[0, 0, sample], result.series[path[-1], 1, : sample + 1]
+            assert value in np.concatenate([seen, -seen])
+
+
+def test_the_path_to_what_decided_a_violation_is_lit_and_unfolded(
+    open_panel: Open, results: list[SpecResult]
+) -> None:
+    page = open_panel("table", "specification")
+    [violated] = [each for each in results if each.verdict == "violated"]
+    witness = violated.causes[0].witness
+    assert witness is not None
+    # of several results the violated one is shown first
+    expect(page.locator("select")).to_have_value("0")
+    seek(page, violated.violated_at_ns or 0)
+    lit = [int(each) for each in page.locator(".panel-body").get_attribute("data-deciding").split()]
+    steps = [each.node for each in witness.path]
+    assert lit[-len(steps) :] == steps
+    expect(page.locator(".row.lit").last).to_be_visible()
+    expect(page.locator(".row.lit").last).to_contain_text("spoon dist plate <= 0.08")
+    expect(page.locator(".chip")).to_have_text("violated")
+    # what holds is folded
+    expect(page.get_by_text("cup ovlp mat", exact=True)).to_be_hidden()
+
+
+def test_a_pointer_on_the_time_line_shows_that_time_until_it_leaves(
+    open_panel: Open, results: list[SpecResult]
+) -> None:
+    page = open_panel("table", "specification")
+    times_ns = results[0].times_ns
+    shown = [number_text(results[0].series[0, 1, sample]) for sample in (30, 200)]
+    now = page.locator(".tree .row").first.locator(".number").last
+    seek(page, int(times_ns[30]))
+    expect(now).to_have_text(shown[0])
+    page.evaluate("seconds => viewer.hover(seconds)", int(times_ns[200]) / 1e9)
+    expect(now).to_have_text(shown[1])
+    expect(page.locator(".panel-head")).to_contain_text("under the pointer")
+    page.evaluate("viewer.hover(undefined)")
+    expect(now).to_have_text(shown[0])
+
+
+def test_a_live_source_is_followed_and_may_jump_back(open_panel: Open, results: list[SpecResult]) -> None:
+    page = open_panel("table", "specification", "live")
+    expect(page.locator(".note")).to_contain_text("No specification here")
+    times_ns = results[0].times_ns.tolist()
+    now = page.locator(".tree .row").first.locator(".number").last
+    for before, sample in [(0, 10), (10, 50), (20, 35)]:
+        window = [[*divmod(times_ns[before] - (before == 0), 10**9)], [*divmod(times_ns[sample], 10**9)]]
+        page.evaluate(
+            """([from, to]) => viewer.play(
+                {sec: from[0], nsec: from[1]}, {sec: to[0], nsec: to[1]})""",
+            window,
+        )
+        page.evaluate("viewer.drawn()")
+        expect(now).to_have_text(number_text(results[0].series[0, 1, sample]))
+
+
+def test_a_node_shows_its_curve_and_an_event_is_one_click_away(open_panel: Open) -> None:
+    page = open_panel("table", "specification")
+    seek(page, 4 * 10**9)
+    expect(page.locator(".event")).to_have_count(9)
+    page.locator(".event", has_text="parallel holds so far").click()
+    assert page.evaluate("viewer.sought.at(-1)") == {"sec": 4, "nsec": 666_666_667}
+    expect(page.locator("select")).to_have_value("1")
+    expect(page.locator(".u-over")).to_have_count(0)
+    page.locator(".tree .row").first.locator(".what").click(position={"x": 80, "y": 8})
+    chart = page.locator(".u-over")
+    box = chart.bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 20)
+    assert page.evaluate("viewer.previews.at(-1)") == pytest.approx(9.9667 / 2, abs=0.05)
+    page.mouse.click(box["x"] + box["width"] / 4, box["y"] + 20)
+    sought = page.evaluate("viewer.sought.at(-1)")
+    assert sought["sec"] + sought["nsec"] / 1e9 == pytest.approx(9.9667 / 4, abs=0.05)
+    # another viewer's layout keeps what was chosen
+    state = page.evaluate("Object.assign({}, ...viewer.saved)")
+    again = open_panel("table", "specification", "lichtblick", state)
+    expect(again.locator(".u-over")).to_be_visible()
+    expect(again.locator("select")).to_have_value("1")
+    page.evaluate("viewer.close()")
+    expect(page.locator(".spatial-replay")).to_have_count(0)
+
+
+def test_the_automaton_is_where_the_run_is_and_says_what_is_left_to_be_done(
+    open_panel: Open, logs: Mapping[str, Path]
+) -> None:
+    page = open_panel("push", "automaton")
+    recorded = list(states_of(logs["push"]))
+    for time_ns, states in random.Random(3).sample(recorded, SEEKS // 4):
+        seek(page, time_ns)
+        assert page.locator(".panel-body").get_attribute("data-states") == " ".join(map(str, states))
+        here = page.locator(".state.here text").all_text_contents()
+        assert here == [str(state) for state in states]
+    moves = [at for at in pairwise(recorded) if at[0][1] != at[1][1]]
+    rows = page.locator(".event")
+    assert rows.count() == len(moves)
+    for row, ((_, [source]), (time_ns, [target])) in zip(rows.all(), moves, strict=True):
+        expect(row).to_contain_text(f"{time_ns / 1e9:.3f} s")
+        expect(row).to_contain_text(f"{source} → {target}")
+        row.click()
+        assert page.evaluate("viewer.sought.at(-1)") == dict(
+            zip(("sec", "nsec"), divmod(time_ns, 10**9), strict=True)
+        )
+    seek(page, 8 * 10**9)
+    tasks = page.locator(".tasks")
+    expect(tasks).to_contain_text(
+        re.compile(
+            r"Still to be done.*green rightof red.*state 3.*Must not happen.*green dist red", re.DOTALL
+        )
+    )
+    places = page.locator(".state").evaluate_all("all => all.map((each) => each.getAttribute('transform'))")
+    seek(page, recorded[-1][0])
+    expect(tasks).to_contain_text("Accepted if the run ends here")
+    # the drawing stays as it is
+    assert (
+        page.locator(".state").evaluate_all("all => all.map((each) => each.getAttribute('transform'))")
+        == places
+    )
+
+
+def test_the_decision_before_the_cursor_shows_candidates_maps_and_edges_given_up(
+    open_panel: Open, logs: Mapping[str, Path]
+) -> None:
+    page = open_panel("push", "decisions")
+    decisions = read_decisions(logs["push"]).decisions
+    for number, decision in reversed(list(enumerate(decisions))):
+        seek(page, decision.time_ns)
+        expect(page.locator(".decision-title")).to_contain_text(f"Decision {number}")
+        text = page.locator(".card").inner_text()
+        for edge in decision.considered:
+            for candidate in edge.candidates:
+                assert candidate.object in text
+                assert (candidate.rejected or candidate.object) in text
+        for each in decision.pruned:
+            expect(page.locator(".tasks")).to_contain_text(f"{each.source} → {each.target}")
+    expect(page.locator(".card")).to_contain_text("Done at 10.367 s")
+    maps = sum(len(each.maps) for edge in decisions[0].considered for each in edge.candidates)
+    expect(page.locator(".candidate canvas")).to_have_count(maps)
+    expect(page.locator(".card > figure canvas")).to_have_count(1)
+
+
+def test_texts_of_a_log_are_shown_as_text(open_panel: Open, logs: Mapping[str, Path], tmp_path: Path) -> None:
+    name = "<img src=x onerror=alert(1)>"
+    samples = [
+        sr.Sample(t * 10**8, {name: sr.Footprint.disc(t, 0, 1), "b": sr.Footprint.disc(9, 0, 1)})
+        for t in range(9)
+    ]
+    log, spec = tmp_path / "hostile.mcap", sr.parse_specification(f'spec near = F ("{name}" dist b <= 3)')
+    with sr.Recorder(log, specifications=[spec]) as recorder:
+        for sample in samples:
+            recorder.write(sample)
+    write_viewer_page(log, log.with_suffix(".html"))
+    page = open_panel("hostile", "specification", logs={"hostile": log})
+    seek(page, 5 * 10**8)
+    expect(page.locator(".tree")).to_contain_text(name)
+    expect(page.locator("img")).to_have_count(0)
+
+
+def test_the_extension_is_small_and_complete() -> None:
+    found = extension_files()
+    package = json.loads(found["package.json"])
+    assert package["name"] and package["publisher"] and package["main"] == "./dist/extension.js"
+    assert sum(map(len, found.values())) < 200_000
+    # no script is loaded, no text is read as HTML or as code
+    assert not re.search(
+        rb"innerHTML|outerHTML|insertAdjacentHTML|\beval\(|new Function", found["dist/extension.js"]
+    )
