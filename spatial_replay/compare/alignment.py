@@ -90,6 +90,7 @@ def align_runs(
         return _alignment("time", None, [start], a, b)
     if align != "progress":
         return _alignment("event", align, [_event(results, align)], a, b)
+    found: list[tuple[str, list[Knot]]] = []
     for one, other in results:
         require_ltlf(one.semantics, "the progress of an automaton")
         paths = [_path(result, files) for result in (one, other)]
@@ -101,11 +102,15 @@ def align_runs(
         ]
         if common == len(paths[0]) == len(paths[1]):
             knots.append(Knot(int(a[-1]), int(b[-1])))
-        return _alignment("progress", one.title, knots, a, b)
-    raise UsageError(
-        "no spec has an automaton to align by (past operators and bounds in seconds have none); "
-        "align by time, or by a spec's name"
-    )
+        found.append((one.title, knots))
+    if not found:
+        raise UsageError(
+            "no spec has an automaton to align by (past operators and bounds in seconds have none); "
+            "align by time, or by a spec's name"
+        )
+    # without temporal operators, an automaton ends where it begins
+    name, knots = max(found, key=lambda each: len(each[1]))
+    return _alignment("progress", name, knots, a, b)
 
 
 def parting_of(one: SpecResult, other: SpecResult, files: Sequence[Specification]) -> Parting | None:

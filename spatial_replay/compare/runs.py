@@ -177,8 +177,8 @@ def diff_sources(
 
     Args:
         options: how each log is evaluated.
-        align: "time" since the first sample, "progress" of the first spec with an automaton, or the name of a
-            spec, whose first change of sign in each run is the event.
+        align: "time" since the first sample, "progress" of the automaton that both go farthest through, or
+            the name of a spec, whose first change of sign in each run is the event.
         advance: called with the number of samples of each block that is read.
 
     Raises:
