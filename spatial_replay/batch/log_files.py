@@ -128,9 +128,11 @@ def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
             continue
         # in the order of their names, and without hidden folders
         folders[:] = sorted(name for name in folders if not name.startswith("."))
+        here = _found(Path(parent), folder)
         for name in sorted(names):
             if name.lower().endswith(_ENDINGS) and not name.startswith("."):
-                yield _found(Path(parent, name), folder)
+                # as texts: paths would take most of the time
+                yield FoundLog(name if here.name == "." else f"{here.name}/{name}", f"{here.path}/{name}")
 
 
 def _found(path: Path, folder: Path) -> FoundLog:
@@ -235,7 +237,9 @@ def _state(path: str) -> str | None:
         None if they cannot be read.
     """
     try:
-        states = [(os.path.realpath(each), each.stat()) for each in _files_of(path)]
+        # not as paths, which take longer than asking the disk
+        files = map(str, _files_of(path)) if os.path.isdir(path) else [path]  # noqa: PTH112
+        states = [(os.path.realpath(each), os.stat(each)) for each in files]  # noqa: PTH116
     except (OSError, ValueError):
         return None
     text = json.dumps([(name, state.st_size, state.st_mtime_ns) for name, state in states])

@@ -42,8 +42,7 @@ class LocalFolder:
 
     def names(self, below: str = "") -> list[str]:
         """Return the names of all files in it, or in a folder below, in order."""
-        files = self._files(self.path / below)
-        return sorted(Path(file).relative_to(self.path).as_posix() for file in files)
+        return sorted(file.removeprefix(f"{self.path}/") for file in self._files(self.path / below))
 
     def read(self, names: Sequence[str]) -> Iterator[bytes]:
         """Read files, and yield the content of each in their order.

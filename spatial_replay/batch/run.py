@@ -138,7 +138,9 @@ def run_batch(
         folder.join_files()
         table = _table(wanted, folder, errors, fail_on)
         folder.write_run(table)
-    return BatchResult(table, len(paths), len({task.task.log for task in tasks}), tuple(wanted))
+    # a log that cannot be read was tried, and is not known
+    evaluated = {task.task.log for task in tasks} | {each.log.path for each in wanted if each.key is None}
+    return BatchResult(table, len(paths), len(evaluated), tuple(wanted))
 
 
 StoredRows: TypeAlias = tuple[ResultRow, ...] | bytes

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import timedelta
@@ -16,6 +16,7 @@ from functools import lru_cache
 from os import PathLike, fspath
 from pathlib import Path
 from threading import Lock
+from types import MappingProxyType
 from typing import Any, BinaryIO, Final, TypeAlias, cast
 from urllib.parse import unquote, urlsplit
 
@@ -36,6 +37,13 @@ _SETTINGS: Final = ("AWS_", "GOOGLE_", "AZURE_")
 
 BAG_METADATA: Final = "metadata.yaml"
 """The file that makes a folder a ROS 2 bag, and lists its other files."""
+_REASONS: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "request or response body error": "the connection breaks off",
+        "error sending request": "the server does not answer",
+    }
+)
+"""What the library says, in other words."""
 WEB_SCHEMES: Final = ("http", "https")
 
 _TAIL_BYTES: Final = 2**19
@@ -383,5 +391,6 @@ def store_failure(shown: str, scheme: str, error: Exception, done: str = "read")
     if "416 " in text:
         return RemoteError(f"{shown} is empty; give a log with at least one sample")
     reason = fspath(text).rpartition(" - ")[2].partition(": <")[0].rstrip(":")
+    reason = _REASONS.get(reason.rpartition("HTTP error: ")[2], reason)
     remedy = "the address" if scheme in WEB_SCHEMES else f"the credentials: {_CREDENTIALS[scheme]}"
     return RemoteError(f"{shown} cannot be {done}: {reason}; check the network and {remedy}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import shutil
 import subprocess
@@ -10,6 +11,7 @@ import sys
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from urllib.request import Request, urlopen
 
 import numpy as np
 import pytest
@@ -295,7 +297,7 @@ def test_a_bucket_of_an_s3_server_is_listed_and_read(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SPATIAL_REPLAY_CACHE", str(tmp_path))
-    with s3_server("fleet", monkeypatch):
+    with s3_server("fleet", monkeypatch) as server:
         import obstore
         from obstore.store import S3Store
 
@@ -309,6 +311,18 @@ def test_a_bucket_of_an_s3_server_is_listed_and_read(
         assert len(sr.read_trace("s3://fleet/2026-11/table.jsonl")) == 300
         with pytest.raises(MissingFileError, match="there is no such file"):
             sr.read_trace("s3://fleet/none.mcap")
+
+        # the protocol of Google's buckets is that of S3, but for the signatures
+        everyone = {"Effect": "Allow", "Principal": "*", "Action": "s3:*", "Resource": "arn:aws:s3:::fleet*"}
+        policy = json.dumps({"Version": "2012-10-17", "Statement": [everyone]}).encode()
+        as_json = {"Content-Type": "application/json"}
+        urlopen(Request(f"{server}/fleet?policy", policy, as_json, method="PUT")).close()
+        account = {"gcs_base_url": server, "disable_oauth": True}
+        account |= dict.fromkeys(("client_email", "private_key", "private_key_id"), "")
+        (tmp_path / "account.json").write_text(json.dumps(account))
+        monkeypatch.setenv("GOOGLE_SERVICE_ACCOUNT", str(tmp_path / "account.json"))
+        (found,) = matching_addresses("gs://fleet/2026-11/*.mcap")
+        assert dict(sr.replay_log(found, SPEC).certificate) == dict(there.certificate)
 
 
 @pytest.mark.skipif(shutil.which("nginx") is None, reason="nginx is not installed")
