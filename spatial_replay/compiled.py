@@ -63,8 +63,9 @@ def long_kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments,
 def elementwise(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """Return a kernel of which the interpreter takes two to five times as little time.
 
-    It gets its arrays as memoryviews, whose elements are plain numbers. So it must take and set single
-    elements, with no slices but of one dimension, and never divide by zero.
+    It gets its arrays as memoryviews, whose elements are plain numbers; of the arrays in a named tuple, those
+    of one dimension. So it must take and set single elements, with no slices but of one dimension, and never
+    divide by zero.
     """
     kernel = cast("_Kernel[_Arguments, _Result]", function)
     return _Kernel(kernel.__wrapped__, kernel.options, is_elementwise=True)
@@ -230,7 +231,10 @@ def _elements(values: object) -> int:
     return 0
 
 
-def _view(value: object) -> object:
+def _view(value: Any) -> object:
+    if isinstance(value, tuple):
+        # kernels take rows of the arrays in named tuples, and a memoryview of several dimensions has none
+        return type(value)(*(_view(each) if each.ndim == 1 else each for each in value))
     # an array is a buffer, though its type does not say so
     return memoryview(cast(bytes, value)) if isinstance(value, np.ndarray) else value
 

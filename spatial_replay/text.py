@@ -103,6 +103,14 @@ def time_text(time_ns: int, first_ns: int = 0) -> str:
     return str(Instant(time_ns, first_ns))
 
 
+def times_apart(*times_ns: int) -> tuple[str, ...]:
+    """Return times in seconds; in nanoseconds, too, if some that differ would read the same."""
+    texts = tuple(time_text(each) for each in times_ns)
+    if len(set(texts)) == len(set(map(int, times_ns))):
+        return texts
+    return tuple(f"{text} ({each} ns)" for text, each in zip(texts, times_ns, strict=True))
+
+
 def requirement_text(identifier: str | None, title: str | None) -> str:
     """Return the id of a requirement and its words, as far as it has them: "REQ-12: no one is hit"."""
     return ": ".join(each for each in (identifier, title) if each)

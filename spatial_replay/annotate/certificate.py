@@ -137,7 +137,7 @@ class MessageHash:
         for number, channel in messages.channels.items():
             codes[number] = topics.index(channel.topic)
         codes = codes[messages.channel]
-        for code in np.unique(codes).tolist():
+        for code in np.flatnonzero(np.bincount(codes)).tolist():
             rows = np.flatnonzero(codes == code)
             payloads = [messages.payloads[row] for row in rows.tolist()]
             lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))

@@ -25,10 +25,10 @@ def leaf_words(text: str, number: float, amount: str, *, past: bool = False) -> 
     Args:
         amount: the number without its sign, in words.
     """
-    if number == 0.0:
-        return f"`{text}` just {'held' if past else 'holds'}"
     holds, fails = ("held", "failed") if past else ("holds", "fails")
-    return f"`{text}` {holds if number > 0.0 else fails} by {amount}"
+    how = holds if number >= 0.0 else fails
+    is_residue = amount.split(" ")[0] == "0"
+    return f"`{text}` just {how}" if is_residue else f"`{text}` {how} by {amount}"
 
 
 def change_sentence(title: str, after: Period, witness: str) -> str:

@@ -22,6 +22,7 @@ import numpy as np
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.read_options import FaultList
+from spatial_replay.text import time_text
 
 _TOGETHER = 512
 """Messages made at once: fewer than the garbage collector lets pass before it runs."""
@@ -271,11 +272,11 @@ def without_jumps(columns: Columns, name: str, checked: Collection[str]) -> Colu
             recorded = topics.setdefault(topic, _Recorded())
             jump = recorded.first_jump(each.log_time_ns[rows], each.place[rows])
             if jump is not None:
+                logged = time_text(int(each.log_time_ns[rows][jump]))
                 raise LogError(
-                    f"{name}: time jumps back: the message on {topic!r} logged at"
-                    f" {each.log_time_ns[rows][jump]} ns was recorded before others that were logged more"
-                    " than a second earlier; on_time_jump='split' (--on-time-jump split) ends the log"
-                    " where it jumps"
+                    f"{name}: time jumps back: the message on {topic!r} logged at {logged} was recorded"
+                    " before others that were logged more than a second earlier; on_time_jump='split'"
+                    " (--on-time-jump split) ends the log where it jumps"
                 )
         yield each
 

@@ -22,9 +22,9 @@ from spatial_replay.bags.sqlite import SQLITE_MAGIC, SqliteBag
 from spatial_replay.bags.topic import Topic
 from spatial_replay.bags.unpacking import ZSTD_MAGIC, temporary_folder, unpack_file, unpacked
 from spatial_replay.errors import LogError, MissingFileError
-from spatial_replay.logs.mcap.chunks import MAGIC
 from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList
+from spatial_replay.logs.topics import MAGIC
 from spatial_replay.text import Instant, Sentence
 
 METADATA_FILE = "metadata.yaml"

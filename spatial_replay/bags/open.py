@@ -11,8 +11,8 @@ from spatial_replay.bags.ros1 import Ros1Bag
 from spatial_replay.bags.ros1_index import BAG_MAGIC
 from spatial_replay.bags.sqlite import SQLITE_MAGIC, SqliteBag
 from spatial_replay.errors import LogError, MissingFileError
-from spatial_replay.logs.mcap.chunks import MAGIC
 from spatial_replay.logs.remote import LogFile, open_file
+from spatial_replay.logs.topics import MAGIC
 
 READERS: dict[bytes, type[MessageReader]] = {BAG_MAGIC: Ros1Bag, SQLITE_MAGIC: SqliteBag, MAGIC: McapLog}
 """The reader of a file, by its first bytes."""

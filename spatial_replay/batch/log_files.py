@@ -14,12 +14,11 @@ from typing import Final, NamedTuple
 from spatial_replay.batch.suite import LogPattern
 from spatial_replay.batch.workers import ThisProcess, WorkerLost, Workers
 from spatial_replay.errors import LogError, SpatialReplayError, UsageError
-from spatial_replay.logs.mcap.chunks import MAGIC
 from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.logs.remote import BAG_METADATA, RemoteFile, is_address, log_file
 from spatial_replay.logs.remote_folder import matching_addresses
-from spatial_replay.logs.topics import CERTIFICATE
+from spatial_replay.logs.topics import CERTIFICATE, MAGIC
 from spatial_replay.sources.open_log import bag_files_at
 from spatial_replay.text import counted
 

@@ -13,6 +13,7 @@ import click
 from spatial_replay.cli.findings import Form, show_findings
 from spatial_replay.cli.options import (
     InputPath,
+    JsonCommand,
     LogPath,
     ReadArguments,
     constants_option,
@@ -40,7 +41,7 @@ _STANDARD_OUTPUT = "-"
 _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
 
 
-@click.command()
+@click.command(cls=JsonCommand)
 @click.argument("specification", metavar="SPEC", type=InputPath())
 @click.option(
     "--log",
@@ -193,7 +194,7 @@ def _compare_with_log(
     return _Compared(
         (*unknown, *doubtful),
         window_lines(specification, numbers),
-        tuple(numbers.ranges.values()),
+        numbers.ranges,
         summary + (" and ".join(found) or "all names, thresholds and windows fit"),
     )
 
@@ -245,10 +246,12 @@ def _document(
         "thresholds": [
             {
                 "atom": each.atom.text,
+                "objects": each.objects,
                 "least": json_number(each.least) if each.known else None,
                 "greatest": json_number(each.greatest) if each.known else None,
                 "known": each.known,
                 "holding": each.holding,
+                "failing": each.failing,
             }
             for each in compared.ranges
         ],

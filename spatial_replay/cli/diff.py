@@ -12,6 +12,7 @@ import click
 from spatial_replay.cli.application import ExitCode, most_severe
 from spatial_replay.cli.options import (
     EvaluationArguments,
+    JsonCommand,
     LogPath,
     evaluation_options,
     open_inputs,
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from spatial_replay.monitor.semantics import Semantics
 
 
-@click.command()
+@click.command(cls=JsonCommand)
 @evaluation_options
 @click.argument("other", required=False, type=LogPath())
 @click.option(

@@ -12,6 +12,7 @@ from spatial_replay.cli.application import exit_code_from_verdicts
 from spatial_replay.cli.options import (
     EvaluationArguments,
     EvaluationInputs,
+    JsonCommand,
     evaluation_options,
     naming_option,
     open_inputs,
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from spatial_replay.replay import Explanation
 
 
-@click.command()
+@click.command(cls=JsonCommand)
 @evaluation_options
 @click.option("--node", metavar="NAME", help="Named spec to explain.  [default: all results]")
 @click.option("--object", "object_name", metavar="NAME", help="Template: explain the result of this object.")
@@ -51,7 +52,7 @@ def explain(
     """
     # imported here so that --help stays fast
     from spatial_replay.logs.topics import MAPPED
-    from spatial_replay.replay import explain_results, has_samples_from, run_replay
+    from spatial_replay.replay import explain_results, has_samples_from, idle_document, run_replay
 
     if at is not None and request.end is not None:
         raise UsageError("--at and --to both set the last sample; give only one")
@@ -70,12 +71,13 @@ def explain(
     if at is not None and not goes_on and replayed.end_ns < inputs.window.end_ns - 1:
         warn(f"--at {at} is after the last sample, at {time_text(replayed.end_ns, replayed.first_ns)}")
     results = explain_results(replayed, node=node, object=object_name, goes_on=goes_on)
+    idle = replayed.vacuous if node is None and object_name is None else ()
     if as_json:
-        show_json([each.document for each in results])
+        show_json([*(each.document for each in results), *map(idle_document, idle)])
     else:
         texts = list(_texts(results))
-        if replayed.vacuous and node is None and object_name is None:
-            texts.append([each.message for each in replayed.vacuous])
+        if idle:
+            texts.append([each.message for each in idle])
         for number, lines in enumerate(texts):
             show(*([""] if number else []), *lines)
     return exit_code_from_verdicts((each.verdict for each in results), bool(replayed.faults))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import click
 
 from spatial_replay.cli.application import ExitCode
-from spatial_replay.cli.options import LogPath, ReadArguments, reading_options
+from spatial_replay.cli.options import JsonCommand, LogPath, ReadArguments, reading_options
 from spatial_replay.cli.output import decision_lines, decision_rows
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, show_bytes, show_file, show_json, warn
@@ -36,7 +36,7 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump"})
 """Options of reading that say something about an external log."""
 
 
-@click.command()
+@click.command(cls=JsonCommand)
 @click.argument("log", type=LogPath(), required=False)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 @click.option("--suggest-mapping", is_flag=True, help="Print a first mapping file (YAML) instead.")

@@ -10,6 +10,7 @@ import click
 
 from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import (
+    JsonCommand,
     LogPath,
     ReadArguments,
     choices_option,
@@ -38,7 +39,7 @@ _MOST_LISTED = 20
 """The most runs that are listed; JSON has all."""
 
 
-class _ManyLogs(click.Command):
+class _ManyLogs(JsonCommand):
     """A command whose options --good and --bad take all that follows, as shells expand `good/*.mcap`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:

@@ -1,14 +1,15 @@
-"""Names in our logs: topics, metadata, attachments."""
+"""Names in our logs: topics, metadata, attachments; what every MCAP file begins with."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
 from spatial_replay.logs.messages import Channel, Schema
 
 if TYPE_CHECKING:
+    from google.protobuf.descriptor import FileDescriptor
     from google.protobuf.message import Message
 
 OWN_PREFIX = "/spatial/"
@@ -32,6 +33,9 @@ PLAN_DECISION = "/plan/decision"
 GRADIENT_MAP = "/plan/gradient_map"
 PLAN_PATH = "/plan/path"
 """Topics that a planner writes; a replay copies them."""
+
+MAGIC = b"\x89MCAP0\r\n"
+"""The first bytes of an MCAP file, and the last."""
 
 LIBRARY = "spatial-replay"
 """How our writer names itself in the header of a log."""
@@ -85,8 +89,20 @@ def is_kept(topic: str, keep: Collection[str], mapped: Collection[str]) -> bool:
 
 def protobuf_channel(topic: str, message: type[Message]) -> Channel:
     """Return the channel of a topic with messages of one protobuf type, with all it takes to decode them."""
-    # imported here since it takes long, and readers need none of it
-    from mcap_protobuf.schema import build_file_descriptor_set
+    # imported here since readers need none of it
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
-    descriptors = build_file_descriptor_set(message).SerializeToString(deterministic=True)
-    return Channel(topic, "protobuf", Schema(message.DESCRIPTOR.full_name, "protobuf", descriptors))
+    descriptors = FileDescriptorSet()
+    for file in _with_dependencies(message.DESCRIPTOR.file, {}):
+        file.CopyToProto(descriptors.file.add())
+    data = descriptors.SerializeToString(deterministic=True)
+    return Channel(topic, "protobuf", Schema(message.DESCRIPTOR.full_name, "protobuf", data))
+
+
+def _with_dependencies(file: FileDescriptor, found: dict[str, FileDescriptor]) -> Iterable[FileDescriptor]:
+    """Return a file of message types and all that it imports, each behind its own imports."""
+    for each in file.dependencies:
+        if each.name not in found:
+            _with_dependencies(each, found)
+    found[file.name] = file
+    return found.values()

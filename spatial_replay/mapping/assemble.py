@@ -31,7 +31,7 @@ from spatial_replay.mapping.reading_plan import DISORDER_NS, ReadingPlan
 from spatial_replay.mapping.topic_reader import MISFITS, TopicReader
 from spatial_replay.mapping.tracker import Remarks, Tracker
 from spatial_replay.mapping.transforms import HISTORY_NS, FrameTree
-from spatial_replay.text import Instant, Sentence
+from spatial_replay.text import Instant, Sentence, time_text, times_apart
 from spatial_replay.trace.sample import FOREVER, LATEST_NS
 from spatial_replay.trace.trace import Trace
 
@@ -231,10 +231,10 @@ class Assembler:
         at = int(late[0])
         self._newest_ns = int(newest[at])
         place = int(places[at])
+        start, end, logged = (int(each) for each in (newest[at], times_ns[at], arrived.log_time_ns[place]))
         where = (
-            f"time jumps back by {(int(newest[at]) - int(times_ns[at])) / 1e9:.3f} s, from {newest[at]} ns to"
-            f" {times_ns[at]} ns, at a message of {arrived.topics[place]} logged at"
-            f" {arrived.log_time_ns[place]} ns"
+            f"time jumps back by {time_text(start, end)}, from {time_text(start)} to {time_text(end)}, at a"
+            f" message of {arrived.topics[place]} logged at {time_text(logged)}"
         )
         if self._on_time_jump == "error":
             raise LogError(
@@ -352,9 +352,10 @@ class _SampleTimes:
         gaps = np.diff(marks)
         if len(gaps) and int(gaps.max()) // step_ns > _MOST_STEPS:
             at = int(np.argmax(gaps))
+            start, end = times_apart(int(marks[at]), int(marks[at + 1]))
             raise LogError(
-                f"{self._name}: time jumps forward from {marks[at]} ns to {marks[at + 1]} ns, more than"
-                f" {_MOST_STEPS} samples without a message; take another clock or a longer step"
+                f"{self._name}: time jumps forward from {start} to {end}, more than {_MOST_STEPS} samples"
+                " without a message; take another clock or a longer step"
             )
         if stop - first > _MOST_AT_ONCE:
             raise UsageError(

@@ -18,6 +18,7 @@ from spatial_replay.monitor.verdict import Verdict, online_verdict, worst_verdic
 from spatial_replay.monitor.violation import Settled, Violation, ViolationLog, rehearse
 from spatial_replay.spec.formula import NamedSpec, Specification, iter_nodes
 from spatial_replay.spec.load import require_specification
+from spatial_replay.text import times_apart
 from spatial_replay.trace.sample import Sample, require_time
 
 
@@ -166,9 +167,9 @@ class Monitor:
         if not isinstance(sample, Sample):
             raise UsageError(f"{sample!r} is not a sample; give a Sample(time_ns, objects)")
         if self._last_ns is not None and sample.time_ns <= self._last_ns:
+            at, last = times_apart(sample.time_ns, self._last_ns)
             raise TraceError(
-                f"a sample at {sample.time_ns} ns follows one at {self._last_ns} ns; "
-                "give samples in the order of their times"
+                f"a sample at {at} follows one at {last}; give samples in the order of their times"
             )
         self._last_ns = sample.time_ns
         numbers = list(map(_read_only, self._live.extend(sample)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import hypot, inf
 from typing import Literal
@@ -12,20 +12,26 @@ import numpy as np
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.spec.diagnostics import Diagnostic, SourceText
-from spatial_replay.spec.format import format_bound, format_number
+from spatial_replay.spec.format import format_bound, format_number, format_term
 from spatial_replay.spec.formula import (
+    ANY_CLASS,
     Atom,
     Bound,
     Expression,
     Formula,
+    Group,
     Measurement,
     Outline,
+    Quantified,
     Signal,
     SignedDistance,
     Span,
     Specification,
     Temporal,
+    Term,
+    TrackedName,
     Variable,
+    operands_of,
 )
 from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, terms_of
 from spatial_replay.text import counted
@@ -44,29 +50,52 @@ class ThresholdRange:
 
     Attributes:
         atom: with one distance or signal in it.
-        least, greatest: of the distance or signal; least > greatest if it is never known.
-        known, holding: samples in which it is known, and in which the atom holds.
+        bound: what binds its variables, from the outside in: open quantifiers, and the objects of a template.
+        least, greatest: of the distance or signal, whatever objects the variables stand for; least > greatest
+            if it is never known.
+        known, holding, failing: samples in which it is known, in which the atom holds, and in which it fails,
+            whatever objects the variables stand for.
     """
 
     atom: Atom
+    bound: tuple[Quantified, ...] = ()
     least: float = inf
     greatest: float = -inf
     known: int = 0
     holding: int = 0
+    failing: int = 0
 
     @property
     def holds(self) -> Literal["always", "never", "sometimes", "unknown"]:
         if not self.known:
             return "unknown"
-        return "never" if not self.holding else "always" if self.holding == self.known else "sometimes"
+        if self.failing == self.known:
+            return "never"
+        return "always" if self.holding == self.known else "sometimes"
+
+    @property
+    def objects(self) -> str | None:
+        """What its variables stand for, as `d in drinks`; None without any."""
+        over = [
+            f"{', '.join(each.variables)} in {format_term(each.group).strip('()')}" for each in self.bound
+        ]
+        return ", ".join(over) or None
+
+    @property
+    def text(self) -> str:
+        """The atom, and what its variables stand for."""
+        return self.atom.text if self.objects is None else f"{self.atom.text} for {self.objects}"
 
     def __str__(self) -> str:
         if not self.known:
-            return f"{self.atom.text}: unknown in every sample"
-        span = f"goes from {self.least:.4g} to {self.greatest:.4g}"
-        if self.holds == "sometimes":
-            return f"{self.atom.text}: {span}, holds in {self.holding:,} of {counted(self.known, 'sample')}"
-        return f"{self.atom.text}: {span}, {self.holds} holds"
+            return f"{self.text}: unknown in every sample"
+        span = f"{self.text}: goes from {self.least:.4g} to {self.greatest:.4g}"
+        if self.holds != "sometimes":
+            return f"{span}, {self.holds} holds"
+        samples = counted(self.known, "sample")
+        if self.bound:
+            return f"{span}, holds for all in {self.holding:,} and for none in {self.failing:,} of {samples}"
+        return f"{span}, holds in {self.holding:,} of {samples}"
 
 
 class LogNumbers:
@@ -85,8 +114,8 @@ class LogNumbers:
         self.times_ns = (0, 0)
         self._regions = specification.regions
         self._ranges = {
-            each.text: ThresholdRange(each)
-            for each in _nodes(specification)
+            _key(each, bound): ThresholdRange(each, bound)
+            for each, bound in _bound_nodes(specification)
             if isinstance(each, Atom) and _compared(each) is not None
         }
 
@@ -108,32 +137,38 @@ class LogNumbers:
         self._add_ranges(trace)
 
     def _add_ranges(self, trace: Trace) -> None:
-        atoms = [each.atom for each in self._ranges.values()]
-        if not atoms:
-            return
-        parts = [_compared(atom) or atom.expression for atom in atoms]
-        compared = [replace(atom, expression=part) for atom, part in zip(atoms, parts, strict=True)]
-        # low and high ends of each; they differ where something is unknown
-        leaves = leaf_values(TraceScene(trace, self._regions), [*compared, *atoms], {})
-        low, high = leaves[0], leaves[min(1, len(leaves) - 1)]
-        known = np.isfinite(low) & (low == high)
-        for row, atom in enumerate(atoms):
-            values = low[row, known[row]]
-            if not len(values):
+        scene = TraceScene(trace, self._regions)
+        for key, seen in self._ranges.items():
+            number = replace(seen.atom, expression=_compared(seen.atom) or seen.atom.expression)
+            # one by one, so that each has as many bindings as in a replay
+            least, greatest, all_hold, any_holds = (
+                leaf_values(scene, [_over(quantifier, seen.bound, atom)], {})[:, 0]
+                for atom in (number, seen.atom)
+                for quantifier in ("forall", "exists")
+            )
+            # low and high ends differ where something is unknown; without any object they are infinite
+            known = np.isfinite(least[0]) & np.isfinite(greatest[0])
+            for ends in (least, greatest):
+                known &= ends[0] == ends[min(1, len(ends) - 1)]
+            if not known.any():
                 continue
-            seen = self._ranges[atom.text]
-            self._ranges[atom.text] = ThresholdRange(
-                atom,
-                min(seen.least, float(values.min())),
-                max(seen.greatest, float(values.max())),
-                seen.known + len(values),
-                seen.holding + int((low[len(atoms) + row, known[row]] >= 0.0).sum()),
+            self._ranges[key] = replace(
+                seen,
+                least=min(seen.least, float(least[0, known].min())),
+                greatest=max(seen.greatest, float(greatest[0, known].max())),
+                known=seen.known + int(known.sum()),
+                holding=seen.holding + int((all_hold[0, known] >= 0.0).sum()),
+                failing=seen.failing + int((any_holds[0, known] < 0.0).sum()),
             )
 
     @property
-    def ranges(self) -> Mapping[str, ThresholdRange]:
-        """What each atom with a threshold compares with it, by the atom's text."""
-        return self._ranges
+    def ranges(self) -> Sequence[ThresholdRange]:
+        """What each atom with a threshold compares with it."""
+        return tuple(self._ranges.values())
+
+    def range_of(self, atom: Atom, bound: tuple[Quantified, ...]) -> ThresholdRange | None:
+        """Return what an atom compares with its threshold; None if that is not one number."""
+        return self._ranges.get(_key(atom, bound))
 
     @property
     def extent(self) -> float:
@@ -178,11 +213,12 @@ def plausibility_warnings(specification: Specification, log: LogNumbers) -> tupl
             hint = f"objects lie in x {log.box[0]:.4g} to {log.box[2]:.4g}, y {log.box[1]:.4g} to "
             span = Span(start, start + len(f"region {name}"))
             found[name] = source.diagnostic("warning", span, message, f"{hint}{log.box[3]:.4g}")
-    for node in _nodes(specification):
+    for node, bound in _bound_nodes(specification):
         doubts: Iterator[tuple[str, str]] = iter(())
         key = ""
         if isinstance(node, Atom):
-            key, doubts = node.text, _doubts(node, log)
+            taken = log.range_of(node, bound)
+            key, doubts = taken.text if taken else node.text, _doubts(node, log, taken)
         elif isinstance(node, Temporal) and node.bound is not None:
             key = f"{node.operator}{format_bound(node.bound)}"
             doubts = _doubts_of_window(key, node.bound, log)
@@ -191,7 +227,7 @@ def plausibility_warnings(specification: Specification, log: LogNumbers) -> tupl
     return tuple(sorted(found.values(), key=lambda each: (each.line, each.column)))
 
 
-def _doubts(atom: Atom, log: LogNumbers) -> Iterator[tuple[str, str]]:
+def _doubts(atom: Atom, log: LogNumbers, taken: ThresholdRange | None) -> Iterator[tuple[str, str]]:
     limits = [each for each in atom.parameters if isinstance(each, float)]
     lengths = limits if atom.relation in _LENGTH_RELATIONS else []
     for length in lengths:
@@ -200,7 +236,6 @@ def _doubts(atom: Atom, log: LogNumbers) -> Iterator[tuple[str, str]]:
         elif 0.0 < log.extent * _FAR < abs(length):
             message = f"{format_number(length)} is far more than anything in the log is apart"
             yield message, f"all that it has lies within {log.extent:.4g}; is the unit the same?"
-    taken = log.ranges.get(atom.text)
     if taken is None or taken.holds not in ("always", "never"):
         return
     for limit in limits:
@@ -208,7 +243,7 @@ def _doubts(atom: Atom, log: LogNumbers) -> Iterator[tuple[str, str]]:
             below = limit < taken.least
             end, side = (taken.least, "below") if below else (taken.greatest, "above")
             what = "its signal is" if atom.relation == "signal" else "the distance is"
-            message = f"`{atom.text}` {taken.holds} holds in this log: {what} never {side} {end:.4g}"
+            message = f"`{taken.text}` {taken.holds} holds in this log: {what} never {side} {end:.4g}"
             yield message, f"no value comes near {format_number(limit)}; is it the threshold you mean?"
 
 
@@ -249,16 +284,67 @@ def _distance(outline: Outline, box: tuple[float, float, float, float]) -> float
 
 
 def _compared(atom: Atom) -> Expression | None:
-    """Return the signal or distance that an atom compares; None if that is not one, or has a variable."""
+    """Return the signal or distance that an atom compares with a number; None if that is not one."""
     parts = {each for each in iter_expressions(atom.expression) if isinstance(each, (Signal, Measurement))}
     part = parts.pop() if len(parts) == 1 else None
     if not isinstance(part, (Signal, SignedDistance)) or not any(
         isinstance(x, float) for x in atom.parameters
     ):
         return None
-    return None if any(isinstance(base_of(term), Variable) for term in terms_of(part)) else part
+    return part
+
+
+def _key(atom: Atom, bound: tuple[Quantified, ...]) -> tuple[str, ...]:
+    return (atom.text, *(f"{each.variables} {each.group}" for each in bound))
+
+
+def _over(
+    quantifier: Literal["forall", "exists"], bound: tuple[Quantified, ...], atom: Atom
+) -> Atom | Quantified:
+    """Return an atom for all objects that its variables may stand for, or for some."""
+    formula: Atom | Quantified = atom
+    for each in reversed(bound):
+        formula = Quantified(quantifier, each.variables, each.group, formula)
+    return formula
 
 
 def _nodes(specification: Specification) -> Iterator[Formula]:
     for spec in specification.results:
         yield from iter_formulas(spec.formula)
+
+
+def _bound_nodes(specification: Specification) -> Iterator[tuple[Formula, tuple[Quantified, ...]]]:
+    """Yield every node, with the quantifiers that bind variables of it, from the outside in."""
+    for spec in specification.results:
+        stack: list[tuple[Formula, tuple[Quantified, ...]]] = [(spec.formula, ())]
+        while stack:
+            node, around = stack.pop()
+            if isinstance(node, Quantified):
+                stack.append((node.body, (*around, node)))
+            else:
+                stack += [(each, around) for each in reversed(operands_of(node))]
+            yield node, _binding(node, around, spec.parameter) if isinstance(node, Atom) else ()
+
+
+def _binding(atom: Atom, around: tuple[Quantified, ...], parameter: str | None) -> tuple[Quantified, ...]:
+    """Return those of the quantifiers around an atom that bind a variable of it, or of one that does.
+
+    The objects of a template are all but those that the atom names: no distance to itself is meant.
+    """
+    wanted = _variables(terms_of(atom.expression))
+    bound: list[Quantified] = []
+    for each in reversed(around):
+        if wanted.intersection(each.variables):
+            bound.insert(0, each)
+            wanted = wanted.difference(each.variables) | _variables([each.group])
+    if parameter is not None and parameter in wanted:
+        named = tuple(t for t in map(base_of, terms_of(atom.expression)) if isinstance(t, TrackedName))
+        everything = Group("", class_name=ANY_CLASS, excluded=named)
+        bound.insert(0, Quantified("forall", (parameter,), everything, atom))
+    return tuple(bound)
+
+
+def _variables(terms: Iterable[Term]) -> frozenset[str]:
+    bases = [base_of(term) for term in terms]
+    left_out = [each for base in bases if isinstance(base, Group) for each in base.excluded]
+    return frozenset(each.name for each in [*bases, *left_out] if isinstance(each, Variable))

@@ -12,11 +12,14 @@ from spatial_replay.monitor.witness.evidence import Gap
 from spatial_replay.monitor.witness.path import End, MissedResponse
 from spatial_replay.monitor.witness.threshold import Threshold
 from spatial_replay.monitor.witness.witness import Witness, WitnessStep
-from spatial_replay.spec.expressions import Scaled
+from spatial_replay.spec.expressions import Number, Scaled
 from spatial_replay.spec.formula import Atom, Formula
+from spatial_replay.spec.walks import iter_expressions, iter_formulas
 from spatial_replay.text import Instant, Sentence, counted, requirement_text, shortened_formula
 
 _DIGITS = 6
+_RESIDUE = 1e-12
+"""A difference of so little, to what is compared, is the rounding error of its two numbers."""
 _ENDED = ", for the log has ended"
 _EDGES = {"min_x": "left", "max_x": "right", "min_y": "lower", "max_y": "upper"}
 
@@ -121,10 +124,23 @@ def divisor_of(atom: Formula) -> float:
 
 def amount_text(number: float, atom: Formula) -> str:
     """Return a number of an atom in the unit of the log: what `scale` divided it by is said beside it."""
-    divisor = divisor_of(atom)
+    divisor, number = divisor_of(atom), without_residue(number, atom)
     if divisor == 1.0:
         return number_text(number)
     return f"{number_text(number * divisor)} ({number_text(number)} on its scale of {number_text(divisor)})"
+
+
+def without_residue(number: float, atom: Formula) -> float:
+    """Return a number of an atom, but 0 where it is no more than a rounding error."""
+    limits = [
+        abs(part.value)
+        for each in iter_formulas(atom)
+        if isinstance(each, Atom)
+        for part in iter_expressions(each.expression)
+        if isinstance(part, Number) and math.isfinite(part.value)
+    ]
+    scale = max(limits, default=0.0) or 1.0
+    return 0.0 if abs(number * divisor_of(atom)) <= _RESIDUE * scale else number
 
 
 def _robustness(lower: float, upper: float) -> str:
@@ -164,8 +180,8 @@ def _how_it_decides(
     amount = deciding.value if deciding.lower == deciding.upper else _end(deciding)
     size = amount_text(abs(amount), deciding.atom)
     how = f"holds by {size}" if amount >= 0.0 else f"fails by {size}"
-    if amount == 0.0:
-        how = "just holds"
+    if without_residue(amount, deciding.atom) == 0.0:
+        how = "just holds" if amount >= 0.0 else "just fails"
     where = _in_time(witness)
     if witness.path[-1].operator == deciding.atom.relation:
         where = _in_time_of_all(witness, deciding, "so far " if is_open else "")

@@ -24,6 +24,7 @@ from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.semantics import Evaluator, Semantics
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.formula import Outline, Specification
+from spatial_replay.text import times_apart
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace, window_of
 
@@ -156,9 +157,9 @@ class EvaluationStream:
         if self._before is not None:
             before_ns = self._before.times_ns[-1]
             if before_ns >= trace.times_ns[0]:
+                at, last = times_apart(int(trace.times_ns[0]), int(before_ns))
                 raise TraceError(
-                    f"a sample at {trace.times_ns[0]} ns follows one at {before_ns} ns; "
-                    "give samples in the order of their times"
+                    f"a sample at {at} follows one at {last}; give samples in the order of their times"
                 )
             if self._reach != (0, 0):
                 recent = tail(self._before, *self._reach)

@@ -13,7 +13,14 @@ from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.causes import Conjunct, conjuncts_of
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.program import Program, compile_formula
-from spatial_replay.monitor.sentences import amount_text, divisor_of, missed_text, number_text, sentences_of
+from spatial_replay.monitor.sentences import (
+    amount_text,
+    divisor_of,
+    missed_text,
+    number_text,
+    sentences_of,
+    without_residue,
+)
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom
 from spatial_replay.monitor.witness.evidence import Evidence
@@ -92,7 +99,9 @@ class Violation:
         number = self.atom.upper if self.atom.end is End.HIGH else self.atom.lower
         size = amount_text(abs(number), self.atom.atom)
         how = f"{'holds' if number >= 0.0 else 'fails'} by {size}"
-        short = _short(self.atom, self.spec, abs(number) * divisor_of(self.atom.atom))
+        short = _short(
+            self.atom, self.spec, abs(without_residue(number, self.atom.atom)) * divisor_of(self.atom.atom)
+        )
         return f"{short}: `{self.atom.text}` {how} at {when}"
 
 

@@ -26,7 +26,7 @@ from spatial_replay.planning.maps import Cubes, refuse_delays, refuse_unknown
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.workspace import Workspace, kind_faults, refuse_faults
 from spatial_replay.spec.formula import Specification
-from spatial_replay.text import counted
+from spatial_replay.text import counted, times_apart
 from spatial_replay.trace.sample import Sample
 
 MOST_MOTIONS: Final = 100
@@ -131,10 +131,8 @@ class Planner:
         if not isinstance(sample, Sample):
             raise UsageError(f"{sample!r} is not a sample; give a Sample(time_ns, objects)")
         if self._sample is not None and sample.time_ns <= self._sample.time_ns:
-            raise TraceError(
-                f"a sample at {sample.time_ns} ns follows one at {self._sample.time_ns} ns; give times that "
-                "increase"
-            )
+            at, last = times_apart(sample.time_ns, self._sample.time_ns)
+            raise TraceError(f"a sample at {at} follows one at {last}; give times that increase")
         if self._settings is None:
             self._settings = Settings(Workspace.around(sample))
         if self._sample is None:

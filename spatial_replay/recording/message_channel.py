@@ -17,6 +17,7 @@ import numpy as np
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.messages import Channel, Messages
 from spatial_replay.recording.message_schema import MessageData, payload_encoder
+from spatial_replay.text import times_apart
 from spatial_replay.trace.sample import LATEST_NS
 
 MOST_WAITING_BYTES: Final = 64 * 2**20
@@ -214,9 +215,10 @@ class MessageChannel:
         with queue.lock:
             queue.require_open()
             if time_ns < self._last_ns:
+                at, last = times_apart(time_ns, self._last_ns)
                 raise UsageError(
-                    f"a message on {self.topic} at {time_ns} ns follows one at {self._last_ns} ns; give times"
-                    " that do not decrease, or each thread a topic"
+                    f"a message on {self.topic} at {at} follows one at {last}; give times that do not"
+                    " decrease, or each thread a topic"
                 )
             self._last_ns = time_ns
             if queue.put(_Waiting(self._number, self._written, time_ns, payload)):

@@ -31,6 +31,7 @@ from spatial_replay.recording.message_schema import SchemaLike, message_channel
 from spatial_replay.recording.recording import Recording, refuse_templates
 from spatial_replay.spec import object_names, signal_names
 from spatial_replay.spec.formula import Specification
+from spatial_replay.text import times_apart
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
@@ -169,9 +170,8 @@ class Recorder:
             raise UsageError(f"{self._path.name} is closed; open another recorder")
         self._raise_failure()
         if sample.time_ns <= self._last_ns:
-            raise TraceError(
-                f"a sample at {sample.time_ns} ns follows one at {self._last_ns} ns; give times that increase"
-            )
+            at, last = times_apart(sample.time_ns, self._last_ns)
+            raise TraceError(f"a sample at {at} follows one at {last}; give times that increase")
         self._last_ns = sample.time_ns
         while self._queue.qsize() >= self._waiting:
             if not self._blocks:

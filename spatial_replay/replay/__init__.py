@@ -15,7 +15,12 @@ from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
     from spatial_replay.replay.annotated import load_files, recorded_texts, run_replay
-    from spatial_replay.replay.document import Explanation, document_from_replay, explain_results
+    from spatial_replay.replay.document import (
+        Explanation,
+        document_from_replay,
+        explain_results,
+        idle_document,
+    )
     from spatial_replay.replay.engine import Replay, Replayed
     from spatial_replay.replay.loaded_log import Evaluated, LoadedLog, constant_text, constant_values
     from spatial_replay.replay.playback import Playback
@@ -49,6 +54,7 @@ __all__ = [
     "export_table",
     "first_sample_ns",
     "has_samples_from",
+    "idle_document",
     "load_files",
     "recorded_texts",
     "run_replay",
@@ -60,7 +66,7 @@ __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
         "annotated": ("load_files", "recorded_texts", "run_replay"),
-        "document": ("Explanation", "document_from_replay", "explain_results"),
+        "document": ("Explanation", "document_from_replay", "explain_results", "idle_document"),
         "engine": ("Replay", "Replayed"),
         "playback": ("Playback",),
         "selection": ("LogNames", "ReplayOptions", "Window", "first_sample_ns", "has_samples_from"),

@@ -192,6 +192,18 @@ def _numbers(rows: Floats) -> list[list[float | str | None]]:
     return [[json_number(number) for number in row] for row in rows.tolist()]
 
 
+def idle_document(template: Vacuous) -> dict[str, Any]:
+    """Return a template without instances as JSON beside explanations: it has a reason, but no verdict."""
+    return {
+        "specification": template.text.partition("(")[0],
+        "object": None,
+        "node": None,
+        "verdict": None,
+        "vacuous": [_vacuous(template)],
+        "explanation": [template.message],
+    }
+
+
 @dataclass(frozen=True, slots=True)
 class Explanation:
     """The reason for the verdict of one node.

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Final
 
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.logs.source import Source, reading_only
 from spatial_replay.logs.topics import ALL, MAPPED, is_kept
@@ -48,6 +47,8 @@ def _check_patterns(source: Source, patterns: Sequence[str]) -> None:
 
 
 def _topics(source: Source) -> list[str]:
+    from spatial_replay.logs.mcap.reader import McapSource
+
     if isinstance(source, McapSource):
         with source.open_walk() as walk:
             return sorted({channel.topic for channel in walk.channels.values()})

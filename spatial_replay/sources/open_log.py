@@ -1,4 +1,7 @@
-"""Open any log: the content of a file decides its format, and `FORMATS` names the reader of each."""
+"""Open any log: the content of a file decides its format, and `FORMATS` names the reader of each.
+
+Readers that take long to load are loaded when there is a log for them.
+"""
 
 from __future__ import annotations
 
@@ -19,16 +22,13 @@ from urllib.parse import quote
 from spatial_replay.errors import LogError, MissingFileError, RemoteError, UsageError
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.downloads import downloaded, downloaded_folder
-from spatial_replay.logs.formats.commonroad import is_scenario, iter_scenario
 from spatial_replay.logs.formats.csv_tracks import COLUMNS, iter_csv
 from spatial_replay.logs.formats.drone import FRAMES_A_SECOND, is_annotations, iter_annotations
 from spatial_replay.logs.formats.tracks import iter_jsonl, open_text
-from spatial_replay.logs.mcap.chunks import MAGIC
-from spatial_replay.logs.mcap.index import has_summary
-from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.read_options import Lost, OnTimeJump, ReadOptions, count_of
 from spatial_replay.logs.remote import BAG_METADATA, LogFile, RemoteFile, is_web, log_file
 from spatial_replay.logs.source import IterTraces, Source, TrackSource, reading_only
+from spatial_replay.logs.topics import MAGIC
 from spatial_replay.text import counted_from
 from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.trace import Trace
@@ -150,6 +150,8 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
     with file.open() as stream:
         if stream.read(len(MAGIC)) != MAGIC:
             return downloaded(file, "only MCAP logs are read in parts")
+        from spatial_replay.logs.mcap.index import has_summary
+
         if not has_summary(stream):
             return downloaded(file, "it has no index, so all of it is read")
     return file
@@ -241,6 +243,11 @@ def _is_jsonl(head: bytes) -> bool:
     return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{")
 
 
+def _is_scenario(head: bytes) -> bool:
+    text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    return text.startswith((b"<?xml", b"<!--", b"<!DOCTYPE", b"<commonRoad"))
+
+
 def _is_csv(head: bytes) -> bool:
     first = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 1)[0]
     return any(name.encode() in first.split(b",") for name in COLUMNS)
@@ -280,6 +287,12 @@ def _open_annotations(path: LogFile, kind: str, options: ReadOptions) -> Source:
     return _track_source(path, kind, options, reader, y_down=True)
 
 
+def _open_scenario(path: LogFile, kind: str, options: ReadOptions) -> Source:
+    from spatial_replay.logs.formats.commonroad import iter_scenario
+
+    return _track_source(path, kind, options, iter_scenario, y_down=False)
+
+
 def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
     """Open an external log of messages."""
     if options.mapping is None:
@@ -296,6 +309,8 @@ def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
 
 def _open_mcap(path: LogFile, kind: str, options: ReadOptions) -> Source:
     """Open our own log, which names its objects, or an external one, given a mapping."""
+    from spatial_replay.logs.mcap.reader import McapSource
+
     source = McapSource(path, kind, options.concave)
     if not options.given():
         return source
@@ -313,5 +328,5 @@ FORMATS: dict[str, Format] = {
     "track JSONL": Format(_is_jsonl, _tracks(iter_jsonl), frozenset({"y_down"})),
     "track CSV": Format(_is_csv, _tracks(iter_csv), frozenset({"y_down"})),
     "drone annotations": Format(is_annotations, _open_annotations, frozenset({"rate", "lost", "y_down"})),
-    "CommonRoad scenario": Format(is_scenario, _tracks(iter_scenario)),
+    "CommonRoad scenario": Format(_is_scenario, _open_scenario),
 }

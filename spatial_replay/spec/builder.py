@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from decimal import Decimal
 from math import isfinite
 from types import MappingProxyType
@@ -217,7 +216,7 @@ class TreeBuilder:
 
     def grouped(self, children: list[Any]) -> Quantity:
         inner: Quantity = children[1]
-        return inner if isinstance(inner, Name) else replace(inner, span=_cover(children))
+        return inner if isinstance(inner, Name) else inner._replace(span=_cover(children))
 
     # -------------------------------------------------------------------------------------- formulas
 
@@ -263,8 +262,8 @@ class TreeBuilder:
     def bracketed(self, children: list[Any]) -> Any:
         inner = children[1]
         if isinstance(inner, BooleanSyntax):
-            return replace(inner, span=_cover(children), is_bracketed=True)
-        return replace(inner, span=_cover(children))
+            return inner._replace(span=_cover(children), is_bracketed=True)
+        return inner._replace(span=_cover(children))
 
     def relation(self, children: list[Any]) -> RelationSyntax:
         first, token, parameters, second = children

@@ -56,8 +56,10 @@ def reach_warnings(tokens: Sequence[Token], source: SourceText, published: bool)
             on both of its sides.
     """
     levels = [_Level()]
-    for token in tokens:
+    for before, token in pairwise([None, *tokens]):
         level = levels[-1]
+        if token is None:
+            continue
         if token.type in STATEMENT_TYPES:
             levels = [_Level()]
         elif token.type == "LPAR":
@@ -71,6 +73,8 @@ def reach_warnings(tokens: Sequence[Token], source: SourceText, published: bool)
             levels[-1] = _Level()
         elif token.type == "NOT":
             level.negation = level.negation or token
+            if before is not None and before.value in ("X", "WX") and _is_strong_sign(before, token):
+                yield _strong_next(before, token, source)
         elif token.type in BINARY_TYPES:
             if level.prefix is not None:
                 yield _reach(level.prefix, token, source)
@@ -78,6 +82,17 @@ def reach_warnings(tokens: Sequence[Token], source: SourceText, published: bool)
             if published:
                 yield from _regrouped(level, token, source)
             level.binary = token
+
+
+def _is_strong_sign(before: Token, token: Token) -> bool:
+    """Return whether a `!` is written as a part of the operator in front of it, as in `X! a`."""
+    return token.value == "!" and before.type == "PREFIX" and before.end_pos == token.start_pos
+
+
+def _strong_next(prefix: Token, sign: Token, source: SourceText) -> Diagnostic:
+    span = Span(span_of(prefix).start, span_of(sign).end)
+    hint = f"write {prefix.value} not (...) for that; a next sample that has to be there is written X (...)"
+    return source.diagnostic("warning", span, f"'{prefix.value}!' is read as '{prefix.value} not'", hint)
 
 
 def _reach(prefix: Token, operator: Token, source: SourceText) -> Diagnostic:

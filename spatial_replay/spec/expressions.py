@@ -114,11 +114,27 @@ class Number(_Arithmetic):
 
 
 @dataclass(frozen=True, slots=True)
-class SignedDistance(_Arithmetic):
-    """Distance of two footprints when apart, minus their penetration depth when not (Def. 2-4)."""
-
+class _OfTwo(_Arithmetic):
     first: Term
     second: Term
+
+
+@dataclass(frozen=True, slots=True)
+class _AlongAxis(_Arithmetic):
+    term: Term
+    axis: Axis
+    side: Side
+
+
+@dataclass(frozen=True, slots=True)
+class _OfSeveral(_Arithmetic):
+    operands: tuple[Expression, ...]
+
+
+class SignedDistance(_OfTwo):
+    """Distance of two footprints when apart, minus their penetration depth when not (Def. 2-4)."""
+
+    __slots__ = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,30 +145,22 @@ class Protrusion(_Arithmetic):
     outer: Term
 
 
-@dataclass(frozen=True, slots=True)
-class Projection(_Arithmetic):
+class Projection(_AlongAxis):
     """Least or greatest coordinate of a footprint along an axis (Def. 8)."""
 
-    term: Term
-    axis: Axis
-    side: Side
+    __slots__ = ()
 
 
-@dataclass(frozen=True, slots=True)
-class CentroidProjection(_Arithmetic):
+class CentroidProjection(_AlongAxis):
     """Least or greatest coordinate, along x or y, of the centroids of a footprint's parts."""
 
-    term: Term
-    axis: Axis
-    side: Side
+    __slots__ = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Misalignment(_Arithmetic):
+class Misalignment(_OfTwo):
     """Half the squared distance of two unit orientation vectors, 1 - cos of their angle (Def. 10)."""
 
-    first: Term
-    second: Term
+    __slots__ = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,18 +185,16 @@ class Negative(_Arithmetic):
     operand: Expression
 
 
-@dataclass(frozen=True, slots=True)
-class Minimum(_Arithmetic):
+class Minimum(_OfSeveral):
     """The least of its operands, as in a conjunction."""
 
-    operands: tuple[Expression, ...]
+    __slots__ = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Maximum(_Arithmetic):
+class Maximum(_OfSeveral):
     """The greatest of its operands, as in a disjunction."""
 
-    operands: tuple[Expression, ...]
+    __slots__ = ()
 
 
 @dataclass(frozen=True, slots=True)

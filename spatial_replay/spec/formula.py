@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 from spatial_replay.lazy import Displayed
 from spatial_replay.spec.expressions import (
@@ -64,8 +64,7 @@ __all__ = [  # noqa: RUF022
 # ------------------------------------------------------------------------------------------- formulas
 
 
-@dataclass(frozen=True, slots=True)
-class Span:
+class Span(NamedTuple):
     """A place in a source text: characters `start` up to, not including, `end`."""
 
     start: int

@@ -268,17 +268,31 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
         return _meant_comparison(tokens, position)
     if last.type == "COMPARE" and token.type in ("NUMBER", "MINUS") and _has_arithmetic(tokens, position):
         return "a signal is compared as it is", _meant_arithmetic(tokens, position)
-    if token.type == "COMPARE" and [each.type for each in tokens[position - 5 : position : 2]] == [
-        "LPAR", "COMMA", "RPAR",
-    ]:  # fmt: skip
-        _, first, _, second, _ = (each.value for each in tokens[position - 5 : position])
-        if position > 5 and tokens[position - 6].value.lower() in ("distance", "d", "sd"):
-            hint = f"a distance is written between its objects: {first} dist {second} {token.value} ..."
-            return f"{tokens[position - 6].value!r} is not a function", hint
+    if token.type == "COMPARE" and (call := _meant_call(tokens[:position], token.value, after.value)):
+        return call
     if token.type == "COMPARE" and last.type in ("RPAR", "AND", "OR"):
         hint = "a comparison is about a signal, battery >= 1.5, or a distance, a dist b <= 2"
         return found, f"{hint}; a range is two comparisons, joined by and"
     return None
+
+
+def _meant_call(tokens: Sequence[Token], comparison: str, limit: str) -> tuple[str, str] | None:
+    """Return what was meant by a function of one or two names in front of a comparison."""
+    limit = limit or "..."
+    match [each.type for each in tokens[-4:]], [each.type for each in tokens[-6:]]:
+        case ["NAME", "LPAR", "NAME", "RPAR"], _:
+            name, signal = tokens[-4].value, tokens[-2].value
+            hint = f"a signal is compared as it is: {signal} {comparison} {limit}"
+            if name.lower() in ("abs", "fabs", "norm", "magnitude"):
+                turned = comparison.translate(str.maketrans("<>", "><"))
+                both = "and" if comparison[0] == "<" else "or"
+                hint = f"write {signal} {turned} -{limit} {both} {signal} {comparison} {limit}"
+        case _, ["NAME", "LPAR", "NAME", "COMMA", "NAME", "RPAR"]:
+            name, first, second = tokens[-6].value, tokens[-4].value, tokens[-2].value
+            hint = f"a distance is written between its objects: {first} dist {second} {comparison} {limit}"
+        case _:
+            return None
+    return f"{name!r} is not a function", hint
 
 
 def _meant_window(tokens: Sequence[Token], position: int) -> str:

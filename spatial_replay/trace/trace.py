@@ -13,6 +13,7 @@ from spatial_replay.errors import TraceError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.text import times_apart
 from spatial_replay.trace.measurement_cache import MeasurementCache
 from spatial_replay.trace.sample import Sample
 
@@ -275,8 +276,10 @@ def _check_times(times_ns: Integers) -> None:
     late = np.flatnonzero(times_ns[1:] <= times_ns[:-1])
     if len(late):
         at = int(late[0])
-        what = f"sample {at + 1} is at {times_ns[at + 1]} ns and the one before it at {times_ns[at]} ns"
-        raise TraceError(f"{what}; give times that increase")
+        this, before = times_apart(int(times_ns[at + 1]), int(times_ns[at]))
+        raise TraceError(
+            f"sample {at + 1} is at {this} and the one before it at {before}; give times that increase"
+        )
 
 
 def _same_samples(a: Trace, b: Trace) -> bool:

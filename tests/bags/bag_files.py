@@ -25,6 +25,14 @@ POSE = "geometry_msgs/msg/PoseStamped"
 POINT = "geometry_msgs/msg/Point"
 TEXT = "std_msgs/msg/String"
 
+MAPPING = """\
+sample: {topic: /b}
+topics:
+  /a: {position: [x, y], shape: {disc: 0.5}}
+  /b: {position: [x, y], shape: {box: [1, 1]}}
+"""
+"""Of the messages of `drive`."""
+
 
 class Sent(NamedTuple):
     """A message to write."""

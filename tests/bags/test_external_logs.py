@@ -13,6 +13,7 @@ import pytest
 from mcap.writer import CompressionType
 
 from bags.bag_files import (
+    MAPPING,
     POINT,
     ROS2,
     SECOND,
@@ -34,13 +35,6 @@ from spatial_replay.cli import run
 from spatial_replay.logs import Block
 from spatial_replay.logs.source import within
 from spatial_replay.sources import open_source
-
-MAPPING = """\
-sample: {topic: /b}
-topics:
-  /a: {position: [x, y], shape: {disc: 0.5}}
-  /b: {position: [x, y], shape: {box: [1, 1]}}
-"""
 
 
 @pytest.fixture

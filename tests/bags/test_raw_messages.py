@@ -17,6 +17,7 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Reader as Reader1
 
 from bags.bag_files import (
+    MAPPING,
     POINT,
     ROS1,
     ROS2,
@@ -34,12 +35,6 @@ from spatial_replay.bags import open_messages
 from spatial_replay.mapping import MappedSource
 from spatial_replay.sources import open_source
 
-MAPPING = """\
-sample: {topic: /b}
-topics:
-  /a: {position: [x, y], shape: {disc: 0.5}}
-  /b: {position: [x, y], shape: {box: [1, 1]}}
-"""
 BAGS = ("apriltags_table.bag", "two_turtles.bag", "two_turtles_lz4.bag", "pose_db3", "talker_mcap")
 BAGS += ("talker_sqlite3", "two_turtles_mcap", "two_turtles_sqlite3")
 

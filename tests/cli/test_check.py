@@ -173,6 +173,52 @@ def test_with_a_log_the_numbers_behind_each_threshold_are_shown(
     assert "1.05 <= crate dist cube <= 1.25: goes from 1 to 1.3, holds in 2 of 4 samples\n" in said
 
 
+def test_thresholds_of_open_groups_and_templates_are_compared_over_their_objects(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, spec = tmp_path / "crossing.jsonl", tmp_path / "s.spatial"
+    # the van comes 1 closer with each sample, and the bus is gone in the last
+    log.write_text(
+        "".join(
+            json.dumps(
+                {
+                    "time_ns": 10**9 * n,
+                    "objects": [
+                        {"name": name, "class": kind, "polygon": [[x, 0], [x + 1, 0], [x + 1, 1], [x, 1]]}
+                        for name, kind, x in (
+                            ("walker", "person", 0),
+                            ("van", "car", 9 - n),
+                            ("bus", "car", 3),
+                        )
+                        if name != "bus" or n < 3
+                    ],
+                }
+            )
+            + "\n"
+            for n in range(4)
+        )
+    )
+    spec.write_text(
+        'group people = class "person"\ngroup cars = class "car"\n'
+        "spec seen = F exists c in cars: c dist walker <= 6.5\n"
+        "spec pairs = G forall p in people: exists c in cars: p dist c >= 0.01\n"
+        "spec clear(ego) = G forall c in cars except ego: ego dist c >= 60\n"
+    )
+    assert run(["check", str(spec), "--log", str(log), "--json"]) == 0
+    output = capsys.readouterr()
+    seen, pairs, clear = json.loads(output.out)["thresholds"]
+    assert (seen["objects"], seen["least"], seen["greatest"]) == ("c in cars", 2.0, 8.0)
+    # for all cars from the third sample on, for none of them in no sample
+    assert (seen["known"], seen["holding"], seen["failing"]) == (4, 2, 0)
+    assert (pairs["objects"], pairs["holding"], pairs["known"]) == ("p in people, c in cars", 4, 4)
+    assert (clear["objects"], clear["least"]) == ("ego in all, c in cars except ego", 2.0)
+    assert "`p dist c >= 0.01 for p in people, c in cars` always holds in this log" in output.err
+    assert "`ego dist c >= 60 for ego in all, c in cars except ego` never holds" in output.err
+    assert run(["check", str(spec), "--log", str(log)]) == 0
+    said = capsys.readouterr().out
+    assert "for c in cars: goes from 2 to 8, holds for all in 2 and for none in 0 of 4 samples\n" in said
+
+
 def test_errors_are_marked_at_their_lines_for_github_and_for_code_scanning(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

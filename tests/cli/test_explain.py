@@ -153,3 +153,32 @@ def test_options_that_exclude_each_other_are_refused(
 ) -> None:
     assert run_in_process([*REPLAY, *arguments]) == 2
     assert expected in capsys.readouterr().err
+
+
+def test_a_rounding_error_is_no_amount(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "run.spatial").write_text(
+        "spec close = G (left dist right <= 0.1)\nspec far = G (left dist right >= 0.3)\n"
+    )
+    objects = ", ".join(
+        f'{{"name": "{name}", "polygon": [[{x}, 0], [{x + 1}, 0], [{x + 1}, 1]]}}'
+        for name, x in (("left", 0.2), ("right", 1.3))
+    )
+    (folder / "run.jsonl").write_text(f'{{"time_ns": 0, "objects": [{objects}]}}\n')
+    _, text = said(capsys, *EXPLAIN)
+    assert "`left dist right <= 0.1`, which just fails at 0.000 s" in text
+    assert "`left dist right >= 0.3`, which fails by 0.2 at" in text
+
+
+def test_json_has_templates_without_objects_and_may_name_standard_output(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "run.spatial").write_text("spec near(ego) = G (ego dist cube <= 3)\nspec on = G (battery >= 0)")
+    arguments = [*EXPLAIN, "--each", "ego=class:bus"]
+    code, text = said(capsys, *arguments, "--json", "-")
+    assert (code, text) == said(capsys, *arguments, "--json")
+    explained, idle = json.loads(text)
+    assert (explained["specification"], explained["verdict"]) == ("on", "satisfied")
+    assert (idle["specification"], idle["verdict"], idle["vacuous"][0]["reason"]) == (
+        "near", None, "no instances",
+    )  # fmt: skip
+    assert idle["explanation"] == ["`near(ego)` was never evaluated: no object stands for ego."]

@@ -122,8 +122,16 @@ TWICE = GOOD.replace("0,", "9,", 1).replace("[{", '[{"name": "cube", "polygon": 
         (gzip.compress((GOOD + "\n").encode() * 1)[:-9], 3, "run.bin:"),
         (_log_of(GOOD, "no sample"), 3, "run.bin:2: "),
         (_log_of(GOOD, '{"time": 3}'), 3, "run.bin:2: "),
-        (_log_of(GOOD, SAME_TIME), 3, "run.bin:2: time_ns is 0, not after 0; give times that increase"),
-        (_log_of(GOOD.replace("0,", "9,", 1), GOOD), 3, "run.bin:2: time_ns is 0, not after 9"),
+        (
+            _log_of(GOOD, SAME_TIME),
+            3,
+            "run.bin:2: its time is 0.000 s, not after 0.000 s; give times that increase",
+        ),
+        (
+            _log_of(GOOD.replace("0,", "9,", 1), GOOD),
+            3,
+            "run.bin:2: its time is 0.000 s (0 ns), not after 0.000 s (9 ns)",
+        ),
         (_log_of(GOOD, TWICE), 3, "run.bin:2: object 'cube' is there twice"),
     ],
     ids=[

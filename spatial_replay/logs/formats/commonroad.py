@@ -112,12 +112,6 @@ class _Obstacle:
         return None if state is None else state.report(self.name, self.class_name, self.parts)
 
 
-def is_scenario(head: bytes) -> bool:
-    """Return whether a file begins as an XML file does."""
-    text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
-    return text.startswith((b"<?xml", b"<!--", b"<!DOCTYPE", b"<commonRoad"))
-
-
 def iter_scenario(path: Path, faults: FaultList, *, concave: Concave = "decompose") -> Iterator[Trace]:
     """Yield the time steps of a CommonRoad scenario in blocks.
 

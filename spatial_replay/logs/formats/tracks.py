@@ -22,7 +22,7 @@ from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.read_options import FaultList
-from spatial_replay.text import is_encodable
+from spatial_replay.text import is_encodable, times_apart
 from spatial_replay.trace.observations import Observations, trace_from_observations
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
@@ -204,7 +204,8 @@ def _jsonl_samples(path: Path, faults: FaultList) -> Iterator[ReportedSample]:
         try:
             time_ns, reports, signals = _sample(line)
             if time_ns <= latest:
-                raise _NoSampleError(f"time_ns is {time_ns}, not after {latest}; give times that increase")
+                at, before = times_apart(time_ns, latest)
+                raise _NoSampleError(f"its time is {at}, not after {before}; give times that increase")
         except _NoSampleError as error:
             faults.add(f"{place}: {error}")
             continue

@@ -25,11 +25,10 @@ from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from spatial_replay.compiled import elementwise, kernel, piece
+from spatial_replay.compiled import elementwise, kernel
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.byte_ranges import plan_reads
 
-MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")
 """Opcode and length of the body that follows."""
 
@@ -64,7 +63,10 @@ Bytes = NDArray[np.uint8]
 Words = NDArray[np.uint64]
 
 _RECORD_HEAD = 9
-_MESSAGE_FIELDS = 22
+_MESSAGE_FIELDS = np.dtype(
+    [("channel", "<u2"), ("sequence", "<u4"), ("log_time", "<u8"), ("publish_time", "<u8")]
+)
+_MESSAGE_BYTES = _MESSAGE_FIELDS.itemsize
 _SCHEMA, _CHANNEL, _MESSAGE = 3, 4, 5
 
 
@@ -90,46 +92,38 @@ def walk_records(content: bytes) -> tuple[RecordHeads, bool]:
     """Return the schemas, channels and messages in some bytes, and whether the last record breaks off."""
     view = np.frombuffer(content, np.uint8)
     # counted first: room for as many as there could be is many times the bytes
-    count, _ = _walk(view, np.empty((3, 0), np.int64), np.empty((4, 0), np.uint64))
+    count, _ = _walk(view, np.empty((3, 0), np.int64))
     places = np.empty((3, count), np.int64)
-    fields = np.empty((4, count), np.uint64)
-    _, end = _walk(view, places, fields)
+    _, end = _walk(view, places)
+    is_message = places[0] == _MESSAGE
+    heads = view[places[1, is_message][:, None] + np.arange(_MESSAGE_BYTES)].view(_MESSAGE_FIELDS)
+    fields = np.zeros((4, count), np.uint64)
+    for field, name in zip(fields, _MESSAGE_FIELDS.names or (), strict=True):
+        field[is_message] = heads[name][:, 0]
     return RecordHeads(*places, *fields), end < len(content)
-
-
-@piece
-def _word(content: Bytes, begin: int, size: int) -> int:
-    """Return a little-endian number of `size` bytes."""
-    word = np.uint64(0)
-    for k in range(size):
-        word |= np.uint64(content[begin + k]) << np.uint64(8 * k)
-    return word  # type: ignore[return-value]
 
 
 @elementwise
 @kernel
-def _walk(content: Bytes, places: Integers, fields: Words) -> tuple[int, int]:
+def _walk(content: Bytes, places: Integers) -> tuple[int, int]:
     """Fill in the records that there is room for; return their number, and where the last whole one ends."""
     size = content.shape[0]
     position = 0
     count = 0
     while position + _RECORD_HEAD <= size:
-        length = _word(content, position + 1, 8)
         begin = position + _RECORD_HEAD
-        if length > np.uint64(size - begin):
+        # from the highest byte on, so that no length, however large, overflows
+        length = 0
+        for k in range(begin - 1, position, -1):
+            length = min(256 * length + content[k], size)
+        if length > size - begin:
             break
-        end = begin + int(length)
+        end = begin + length
         opcode = content[position]
-        is_message = opcode == _MESSAGE and end - begin >= _MESSAGE_FIELDS
+        is_message = opcode == _MESSAGE and end - begin >= _MESSAGE_BYTES
         if is_message or _SCHEMA <= opcode <= _CHANNEL:
             if count < places.shape[1]:
                 places[0, count], places[1, count], places[2, count] = opcode, begin, end
-                fields[0, count] = fields[1, count] = fields[2, count] = fields[3, count] = 0
-                if is_message:
-                    fields[0, count] = _word(content, begin, 2)
-                    fields[1, count] = _word(content, begin + 2, 4)
-                    fields[2, count] = _word(content, begin + 6, 8)
-                    fields[3, count] = _word(content, begin + 14, 8)
             count += 1
         position = end
     return count, position
@@ -298,11 +292,11 @@ def split_records(content: bytes, passed_over: frozenset[int] = frozenset()) -> 
         passed_over: channels whose messages are not wanted.
     """
     heads, breaks_off = walk_records(content)
-    is_message = (heads.opcode == Opcode.MESSAGE) & (heads.end - heads.begin >= _MESSAGE_FIELDS)
+    is_message = (heads.opcode == Opcode.MESSAGE) & (heads.end - heads.begin >= _MESSAGE_BYTES)
     for channel in passed_over:
         is_message &= heads.channel != channel
     wanted = np.flatnonzero(is_message)
-    begins, ends = (heads.begin[wanted] + _MESSAGE_FIELDS).tolist(), heads.end[wanted].tolist()
+    begins, ends = (heads.begin[wanted] + _MESSAGE_BYTES).tolist(), heads.end[wanted].tolist()
     fields = (heads.log_time, heads.channel, heads.sequence, heads.publish_time)
     payloads = [content[begin:end] for begin, end in zip(begins, ends, strict=True)]
     messages = list(zip(*(field[wanted].tolist() for field in fields), payloads, strict=True))

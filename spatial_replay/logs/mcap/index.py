@@ -18,10 +18,10 @@ from typing import BinaryIO
 from mcap import records
 from mcap.opcode import Opcode
 
-from spatial_replay.logs.mcap.chunks import MAGIC, RECORD_HEAD, ChunkPlace, DamageError, chunk_place, decoded
+from spatial_replay.logs.mcap.chunks import RECORD_HEAD, ChunkPlace, DamageError, chunk_place, decoded
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.read_options import FaultList
-from spatial_replay.logs.topics import LIBRARY
+from spatial_replay.logs.topics import LIBRARY, MAGIC
 from spatial_replay.text import Instant, Sentence
 
 _FOOTER_BYTES = RECORD_HEAD.size + 20

@@ -21,11 +21,11 @@ from mcap import records
 
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.mcap.chunks import MAGIC, encoded
+from spatial_replay.logs.mcap.chunks import encoded
 from spatial_replay.logs.mcap.packing import Batch, McapSummary, MessageRange, PackedChunk, pack
 from spatial_replay.logs.messages import Channel, Messages, Schema, messages_of, select
 from spatial_replay.logs.output_file import output_error
-from spatial_replay.logs.topics import LIBRARY, OWN_PREFIX
+from spatial_replay.logs.topics import LIBRARY, MAGIC, OWN_PREFIX
 
 CHUNK_BYTES = 128 * 2**10
 """A chunk is closed when it holds this much, uncompressed."""

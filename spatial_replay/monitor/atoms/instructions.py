@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from spatial_replay.compiled import long_kernel
+from spatial_replay.compiled import elementwise, long_kernel
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Flags, Floats, Integers
 from spatial_replay.monitor.atoms.terms import Bindings
@@ -53,6 +53,7 @@ TILE = 128
 """Samples processed together: few, so that their columns stay in the processor's cache."""
 
 
+@elementwise
 @long_kernel
 def run_instructions(
     code: Integers,
@@ -91,7 +92,7 @@ def run_instructions(
                     elif op == NEGATE:
                         target[k] = -columns[a, mirror, k]
                     elif op in (LEAST, GREATEST):
-                        if np.isnan(first[k]) or np.isnan(second[k]):
+                        if first[k] != first[k] or second[k] != second[k]:  # not a number
                             target[k] = np.nan
                         elif op == LEAST:
                             target[k] = min(first[k], second[k])
@@ -99,7 +100,7 @@ def run_instructions(
                             target[k] = max(first[k], second[k])
                     elif op == HOLDS:
                         target[k] = first[k]
-                        if np.isnan(first[k]) or np.isnan(columns[a, mirror, k]):
+                        if first[k] != first[k] or columns[a, mirror, k] != columns[a, mirror, k]:
                             target[k] = np.inf if channel % 2 else -np.inf
                     elif op == AND:
                         target[k] = min(first[k], second[k])

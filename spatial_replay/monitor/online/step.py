@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spatial_replay.compiled import kernel, piece
+from spatial_replay.compiled import elementwise, kernel, piece
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.codes import in_channels
@@ -66,6 +66,12 @@ def _combine(code: int, into: Floats, other: Floats, count: int) -> None:
                     _combine_low(code, low[k], high[k], other_low[k], other_high[k]),
                     _combine_low(code, high[k], low[k], other_high[k], other_low[k]),
                 )
+
+
+@piece
+def _copy(source: Floats, target: Floats) -> None:
+    """Copy one row of numbers to the beginning of another."""
+    target[: len(source)] = source
 
 
 @piece
@@ -125,18 +131,15 @@ def report(
         start, stop = reports[n, codes.REPORT_FIRST], reports[n, codes.REPORT_END]
         rows = numbers[n]
         if code == codes.REPORT_SIGNAL:  # settled by the first sample
+            _copy(memory.history[0, index, begin : begin + count], rows[2])
+            _copy(memory.history[nominal_high, index, begin : begin + count], rows[3])
             for k in range(count):
                 rows[0, k], rows[1, k] = memory.firsts[0, index], memory.firsts[nominal_high, index]
-                rows[2, k], rows[3, k] = (
-                    memory.history[0, index, begin + k],
-                    memory.history[nominal_high, index, begin + k],
-                )
                 rows[4, k], rows[5, k] = memory.firsts[wide_low, index], memory.firsts[wide_high, index]
-                rows[6, k], rows[7, k] = memory.firsts[wide_low, index], memory.firsts[wide_high, index]
+                rows[6, k], rows[7, k] = rows[4, k], rows[5, k]
         elif code == codes.REPORT_PART:
             for number in range(NUMBERS):
-                for k in range(count):
-                    rows[number, k] = scratch.parts[index, number, k]
+                _copy(scratch.parts[index, number, :count], rows[number])
             _set_now(rule, rows, numbers[operands[start]], numbers[operands[stop - 1]], count)
         elif code == codes.REPORT_NOT:
             child = numbers[operands[start]]
@@ -146,8 +149,7 @@ def report(
         else:
             child = numbers[operands[start]]
             for number in range(NUMBERS):
-                for k in range(count):
-                    rows[number, k] = child[number, k]
+                _copy(child[number, :count], rows[number])
             for each in range(start + 1, stop):
                 _combine(code, rows, numbers[operands[each]], count)
     _write_series(numbers, t, count, series)
@@ -273,6 +275,7 @@ class Tables(NamedTuple):
         return cls(program.signals, program.nodes, program.parts, program.reports, program.operands)
 
 
+@elementwise
 @kernel
 def step(
     tables: Tables, memory: Memory, scratch: Scratch, leaves: Floats, times_ns: Integers, start_ns: int,

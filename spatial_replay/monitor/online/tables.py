@@ -94,21 +94,19 @@ def _is_anchored(code: int) -> bool:
 
 
 @piece
-def _expand(node: Integers, left: float, right: float, later: float, position: int, elapsed_ns: int) -> float:
-    """Expand an until or release at a sample, from its operands there and its value at the next sample.
+def _expand_anchored(node: Integers, values: Floats, later: float, position: int, elapsed_ns: int) -> float:
+    """Expand an anchored until or release at a sample, from `values` there and its value at the next sample.
 
-    Of an anchored one the right operand counts inside its window only.
+    Its right operand counts inside its window only.
     """
-    value = later
-    counts = True
-    if _is_anchored(node[codes.NODE_CODE]):
-        now = position if node[codes.NODE_UNIT] == codes.SAMPLES else elapsed_ns
-        counts = node[codes.NODE_LOW] <= now and (node[codes.NODE_HIGH] < 0 or now <= node[codes.NODE_HIGH])
-    if node[codes.NODE_CODE] == codes.UNTIL or node[codes.NODE_CODE] == codes.ANCHORED_UNTIL:
-        value = min(left, value)
-        return max(right, value) if counts else value
-    value = max(left, value)
-    return min(right, value) if counts else value
+    a, right = node[codes.NODE_A], values[node[codes.NODE_B]]
+    now = position if node[codes.NODE_UNIT] == codes.SAMPLES else elapsed_ns
+    counts = node[codes.NODE_LOW] <= now and (node[codes.NODE_HIGH] < 0 or now <= node[codes.NODE_HIGH])
+    if node[codes.NODE_CODE] == codes.ANCHORED_UNTIL:
+        value = min(values[a], later) if a >= 0 else later
+        return float(max(right, value)) if counts else float(value)
+    value = max(values[a], later) if a >= 0 else later
+    return float(min(right, value)) if counts else float(value)
 
 
 @piece
@@ -152,10 +150,13 @@ def _step_channel(
         return
     for k in range(count):
         elapsed_ns = memory.stamps[begin + k] - start_ns
+        for d in range(first, end):
+            # what depends on no variable is the same at every corner
+            if not nodes[d, codes.NODE_DEPENDS]:
+                values[d - first] = columns[d - first, k]
         for corner in range(corners):
             for d in range(first, end):
                 if not nodes[d, codes.NODE_DEPENDS]:
-                    values[d - first] = columns[d - first, k]
                     continue
                 code, a, b = nodes[d, codes.NODE_CODE], nodes[d, codes.NODE_A], nodes[d, codes.NODE_B]
                 if code == codes.PART_AND:
@@ -163,11 +164,16 @@ def _step_channel(
                 elif code == codes.PART_OR:
                     value = max(values[a], values[b])
                 else:
-                    later = corner_value(corner, nodes[d, codes.NODE_VARIABLE])
-                    neutral = np.inf if code in (codes.UNTIL, codes.ANCHORED_UNTIL) else -np.inf
-                    left = values[a] if a >= 0 else neutral
-                    value = _expand(nodes[d], left, values[b], later, position + k, elapsed_ns)
-                    point[nodes[d, codes.NODE_VARIABLE]] = value
+                    variable = nodes[d, codes.NODE_VARIABLE]
+                    later = np.inf if (corner >> variable) & 1 else -np.inf
+                    # the two that most formulas are made of come without a call
+                    if code == codes.UNTIL:
+                        value = max(values[b], min(values[a], later) if a >= 0 else later)
+                    elif code == codes.RELEASE:
+                        value = min(values[b], max(values[a], later) if a >= 0 else later)
+                    else:
+                        value = _expand_anchored(nodes[d], values, later, position + k, elapsed_ns)
+                    point[variable] = value
                 values[d - first] = value
             fresh[corner] = read_table(table, variables, point, scratch.order)
         for corner in range(corners):

@@ -109,13 +109,7 @@ function makeCurvesOfBoth(clock, other, pairs) {
     }
   };
   build();
-  clock.on("view", () => chart?.setScale("x", {min: clock.view[0], max: clock.view[1]}));
-  clock.on("view", showCursor);
-  clock.on("time", showCursor);
-  window.addEventListener("themechange", build);
-  new ResizeObserver(() => {
-    if (chart && chart.width !== place.clientWidth) build();
-  }).observe(place);
+  followClock(clock, place, () => chart, build, showCursor);
 }
 
 // Numbers at other times: each holds until the next one; NaN before the first and after the last.

@@ -36,12 +36,17 @@ function makeCurves(clock) {
     }
   };
   clock.on("result", build);
-  clock.on("view", () => chart?.setScale("x", {min: clock.view[0], max: clock.view[1]}));
+  followClock(clock, place, () => chart, build, showCursor);
+}
+
+// Keeps a chart, the current one, at the view and the time of the clock, and as wide as its place.
+function followClock(clock, place, current, build, showCursor) {
+  clock.on("view", () => current()?.setScale("x", {min: clock.view[0], max: clock.view[1]}));
   clock.on("view", showCursor);
   clock.on("time", showCursor);
   window.addEventListener("themechange", build);
   new ResizeObserver(() => {
-    if (chart && chart.width !== place.clientWidth) build();
+    if (current() && current().width !== place.clientWidth) build();
   }).observe(place);
 }
 
