@@ -234,7 +234,8 @@ def _elements(values: object) -> int:
 def _view(value: Any) -> object:
     if isinstance(value, tuple):
         # kernels take rows of the arrays in named tuples, and a memoryview of several dimensions has none
-        return type(value)(*(_view(each) if each.ndim == 1 else each for each in value))
+        make: Any = type(value)
+        return cast(object, make(*(_view(each) if each.ndim == 1 else each for each in value)))
     # an array is a buffer, though its type does not say so
     return memoryview(cast(bytes, value)) if isinstance(value, np.ndarray) else value
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from spatial_replay.logs.messages import Channel, Schema
 
@@ -99,7 +99,7 @@ def protobuf_channel(topic: str, message: type[Message]) -> Channel:
     return Channel(topic, "protobuf", Schema(message.DESCRIPTOR.full_name, "protobuf", data))
 
 
-def _with_dependencies(file: FileDescriptor, found: dict[str, FileDescriptor]) -> Iterable[FileDescriptor]:
+def _with_dependencies(file: Any, found: dict[str, FileDescriptor]) -> Iterable[FileDescriptor]:
     """Return a file of message types and all that it imports, each behind its own imports."""
     for each in file.dependencies:
         if each.name not in found:

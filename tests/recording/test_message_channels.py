@@ -292,7 +292,7 @@ def test_a_channel_that_cannot_be_decoded_is_refused(
         (-1, b"", r"/a is -1; give integer nanoseconds from 0 to 2\*\*63 - 1"),
         (2**63, b"", "/a is 9223372036854775808; give integer nanoseconds"),
         (1.5, b"", r"/a is 1\.5; give integer"),
-        (4, b"", "at 0.000 s (4 ns) follows one at 0.000 s (5 ns); give times that do not decrease"),
+        (4, b"", r"at 0.000 s \(4 ns\) follows one at 0.000 s \(5 ns\); give times that do not decrease"),
         (5, "text", "/a has json messages, and 'text' is str; give a dict or bytes"),
         (5, {"x": float("nan")}, "cannot be written as JSON"),
         (5, {"x": object()}, "cannot be written as JSON"),
