@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 from mcap.writer import IndexType, Writer
 from mcap_protobuf.decoder import DecoderFactory
+from mcap_protobuf.schema import build_file_descriptor_set
 
 from spatial_replay import (
     Footprint,
@@ -95,6 +97,12 @@ def test_the_mcap_library_reads_everything():
     summary = reader.get_summary()
     assert summary.statistics.message_count == 10
     assert (summary.statistics.message_start_time, summary.statistics.message_end_time) == (0, 3_600_000_000)
+
+
+def test_schemas_of_messages_are_those_that_the_mcap_library_makes():
+    for message in (ObjectStates, SceneUpdate):
+        theirs = build_file_descriptor_set(message).SerializeToString(deterministic=True)
+        assert protobuf_channel("/a", message).schema.data == theirs
 
 
 def test_chunks_end_by_size_or_after_a_second():
