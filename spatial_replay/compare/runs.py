@@ -231,20 +231,15 @@ def _compare(
         traces: their samples.
     """
     a, b = traces
-    times_ns = a.times_ns, b.times_ns
     # all three measure for most of their time, which leaves the interpreter to the others
     with ThreadPoolExecutor(2, "comparing") as threads:
         waiting = [
             threads.submit(_evaluated, trace, files, own) for trace, own in zip(traces, options, strict=True)
         ]
-        if align == "time":
-            alignment = align_runs(times_ns, (), files, align)
-            objects = compare_objects(a, b, alignment)
+        aligned = _aligned(a, b, (), files, align) if align == "time" else None
         evaluations = [each.result() for each in waiting]
     results = _paired(evaluations)
-    if align != "time":
-        alignment = align_runs(times_ns, results, files, align)
-        objects = compare_objects(a, b, alignment)
+    alignment, objects = aligned or _aligned(a, b, results, files, align)
     titles = [{result.title for evaluation in own for result in evaluation} for own in evaluations]
     return LogDiff(
         sources[0].name,
@@ -263,6 +258,17 @@ def _compare(
         (*_faults(a), *_faults(b)),
         traces,
     )
+
+
+def _aligned(
+    a: Trace,
+    b: Trace,
+    results: Sequence[tuple[SpecResult, SpecResult]],
+    files: Sequence[Specification],
+    align: str,
+) -> tuple[Alignment, tuple[ObjectDiff, ...]]:
+    alignment = align_runs((a.times_ns, b.times_ns), results, files, align)
+    return alignment, compare_objects(a, b, alignment)
 
 
 def _only_in(one: Trace, other: Trace, titles: set[str]) -> tuple[str, ...]:
