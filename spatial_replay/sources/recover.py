@@ -231,7 +231,7 @@ def _spans(faults: Sequence[str]) -> tuple[tuple[int, int], ...]:
 
 
 class _Samples:
-    """Tells usable samples of ours from others, and finds gaps in their numbers."""
+    """Separates usable samples of ours from others, and finds gaps in their numbers."""
 
     def __init__(
         self,
