@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import click
 
 from spatial_replay.cli.application import ExitCode
@@ -9,7 +11,7 @@ from spatial_replay.cli.options import LogPath, ReadArguments, reading_options
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, warn
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.remote import LogFile
+from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.text import counted, counted_from
 
 
@@ -22,27 +24,64 @@ from spatial_replay.text import counted, counted_from
     help="Evaluate the log that LOG was made from instead of LOG.",
 )
 @click.option("--decisions", is_flag=True, help="Also recompute the decisions of a planned run.")
+@click.option("--explain", is_flag=True, help="Say which part differs, and where first.")
+@click.option(
+    "--sign",
+    metavar="KEY",
+    type=click.Path(path_type=Path),
+    help="Sign the certificate, if all is equal, with an OpenSSH key, such as ~/.ssh/id_ed25519.",
+)
+@click.option(
+    "--signer",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Also check that one of these people signed it: public keys, or an allowed_signers file.",
+)
+@click.option(
+    "--signature",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="The signature to write or check.  [default: LOG.sig]",
+)
 @reading_options
-def verify(log: LogFile, source: LogFile | None, decisions: bool, reading: ReadArguments) -> int:
+def verify(
+    log: LogFile,
+    source: LogFile | None,
+    decisions: bool,
+    explain: bool,
+    sign: Path | None,
+    signer: Path | None,
+    signature: Path | None,
+    reading: ReadArguments,
+) -> int:
     """Recompute a log's certificate and compare it with the recorded one.
 
     The log is evaluated with its own specifications and options. With --decisions, every planner decision is
     recomputed from the recorded samples, with all its maps, and compared bit for bit; with --source, the
-    decisions in the source. Exits with 0 if all is equal, otherwise with 1.
+    decisions in the source. With --sign, a certificate that is right is signed with your SSH key, into
+    LOG.sig; with --signer, this signature is checked. Exits with 0 if all is equal, otherwise with 1.
 
     \b
     Examples:
       spatial-replay verify annotated.mcap
       spatial-replay verify annotated.mcap --source run.mcap
       spatial-replay verify push.mcap --decisions
+      spatial-replay verify annotated.mcap --sign ~/.ssh/id_ed25519
+      spatial-replay verify annotated.mcap --signer colleague.pub
     """
     # imported here so that --help stays fast
+    from spatial_replay.logs.output_file import replacing
     from spatial_replay.logs.read_options import ReadOptions
     from spatial_replay.planning.recompute import recompute_decisions
     from spatial_replay.replay import first_sample_ns
+    from spatial_replay.replay.signatures import sign_certificate, signer_of
     from spatial_replay.replay.verification import recorded_reading, verify_certificate
     from spatial_replay.sources.open_log import open_source
 
+    if signature is not None and sign is None and signer is None:
+        raise UsageError("--signature names the file of --sign or --signer; add one of them")
+    if signature is None:
+        signature = Path(f"{log}.sig") if isinstance(log, Path) else Path(f"{log.name}.sig")
     if source is None and reading["mapping"] is not None:
         raise UsageError("--mapping applies to the source of the log; add --source SOURCE")
     own = open_source(log)
@@ -52,7 +91,7 @@ def verify(log: LogFile, source: LogFile | None, decisions: bool, reading: ReadA
         given = ReadOptions(**reading).given()
         original = open_source(source, **{**reading, **recorded_reading(own, source.name), **given})
     with progress("samples") as advance:
-        verified = verify_certificate(own, original, advance)
+        verified = verify_certificate(own, original, advance, explain=explain)
     faults = list(verified.faults)
     differences = [f"{log.name}: {each}" for each in verified.differences]
     if verified.recorded and not differences:
@@ -71,4 +110,20 @@ def verify(log: LogFile, source: LogFile | None, decisions: bool, reading: ReadA
     warn(*dict.fromkeys(faults))
     for difference in differences:
         show(difference)
+    show(*(f"  {line}" for line in verified.explanation))
+    if signer is not None and verified.recorded:
+        signed_by = signer_of(verified.recorded, signature, signer)
+        if signed_by is None:
+            differences.append("the signature")
+            show(
+                f"{log.name}: {signature.name} is no signature of its certificate by anyone in {signer.name}"
+            )
+        else:
+            show(f"{log.name}: its certificate is signed by {signed_by}")
+    if sign is not None and differences:
+        warn(f"{log.name} was not signed: only a log whose certificate is right is")
+    elif sign is not None:
+        with replacing(signature, local_files([log, sign])) as stream:
+            stream.write(sign_certificate(verified.recorded, sign))
+        show(f"{log.name}: signed in {signature}")
     return ExitCode.VIOLATED if differences else ExitCode.SATISFIED

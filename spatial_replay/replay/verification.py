@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
 from spatial_replay.errors import LogError, UsageError
+from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import CERTIFICATE, METADATA
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.replay.annotated import load_files, run_replay
 from spatial_replay.replay.clipped_source import CLIP_METADATA, clipped_source
+from spatial_replay.replay.engine import Replay
+from spatial_replay.replay.first_differences import FirstDifferences, explain_differences
 from spatial_replay.replay.kept_messages import KEEP_ALL
 from spatial_replay.replay.selection import ReplayOptions, Window
 from spatial_replay.spec.formula import Specification
+from spatial_replay.text import counted_from
 
 _HASHES: Mapping[str, str] = MappingProxyType(
     {
@@ -40,11 +44,14 @@ class Verified:
         recorded: the log's certificate; empty where it has none.
         computed: the one of the new evaluation.
         faults: what could not be read.
+        explanation: for each part of the certificate whether it is the same, and where it differs first;
+            empty unless it was asked for.
     """
 
     recorded: Mapping[str, str]
     computed: Mapping[str, str]
     faults: tuple[str, ...] = ()
+    explanation: tuple[str, ...] = ()
 
     @property
     def differences(self) -> tuple[str, ...]:
@@ -59,13 +66,18 @@ class Verified:
 
 
 def verify_certificate(
-    log: Source, source: Source | None = None, advance: Callable[[int], None] = lambda samples: None
+    log: Source,
+    source: Source | None = None,
+    advance: Callable[[int], None] = lambda samples: None,
+    *,
+    explain: bool = False,
 ) -> Verified:
     """Evaluate a log, or its source, again with the log's own specifications and options.
 
     Args:
         source: the log that it was made from; None evaluates the log itself.
         advance: called with the number of samples of each block that is done.
+        explain: say where a certificate that differs does so first, which takes another evaluation.
 
     Raises:
         UsageError, LogError, SpecificationError: it cannot be evaluated.
@@ -84,18 +96,24 @@ def verify_certificate(
     # a replay of a clip has its record, too, but was made from all of the clip
     if source is not None and clip and clip.get("source") == about.get("source"):
         source, keep = clipped_source(source, clip), None
-    replayed = run_replay(
-        log if source is None else source,
-        _files(log),
-        ReplayOptions(
-            Window(**{name: options[name] for name in _WINDOW if name in options}),
-            options.get("each", {}),
-            _semantics(about),
-            keep=keep,
-        ),
-        advance=advance,
+    evaluated = log if source is None else source
+    chosen = ReplayOptions(
+        Window(**{name: options[name] for name in _WINDOW if name in options}),
+        options.get("each", {}),
+        _semantics(about),
+        keep=keep,
     )
-    return Verified(dict(recorded), dict(replayed.certificate), replayed.faults)
+    replayed = run_replay(evaluated, _files(log), chosen, advance=advance)
+    verified = Verified(dict(recorded), dict(replayed.certificate), replayed.faults)
+    if explain and verified.differences and isinstance(log, McapSource):
+        compared = FirstDifferences(log.path)
+        Replay(evaluated, _files(log), chosen, certify=False).run(
+            compared.add, layer=bool(options.get("layer")), advance=advance
+        )
+        compared.finish()
+        explanation = explain_differences(verified.recorded, verified.computed, compared.found)
+        verified = replace(verified, explanation=counted_from(explanation, replayed.first_ns))
+    return verified
 
 
 def recorded_reading(log: Source, source: str) -> dict[str, Any]:

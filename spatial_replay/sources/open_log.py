@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -233,7 +234,7 @@ def _head(path: LogFile) -> bytes:
     try:
         with open_text(path) if isinstance(path, Path) else path.open() as stream:
             return stream.read(_HEAD)
-    except (EOFError, ValueError):
+    except (EOFError, ValueError, zlib.error):
         return b"{"
     except OSError as error:
         raise MissingFileError.of(path, error) from None

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +14,12 @@ from click.testing import CliRunner
 
 import spatial_replay as sr
 from planning.plans import PUSH, record_plan_of
+from spatial_replay.bags import open_messages
 from spatial_replay.cli.application import application
+from spatial_replay.logs import LogWriter
+from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.topics import CERTIFICATE, OBJECTS
+from spatial_replay.replay.signatures import statement
 
 
 def call(*arguments: object) -> tuple[int, str]:
@@ -185,3 +193,165 @@ def test_a_source_is_read_as_it_was_when_the_log_was_made(tmp_path: Path) -> Non
     )
     assert call("verify", tmp_path / "a.mcap", "--source", boxes)[0] == 0
     assert call("verify", tmp_path / "a.mcap", "--source", boxes, "--y-down")[0] == 1
+
+
+def explained(said: str) -> dict[str, str]:
+    """What `--explain` says of each part."""
+    lines = (line.partition(" ")[::2] for line in map(str.strip, said.splitlines()))
+    return {part: what.strip() for part, what in lines}
+
+
+def rewritten(path: Path, output: Path, change: Callable[[str, int, bytes], bytes]) -> Path:
+    """A copy of a log with other messages; its certificate stays."""
+    reader = open_messages(path)
+    names = {topic.name for topic in reader.topics()}
+    channels = {channel.topic: channel for channel in reader.channels(names).values()}
+    with output.open("wb") as stream, LogWriter(stream) as writer:
+        for name, data in reader.metadata():
+            writer.add_metadata(name, data)
+        for each in reader.attachments():
+            writer.add_attachment(each.name, each.media_type, each.data)
+        for message in reader.iter_messages(names):
+            payload = change(message.topic, message.log_time_ns, message.payload)
+            channel = channels[message.topic]
+            writer.write(channel, message.log_time_ns, payload, sequence=message.sequence)
+    return output
+
+
+def test_where_results_differ_first_is_explained(recorded: Path, tmp_path: Path) -> None:
+    def change(topic: str, time_ns: int, payload: bytes) -> bytes:
+        if topic == OBJECTS and time_ns >= 7 * 10**8:
+            states = ObjectStates.FromString(payload)
+            corners = states.objects[0].parts[0].coordinates
+            corners[::2] = [x - 0.5 for x in corners[::2]]
+            return states.SerializeToString(deterministic=True)
+        return payload
+
+    changed = rewritten(recorded, tmp_path / "changed.mcap", change)
+    code, said = call("verify", changed, "--explain")
+    assert code == 1
+    parts = explained(said)
+    assert parts["samples"].startswith("differ from those certified")
+    assert parts["specification"] == "the same"
+    assert parts["program"] == "the same"
+    assert parts["results"].startswith("differ first at 0.700 s: ")
+    assert " now, " in parts["results"] and " recorded" in parts["results"]
+
+
+def test_which_sample_and_message_differ_from_the_source_is_explained(recorded: Path, tmp_path: Path) -> None:
+    def change(topic: str, time_ns: int, payload: bytes) -> bytes:
+        if topic == OBJECTS and time_ns == 12 * 10**8:
+            states = ObjectStates.FromString(payload)
+            states.objects[1].yaw = 1.0
+            return states.SerializeToString(deterministic=True)
+        return payload
+
+    call("replay", recorded, "-o", tmp_path / "annotated.mcap")
+    other = rewritten(recorded, tmp_path / "run2.mcap", change)
+    code, said = call("verify", tmp_path / "annotated.mcap", "--source", other, "--explain")
+    assert code == 1
+    parts = explained(said)
+    assert parts["samples"] == "differ first at 1.200 s: `b` has another yaw"
+    assert parts["results"] == "the same"
+
+
+def test_another_version_and_another_specification_are_explained(recorded: Path, tmp_path: Path) -> None:
+    data = recorded.read_bytes()
+    reader = open_messages(recorded)
+    names = {topic.name for topic in reader.topics()}
+    channels = reader.channels(names)
+    with (tmp_path / "other.mcap").open("wb") as stream, LogWriter(stream) as writer:
+        for name, record in reader.metadata():
+            changed = {"spatial_replay_version": "0.0.1"} if name == CERTIFICATE else {}
+            writer.add_metadata(name, {**record, **changed})
+        for each in reader.attachments():
+            text = (
+                each.data.replace(b"leftof", b"rightof") if each.name.startswith("recorded/") else each.data
+            )
+            writer.add_attachment(each.name, each.media_type, text)
+        for message in reader.iter_messages(names):
+            channel = next(each for each in channels.values() if each.topic == message.topic)
+            writer.write(channel, message.log_time_ns, message.payload, sequence=message.sequence)
+    assert recorded.read_bytes() == data
+    code, said = call("verify", tmp_path / "other.mcap", "--explain")
+    parts = explained(said)
+    assert code == 1
+    assert parts["program"].endswith("now, 0.0.1 recorded")
+    assert "as formatted: `spec" in parts["specification"]
+    assert "rightof" in parts["specification"] and "leftof" in parts["specification"]
+    assert parts["samples"] == parts["messages"] == "the same"
+
+
+@pytest.fixture
+def keys(tmp_path: Path) -> tuple[Path, Path]:
+    """Two SSH keys without a passphrase."""
+    if shutil.which("ssh-keygen") is None:
+        pytest.skip("ssh-keygen is not installed")
+    paths = tmp_path / "own", tmp_path / "other"
+    for path in paths:
+        make = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", f"{path.name}@robot", "-f", str(path)]
+        subprocess.run(make, check=True)
+    return paths
+
+
+def test_a_signed_certificate_names_its_signer(
+    recorded: Path, keys: tuple[Path, Path], tmp_path: Path
+) -> None:
+    own, other = keys
+    code, said = call("verify", recorded, "--sign", own)
+    assert code == 0
+    assert (tmp_path / "run.mcap.sig").read_text().startswith("-----BEGIN SSH SIGNATURE-----")
+    code, said = call("verify", recorded, "--signer", own.with_suffix(".pub"))
+    assert code == 0
+    assert "signed by own@robot" in said
+    people = tmp_path / "allowed_signers"
+    lines = [
+        f"{name}@lab {key.with_suffix('.pub').read_text()}" for name, key in (("ann", other), ("ben", own))
+    ]
+    people.write_text("# people\n" + "".join(lines))
+    code, said = call("verify", recorded, "--signer", people)
+    assert code == 0
+    assert "signed by ben@lab" in said
+
+
+def test_a_signature_of_another_person_log_or_purpose_does_not_fit(
+    recorded: Path, keys: tuple[Path, Path], tmp_path: Path
+) -> None:
+    own, other = keys
+    call("verify", recorded, "--sign", own)
+    code, said = call("verify", recorded, "--signer", other.with_suffix(".pub"))
+    assert code == 1
+    assert "no signature of its certificate by anyone in other.pub" in said
+    call("replay", recorded, "-o", tmp_path / "half.mcap", "--to", "2s")
+    code, said = call(
+        "verify",
+        tmp_path / "half.mcap",
+        "--signer",
+        own.with_suffix(".pub"),
+        "--signature",
+        f"{recorded}.sig",
+    )
+    assert code == 1
+    mail = statement(dict(open_messages(recorded).metadata())[CERTIFICATE])
+    make = ["ssh-keygen", "-Y", "sign", "-f", str(own), "-n", "file"]
+    signed = subprocess.run(make, input=mail, capture_output=True, check=True).stdout
+    (tmp_path / "mail.sig").write_bytes(signed)
+    code, said = call(
+        "verify", recorded, "--signer", own.with_suffix(".pub"), "--signature", tmp_path / "mail.sig"
+    )
+    assert code == 1
+
+
+def test_only_a_right_certificate_is_signed(recorded: Path, keys: tuple[Path, Path], tmp_path: Path) -> None:
+    changed = rewritten(
+        recorded,
+        tmp_path / "changed.mcap",
+        lambda topic, time_ns, payload: b"" if topic == OBJECTS else payload,
+    )
+    with pytest.raises(sr.LogError):
+        call("verify", changed, "--sign", keys[0])
+    with pytest.raises(sr.UsageError, match="cannot sign"):
+        call("verify", recorded, "--sign", recorded)
+    with pytest.raises(sr.UsageError, match=r"run[.]mcap[.]sig"):
+        call("verify", recorded, "--signer", keys[0].with_suffix(".pub"))
+    assert not list(tmp_path.glob("*.sig"))

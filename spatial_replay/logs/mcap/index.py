@@ -230,10 +230,17 @@ class _Scan:
         """Report the bytes from a position to the next chunk as lost, with the times around them."""
         lost = max(0, (following.offset if following else self._size) - position)
         known = [place.end_ns for place in (*self._directory.chunks, self._loose) if place]
-        after = (" after ", Instant(max(known), 0)) if known else ()
-        before = (" and" * bool(known) + " before ", Instant(following.start_ns, 0)) if following else ()
+        after = [Instant(max(known), 0)] if known else []
+        before = [Instant(following.start_ns, 0)] if following else []
+        when: tuple[str | Instant, ...] = ()
+        if after and before:
+            # chunks may overlap in time
+            first, last = sorted([*after, *before], key=lambda instant: instant.time_ns)
+            when = (" between ", first, " and ", last)
+        elif after or before:
+            when = (" after " if after else " before ", *after, *before)
         what = f"{self._name}: at byte {position}: {damage}; {lost} bytes"
-        self._faults.add(Sentence(what, *after, *before, " cannot be read"))
+        self._faults.add(Sentence(what, *when, " cannot be read"))
 
     def _record(self, position: int) -> int:
         """Take in the record at a position; return where the next one begins."""
