@@ -66,12 +66,15 @@ class Viewer {
   }
 
   // Jumps: the newest message of each topic is all that a panel gets.
-  seek(time, {preview} = {}) {
-    const frame = this.subscribed().flatMap((topic) => {
+  seek(time) {
+    this.render({currentFrame: this.frameAt(time), currentTime: time, didSeek: true, previewTime: undefined});
+  }
+
+  frameAt(time) {
+    return this.subscribed().flatMap((topic) => {
       const before = this.messages.filter((each) => each.topic === topic && compare(each.receiveTime, time) <= 0);
       return before.slice(-1);
     });
-    this.render({currentFrame: frame, currentTime: time, didSeek: true, previewTime: preview});
   }
 
   // Plays from after one time up to another.

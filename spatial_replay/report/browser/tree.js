@@ -71,7 +71,7 @@ function showRow(row, run, result, place, isLast) {
   showNumber(row.soFar, hasValue ? node.series[VALUE][at] : NaN, !hasValue, isPending);
   if (row.interval) {
     const [lower, upper] = [node.series[LOWER][at], node.series[UPPER][at]];
-    row.interval.textContent = hasValue && lower < upper ? `${numberText(lower)} … ${numberText(upper)}` : "";
+    write(row.interval, hasValue && lower < upper ? `${numberText(lower)} … ${numberText(upper)}` : "");
   }
   if (hasValue && isLast) row.soFar.title = node.value;
   else row.soFar.title = hasValue && run.settles ? intervalText(node.series[LOWER][at], node.series[UPPER][at]) : "";
@@ -83,7 +83,16 @@ function intervalText(lower, upper) {
 
 // What is pending is no violation, whatever its sign.
 function showNumber(made, number, isEmpty, isPending) {
-  made.textContent = isEmpty ? "" : numberText(number);
+  write(made, isEmpty ? "" : numberText(number));
   const sign = isPending || isEmpty || Number.isNaN(number) ? "unknown" : signOf(number);
+  if (made.sign === sign) return;
+  made.sign = sign;
   made.className = `number is-${sign}`;
+}
+
+// Only a text that changes costs the browser a layout.
+function write(made, text) {
+  if (made.written === text) return;
+  made.written = text;
+  made.textContent = text;
 }
