@@ -51,18 +51,19 @@ export class AutomatonView implements View {
   }
 
   reset(topic: string): void {
-    if (topic === EVENTS) this.results.events = [];
-    else this.run?.clear();
+    if (topic === EVENTS) {
+      this.results.events = [];
+      return;
+    }
+    // the events of a file were read before its states
+    this.results.findWorst();
+    if (this.results.shown !== this.run?.result) this.build();
+    this.run?.clear();
   }
 
   take(topic: string, time: number, message: unknown): void {
-    if (topic === EVENTS) {
-      const before = this.results.shown;
-      this.results.takeEvent(time, message as EventMessage);
-      if (this.results.shown !== before) this.rebuild();
-    } else {
-      this.run?.take(time, message as AutomatonStateMessage);
-    }
+    if (topic === EVENTS) this.results.takeEvent(time, message as EventMessage);
+    else this.run?.take(time, message as AutomatonStateMessage);
   }
 
   show(cursor: Cursor): void {
@@ -90,19 +91,18 @@ export class AutomatonView implements View {
       results.all.length > 1
         ? chooser("Result", results.titles, results.place, (place) => this.choose(place))
         : createElement("b", null, results.titles[0] ?? ""),
-      createElement("span", { className: "quiet" }, this.automaton?.summary ?? "has no automaton: past operators, or bounds in seconds"));
+      createElement("span", { className: "quiet" }, this.automaton?.summary ?? (this.run?.isEmpty
+        ? "has no automaton: `check --dfa -` says why" : "has its automaton elsewhere: replay the log again")));
   }
 
   private choose(place: number): void {
     const before = this.results.shown;
     this.results.choose(place);
-    if (this.results.shown !== before) this.rebuild();
+    if (this.results.shown !== before) {
+      this.build();
+      this.viewer.reread([AUTOMATON]);
+    }
     this.viewer.refresh();
-  }
-
-  private rebuild(): void {
-    this.build();
-    this.viewer.reread();
   }
 
   private build(): void {
@@ -175,7 +175,11 @@ class Run {
   private readonly guards = new Map<string, string>();
   private known: Taken[] | null = null;
 
-  constructor(private readonly result: ResultMessage) {}
+  constructor(readonly result: ResultMessage) {}
+
+  get isEmpty(): boolean {
+    return this.series.samples === 0;
+  }
 
   clear(): void {
     this.series.clear();

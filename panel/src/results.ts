@@ -24,6 +24,7 @@ export class Results {
   all: readonly ResultMessage[] = [];
   events: Event[] = [];
   private chosen: string | null;
+  private worst = 0;
 
   constructor(private readonly viewer: Viewer) {
     const { result } = viewer.state;
@@ -33,6 +34,7 @@ export class Results {
   specify(message: SpecificationMessage): void {
     this.files = message.files;
     this.all = message.results;
+    this.findWorst();
   }
 
   get titles(): string[] {
@@ -42,9 +44,13 @@ export class Results {
   /** The place of the result that is shown; 0 without any. */
   get place(): number {
     const found = this.all.findIndex((each) => titleOf(each.name, each.object) === this.chosen);
-    if (found >= 0) return found;
-    const verdicts = this.all.map((each) => this.verdict(each, Infinity));
-    return Math.max(0, ["violated", "unknown"].map((bad) => verdicts.indexOf(bad)).find((place) => place >= 0) ?? 0);
+    return found >= 0 ? found : this.worst;
+  }
+
+  /** Finds the result that went worst, by the events so far. */
+  findWorst(): void {
+    const verdicts = this.all.map((each) => this.newest(each, Infinity)?.verdict);
+    this.worst = ["violated", "unknown"].map((bad) => verdicts.indexOf(bad)).find((place) => place >= 0) ?? 0;
   }
 
   get shown(): ResultMessage | undefined {
@@ -95,10 +101,6 @@ export class Results {
       if (isOfResult && each.known <= time && (!newest || each.known >= newest.known)) newest = each;
     }
     return newest;
-  }
-
-  verdict(result: ResultMessage, time: number): string {
-    return this.newest(result, time)?.verdict ?? "pending";
   }
 
   /** Returns the nodes as they are written in their file; what a `def` stands for, in canonical form. */

@@ -51,12 +51,18 @@ export class SpecificationView implements View {
   }
 
   reset(topic: string): void {
-    if (topic === EVENTS) this.results.events = [];
-    else this.tree?.series.clear();
+    if (topic === EVENTS) {
+      this.results.events = [];
+      return;
+    }
+    // the events of a file were read before its numbers
+    this.results.findWorst();
+    if (this.results.shown !== this.tree?.message) this.build();
+    this.tree?.series.clear();
   }
 
   take(topic: string, time: number, message: unknown): void {
-    if (topic === EVENTS) this.takeEvent(time, message as EventMessage);
+    if (topic === EVENTS) this.results.takeEvent(time, message as EventMessage);
     else this.tree?.take(time, message as RobustnessMessage);
   }
 
@@ -91,23 +97,14 @@ export class SpecificationView implements View {
       createElement("span", { className: "quiet" }, `${at}${cursor.isPreview ? ", under the pointer" : ""}`));
   }
 
-  private takeEvent(time: number, message: EventMessage): void {
-    const before = this.results.shown;
-    this.results.takeEvent(time, message);
-    if (this.results.shown !== before) this.rebuild();
-  }
-
   private chooseResult(place: number): void {
     const before = this.results.shown;
     this.results.choose(place);
-    if (this.results.shown !== before) this.rebuild();
+    if (this.results.shown !== before) {
+      this.build();
+      this.viewer.reread([ROBUSTNESS]);
+    }
     this.viewer.refresh();
-  }
-
-  /** Shows another result, whose numbers have to be read first. */
-  private rebuild(): void {
-    this.build();
-    this.viewer.reread();
   }
 
   private build(): void {

@@ -61,8 +61,8 @@ export interface Viewer {
   preview(time: number | undefined): void;
   /** Draws again, and the head, too. */
   refresh(): void;
-  /** Reads the ranges of the topics again. */
-  reread(): void;
+  /** Reads the ranges of some topics again. */
+  reread(topics: readonly string[]): void;
   save(state: object): void;
   readonly state: Readonly<Record<string, unknown>>;
   /** Returns a time of a message in seconds after the first sample. */
@@ -155,8 +155,8 @@ class Panel implements Viewer {
     this.head.render(this.view.head(cursor));
   }
 
-  reread(): void {
-    this.readAll().catch(report);
+  reread(topics: readonly string[]): void {
+    this.readAll(topics).catch(report);
   }
 
   private stamp(time: number): bigint {
@@ -212,12 +212,12 @@ class Panel implements Viewer {
     this.view.specify(message);
     for (const each of this.early.values()) this.take(each, false);
     this.early.clear();
-    this.reread();
+    this.reread(this.view.topics);
   }
 
-  /** Reads what a file has of each topic, one after the other; live sources have nothing to read. */
-  private async readAll(): Promise<void> {
-    for (const topic of this.view.topics) await this.readRange(topic);
+  /** Reads what a file has of topics, one after the other; live sources have nothing to read. */
+  private async readAll(topics: readonly string[]): Promise<void> {
+    for (const topic of topics) await this.readRange(topic);
   }
 
   /** Reads all messages of a topic, now and whenever its data change; resolves once they were read. */

@@ -10,6 +10,7 @@ import pytest
 
 from replay.runs import PiecewiseSource, content_of
 from spatial_replay import Automaton, Footprint, Recorder, Sample, Trace, automaton, parse_specification
+from spatial_replay.annotate.specification import ReportedTree, encode_specification
 from spatial_replay.automata import stored_text
 from spatial_replay.automata.propositions import Propositions
 from spatial_replay.logs import Attachment, MemorySink
@@ -41,6 +42,7 @@ def sample(index: int, x: float | None, battery: float = 1.0) -> Sample:
 
 
 RUN = [sample(0, 20), sample(1, 20), sample(2, 3), sample(3, 20), sample(4, 20, 0.1), sample(5, 3)]
+LARGE = parse_specification("spec late = G (battery >= 1 -> F[0, 200] battery >= 2)")
 HIDDEN = [sample(0, 20), sample(1, None), sample(2, 20), sample(3, 3)]
 
 
@@ -201,3 +203,45 @@ def test_under_the_papers_semantics_there_is_none(tmp_path: Path) -> None:
     run_replay(open_source(log), [SPEC], ReplayOptions(semantics="paper"), output=tmp_path / "out.mcap")
     assert "/spatial/automaton" not in content_of(tmp_path / "out.mcap").topics()
     assert about_automata(tmp_path / "out.mcap")["done"].startswith("none: ")
+
+
+def test_the_specification_has_its_automaton_as_it_is_drawn() -> None:
+    sink = MemorySink()
+    recording = Recording(sink, [SPEC, parse_specification("spec before = O battery >= 0")])
+    recording.add(Trace.from_samples(RUN))
+    [payload] = [
+        payload
+        for block in sink.messages
+        for channel, payload in zip(block.channel.tolist(), block.payloads, strict=True)
+        if block.channels[channel].topic == "/spatial/specification"
+    ]
+    results = {each.name: each for each in SpecificationMessage.FromString(payload).results}
+    assert not results["before"].HasField("automaton")
+    drawn, expected = results["done"].automaton, automaton(SPEC)
+    assert [each.number for each in drawn.states] == list(expected.states)
+    assert len({(each.column, each.row) for each in drawn.states}) == len(drawn.states)
+    for each in drawn.states:
+        assert each.accepting == (each.number in expected.accepting)
+        assert each.can_reject == (each.number in expected.can_reject)
+        # acceptance is as far as the shortest path to it; from a trap there is none
+        shortest = next(expected.paths(each.number), None)
+        assert each.HasField("distance") == (each.number in expected.can_accept) == (shortest is not None)
+        assert each.distance == len(shortest or ())
+    moves = [(each.source, each.target, each.guard) for each in drawn.moves]
+    assert sorted(moves) == sorted(
+        (each.source, each.target, expected.guard_words(each)) for each in expected.transitions
+    )
+
+
+def test_of_a_large_automaton_the_states_nearest_to_the_start_are_drawn() -> None:
+    message = SpecificationMessage.FromString(
+        encode_specification(
+            [LARGE],
+            [ReportedTree("late", None, 0, LARGE.specs[0].formula)],
+            automata=[automaton(LARGE)],
+        )
+    )
+    drawn = message.results[0].automaton
+    assert (len(drawn.states), drawn.left_out) == (60, len(automaton(LARGE).states) - 60)
+    assert [each.number for each in drawn.states] == list(range(60))
+    assert len(drawn.moves) <= 300

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import random
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -17,7 +16,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from playwright.sync_api import Browser, Page, expect
 
 import spatial_replay as sr
-from browser.viewer_page import differences, extension_files, write_viewer_page
+from browser.viewer_page import differences, write_viewer_page
 from spatial_replay.cli import run
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.planning.read import read_decisions
@@ -279,12 +278,23 @@ def test_texts_of_a_log_are_shown_as_text(open_panel: Open, logs: Mapping[str, P
     expect(page.locator("img")).to_have_count(0)
 
 
-def test_the_extension_is_small_and_complete() -> None:
-    found = extension_files()
-    package = json.loads(found["package.json"])
-    assert package["name"] and package["publisher"] and package["main"] == "./dist/extension.js"
-    assert sum(map(len, found.values())) < 200_000
-    # no script is loaded, no text is read as HTML or as code
-    assert not re.search(
-        rb"innerHTML|outerHTML|insertAdjacentHTML|\beval\(|new Function", found["dist/extension.js"]
-    )
+def test_the_worst_of_several_results_is_shown_first_unless_the_reader_chose(
+    open_panel: Open, logs: Mapping[str, Path], tmp_path: Path
+) -> None:
+    log = tmp_path / "several.mcap"
+    text = "spec near = F (a dist b <= 30)\nspec apart = G (a dist b >= 4)\nspec met = F (a ovlp b)"
+    specification = sr.parse_specification(text)
+    with sr.Recorder(log, specifications=[specification]) as recorder:
+        for t in range(40):
+            objects = {"a": sr.Footprint.disc(9 - t / 8, 0, 1), "b": sr.Footprint.disc(0, 0, 1)}
+            recorder.write(sr.Sample(t * 10**8, objects))
+    write_viewer_page(log, log.with_suffix(".html"))
+    for panel in ("specification", "automaton"):
+        page = open_panel("several", panel, logs={"several": log})
+        expect(page.locator("select option:checked")).to_have_text("apart")
+        seek(page, 39 * 10**8)
+        expect(page.locator(".row.lit, .state.here").first).to_be_visible()
+        page.locator("select").select_option(label="near")
+        page.evaluate("viewer.settled()")
+        expect(page.locator("select option:checked")).to_have_text("near")
+        assert page.evaluate("viewer.ranges.length") < 10

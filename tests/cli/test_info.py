@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
+import zipfile
+from io import BytesIO
 from pathlib import Path
 
 import pytest
@@ -259,3 +262,21 @@ def test_for_a_log_without_a_layout_the_error_says_how_to_get_one(
     assert run(["info", str(log), "--layout"]) == 2
     assert "run.jsonl has no layout" in capsys.readouterr().err
     assert run(["info", str(log), "--layout", "--json"]) == 2
+
+
+def test_the_extension_for_viewers_is_printed(log: Path, capfdbinary: pytest.CaptureFixture[bytes]) -> None:
+    assert run(["info", "--panel"]) == 0
+    content = capfdbinary.readouterr().out
+    assert len(content) <= 200_000
+    with zipfile.ZipFile(BytesIO(content)) as archive:
+        assert archive.testzip() is None
+        assert {each.date_time for each in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+        package = json.loads(archive.read("package.json"))
+        script = archive.read(package["main"].removeprefix("./"))
+    # viewers install by these
+    assert package["name"] and package["publisher"] and package["version"]
+    # a text of a log is never read as HTML, or as code
+    assert not re.search(rb"innerHTML|outerHTML|insertAdjacentHTML|\beval\(|new Function", script)
+    assert run(["info", "--panel", str(log)]) == 2
+    assert run(["info", "--panel", "--json"]) == 2
+    assert run(["info"]) == 2
