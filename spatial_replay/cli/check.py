@@ -12,7 +12,6 @@ import click
 
 from spatial_replay.cli.findings import Form, show_findings
 from spatial_replay.cli.options import (
-    InputPath,
     JsonCommand,
     LogPath,
     ReadArguments,
@@ -42,7 +41,7 @@ _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
 
 
 @click.command(cls=JsonCommand)
-@click.argument("specification", metavar="SPEC", type=InputPath())
+@click.argument("specification", metavar="SPEC", type=LogPath())
 @click.option(
     "--log",
     type=LogPath(),
@@ -68,7 +67,7 @@ _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
 )
 @click.option("--of", metavar="NAME", help="With --dfa: which result, if SPEC has several.")
 def check(
-    specification: Path,
+    specification: LogFile,
     log: LogFile | None,
     constants: Mapping[str, float | str],
     strict_names: bool,
@@ -100,7 +99,8 @@ def check(
         )
     if log is None:
         _refuse_log_options(reading, strict_names)
-    with _findings_of(specification, form):
+    shown = Path(str(specification))
+    with _findings_of(shown, form):
         (parsed,) = load_spec_options([specification], profile, constants)
     inputs = local_files([specification] if log is None else [specification, log])
     if dfa is not None:
@@ -108,7 +108,7 @@ def check(
     compared = _compare_with_log(parsed, log, reading, strict_names) if log is not None else _Compared()
     diagnostics = [*parsed.warnings, *compared.diagnostics]
     show_diagnostics(diagnostics)
-    show_findings(form, specification, diagnostics)
+    show_findings(form, shown, diagnostics)
     if any(each.severity == "error" for each in diagnostics):
         raise SpecificationError([each for each in diagnostics if each.severity == "error"])
     if as_json:

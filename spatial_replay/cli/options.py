@@ -78,15 +78,6 @@ class LogPath(click.Path):
         return log_file(value) if is_address(value) else super().convert(value, param, ctx)
 
 
-class InputPath(LogPath):
-    """A path of a small file, or its address, of which a copy on this machine is taken."""
-
-    def convert(
-        self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
-    ) -> Any:
-        return local_copy(value) if is_address(value) else super().convert(value, param, ctx)
-
-
 def output_option(text: str, *, required: bool = False) -> Callable[[_Command], _Command]:
     """Return the option `-o FILE`, with its help."""
     return click.option("-o", "--output", type=_OutputFile(path_type=Path), required=required, help=text)
@@ -97,13 +88,9 @@ def log_output_option(text: str) -> Callable[[_Command], _Command]:
     return click.option("-o", "--output", type=_LogOutput(path_type=Path), required=True, help=text)
 
 
-def specs_option(text: str, kind: click.Path | None = None) -> Callable[[_Command], _Command]:
-    """Return the repeatable option `--spec SPEC`, with its help.
-
-    Args:
-        kind: of its values; by default, of an address a copy is taken.
-    """
-    return click.option("--spec", "specs", metavar="SPEC", multiple=True, type=kind or InputPath(), help=text)
+def specs_option(text: str) -> Callable[[_Command], _Command]:
+    """Return the repeatable option `--spec SPEC`, with its help."""
+    return click.option("--spec", "specs", metavar="SPEC", multiple=True, type=LogPath(), help=text)
 
 
 def _read_constants(
@@ -254,7 +241,7 @@ def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
 class ConditionArguments:
     """What to evaluate over logs, and how to read these, as given on the command line."""
 
-    specs: tuple[Path, ...]
+    specs: tuple[LogFile, ...]
     start: str | None
     end: str | None
     every: int
@@ -324,7 +311,7 @@ def evaluation_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def condition_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that say what to evaluate over many logs; the command takes them as `conditions`."""
-    specs = specs_option("Specification file; repeat for several.", LogPath())
+    specs = specs_option("Specification file; repeat for several.")
     gathered = reading_options(gather("conditions", ConditionArguments, command))
     return add_options((specs, *_CONDITIONS), gathered)
 
@@ -368,7 +355,8 @@ def open_inputs(
     files = list(known)
     is_bare = can_do_without and not (request.specs or request.constants or recorded_texts(source))
     if not files and not is_bare:
-        files = load_files(request.specs, source, profile=request.profile, constants=request.constants)
+        specs = [local_copy(each) for each in request.specs]
+        files = load_files(specs, source, profile=request.profile, constants=request.constants)
         show_diagnostics(warning for file in files for warning in file.warnings)
     window, each = _window(source, request), objects_by_parameter(request.choices)
     return EvaluationInputs(source, files, window, each, request.strict_names)
@@ -412,7 +400,7 @@ def _window(source: Source, request: EvaluationArguments) -> Window:
 
 
 def load_spec_options(
-    specs: Sequence[Path],
+    specs: Sequence[LogFile],
     profile: str | None,
     constants: Mapping[str, float | str],
     default: Callable[[], Specification] | None = None,
@@ -429,7 +417,7 @@ def load_spec_options(
     # imported here so that --help stays fast
     from spatial_replay.spec.overrides import SpecificationText, load_specifications
 
-    sources: list[Path | SpecificationText] = [*dict.fromkeys(specs)]
+    sources: list[Path | SpecificationText] = [*dict.fromkeys(map(local_copy, specs))]
     if constants and not sources and default is not None:
         own = default()
         sources = [SpecificationText(own.source, own.filename)]

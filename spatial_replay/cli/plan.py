@@ -10,7 +10,7 @@ import click
 
 from spatial_replay.cli.application import exit_code_from_verdicts
 from spatial_replay.cli.options import (
-    InputPath,
+    LogPath,
     constants_option,
     load_spec_options,
     log_output_option,
@@ -20,6 +20,7 @@ from spatial_replay.cli.options import (
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.record import SCENARIOS, SimulationArguments, parse_injections, simulation_options
 from spatial_replay.cli.terminal import show
+from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.text import counted
 
 
@@ -55,7 +56,7 @@ def planning_command(scenario: str) -> click.Command:
     @click.option(
         "--spec",
         metavar="SPEC",
-        type=InputPath(),
+        type=LogPath(),
         help="Specification to plan for.  [default: the scenario's own]",
     )
     @click.option("--of", metavar="NAME", help="Result to plan for, if SPEC has several.")
@@ -64,7 +65,7 @@ def planning_command(scenario: str) -> click.Command:
     @simulation_options
     def command(
         output: Path,
-        spec: Path | None,
+        spec: LogFile | None,
         of: str | None,
         constants: Mapping[str, float | str],
         profile: str | None,
@@ -89,7 +90,7 @@ def planning_command(scenario: str) -> click.Command:
                 noise_m=simulation["noise"],
                 injections=parse_injections(simulation["inject"]),
                 gui=simulation["gui"],
-                inputs=() if spec is None else (spec,),
+                inputs=local_files(named),
                 advance=advance,
             )
         show(

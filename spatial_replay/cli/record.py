@@ -26,7 +26,7 @@ from spatial_replay.cli.options import (
 )
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show
-from spatial_replay.logs.remote import LogFile
+from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.text import counted
 from spatial_replay.trace.time_points import duration_ns_from_text
 
@@ -123,7 +123,7 @@ def recording_command(scenario: str) -> click.Command:
     @simulation_options
     def command(
         output: Path,
-        specs: tuple[Path, ...],
+        specs: tuple[LogFile, ...],
         constants: Mapping[str, float | str],
         profile: str | None,
         duration: str | None,
@@ -144,7 +144,7 @@ def recording_command(scenario: str) -> click.Command:
                 noise_m=simulation["noise"],
                 injections=parse_injections(simulation["inject"]),
                 gui=simulation["gui"],
-                inputs=specs,
+                inputs=local_files(specs),
                 advance=advance,
             )
         show(
@@ -182,7 +182,7 @@ for _scenario in SCENARIOS:
 def tracks(
     file: LogFile,
     output: Path,
-    specs: tuple[Path, ...],
+    specs: tuple[LogFile, ...],
     constants: Mapping[str, float | str],
     profile: str | None,
     reading: ReadArguments,

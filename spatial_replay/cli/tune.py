@@ -167,7 +167,7 @@ def tune(
         raise UsageError(
             f"--write changes {spec}, which is an address; copy it to this machine, and give that"
         )
-    (file,) = load_spec_options([local_copy(spec)], profile, constants)
+    (file,) = load_spec_options([spec], profile, constants)
     show_diagnostics(file.warnings)
     if output is not None:
         if output.suffix.lower() not in _PICTURES:

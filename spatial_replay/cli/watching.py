@@ -18,6 +18,7 @@ from spatial_replay.cli.output import print_verdicts
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, show_diagnostics
 from spatial_replay.errors import SpatialReplayError
+from spatial_replay.logs.downloads import local_copy
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -43,7 +44,8 @@ def files_to_watch(request: EvaluationArguments) -> SpecificationFiles:
     # imported here so that --help stays fast
     from spatial_replay.replay import SpecificationFiles
 
-    files = SpecificationFiles(request.specs, profile=request.profile, constants=request.constants)
+    specs = [local_copy(each) for each in request.specs]
+    files = SpecificationFiles(specs, profile=request.profile, constants=request.constants)
     files.load()
     return files
 
