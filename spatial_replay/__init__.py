@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Step
     from spatial_replay.planning.planner import Planner
     from spatial_replay.planning.settings import Settings
+    from spatial_replay.recording.clip_log import Trigger
     from spatial_replay.recording.message_channel import MessageChannel
     from spatial_replay.recording.recorder import Recorder
     from spatial_replay.replay.engine import Replayed
@@ -140,6 +141,7 @@ __all__ = [
     "TraceError",
     "TrackedObject",
     "Transition",
+    "Trigger",
     "Tuning",
     "Update",
     "UsageError",
@@ -212,6 +214,7 @@ __getattr__, __dir__ = loaded_when_used(
         "planning.decisions": ("Candidate", "Consideration", "Guards", "Step"),
         "planning.planner": ("Planner",),
         "planning.settings": ("Settings",),
+        "recording.clip_log": ("Trigger",),
         "recording.message_channel": ("MessageChannel",),
         "recording.recorder": ("Recorder",),
         "replay.engine": ("Replayed",),

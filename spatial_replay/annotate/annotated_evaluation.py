@@ -81,6 +81,10 @@ class AnnotatedEvaluation:
         self._has_samples |= len(trace) > 0
         return self._annotator.messages(trace, blocks)
 
+    def redraw(self) -> None:
+        """Draw the whole scene with the next sample, for a viewer that shows nothing yet."""
+        self._annotator.redraw()
+
     @property
     def finals(self) -> list[Floats]:
         """For each of `trees` (N, 2), lower and upper end of each node's value if the log ends here."""

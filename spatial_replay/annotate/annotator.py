@@ -99,6 +99,10 @@ class Annotator:
         """What a viewer shows after the messages so far."""
         return self._scene
 
+    def redraw(self) -> None:
+        """Draw the whole scene with the next sample, for a viewer that shows nothing yet."""
+        self._scene = SceneState()
+
     def messages(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
         """Return what to write beside the next samples.
 

@@ -12,8 +12,9 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.message_factory import GetMessageClass
 
+from spatial_replay.bags.ros_definitions import full_type_name
 from spatial_replay.bags.ros_types import ros_decoder, ros_definitions, standard_schema
-from spatial_replay.bags.topic import Decoder, Topic
+from spatial_replay.bags.topic import Decoder, Topic, is_latched
 from spatial_replay.errors import LogError
 from spatial_replay.logs.messages import Channel, Schema
 
@@ -147,6 +148,23 @@ def topics_by_name(described: Iterable[Topic], distribution: str | None = None) 
     return tuple(
         topic if topic.unreadable else replace(topic, unreadable=why_unreadable(topic, distribution))
         for _, topic in sorted(named.items())
+    )
+
+
+def topic_of(channel: Channel, count: int | None = None) -> Topic:
+    """Return the topic of a channel, of whose messages a log declares so many."""
+    schema = channel.schema
+    is_ros = channel.encoding in ("ros1", "cdr")
+    name = schema.name if schema else ""
+    return Topic(
+        name=channel.topic,
+        type=full_type_name(name) if is_ros else name,
+        encoding=channel.encoding,
+        count=count,
+        schema=schema,
+        latched=is_latched(channel.metadata.get("offered_qos_profiles", ""))
+        or channel.metadata.get("latching") in ("1", "true"),
+        metadata=channel.metadata,
     )
 
 

@@ -15,10 +15,9 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from spatial_replay.bags.columns import Columns, MessageColumns, in_order, places_in
-from spatial_replay.bags.decoders import topics_by_name
+from spatial_replay.bags.decoders import topic_of, topics_by_name
 from spatial_replay.bags.reader import MessageReader
-from spatial_replay.bags.ros_definitions import full_type_name
-from spatial_replay.bags.topic import Topic, is_latched
+from spatial_replay.bags.topic import Topic
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.chunks import ChunkPlace, DamageError, plan_places, read_records, walk_records
 from spatial_replay.logs.mcap.index import Directory, iter_attachments, iter_metadata, read_directory
@@ -63,7 +62,7 @@ class McapLog(MessageReader):
                 f" and {sum(counts.values())} on its channels"
             )
         return topics_by_name(
-            _topic(channel, None if counts is None else counts.get(number, 0))
+            topic_of(channel, None if counts is None else counts.get(number, 0))
             for number, channel in sorted(channels.items())
         )
 
@@ -183,19 +182,3 @@ class McapLog(MessageReader):
 
     def _fault(self, place: ChunkPlace, what: str) -> None:
         self._faults.add(Sentence(f"{self.name}: at byte {place.offset}: ", what))
-
-
-def _topic(channel: Channel, count: int | None) -> Topic:
-    schema = channel.schema
-    is_ros = channel.encoding in ("ros1", "cdr")
-    name = schema.name if schema else ""
-    return Topic(
-        name=channel.topic,
-        type=full_type_name(name) if is_ros else name,
-        encoding=channel.encoding,
-        count=count,
-        schema=schema,
-        latched=is_latched(channel.metadata.get("offered_qos_profiles", ""))
-        or channel.metadata.get("latching") in ("1", "true"),
-        metadata=channel.metadata,
-    )

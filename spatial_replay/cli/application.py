@@ -44,6 +44,7 @@ COMMANDS: dict[str, str] = {
     "explain": "Explain a verdict.",
     "export": "Export the robustness of every node as a table.",
     "info": "Show what a log contains.",
+    "monitor": "Monitor a running robot.",
     "plan": "Plan a run in a simulated world.",
     "record": "Record a run as a log.",
     "recover": "Save all that can be read of a damaged log.",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
@@ -45,6 +46,26 @@ def _piece(piece: str | Coloured) -> str:
     if isinstance(piece, Coloured):
         return click.style(escaped(piece.text), fg=piece.colour, bold=True)
     return escaped(piece)
+
+
+class StatusLine:
+    """A line at the bottom of a terminal that is written again and again; nothing where there is none."""
+
+    def __init__(self) -> None:
+        self._is_shown = False
+
+    def show(self, text: str) -> None:
+        """Replace the line."""
+        if sys.stderr.isatty():
+            width = shutil.get_terminal_size().columns - 1
+            click.echo(f"\r\x1b[K{escaped(text)[:width]}", nl=False, err=True)
+            self._is_shown = True
+
+    def clear(self) -> None:
+        """Remove the line, so that others can be printed."""
+        if self._is_shown:
+            click.echo("\r\x1b[K", nl=False, err=True)
+            self._is_shown = False
 
 
 def show_json(value: Any, indent: int | None = 2) -> None:

@@ -89,6 +89,18 @@ class FootprintBatch:
         )
 
     @classmethod
+    def unknown(cls, count: int) -> FootprintBatch:
+        """Build rows of which nothing is known: one point each, at NaN."""
+        return cls(
+            part_start=np.arange(count + 1),
+            vertex_start=np.arange(count + 1),
+            vertices=np.full((count, 2), np.nan),
+            radius=np.zeros(count),
+            bottom=np.full(count, np.nan),
+            top=np.full(count, np.nan),
+        )
+
+    @classmethod
     def concatenate(cls, batches: Sequence[FootprintBatch]) -> FootprintBatch:
         """Join the rows of several batches, one after the other."""
         none = np.empty(0, np.int64)

@@ -46,6 +46,9 @@ METADATA = "spatial_replay"
 ENDING = "spatial_replay_ending"
 """The metadata record at the end of a recording: how many samples it holds, and how it ended."""
 
+TRIGGER = "spatial_replay_trigger"
+"""The metadata record of a clip: what fired, when, and how much around it was asked for and held."""
+
 CERTIFICATE = "spatial_replay_certificate"
 """The metadata record that comes last: hashes of inputs and results."""
 

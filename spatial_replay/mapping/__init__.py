@@ -11,6 +11,7 @@ from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
     from spatial_replay.mapping.assemble import Assembler
+    from spatial_replay.mapping.live_assembler import LiveAssembler
     from spatial_replay.mapping.mapped_source import MappedSource
     from spatial_replay.mapping.mapping_file import load_mapping, parse_mapping
     from spatial_replay.mapping.model import LogMapping
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Assembler",
+    "LiveAssembler",
     "LogMapping",
     "MappedSource",
     "ReadingPlan",
@@ -32,6 +34,7 @@ __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
         "assemble": ("Assembler",),
+        "live_assembler": ("LiveAssembler",),
         "mapped_source": ("MappedSource",),
         "mapping_file": ("load_mapping", "parse_mapping"),
         "model": ("LogMapping",),

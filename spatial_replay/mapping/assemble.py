@@ -14,7 +14,7 @@ Messages wait in the first stage until none that is earlier can arrive.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from itertools import compress, repeat
 from typing import Any, Final, NamedTuple
 
@@ -61,6 +61,8 @@ class Assembler:
         start_ns, end_ns: only samples from `start_ns` up to, not including, `end_ns` come out. Messages
             before and after the window may be added, and count.
         on_time_jump: whether a log whose time jumps back by more than a second is refused, or ends there.
+        arrived: takes the messages of each topic as they arrive: its reader, their times on its clock, and
+            their contents, decoded where frames matter.
     """
 
     def __init__(
@@ -73,8 +75,10 @@ class Assembler:
         end_ns: int | None = None,
         on_time_jump: OnTimeJump = "error",
         concave: Concave = "decompose",
+        arrived: Callable[[TopicReader, Integers, Sequence[Any]], None] | None = None,
     ) -> None:
         self._plan = plan
+        self._arrived = arrived
         self._name = name
         self._window_ns = start_ns or 0, FOREVER if end_ns is None else end_ns
         self._on_time_jump = on_time_jump
@@ -94,6 +98,7 @@ class Assembler:
                 classes,
                 mapping_name=plan.mapping.name,
                 needs_frame=plan.mapping.fixed_frame is not None,
+                decodes_early=arrived is not None,
                 report=self._add_fault,
             )
             for topic in plan.planned
@@ -112,7 +117,7 @@ class Assembler:
         )
         self._sample_times = _SampleTimes(plan, name, self._window_ns[0])
         self._newest_ns = -1
-        self._latest_ns = self._settled_ns = -1
+        self._latest_ns = self._settled_ns = self._forgot_ns = -1
         self._count = self._bytes = 0
         self._step = _FIRST_STEP
         self._has_split = False
@@ -146,6 +151,50 @@ class Assembler:
                 self._step = min(2 * self._step, _LONGEST_STEP)
                 traces.append(self._settle(self._newest_ns - self._plan.margin_ns))
         return traces[0] if len(traces) == 1 else Trace.concatenate(traces)
+
+    def take_in(self, messages: Sequence[Message]) -> None:
+        """Add messages in the order in which they came, without looking for samples; see `settle`.
+
+        Raises:
+            UsageError: the mapping does not fit what the messages hold.
+        """
+        if messages and not self.is_finished:
+            self._add_step(_columns(messages))
+
+    @property
+    def newest_ns(self) -> int:
+        """How far the messages have come, on the clocks of their topics; -1 before the first."""
+        return self._newest_ns
+
+    @property
+    def frames(self) -> FrameTree:
+        """The transforms so far."""
+        return self._tree
+
+    def settle(self, upto_ns: int) -> Trace:
+        """Return the samples up to a time; messages before it that come later count from then on.
+
+        Raises:
+            LogError, UsageError: as `add`.
+        """
+        return self._settle(upto_ns)
+
+    def lose(self, topics: Collection[str]) -> Trace:
+        """Return the samples so far and one right after them, in which what some topics reported is unknown.
+
+        It stays unknown until they report it again.
+        """
+        so_far = self._settle(self._newest_ns)
+        lost_ns = self._settled_ns + 1
+        if not self._sample_times.note(lost_ns):
+            return so_far
+        self._tracker.lose(lost_ns, topics)
+        if any(self._readers[topic].transforms is not None for topic in topics):
+            self._tree.forget_moving()
+        self._settled_ns = lost_ns
+        lost = self._tracker.trace(np.array([lost_ns], np.int64))
+        self._tracker.forget(lost_ns)
+        return Trace.concatenate([so_far, lost])
 
     def finish(self) -> Trace:
         """End the log; return the remaining samples.
@@ -247,6 +296,8 @@ class Assembler:
 
     def _put(self, stamped: _Stamped, arrived: MessageColumns) -> None:
         reader = stamped.reader
+        if self._arrived is not None and len(stamped.times_ns):
+            self._arrived(reader, stamped.times_ns, stamped.contents)
         log_times_ns = arrived.log_time_ns[stamped.places]
         if reader.transforms is not None:
             is_static = reader.planned.is_static
@@ -274,7 +325,10 @@ class Assembler:
             trace = self._tracker.trace(times_ns[(times_ns >= start_ns) & (times_ns < end_ns)])
             self._tracker.forget(upto_ns)
         self._settled_ns = upto_ns
-        self._tree.forget_before(upto_ns - HISTORY_NS)
+        # looking through all transforms takes longer than a sample
+        if upto_ns - self._forgot_ns > DISORDER_NS:
+            self._tree.forget_before(upto_ns - HISTORY_NS)
+            self._forgot_ns = upto_ns
         return trace
 
     def _add_fault(self, topic: str, log_time_ns: int, what: str) -> None:
@@ -339,6 +393,13 @@ class _SampleTimes:
         if len(times):
             self._last_ns = int(times[-1])
         return times
+
+    def note(self, time_ns: int) -> bool:
+        """Count a sample taken besides; return whether it comes after the first and the last."""
+        comes_after = 0 <= self._last_ns < time_ns
+        if comes_after:
+            self._last_ns = time_ns
+        return comes_after
 
     def _multiples(self, times_ns: Integers, upto_ns: int, step_ns: int) -> Integers:
         if self._from_ns is None and len(times_ns):

@@ -173,14 +173,7 @@ class ObservationRows:
     def blank(cls, class_code: Integers) -> ObservationRows:
         """Return observations of which only the class is known."""
         count = len(class_code)
-        nowhere = FootprintBatch(
-            part_start=np.arange(count + 1),
-            vertex_start=np.arange(count + 1),
-            vertices=np.full((count, 2), np.nan),
-            radius=np.zeros(count),
-            bottom=np.full(count, np.nan),
-            top=np.full(count, np.nan),
-        )
+        nowhere = FootprintBatch.unknown(count)
         return cls(nowhere, np.full(count, np.nan), np.zeros(count), class_code, np.zeros(count, np.bool_))
 
     def select(self, rows: Integers) -> ObservationRows:

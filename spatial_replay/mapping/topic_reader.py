@@ -70,6 +70,7 @@ class TopicReader:
     Args:
         names, classes: codes that all topics share.
         needs_frame: whether there is a fixed frame, so that frames matter.
+        decodes_early: whether messages whose objects have frames are decoded when they arrive.
         report: receives each message that is lost.
     """
 
@@ -82,12 +83,17 @@ class TopicReader:
         *,
         mapping_name: str,
         needs_frame: bool,
+        decodes_early: bool = False,
         report: ReportFault,
     ) -> None:
         self.planned = planned
         self.name = planned.name
         self.pending = PendingMessages()
-        self.decodes_on_arrival = planned.is_transforms or planned.clock == "header"
+        self.decodes_on_arrival = (
+            planned.is_transforms
+            or planned.clock == "header"
+            or (decodes_early and needs_frame and planned.layout is not None)
+        )
         self.transforms = TransformReader() if planned.is_transforms else None
         self.extractor: Extractor | None = None
         self.unstamped = 0

@@ -5,7 +5,7 @@ The tracker holds the last state of every object and signal, so that a log can b
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -157,6 +157,22 @@ class Tracker:
         for carried in self._carried.values():
             for each in carried.values():
                 del each[:-1]
+
+    def lose(self, time_ns: int, topics: Collection[str]) -> None:
+        """Make unknown, from a time on, what some topics have reported: objects stay, without a place."""
+        for topic in topics:
+            last = self._events[topic].last()
+            last = last.select(np.flatnonzero(last.expires_ns > time_ns))
+            rows = self._add(ObservationRows.blank(last.class_code))
+            at = np.full(len(rows), time_ns, np.int64)
+            forever = np.full(len(rows), FOREVER_NS, np.int64)
+            self._events[topic] = Events(last.name, at, rows, forever, last.class_code).after(last)
+            self._carried.pop(topic, None)
+        self._signals = {
+            key: (np.array([time_ns]), np.array([np.nan])) if key[0] in topics else series
+            for key, series in self._signals.items()
+        }
+        self._store_added()
 
     def _take_detections(
         self, reader: TopicReader, times_ns: Integers, log_times_ns: Integers, detections: Detections

@@ -204,7 +204,8 @@ class FrameTree:
             return
         entry.entries.append((stamp_ns, clock_ns, parent, pose))
         entry.parents.setdefault(parent)
-        self._series.clear()
+        for by_stamp in (False, True):
+            self._series.pop((child, by_stamp), None)
 
     def forget_before(self, clock_ns: int) -> None:
         """Drop the transforms of messages before a time, except the last one of each child."""
@@ -214,6 +215,11 @@ class FrameTree:
                 # the last one names the parent, and may be the start of the next interpolation
                 child.entries = keep or child.entries[-1:]
                 child.parents = dict.fromkeys(entry[2] for entry in child.entries)
+        self._series.clear()
+
+    def forget_moving(self) -> None:
+        """Drop every transform but the static ones: nothing is known between those and what comes next."""
+        self._children = {name: child for name, child in self._children.items() if child.static is not None}
         self._series.clear()
 
     @property

@@ -14,7 +14,7 @@ from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.result import no_such_node
 from spatial_replay.monitor.semantics import LIVE_ROOM, checked_semantics
 from spatial_replay.monitor.stream import LiveStream
-from spatial_replay.monitor.verdict import Verdict, online_verdict, worst_verdict
+from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict, worst_verdict
 from spatial_replay.monitor.violation import Settled, Violation, ViolationLog, rehearse
 from spatial_replay.spec.formula import NamedSpec, Specification, iter_nodes
 from spatial_replay.spec.load import require_specification
@@ -115,6 +115,21 @@ class Update:
         return self.specs[spec].node(identifier)
 
 
+class Ending(NamedTuple):
+    """The result of one spec if a run ends with its newest sample, as a replay of its log reports it.
+
+    Attributes:
+        robustness: the value of the root on the samples so far; NaN if it is not determined.
+        lower, upper: the ends of the value's interval over the finished log.
+    """
+
+    spec: NamedSpec
+    verdict: Verdict
+    robustness: float
+    lower: float
+    upper: float
+
+
 class Monitor:
     """Evaluates a specification as samples come.
 
@@ -156,6 +171,16 @@ class Monitor:
         self._live = LiveStream(specification, checked, start_ns or 0)
         self._violations = ViolationLog(specification, start_ns or 0) if checked == "ltlf" else None
         self._last_ns: int | None = None
+        self._robustness = [float("nan")] * len(self._specs)
+
+    def endings(self) -> tuple[Ending, ...]:
+        """Return the result of each spec if the run ends here; unknown before the first sample."""
+        return tuple(
+            Ending(spec, Verdict.UNKNOWN, robustness, float("-inf"), float("inf"))
+            if final is None
+            else Ending(spec, final_verdict(*final[0].tolist()), robustness, *final[0].tolist())
+            for spec, final, robustness in zip(self._specs, self._live.finals, self._robustness, strict=True)
+        )
 
     def update(self, sample: Sample) -> Update:
         """Add the next sample and return its numbers and verdicts.
@@ -173,6 +198,7 @@ class Monitor:
             )
         self._last_ns = sample.time_ns
         numbers = list(map(_read_only, self._live.extend(sample)))
+        self._robustness = [float("nan") if each is None else float(each[0, 0]) for each in numbers]
         specs = tuple(map(SpecUpdate, self._specs, numbers, self._names))
         if self._violations is None:
             return Update(sample.time_ns, specs, self._places)

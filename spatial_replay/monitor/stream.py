@@ -189,6 +189,12 @@ class LiveStream:
         self._first_ns: int | None = None
         self._position = -1
 
+    @property
+    def finals(self) -> list[Floats | None]:
+        """For each formula (N, 2), lower and upper end of each node's value if the log ends here, or None
+        before the first sample that is evaluated."""
+        return [run.final if len(run) else None for run in self._runs]
+
     def extend(self, sample: Sample) -> list[Floats | None]:
         """Add the next sample, whose time comes after the last one's.
 

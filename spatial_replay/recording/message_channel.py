@@ -35,6 +35,7 @@ class _Waiting(NamedTuple):
     channel: int
     sequence: int
     time_ns: int
+    publish_ns: int
     payload: bytes
 
 
@@ -136,16 +137,9 @@ class MessageQueue:
         self._bytes_out += size
         if not taken:
             return Messages()
-        channel, sequence, times_ns, payloads = zip(*taken, strict=True)
-        log_time_ns = np.array(times_ns, np.int64)
-        return Messages(
-            self._declared,
-            np.array(channel, np.int64),
-            np.array(sequence, np.int64),
-            log_time_ns,
-            log_time_ns,
-            payloads,
-        )
+        *numbers, payloads = zip(*taken, strict=True)
+        channel, sequence, log_ns, publish_ns = (np.array(each, np.int64) for each in numbers)
+        return Messages(self._declared, channel, sequence, log_ns, publish_ns, payloads)
 
     def fail(self, error: Exception) -> None:
         """Raise an error of the writing thread in whichever call comes next."""
@@ -220,11 +214,21 @@ class MessageChannel:
                     f"a message on {self.topic} at {at} follows one at {last}; give times that do not"
                     " decrease, or each thread a topic"
                 )
-            self._last_ns = time_ns
-            if queue.put(_Waiting(self._number, self._written, time_ns, payload)):
-                self._written += 1
-            else:
-                self._dropped += 1
+            self._put(time_ns, time_ns, payload)
+
+    def copy(self, time_ns: int, payload: bytes) -> None:
+        """Hand over a message of another program, which may come a little late: it is published at its time,
+        and logged then or, if that is later, when the one before was."""
+        with self._queue.lock:
+            self._queue.require_open()
+            self._put(max(time_ns, self._last_ns), time_ns, payload)
+
+    def _put(self, time_ns: int, publish_ns: int, payload: bytes) -> None:
+        self._last_ns = time_ns
+        if self._queue.put(_Waiting(self._number, self._written, time_ns, publish_ns, payload)):
+            self._written += 1
+        else:
+            self._dropped += 1
 
     def _checked(self, time_ns: object) -> int:
         try:

@@ -59,7 +59,7 @@ def message_channel(
     Raises:
         UsageError: a topic of ours, an unknown encoding, a schema that does not fit.
     """
-    _check_topic(topic)
+    check_topic(topic)
     message = schema if isinstance(schema, type) and issubclass(schema, Message) else None
     if encoding is None:
         encoding = "protobuf" if message else "json"
@@ -110,7 +110,7 @@ def payload_encoder(channel: Channel) -> Callable[[object], bytes]:
     return encode
 
 
-def _check_topic(topic: object) -> None:
+def check_topic(topic: object) -> None:
     if not isinstance(topic, str) or not topic.strip("/ "):
         raise UsageError(f"a topic is named {shortened(topic)}; give a text such as '/joint_states'")
     if topic == "/spatial" or topic.startswith("/spatial/") or topic in _OURS:

@@ -11,7 +11,7 @@ from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.certificate import EvaluationHashes, specifications_json
 from spatial_replay.annotate.specification import logged_specifications, specification_attachments
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.messages import Messages, Sink, merge, messages_of
+from spatial_replay.logs.messages import Channel, Messages, Sink, merge, messages_of
 from spatial_replay.logs.objects.encode import encode_objects
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import (
@@ -89,6 +89,15 @@ class Recording:
         """The verdict of each result, by its name, if the log ends here."""
         reported = zip(self._evaluation.trees, self._evaluation.streams, strict=True)
         return {tree.name: stream.verdict for tree, stream in reported}
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """The channels of the messages that annotate a sample."""
+        return self._evaluation.channels
+
+    def redraw(self) -> None:
+        """Draw the whole scene with the next sample, for a viewer that shows nothing yet."""
+        self._evaluation.redraw()
 
     def add(self, trace: Trace, beside: Messages | None = None) -> None:
         """Write the next samples.

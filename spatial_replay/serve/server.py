@@ -6,7 +6,7 @@ import ipaddress
 import json
 import logging
 import socket
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from reprlib import repr as shortened
 from threading import Thread
@@ -57,28 +57,28 @@ _CAPABILITIES: Final = (
 )
 
 
-class LiveServer:
-    """A session that viewers connect to over WebSocket; see `Viewers`.
+class PublishingServer:
+    """A server that viewers connect to over WebSocket, for messages while they are made.
 
     A viewer that reads too slowly loses the oldest messages; one that reads nothing is disconnected.
     """
 
-    def __init__(
-        self, session: Session, questions: Questions, channels: Sequence[Channel], host: str, port: int
-    ) -> None:
+    def __init__(self, name: str, channels: Sequence[Channel], host: str, port: int) -> None:
         """Listen.
 
         Args:
-            questions: those of viewers to the services.
-            channels: all channels that may have messages.
+            channels: those known before; others are added with their first message.
             port: 0 for any that is free.
 
         Raises:
             UsageError: nothing can listen there.
         """
-        self._session, self._questions = session, questions
+        self._name = name
         self._context = foxglove.Context()
-        self._channels = self._advertised(channels)
+        self._sent: dict[tuple[str, str, Schema | None], foxglove.Channel] = {}
+        self._channels: dict[Channel, foxglove.Channel] = {}
+        for channel in channels:
+            self._advertise(channel)
         self._host = f"[{host}]" if _is_v6(host) else host
         self._started: Future[protocol.WebSocketServer] = Future()
         try:
@@ -121,17 +121,9 @@ class LiveServer:
             if number in wanted:
                 wanted[number].log(payload, log_time=time_ns)
 
-    def send_state(self, state: PlaybackState) -> None:
-        """See `Viewers.send_state`."""
-        self._server.broadcast_playback_state(_playback_state(state, None))
-
     def send_time(self, time_ns: int) -> None:
         """See `Viewers.send_time`."""
         self._server.broadcast_time(time_ns)
-
-    def send_values(self, values: Values) -> None:
-        """See `Viewers.send_values`."""
-        self._server.publish_parameter_values(_parameters(values))
 
     def send_note(self, note: Note) -> None:
         """See `Viewers.send_note`."""
@@ -148,29 +140,22 @@ class LiveServer:
 
     def _start(self, port: int) -> protocol.WebSocketServer:
         return foxglove.start_server(
-            name=f"spatial-replay: {self._session.name}",
+            name=self._name,
             host=self._host,
             port=port,
-            capabilities=list(_CAPABILITIES),
-            server_listener=_Listener(self._session, self),
-            services=[self._service(name) for name in SERVICES],
-            asset_handler=lambda uri: asset(self._session.wait_for_evaluation(), uri),
+            capabilities=[protocol.Capability.Time],
             context=self._context,
-            playback_time_range=self._session.span_ns,
         )
 
-    def _advertised(self, channels: Sequence[Channel]) -> dict[Channel, foxglove.Channel]:
-        """Return the channels that viewers can decode: those with a schema, and JSON."""
-        sent: dict[tuple[str, str, Schema | None], foxglove.Channel] = {}
-        advertised: dict[Channel, foxglove.Channel] = {}
-        for channel in channels:
-            if channel.schema is not None or channel.encoding == "json":
-                # channels that differ only in their publisher are one to a viewer
-                alike = channel.topic, channel.encoding, channel.schema
-                if alike not in sent:
-                    sent[alike] = self._channel(channel)
-                advertised[channel] = sent[alike]
-        return advertised
+    def _advertise(self, channel: Channel) -> None:
+        """Offer a channel if viewers can decode it: with a schema, or in JSON."""
+        if channel.schema is None and channel.encoding != "json":
+            return
+        # channels that differ only in their publisher are one to a viewer
+        alike = channel.topic, channel.encoding, channel.schema
+        if alike not in self._sent:
+            self._sent[alike] = self._channel(channel)
+        self._channels[channel] = self._sent[alike]
 
     def _channel(self, channel: Channel) -> foxglove.Channel:
         schema = channel.schema
@@ -179,6 +164,47 @@ class LiveServer:
             described = foxglove.Schema(name=schema.name, encoding=schema.encoding, data=schema.data)
         return foxglove.Channel(
             channel.topic, schema=described, message_encoding=channel.encoding, context=self._context
+        )
+
+
+class LiveServer(PublishingServer):
+    """A session that viewers connect to; see `Viewers`."""
+
+    def __init__(
+        self, session: Session, questions: Questions, channels: Sequence[Channel], host: str, port: int
+    ) -> None:
+        """Listen.
+
+        Args:
+            questions: those of viewers to the services.
+            channels: all channels that may have messages.
+            port: 0 for any that is free.
+
+        Raises:
+            UsageError: nothing can listen there.
+        """
+        self._session, self._questions = session, questions
+        super().__init__(f"spatial-replay: {session.name}", channels, host, port)
+
+    def send_state(self, state: PlaybackState) -> None:
+        """See `Viewers.send_state`."""
+        self._server.broadcast_playback_state(_playback_state(state, None))
+
+    def send_values(self, values: Values) -> None:
+        """See `Viewers.send_values`."""
+        self._server.publish_parameter_values(_parameters(values))
+
+    def _start(self, port: int) -> protocol.WebSocketServer:
+        return foxglove.start_server(
+            name=self._name,
+            host=self._host,
+            port=port,
+            capabilities=list(_CAPABILITIES),
+            server_listener=_Listener(self._session, self),
+            services=[self._service(name) for name in SERVICES],
+            asset_handler=lambda uri: asset(self._session.wait_for_evaluation(), uri),
+            context=self._context,
+            playback_time_range=self._session.span_ns,
         )
 
     def _service(self, name: str) -> Service:
@@ -199,6 +225,80 @@ class LiveServer:
         return Service(
             name, schema=foxglove.ServiceSchema(name, request=request, response=response), handler=handle
         )
+
+
+class RunServer(PublishingServer):
+    """A server of a run that goes on, which reports new subscriptions, and offers a service that fires."""
+
+    def __init__(
+        self,
+        channels: Sequence[Channel],
+        host: str,
+        port: int,
+        subscribed: Callable[[], None],
+        fire: Callable[[str], None] | None,
+    ) -> None:
+        """Listen; see `PublishingServer`.
+
+        Args:
+            subscribed: called, on a thread of the library, when a viewer has subscribed to a topic.
+            fire: what the service `trigger` calls with a reason; None for no service.
+        """
+        self._subscribed, self._fire = subscribed, fire
+        super().__init__("spatial-replay: live", channels, host, port)
+
+    def publish(self, messages: Messages) -> None:
+        """See `Viewers.publish`; channels that are new are offered first."""
+        for channel in messages.channels.values():
+            if channel not in self._channels:
+                self._advertise(channel)
+        super().publish(messages)
+
+    def _start(self, port: int) -> protocol.WebSocketServer:
+        services = [] if self._fire is None else [_trigger_service(self._fire)]
+        capabilities = [protocol.Capability.Time, *([protocol.Capability.Services] if services else [])]
+        return foxglove.start_server(
+            name=self._name,
+            host=self._host,
+            port=port,
+            capabilities=capabilities,
+            services=services,
+            server_listener=_Subscriptions(self._subscribed),
+            context=self._context,
+        )
+
+
+class _Subscriptions(protocol.ServerListener):
+    """Reports subscriptions; called on threads of the SDK."""
+
+    def __init__(self, subscribed: Callable[[], None]) -> None:
+        self._subscribed = subscribed
+
+    def on_subscribe(self, client: protocol.Client, channel: protocol.ChannelView) -> None:
+        self._subscribed()
+
+
+def _trigger_service(fire: Callable[[str], None]) -> Service:
+    def handle(request: ServiceRequest) -> bytes:
+        try:
+            given = json.loads(request.payload or b"{}")
+        except (ValueError, RecursionError):
+            given = {}
+        reason = given.get("reason") if isinstance(given, dict) else None
+        fire(reason[:_LONGEST_TEXT] if isinstance(reason, str) and reason else "service call")
+        return b'{"fired": true}'
+
+    request, response = (
+        foxglove.MessageSchema(
+            encoding="json",
+            schema=foxglove.Schema(
+                name=name, encoding="jsonschema", data=json.dumps({"type": "object"}).encode()
+            ),
+        )
+        for name in ("TriggerRequest", "TriggerResponse")
+    )
+    schema = foxglove.ServiceSchema("trigger", request=request, response=response)
+    return Service("trigger", schema=schema, handler=handle)
 
 
 class _Listener(protocol.ServerListener):

@@ -50,6 +50,9 @@ class Sample:
         time_ns: nanoseconds, 0 to 2**63 - 1.
         objects: the detected objects by name; a bare footprint stands for a `TrackedObject` with it.
         signals: numeric signals by name; NaN for an unknown value.
+        unknown: the objects that are there, but not known where: their classes by name, None without one.
+            Unlike an object that is left out, they stay members of open groups, and make atoms over these
+            unknown.
 
     Raises:
         TraceError: an invalid time, name or value.
@@ -58,6 +61,7 @@ class Sample:
     time_ns: int
     objects: Mapping[str, TrackedObject | Footprint] = field(default_factory=dict)
     signals: Mapping[str, float] = field(default_factory=dict)
+    unknown: Mapping[str, str | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if isinstance(self.time_ns, bool) or not isinstance(self.time_ns, int):
@@ -79,5 +83,12 @@ class Sample:
                 signals[name] = float(value)
             except (TypeError, ValueError, OverflowError) as error:
                 raise TraceError(f"signal {name!r} is {shortened(value)}; give a number") from error
+        for name, class_name in self.unknown.items():
+            _require_name(name, "an object")
+            if name in objects:
+                raise TraceError(f"object {name!r} is both known and unknown; give it once")
+            if class_name is not None:
+                _require_name(class_name, "a class")
         object.__setattr__(self, "objects", MappingProxyType(objects))
+        object.__setattr__(self, "unknown", MappingProxyType(dict(self.unknown)))
         object.__setattr__(self, "signals", MappingProxyType(signals))

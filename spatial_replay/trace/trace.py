@@ -114,7 +114,7 @@ class Trace:
             TraceError: times that do not increase.
         """
         listed = list(samples)
-        names = tuple(sorted({name for sample in listed for name in sample.objects}))
+        names = tuple(sorted({name for each in listed for name in (*each.objects, *each.unknown)}))
         number = {name: index for index, name in enumerate(names)}
         rows = np.full((len(listed), len(names)), ABSENT, np.int64)
         observed: list[TrackedObject] = []
@@ -123,29 +123,45 @@ class Trace:
                 tracked = sample.objects[name]
                 rows[index, number[name]] = len(observed)
                 observed.append(TrackedObject(tracked) if isinstance(tracked, Footprint) else tracked)
-        classes = _class_order(tracked.class_name for tracked in observed)
+        # what is known of an object that is not known where: its class, in a row after the others
+        blank: list[str | None] = []
+        for index, sample in enumerate(listed):
+            for name in sorted(sample.unknown):
+                rows[index, number[name]] = -2 - (len(observed) + len(blank))
+                blank.append(sample.unknown[name])
+        named = [*(tracked.class_name for tracked in observed), *blank]
+        classes = _class_order(named)
         signals = sorted({name for sample in listed for name in sample.signals})
         footprints, heights = [each.footprint for each in observed], [each.height for each in observed]
         columns = {name: [sample.signals.get(name, np.nan) for sample in listed] for name in signals}
+        shapes = FootprintBatch.from_footprints(footprints, heights)
+        if blank:
+            shapes = FootprintBatch.concatenate([shapes, FootprintBatch.unknown(len(blank))])
+        yaws = [*(np.nan if each.yaw is None else each.yaw for each in observed), *(np.nan for _ in blank)]
         return cls(
             times_ns=np.array([sample.time_ns for sample in listed], np.int64),
             names=names,
             rows=rows,
-            footprints=FootprintBatch.from_footprints(footprints, heights),
-            yaw=np.array([np.nan if each.yaw is None else each.yaw for each in observed], np.float64),
-            uncertainty=np.array([each.uncertainty for each in observed], np.float64),
-            class_code=np.array([classes.index(each.class_name) for each in observed], np.int64),
+            footprints=shapes,
+            yaw=np.array(yaws, np.float64),
+            uncertainty=np.array([*(each.uncertainty for each in observed), *(0.0 for _ in blank)]),
+            class_code=np.array([classes.index(name) for name in named], np.int64),
             classes=classes,
             signals={name: np.array(values, np.float64) for name, values in columns.items()},
         )
 
     def samples(self) -> Iterator[Sample]:
-        """Iterate over the samples as objects, without unreadable observations and unknown signals."""
+        """Iterate over the samples as objects, without the numbers of unreadable observations and without
+        unknown signals."""
         for index, time_ns in enumerate(self.times_ns.tolist()):
-            rows = zip(self.names, self.rows[index].tolist(), strict=True)
+            rows = list(zip(self.names, self.rows[index].tolist(), strict=True))
             objects = {name: self.observation(row) for name, row in rows if row >= 0}
+            unknown = {
+                name: self.classes[int(self.class_code[-2 - row])] for name, row in rows if row < ABSENT
+            }
             values = ((name, float(column[index])) for name, column in self.signals.items())
-            yield Sample(time_ns, objects, {name: value for name, value in values if value == value})
+            known = {name: value for name, value in values if value == value}
+            yield Sample(time_ns, objects, known, unknown)
 
     def observation(self, row: int) -> TrackedObject:
         """Return the object that row `row` (at least 0) reports."""

@@ -33,8 +33,8 @@ from spatial_replay.monitor.atoms.live_rows import (
     PlanContext,
     PlanRows,
 )
-from spatial_replay.monitor.atoms.measurements import quantity_of
-from spatial_replay.monitor.atoms.terms import footprint_from_outline
+from spatial_replay.monitor.atoms.measurements import leaf_values, quantity_of
+from spatial_replay.monitor.atoms.terms import TraceScene, footprint_from_outline
 from spatial_replay.spec.formula import (
     ANY_CLASS,
     Enlarged,
@@ -47,6 +47,7 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.spec.walks import base_of, iter_terms, measured_terms
 from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Trace
 
 
 class LeafPlan:
@@ -222,6 +223,7 @@ class SampleLeaves:
             {name: code for code, name in enumerate(classes, start=1)},
             {name: outline for name, outline in regions.items() if name in regions_named},
         )
+        self._regions = regions
         self._recent = RecentSamples(self._frame.delays)
         self._takes_any = ANY_CLASS in open_classes
         self._own_names = _names(bases)
@@ -247,7 +249,10 @@ class SampleLeaves:
             UsageError: more bindings than `MAX_BINDINGS`.
         """
         if self._only_plan is not None:
+            # to what names its objects, one that is unknown is as one that is not there
             return self._only_plan.leaf_values(samples, {})
+        if any(sample is not None and sample.unknown for sample in samples):
+            return self._values_with_unknown()
         unnamed = self._unnamed_members(samples)
         counts = {classes: _room(len(names)) for classes, names in unnamed.items()}
         try:
@@ -261,6 +266,11 @@ class SampleLeaves:
                 zip_longest(self._placeholders(classes, counts[classes]), names, fillvalue=_NO_OBJECT)
             )
         return plan.leaf_values(samples, stands_for)
+
+    def _values_with_unknown(self) -> Floats:
+        """Compute the leaves as a replay does: plans have no unknown members of open groups."""
+        scene = TraceScene(Trace.from_samples(self._recent.span), self._regions)
+        return leaf_values(scene, list(chain.from_iterable(self._frame.leaves)), {})[:, :, -1:]
 
     def _unnamed_members(self, samples: Sequence[Sample | None]) -> dict[_Classes, list[str]]:
         """Return the members of open groups that the specification does not name, by their classes."""

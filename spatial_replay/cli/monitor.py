@@ -1,0 +1,425 @@
+"""`spatial-replay monitor`: listen to a running robot, and print its verdicts as they change."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import click
+
+from spatial_replay.cli.application import ExitCode, exit_code_from_verdicts
+from spatial_replay.cli.options import (
+    constants_option,
+    load_spec_options,
+    naming_option,
+    output_option,
+    profile_option,
+    specs_option,
+)
+from spatial_replay.cli.terminal import Coloured, Line, StatusLine, show, show_diagnostics, warn
+from spatial_replay.errors import UsageError
+from spatial_replay.text import counted, escaped, time_text
+from spatial_replay.trace.time_points import duration_ns_from_text
+
+if TYPE_CHECKING:
+    from spatial_replay.live import LiveSession, LiveUpdate
+    from spatial_replay.live.viewing import Viewing
+    from spatial_replay.mapping import LogMapping
+    from spatial_replay.monitor.monitor import Ending
+    from spatial_replay.recording import Recorder
+    from spatial_replay.recording.clip_log import Trigger
+    from spatial_replay.recording.recorder import SampleWriter
+    from spatial_replay.spec.formula import Specification
+
+_COLOURS: Final = {
+    "satisfied": "blue",
+    "holds": "blue",
+    "violated": "red",
+    "pending": "yellow",
+    "unknown": "yellow",
+}
+_STATUS_S: Final = 0.5
+_UNITS: Final = {"kb": 2**10, "mb": 2**20, "gb": 2**30}
+
+
+def _seconds(context: click.Context, parameter: click.Parameter, text: str | None) -> float | None:
+    if text is None:
+        return None
+    with naming_option(parameter.opts[0]):
+        return duration_ns_from_text(text) / 1e9
+
+
+def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int:
+    number, factor = text.strip(), 1
+    for unit, each in _UNITS.items():
+        if number.lower().endswith(unit):
+            number, factor = number[: -len(unit)], each
+    with suppress(ValueError, OverflowError):
+        return round(float(number) * factor)
+    raise UsageError(f"{parameter.opts[0]}: {text!r} is not a size; write it as 256MB or 1.5GB")
+
+
+@click.command()
+@click.argument("address", metavar="ADDRESS")
+@specs_option("Specification file; repeat for several.")
+@click.option(
+    "--mapping",
+    "mapping_file",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Mapping file (YAML), as for a log of the same topics.  [default: samples on /spatial/objects]",
+)
+@constants_option
+@profile_option
+@output_option("Log of the whole run to write (MCAP), with the robot's own messages.")
+@click.option(
+    "--topics",
+    metavar="PATTERN",
+    multiple=True,
+    help="Topics whose messages are written, such as '/camera/*'; repeat for several.  [default: mapped]",
+)
+@click.option(
+    "--for", "length_s", metavar="T", callback=_seconds, help="End after so much time, such as 60s."
+)
+@click.option(
+    "--until",
+    type=click.Choice(["violated", "satisfied", "settled"]),
+    help="End when a spec is violated, when all are satisfied, or when each is one or the other.",
+)
+@click.option(
+    "--dead-man",
+    "dead_man_s",
+    metavar="T",
+    callback=_seconds,
+    help="After so much silence of a topic, what it reported is unknown.",
+)
+@click.option(
+    "--max-delay",
+    "max_delay_s",
+    metavar="T",
+    callback=_seconds,
+    default="200ms",
+    show_default=True,
+    help="How long a sample waits for transforms and for stamps that lag behind.",
+)
+@click.option(
+    "--trigger",
+    "triggers",
+    metavar="WHEN",
+    multiple=True,
+    help="Write a clip when: violated, 'NAME satisfied', 'NAME < 0.2', event, manual; repeat for several.",
+)
+@click.option(
+    "--before",
+    "before_s",
+    metavar="T",
+    callback=_seconds,
+    default="10s",
+    show_default=True,
+    help="With --clips: time kept before a trigger.",
+)
+@click.option(
+    "--after",
+    "after_s",
+    metavar="T",
+    callback=_seconds,
+    default="5s",
+    show_default=True,
+    help="With --clips: time kept after a trigger.",
+)
+@click.option("--clips", metavar="DIR", type=click.Path(path_type=Path), help="Folder for clips.")
+@click.option(
+    "--ring",
+    metavar="SIZE",
+    callback=_bytes,
+    default="256MB",
+    show_default=True,
+    help="With --clips: memory for what waits for a trigger.",
+)
+@click.option("--serve", "serves", is_flag=True, help="Show what is monitored to viewers over WebSocket.")
+@click.option(
+    "--port",
+    metavar="P",
+    type=click.IntRange(0, 65535),
+    default=8766,
+    show_default=True,
+    help="With --serve: port to listen on; 0 for any free port.",
+)
+@click.option(
+    "--host",
+    metavar="HOST",
+    default="127.0.0.1",
+    show_default=True,
+    help="With --serve: address to listen on; anyone who can reach it can see the robot.",
+)
+def monitor(
+    address: str,
+    specs: tuple[Path, ...],
+    mapping_file: Path | None,
+    constants: Mapping[str, float | str],
+    profile: str | None,
+    output: Path | None,
+    topics: tuple[str, ...],
+    length_s: float | None,
+    until: str | None,
+    dead_man_s: float | None,
+    max_delay_s: float,
+    triggers: tuple[str, ...],
+    before_s: float,
+    after_s: float,
+    clips: Path | None,
+    ring: int,
+    serves: bool,
+    port: int,
+    host: str,
+) -> ExitCode:
+    """Monitor a running robot through foxglove_bridge, or another server of Foxglove's WebSocket protocol.
+
+    Prints each change of a verdict with its reason, as it happens. While the connection is lost, everything
+    is unknown; it is made again as soon as the server is back. Ctrl-C ends the run.
+
+    Exits with 0 if all specifications are satisfied by what was recorded, 1 if any is violated, 4 if none is
+    violated and any is unknown, 3 if the server does not answer, or its time jumps back.
+
+    With --clips nothing is written until a trigger fires; then a log of what came before and after. SIGUSR1
+    fires it, too, and so does the service `trigger` of --serve.
+
+    \b
+    Examples:
+      spatial-replay monitor ws://robot:8765 --mapping drive.yaml --spec safety.spatial
+      spatial-replay monitor ws://robot:8765 --mapping drive.yaml --spec safety.spatial --for 60s -o live.mcap
+      spatial-replay monitor ws://robot:8765 --mapping drive.yaml --spec safety.spatial --until violated
+      spatial-replay monitor ws://robot:8765 --mapping drive.yaml --spec safety.spatial --trigger violated \
+--before 10s --after 5s --clips clips/
+    """
+    # imported here so that --help stays fast
+    from spatial_replay.live import LiveSession, open_recorders
+    from spatial_replay.mapping import load_mapping
+
+    if not specs:
+        raise UsageError("there is nothing to monitor; give --spec FILE")
+    if topics and output is None and clips is None:
+        raise UsageError("--topics says which messages are written; add -o FILE or --clips DIR")
+    if triggers and clips is None:
+        raise UsageError("--trigger writes clips; add --clips DIR")
+    for option, given in (("--for", length_s), ("--dead-man", dead_man_s), ("--max-delay", max_delay_s)):
+        if given is not None and given <= 0:
+            raise UsageError(f"{option} is 0; give it a length, as in {option} 2s")
+    files = load_spec_options(specs, profile, constants)
+    show_diagnostics(warning for file in files for warning in file.warnings)
+    mapping = None if mapping_file is None else load_mapping(mapping_file)
+    trigger = None if clips is None else _trigger(triggers, before_s, after_s, ring)
+    if output is not None:
+        _refuse_inputs(output, specs, mapping_file)
+    with ExitStack() as opened:
+        recorders = opened.enter_context(open_recorders(files, mapping, output, trigger, clips))
+        writers: list[SampleWriter] = [*recorders]
+        fire = next((each.trigger for each in recorders if trigger and each.is_triggered), None)
+        if serves:
+            writers.append(opened.enter_context(_viewing(files, mapping, host, port, fire)))
+        session = LiveSession(
+            address,
+            files,
+            mapping,
+            recorders=writers,
+            topics=topics,
+            max_delay_s=max_delay_s,
+            dead_man_s=dead_man_s,
+        )
+        run = _Run(session, recorders, length_s, until, fire)
+        asyncio.run(run.follow())
+    run.show_remarks()
+    for clip in (each for recorder in recorders for each in recorder.clips):
+        show(f"clip {clip.path}: {clip.reason} at {time_text(clip.time_ns, run.first_ns)}")
+    if output is not None:
+        show(f"wrote {output}")
+    return run.exit_code
+
+
+def _trigger(when: tuple[str, ...], before_s: float, after_s: float, ring: int) -> Trigger:
+    from spatial_replay.recording.clip_log import Trigger
+
+    with naming_option("--clips"):
+        return Trigger(when or "violated", before_s, after_s, ring)
+
+
+def _refuse_inputs(output: Path, specs: Sequence[Path], mapping_file: Path | None) -> None:
+    from spatial_replay.logs.output_file import refuse_inputs
+
+    refuse_inputs(output, [*specs, *([mapping_file] if mapping_file is not None else [])])
+
+
+@contextmanager
+def _viewing(
+    files: Sequence[Specification],
+    mapping: LogMapping | None,
+    host: str,
+    port: int,
+    fire: Callable[[str], None] | None,
+) -> Iterator[Viewing]:
+    from spatial_replay.live.viewing import open_viewing
+
+    with open_viewing(files, mapping, host=host, port=port, fire=fire) as viewing:
+        show(f"serving at {viewing.address}: in Foxglove or Lichtblick, Open connection, Foxglove WebSocket")
+        yield viewing
+
+
+class _Run:
+    """A session on a terminal, from its start to its end."""
+
+    def __init__(
+        self,
+        session: LiveSession,
+        recorders: Sequence[Recorder],
+        length_s: float | None,
+        until: str | None,
+        fire: Callable[[str], None] | None,
+    ) -> None:
+        self._session, self._recorders, self._fire = session, recorders, fire
+        self._length_s, self._until = length_s, until
+        self._status = StatusLine()
+        self.first_ns = 0
+        self._verdicts: list[str] = []
+
+    async def follow(self) -> None:
+        """Print what happens until the run ends, and then the verdicts."""
+        loop = asyncio.get_running_loop()
+        with self._signals(loop):
+            ticking = asyncio.create_task(self._tick())
+            if self._length_s is not None:
+                loop.call_later(self._length_s, self._session.stop)
+            try:
+                is_first = True
+                async for update in self._session.updates():
+                    if is_first:
+                        self.first_ns, is_first = update.time_ns, False
+                    self._show(update)
+                    if self._is_over(update):
+                        self._session.stop()
+                        break
+            finally:
+                ticking.cancel()
+                self._status.clear()
+        self._show_end()
+
+    @property
+    def exit_code(self) -> ExitCode:
+        """The code for the verdicts at the end."""
+        return exit_code_from_verdicts(self._verdicts, damaged=self._session.failure is not None)
+
+    def show_remarks(self) -> None:
+        """Print what recorders have done or could not hold."""
+        for recorder in self._recorders:
+            for remark in recorder.take_remarks():
+                self._print(f"  {remark}")
+
+    @contextmanager
+    def _signals(self, loop: asyncio.AbstractEventLoop) -> Iterator[None]:
+        """End the run at the first Ctrl-C; the second one interrupts the program."""
+        handled: list[signal.Signals] = []
+
+        def stop(number: signal.Signals) -> None:
+            self._session.stop()
+            loop.remove_signal_handler(number)
+
+        # only the main thread may handle signals
+        with suppress(NotImplementedError, RuntimeError, ValueError):
+            for number in (signal.SIGINT, signal.SIGTERM):
+                loop.add_signal_handler(number, stop, number)
+                handled.append(number)
+            if self._fire is not None:
+                loop.add_signal_handler(signal.SIGUSR1, self._fire, "SIGUSR1")
+                handled.append(signal.SIGUSR1)
+        try:
+            yield
+        finally:
+            for number in handled:
+                loop.remove_signal_handler(number)
+
+    async def _tick(self) -> None:
+        """Write the status line, and what happens without a sample."""
+        before, then_s = self._session.status, time.monotonic()
+        rate = 0.0
+        while True:
+            await asyncio.sleep(_STATUS_S)
+            status, now_s = self._session.status, time.monotonic()
+            for note in self._session.take_notes():
+                self._print(f"  {note}")
+            self.show_remarks()
+            rate += 0.5 * ((status.samples - before.samples) / (now_s - then_s) - rate)
+            before, then_s = status, now_s
+            self._status.show(self._status_text(rate))
+
+    def _status_text(self, rate: float) -> str:
+        status = self._session.status
+        if not status.is_connected:
+            return "not connected"
+        if status.waits_for:
+            return f"waiting for {', '.join(status.waits_for)}"
+        if status.time_ns is None:
+            return f"connected, no sample yet ({counted(status.messages, 'message')})"
+        parts = [time_text(status.time_ns, self.first_ns), f"{rate:.0f} samples/s"]
+        parts.append(f"delay {status.delay_s * 1e3:.1f} ms")
+        parts.append(f"dropped {status.dropped}")
+        if status.messages_dropped:
+            parts.append(f"messages dropped {status.messages_dropped}")
+        if status.overdue:
+            parts.append(f"without transforms {status.overdue}")
+        return "   ".join(parts)
+
+    def _show(self, update: LiveUpdate) -> None:
+        for note in update.notes:
+            self._print(f"  {note}")
+        for change in update.changes:
+            when = time_text(update.time_ns, self.first_ns)
+            label = Coloured(f"{change.state:<9}", _COLOURS[change.state])
+            self._print((f"{when:>12}  ", label, f"  {change.sentence}"))
+
+    def _is_over(self, update: LiveUpdate) -> bool:
+        verdicts = {str(spec.verdict) for spec in update.specs}
+        match self._until:
+            case "violated":
+                return "violated" in verdicts
+            case "satisfied":
+                return verdicts == {"satisfied"}
+            case "settled":
+                return "pending" not in verdicts
+        return False
+
+    def _show_end(self) -> None:
+        for note in self._session.take_notes():
+            show(f"  {note}")
+        status = self._session.status
+        warn(*self._session.remarks)
+        if self._session.failure is not None:
+            warn(str(self._session.failure))
+        endings = self._session.endings()
+        self._verdicts = [str(each.verdict) for each in endings]
+        span = "no time" if status.time_ns is None else time_text(status.time_ns, self.first_ns)
+        lost = ""
+        if status.dropped or status.messages_dropped:
+            lost = f"; dropped {counted(status.dropped, 'sample')} and"
+            lost += f" {counted(status.messages_dropped, 'message')}: verdicts are over the others"
+        show(f"{counted(status.samples, 'sample')} over {span}{lost}")
+        width = max(len(escaped(each.spec.name)) for each in endings)
+        for each in endings:
+            verdict = Coloured(f"{each.verdict:<9}", _COLOURS[str(each.verdict)])
+            show((f"  {escaped(each.spec.name):<{width}}  ", verdict, f"  {_numbers(each)}"))
+
+    def _print(self, line: Line) -> None:
+        self._status.clear()
+        show(line)
+
+
+def _numbers(ending: Ending) -> str:
+    robustness, lower, upper = ending.robustness, ending.lower, ending.upper
+    if math.isnan(robustness):
+        return f"robustness not determined, between {lower:.6g} and {upper:.6g}"
+    between = "" if lower == upper == robustness else f", between {lower:.6g} and {upper:.6g}"
+    return f"robustness {robustness:.6g}{between}"

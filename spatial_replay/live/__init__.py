@@ -1,0 +1,32 @@
+"""A running robot, monitored: messages over Foxglove's WebSocket protocol in; verdicts, logs and clips out.
+
+    protocol      what servers send, decoded
+    client        one connection: it is kept up, and what comes waits in a bounded inbox
+    live_session  messages to samples, samples to verdicts, one after the other
+    monitoring    a session with the logs that are written beside, in one call
+    viewing       what a session gives, as viewers see it
+
+Names are loaded when they are first used.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from spatial_replay.lazy import loaded_when_used
+
+if TYPE_CHECKING:
+    from spatial_replay.live.live_session import LiveSession
+    from spatial_replay.live.live_update import LiveUpdate, SessionStatus
+    from spatial_replay.live.monitoring import monitor, open_recorders
+
+__all__ = ["LiveSession", "LiveUpdate", "SessionStatus", "monitor", "open_recorders"]
+
+__getattr__, __dir__ = loaded_when_used(
+    globals(),
+    {
+        "live_update": ("LiveUpdate", "SessionStatus"),
+        "monitoring": ("monitor", "open_recorders"),
+        "live_session": ("LiveSession",),
+    },
+)

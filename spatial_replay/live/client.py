@@ -1,0 +1,262 @@
+"""A client of one server: it keeps the connection up, and what comes waits in a bounded inbox."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import chain
+from typing import Final, NamedTuple, TypeAlias
+
+from spatial_replay.errors import LogError, RemoteError, UsageError
+from spatial_replay.live.protocol import (
+    SUBPROTOCOLS,
+    Advertised,
+    MessageData,
+    ServerInfo,
+    StatusMessage,
+    Unadvertised,
+    decoded,
+    subscribe,
+)
+from spatial_replay.logs.messages import Channel
+
+try:
+    from websockets.asyncio.client import ClientConnection, connect
+    from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
+    from websockets.typing import Subprotocol
+except ImportError:
+    raise UsageError(
+        "a running robot is listened to with websockets, which is not installed: pip install"
+        " 'spatial-replay[live]'"
+    ) from None
+
+LARGEST_FRAME: Final = 64 * 2**20
+"""The most bytes of one frame; a server that sends more is disconnected."""
+
+MOST_WAITING: Final = 8_192
+MOST_WAITING_BYTES: Final = 64 * 2**20
+"""Messages, and bytes of them, that may wait to be evaluated; of more, the oldest are dropped."""
+
+_MOST_CHANNELS: Final = 100_000
+_FRAMES: Final = 64
+_OPEN_S: Final = 10.0
+_ALIVE_S: Final = 10.0
+"""How long a connection may take, and how often and for how long a server is asked whether it is there."""
+
+_FIRST_PAUSE_S: Final = 0.25
+_LONGEST_PAUSE_S: Final = 8.0
+"""Pauses before another attempt to connect: each twice as long as the one before."""
+
+
+class Received(NamedTuple):
+    """A message as it came."""
+
+    channel: Channel
+    time_ns: int
+    payload: bytes
+    arrived_s: float
+
+
+class Connected(NamedTuple):
+    """A connection stands; channels are advertised next."""
+
+    server: str
+
+
+class Offered(NamedTuple):
+    """All channels that the server offers now, after a change."""
+
+    channels: tuple[Channel, ...]
+
+
+class Disconnected(NamedTuple):
+    """The connection is lost; what the server sent up to then has come before."""
+
+    reason: str
+    arrived_s: float
+
+
+class Warned(NamedTuple):
+    """The server says something about itself, or sends what breaks the protocol."""
+
+    text: str
+
+
+Item: TypeAlias = Received | Connected | Offered | Disconnected | Warned
+
+
+class Inbox:
+    """What came and was not yet taken, in its order; see `MOST_WAITING`.
+
+    Attributes:
+        dropped: messages that were dropped for lack of room.
+    """
+
+    def __init__(self) -> None:
+        self._items: deque[Item] = deque()
+        self._messages = self._bytes = 0
+        self._others: list[Item] = []
+        self.dropped = 0
+        self.filled = asyncio.Event()
+
+    def put(self, item: Item) -> None:
+        """Add what came; the oldest messages make room."""
+        if isinstance(item, Received):
+            self._messages += 1
+            self._bytes += len(item.payload)
+            while self._messages > 1 and (self._messages > MOST_WAITING or self._bytes > MOST_WAITING_BYTES):
+                self._drop()
+        self._items.append(item)
+        self.filled.set()
+
+    def take(self) -> list[Item]:
+        """Return all that waits."""
+        taken = [*self._others, *self._items]
+        self._items.clear()
+        self._others.clear()
+        self._messages = self._bytes = 0
+        self.filled.clear()
+        return taken
+
+    def _drop(self) -> None:
+        while not isinstance(oldest := self._items.popleft(), Received):
+            self._others.append(oldest)
+        self._messages -= 1
+        self._bytes -= len(oldest.payload)
+        self.dropped += 1
+
+
+@dataclass(frozen=True, slots=True)
+class Client:
+    """A client that connects to a server, subscribes, and connects again when the connection is lost.
+
+    Attributes:
+        wants: returns whether to subscribe to a topic.
+        record: takes each message as it comes, whether or not it can be evaluated in time.
+    """
+
+    address: str
+    wants: Callable[[str], bool]
+    inbox: Inbox
+    record: Callable[[Received], None] = lambda received: None
+
+    async def run(self) -> None:
+        """Fill the inbox until cancelled.
+
+        Raises:
+            UsageError: not an address of a server.
+            RemoteError: the first connection fails.
+        """
+        pause_s, was_connected = _FIRST_PAUSE_S, False
+        while True:
+            try:
+                async with connect(
+                    self.address,
+                    subprotocols=[Subprotocol(each) for each in SUBPROTOCOLS],
+                    compression=None,
+                    max_size=LARGEST_FRAME,
+                    max_queue=_FRAMES,
+                    open_timeout=_OPEN_S,
+                    ping_interval=_ALIVE_S,
+                    ping_timeout=_ALIVE_S,
+                    close_timeout=1.0,
+                    proxy=None,
+                ) as connection:
+                    if connection.subprotocol is None:
+                        raise RemoteError(
+                            f"{self.address}: this server speaks none of {', '.join(SUBPROTOCOLS)}; give the"
+                            " address of foxglove_bridge or of a Foxglove SDK server"
+                        )
+                    was_connected, pause_s = True, _FIRST_PAUSE_S
+                    reason = await self._listen(connection)
+                self.inbox.put(Disconnected(reason, time.monotonic()))
+            except (OSError, InvalidHandshake, InvalidURI, EOFError, RemoteError, ValueError) as error:
+                if not was_connected:
+                    raise _connecting_error(self.address, error) from None
+            await asyncio.sleep(pause_s)
+            pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+
+    async def _listen(self, connection: ClientConnection) -> str:
+        """Take what comes, until the connection ends; return why it did."""
+        offered: dict[int, Channel] = {}
+        subscribed: dict[int, Channel] = {}
+        has_warned = False
+        try:
+            async for raw in connection:
+                arrived_s = time.monotonic()
+                try:
+                    frame = decoded(raw)
+                except LogError as error:
+                    if not has_warned:
+                        has_warned = True
+                        self.inbox.put(Warned(f"{self.address}: {error}; such frames are left out"))
+                    continue
+                match frame:
+                    case MessageData(number, time_ns, payload):
+                        channel = subscribed.get(number)
+                        if channel is not None:
+                            received = Received(channel, time_ns, payload, arrived_s)
+                            self.record(received)
+                            self.inbox.put(received)
+                    case ServerInfo(name):
+                        self.inbox.put(Connected(name))
+                    case Advertised(channels):
+                        offered |= channels
+                        if len(offered) > _MOST_CHANNELS:
+                            return f"it offers more than {_MOST_CHANNELS} channels"
+                        new = {n: each for n, each in channels.items() if self.wants(each.topic)}
+                        if new:
+                            subscribed |= new
+                            await connection.send(subscribe(new))
+                        self.inbox.put(Offered(tuple(offered.values())))
+                    case Unadvertised(numbers):
+                        for number in numbers:
+                            offered.pop(number, None)
+                            subscribed.pop(number, None)
+                        self.inbox.put(Offered(tuple(offered.values())))
+                    case StatusMessage(level, text) if level > 0:
+                        self.inbox.put(Warned(f"{self.address} says: {text}"))
+                    case _:
+                        pass
+        except ConnectionClosed as closed:
+            return _closing_reason(closed)
+        return "the server closed it"
+
+
+def _closing_reason(closed: ConnectionClosed) -> str:
+    if closed.sent is not None and closed.sent.code == 1009:
+        return f"it sent a frame of more than {LARGEST_FRAME // 2**20} MB; subscribe to fewer topics"
+    if closed.sent is not None and closed.rcvd is None:
+        return f"it broke the protocol or did not answer ({closed.sent.code} {closed.sent.reason})".rstrip()
+    if closed.rcvd is not None:
+        return f"the server closed it ({closed.rcvd.code} {closed.rcvd.reason:.100})".replace(" )", ")")
+    return "it broke off"
+
+
+def _connecting_error(address: str, error: Exception) -> Exception:
+    match error:
+        case RemoteError():
+            return error
+        case InvalidURI() | ValueError():
+            return UsageError(f"{address} is not the address of a server; write it as ws://robot:8765")
+        case InvalidStatus():
+            return RemoteError(
+                f"{address}: the server refuses the connection (HTTP {error.response.status_code}); it speaks"
+                f" neither {' nor '.join(SUBPROTOCOLS)}"
+            )
+        case TimeoutError():
+            reason = f"no answer within {_OPEN_S:.0f} s"
+        case OSError():
+            reason = (error.strerror or str(error)).lower()
+            for each in chain(getattr(error, "exceptions", ())):
+                reason = (each.strerror or str(each)).lower()
+            if "multiple exceptions" in reason or "connect call failed" in reason:
+                reason = "connection refused"
+        case _:
+            reason = f"it does not answer as a WebSocket server ({error!s:.100})"
+    return RemoteError(
+        f"{address}: {reason}; start foxglove_bridge or the server there first, and check host and port"
+    )

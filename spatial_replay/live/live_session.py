@@ -1,0 +1,402 @@
+"""A running robot, monitored: what its server sends becomes samples, and each sample verdicts."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import AsyncIterator, Sequence
+from contextlib import suppress
+from os import PathLike
+from typing import Final
+
+from spatial_replay.bags.columns import Message
+from spatial_replay.bags.decoders import decoder_of, topic_of, topics_by_name
+from spatial_replay.errors import LogError, UsageError
+from spatial_replay.live.client import (
+    Client,
+    Connected,
+    Disconnected,
+    Inbox,
+    Offered,
+    Received,
+    Warned,
+)
+from spatial_replay.live.live_update import LiveUpdate, SessionStatus
+from spatial_replay.live.objects_topic import ObjectsAssembler
+from spatial_replay.logs.messages import Channel
+from spatial_replay.logs.topics import OBJECTS, is_kept
+from spatial_replay.mapping import LiveAssembler, LogMapping, ReadingPlan, load_mapping
+from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
+from spatial_replay.monitor.monitor import Ending, Monitor
+from spatial_replay.recording.changes import VerdictChanges
+from spatial_replay.recording.recorder import SampleWriter
+from spatial_replay.spec.formula import Specification
+from spatial_replay.text import counted
+from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Trace
+
+MAX_DELAY_S: Final = 0.2
+"""How long a sample waits for transforms, and for topics that lag behind, by default."""
+
+LATE_S: Final = 0.5
+"""A sample that has waited longer than this for its evaluation is dropped if there is a newer one."""
+
+_OFFER_S: Final = 10.0
+_SETTLE_S: Final = 0.3
+"""How long the topics of the mapping may take to be offered; and further ones, such as transforms."""
+
+_TURN_S: Final = 0.02
+"""How long samples are evaluated before what has come is taken in."""
+
+
+class LiveSession:
+    """One run of monitors over what a server sends: a process for one event loop.
+
+    Iterate over `updates` once, and `stop` it from anywhere in the loop.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        specifications: Specification | Sequence[Specification],
+        mapping: LogMapping | str | PathLike[str] | None = None,
+        *,
+        recorders: Sequence[SampleWriter] = (),
+        topics: Sequence[str] = (),
+        max_delay_s: float = MAX_DELAY_S,
+        dead_man_s: float | None = None,
+    ) -> None:
+        """Compile everything, before the connection is made; see `monitor` for the arguments.
+
+        Args:
+            recorders: take every sample, and the messages of mapped topics and of `topics`, as they come.
+        """
+        for name, value in (("max_delay_s", max_delay_s), ("dead_man_s", dead_man_s)):
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise UsageError(f"{name} is {value!r}; give seconds above 0")
+        self.files = (
+            [specifications] if isinstance(specifications, Specification) else list(specifications)
+        )
+        if not self.files:
+            raise UsageError("there is no specification to monitor; give one")
+        self._address = address
+        self._mapping = (
+            mapping if mapping is None or isinstance(mapping, LogMapping) else load_mapping(mapping)
+        )
+        self._recorders = recorders
+        self._topics = tuple(topics)
+        self._max_delay_s, self._dead_man_s = max_delay_s, dead_man_s
+        self._monitors = [Monitor(file) for file in self.files]
+        self._changes = VerdictChanges(self.files)
+        self._assembler: LiveAssembler | ObjectsAssembler | None = None
+        self._channels: tuple[Channel, ...] = ()
+        self._planned: dict[str, Channel] = {}
+        self._offered_s = self._settled_s = math.inf
+        self._last_s: dict[str, float] = {}
+        self._silent: set[str] = set()
+        self._notes: list[str] = []
+        self._missing: tuple[str, ...] = ()
+        self._server: str | None = None
+        self._is_connected = False
+        self._samples = self._messages = self._dropped = 0
+        self._delay_s = math.nan
+        self._time_ns: int | None = None
+        self._stopped = False
+        self._inbox: Inbox | None = None
+        self._refused: set[str] = set()
+        self.remarks: tuple[str, ...] = ()
+        self.failure: LogError | None = None
+        """Why the run ended before it was stopped: time that jumped back."""
+
+    @property
+    def status(self) -> SessionStatus:
+        """How it goes."""
+        return SessionStatus(
+            self._server,
+            self._is_connected,
+            self._missing,
+            self._samples,
+            self._messages,
+            self._dropped,
+            0 if self._inbox is None else self._inbox.dropped,
+            0 if self._assembler is None else self._assembler.overdue,
+            self._delay_s,
+            self._time_ns,
+        )
+
+    def endings(self) -> tuple[Ending, ...]:
+        """Return the result of each spec if the run ends with the newest sample."""
+        return tuple(each for monitor in self._monitors for each in monitor.endings())
+
+    def take_notes(self) -> tuple[str, ...]:
+        """Return what happened since the last update, if anything did."""
+        notes, self._notes = tuple(self._notes), []
+        return notes
+
+    def stop(self) -> None:
+        """End `updates` once what has come is evaluated."""
+        self._stopped = True
+        if self._inbox is not None:
+            self._inbox.filled.set()
+
+    async def updates(self) -> AsyncIterator[LiveUpdate]:
+        """Yield an update for each sample, until stopped.
+
+        Raises:
+            RemoteError: the first connection fails.
+            UsageError: the mapping does not fit what the server sends.
+            LogError: a message cannot be brought into the order of time.
+        """
+        inbox = self._inbox = Inbox()
+        client = Client(self._address, self._wants, inbox, self._record)
+        listening = asyncio.create_task(client.run())
+        listening.add_done_callback(lambda _: inbox.filled.set())
+        try:
+            while not (self._stopped or self.failure):
+                await self._wait(inbox)
+                if listening.done():
+                    listening.result()
+                async for update in self._turn(inbox):
+                    yield update
+            async for update in self._evaluated(self._finish(), time.monotonic()):
+                yield update
+        finally:
+            listening.cancel()
+            with suppress(asyncio.CancelledError, Exception):
+                await listening
+
+    # ------------------------------------------------------------------------------ what comes
+
+    def _wants(self, topic: str) -> bool:
+        return self._is_evaluated(topic) or self._is_copied(topic)
+
+    def _is_evaluated(self, topic: str) -> bool:
+        if self._mapping is None:
+            return topic == OBJECTS
+        if topic in self._planned or topic == self._mapping.sampling.topic:
+            return True
+        # which topics have transforms is known once they are offered: their names say it to a client
+        is_frames = self._mapping.fixed_frame is not None and topic.rsplit("/", 1)[-1] in ("tf", "tf_static")
+        return is_frames or any(entry.topic == topic for entry in self._mapping.topics)
+
+    def _is_copied(self, topic: str) -> bool:
+        return is_kept(topic, self._topics, ()) if self._topics else self._is_evaluated(topic)
+
+    def _record(self, received: Received) -> None:
+        """Hand a message to the recorders, before anything may drop it."""
+        channel = received.channel
+        if not self._recorders or channel.topic in self._refused or not self._is_copied(channel.topic):
+            return
+        for recorder in self._recorders:
+            try:
+                recorder.copy(channel, received.time_ns, received.payload)
+            except UsageError as error:
+                self._refused.add(channel.topic)
+                self._notes.append(f"{channel.topic} is not recorded: {error}")
+
+    async def _wait(self, inbox: Inbox) -> None:
+        """Wait until there is something to do."""
+        now_s = time.monotonic()
+        times = [self._settled_s, self._offered_s]
+        if self._assembler is not None:
+            times.append(self._assembler.due_s() or math.inf)
+            if self._dead_man_s is not None:
+                waiting = (at for topic, at in self._last_s.items() if topic not in self._silent)
+                times.append(min(waiting, default=math.inf) + self._dead_man_s)
+        due_s = min(times)
+        if inbox.filled.is_set() or due_s <= now_s:
+            # the client has to be let in, however much there is to evaluate
+            await asyncio.sleep(0)
+            return
+        with suppress(TimeoutError):
+            async with asyncio.timeout(None if due_s == math.inf else due_s - now_s):
+                await inbox.filled.wait()
+
+    async def _turn(self, inbox: Inbox) -> AsyncIterator[LiveUpdate]:
+        """Take in what has come, and evaluate the samples that are complete."""
+        messages: list[Message] = []
+        arrived_s = math.inf
+        for item in inbox.take():
+            if isinstance(item, Received):
+                self._messages += 1
+                topic = item.channel.topic
+                if self._assembler is None or self._planned.get(topic) is None:
+                    continue
+                arrived_s = min(arrived_s, item.arrived_s)
+                self._last_s[topic] = item.arrived_s
+                self._silent.discard(topic)
+                messages.append(Message(topic, item.time_ns, item.time_ns, 0, item.payload))
+                continue
+            # what came before is evaluated first: afterwards it may be unknown
+            async for update in self._evaluated(self._add(messages), arrived_s):
+                yield update
+            messages, arrived_s = [], math.inf
+            match item:
+                case Connected(server):
+                    if self._server is not None:
+                        self._notes.append(f"connected again to {self._address}")
+                    self._server, self._is_connected = server, True
+                    self._offered_s = time.monotonic() + _OFFER_S
+                case Offered(channels):
+                    self._channels = channels
+                    self._plan()
+                case Warned(text):
+                    self._notes.append(text)
+                case Disconnected(reason, at_s):
+                    self._is_connected = False
+                    self._offered_s = self._settled_s = math.inf
+                    self._notes.append(
+                        f"the connection to {self._address} is lost: {reason}; everything is unknown until"
+                        " it is back"
+                    )
+                    async for update in self._evaluated(self._lose(list(self._planned)), at_s):
+                        yield update
+        async for update in self._evaluated(self._add(messages), arrived_s):
+            yield update
+        now_s = time.monotonic()
+        if self._assembler is None and self._is_connected and now_s >= min(self._offered_s, self._settled_s):
+            self._begin()
+        async for update in self._evaluated(self._fall_silent(now_s), now_s):
+            yield update
+
+    def _add(self, messages: Sequence[Message]) -> Trace:
+        if self._assembler is None:
+            return Trace.from_samples(())
+        trace = self._assembler.add(messages, time.monotonic())
+        self._notes += self._assembler.take_faults()
+        if self._assembler.is_finished and self.failure is None:
+            self.failure = LogError(
+                f"{self._address}: time jumps back by more than a second, as when a simulation or a player"
+                " starts again; the run ends there, and what comes after is another: start the monitor again"
+            )
+        return trace
+
+    def _lose(self, topics: Sequence[str]) -> Trace:
+        if self._assembler is None:
+            return Trace.from_samples(())
+        return self._assembler.lose(topics, time.monotonic())
+
+    def _fall_silent(self, now_s: float) -> Trace:
+        """Note topics that have been silent for too long; what they reported is unknown from now on."""
+        if self._dead_man_s is None or self._assembler is None or not self._is_connected:
+            return Trace.from_samples(())
+        watched = [topic for topic in self._assembler.topics if topic not in self._silent]
+        silent = [each for each in watched if now_s - self._last_s.get(each, now_s) >= self._dead_man_s]
+        if not silent:
+            return Trace.from_samples(())
+        self._silent |= {*silent}
+        listed = ", ".join(silent)
+        self._notes.append(f"no message on {listed} for {self._dead_man_s:g} s: what it reports is unknown")
+        return self._lose(silent)
+
+    # -------------------------------------------------------------------------------- planning
+
+    def _plan(self) -> None:
+        """Look for the topics of the mapping among those that the server offers."""
+        offered = {channel.topic: channel for channel in self._channels}
+        if self._assembler is not None:
+            changed = [
+                topic
+                for topic, channel in self._planned.items()
+                if topic in offered and offered[topic] != channel
+            ]
+            if changed:
+                raise LogError(
+                    f"{self._address}: {', '.join(changed)} has another type or definition than before; start"
+                    " the monitor again"
+                )
+            self._missing = tuple(topic for topic in self._planned if topic not in offered)
+            return
+        if self._mapping is None:
+            wanted = [OBJECTS]
+        else:
+            wanted = [entry.topic for entry in self._mapping.topics if not entry.optional]
+            wanted += [each for each in [self._mapping.sampling.topic] if each is not None]
+        self._missing = tuple(topic for topic in dict.fromkeys(wanted) if topic not in offered)
+        # transforms and optional topics are often offered a little later
+        self._settled_s = math.inf if self._missing else time.monotonic() + _SETTLE_S
+
+    def _begin(self) -> None:
+        """Begin to assemble samples from the topics that are offered now."""
+        self._offered_s = self._settled_s = math.inf
+        offered = {channel.topic: channel for channel in self._channels}
+        if self._mapping is None:
+            if OBJECTS not in offered:
+                raise UsageError(
+                    f"{self._address} has no topic {OBJECTS}; give --mapping FILE (`mapping=`) to say which"
+                    f" topics carry which objects: {', '.join(sorted(offered)[:20]) or 'it has none'}"
+                )
+            self._assembler, self._planned = ObjectsAssembler(self._address), {OBJECTS: offered[OBJECTS]}
+        else:
+            topics = topics_by_name(map(topic_of, self._channels))
+            try:
+                plan = ReadingPlan.of(self._mapping, topics)
+            except UsageError as error:
+                raise UsageError(str(error).replace("the log has", "the server offers")) from None
+            by_name = {topic.name: topic for topic in topics}
+            self._assembler = LiveAssembler(
+                plan,
+                lambda topic: decoder_of(by_name[topic]),
+                name=self._address,
+                max_delay_s=self._max_delay_s,
+            )
+            self._planned = {topic: offered[topic] for topic in plan.topics}
+            unheard = [
+                topic.name
+                for topic in topics
+                if topic.name in self._planned
+                and short_type(topic.type) in TRANSFORM_TYPES
+                and not self._wanted_before(topic.name)
+            ]
+            if unheard:
+                self._notes.append(f"transforms on {', '.join(unheard)} are not listened to: map the topic")
+        now_s = time.monotonic()
+        self._last_s = dict.fromkeys(self._assembler.topics, now_s)
+        self._notes.append(
+            f"connected to {self._address}{f' ({self._server})' if self._server else ''}:"
+            f" {counted(len(self._planned), 'topic')}"
+        )
+
+    def _wanted_before(self, topic: str) -> bool:
+        planned, self._planned = self._planned, {}
+        try:
+            return self._is_evaluated(topic)
+        finally:
+            self._planned = planned
+
+    # ------------------------------------------------------------------------------ evaluating
+
+    async def _evaluated(self, trace: Trace, arrived_s: float) -> AsyncIterator[LiveUpdate]:
+        """Evaluate samples, and yield what they give; late ones are dropped while newer ones wait."""
+        if not len(trace):
+            return
+        turn_s = time.monotonic()
+        last_ns = int(trace.times_ns[-1])
+        for sample in trace.samples():
+            now_s = time.monotonic()
+            if now_s - arrived_s > LATE_S and sample.time_ns != last_ns:
+                self._dropped += 1
+                continue
+            if now_s - turn_s > _TURN_S:
+                await asyncio.sleep(0)
+                turn_s = now_s
+            yield self._update(sample, arrived_s)
+
+    def _update(self, sample: Sample, arrived_s: float) -> LiveUpdate:
+        updates = tuple(monitor.update(sample) for monitor in self._monitors)
+        self._samples += 1
+        self._time_ns = sample.time_ns
+        now_s = time.monotonic()
+        self._delay_s = max(0.0, now_s - min(arrived_s, now_s))
+        for recorder in self._recorders:
+            recorder.write(sample)
+        changes = tuple(self._changes.after(updates))
+        return LiveUpdate(sample, changes, self.take_notes(), self._delay_s, self._dropped, updates)
+
+    def _finish(self) -> Trace:
+        if self._assembler is None:
+            return Trace.from_samples(())
+        trace = self._assembler.finish() if self.failure is None else Trace.from_samples(())
+        self.remarks = self._assembler.take_remarks()
+        return trace

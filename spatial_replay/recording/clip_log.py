@@ -1,0 +1,479 @@
+"""Clips around triggers: everything waits in a ring in memory, and a log is written when one fires."""
+
+from __future__ import annotations
+
+import json
+import math
+import queue
+import re
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from spatial_replay.errors import OutputError, UsageError
+from spatial_replay.geometry.footprint import Footprint
+from spatial_replay.logs.mcap.writer import LogWriter
+from spatial_replay.logs.messages import Channel, Messages
+from spatial_replay.logs.output_file import open_output
+from spatial_replay.logs.topics import TRIGGER
+from spatial_replay.monitor.monitor import Monitor, Update
+from spatial_replay.recording.changes import VerdictChanges
+from spatial_replay.recording.recorder_log import GATHER_S, RunEnd, warm_up
+from spatial_replay.recording.recording import Recording
+from spatial_replay.spec.formula import Specification, iter_nodes
+from spatial_replay.text import counted, nearest_hint
+from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Trace
+
+MOST_BYTES: Final = 256 * 2**20
+"""The most bytes that a ring holds by default."""
+
+_SLICE_BYTES: Final = 8 * 2**20
+"""About the most bytes that are written to a clip before what has come is taken in."""
+
+_LATE_NS: Final = 10**9
+"""How far samples may come behind messages, and messages behind samples."""
+
+_MESSAGE_BYTES, _SAMPLE_BYTES, _OBJECT_BYTES, _VERTEX_BYTES = 320, 400, 600, 16
+"""What a message takes in memory besides its payload; a sample, each object of it, each corner."""
+
+_MOST_STATIC: Final = 256
+_STATIC: Final = "tf_static"
+_VERDICTS: Final = ("violated", "satisfied")
+_BELOW: Final = re.compile(r"(?P<name>.+?)\s*<=?\s*(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)$")
+
+
+@dataclass(frozen=True, slots=True)
+class Trigger:
+    """When a recorder writes a clip, and how much of what it holds.
+
+    Attributes:
+        when: "violated" or "satisfied" for any spec, "NAME violated" for one; "NAME < 0.2" when its
+            robustness falls below a number; "event" for any change of a verdict, or of a sign that lasts;
+            "manual" for `Recorder.trigger` alone, which always fires. Several are given as a sequence.
+        before_s, after_s: how much time is kept, on the clock of the samples.
+        most_bytes: how much memory the ring takes; when that does not hold `before_s`, it is reported.
+    """
+
+    when: str | Sequence[str] = "violated"
+    before_s: float = 10.0
+    after_s: float = 5.0
+    most_bytes: int = MOST_BYTES
+
+    def __post_init__(self) -> None:
+        for name in ("before_s", "after_s"):
+            value = getattr(self, name)
+            if not (isinstance(value, (int, float)) and math.isfinite(value) and value >= 0):
+                raise UsageError(f"{name} is {value!r}; give seconds, 0 or more")
+        if self.most_bytes < 2**20:
+            raise UsageError(f"most_bytes is {self.most_bytes}; a ring takes 1 MB (1048576) or more")
+
+
+@dataclass(frozen=True, slots=True)
+class TriggeredClip:
+    """One log that a trigger has left.
+
+    Attributes:
+        path: its file.
+        reason: what fired, the first if several did while it was written.
+        time_ns: when it fired.
+        held_s: how much of the time before it the clip has.
+    """
+
+    path: Path
+    reason: str
+    time_ns: int
+    held_s: float
+
+
+class _Held(NamedTuple):
+    """A message in the ring; `size` is what it takes in memory."""
+
+    time_ns: int
+    channel: int
+    sequence: int
+    publish_ns: int
+    payload: bytes
+    size: int
+
+
+class _HeldSample(NamedTuple):
+    """A sample in the ring."""
+
+    time_ns: int
+    sample: Sample
+    size: int
+
+
+_Condition = Callable[[Sequence[Update], bool], str | None]
+
+
+class _Open:
+    """A clip that is being written: some of the ring still waits, and what comes follows."""
+
+    def __init__(
+        self, path: Path, files: Sequence[Specification], about: Mapping[str, str], fired: str, at_ns: int
+    ) -> None:
+        self.path, self.reasons, self.at_ns = path, [fired], at_ns
+        self.waiting: deque[_Held | _HeldSample] = deque()
+        self.waiting_bytes = 0
+        self.until_ns = at_ns
+        self.first_ns: int | None = None
+        self.last_s = time.monotonic()
+        self.channels: Mapping[int, Channel] = {}
+        self._stream = open_output(path)
+        try:
+            self._writer = LogWriter(self._stream, clock=time.monotonic)
+            self._recording = Recording(self._writer, files, {**about, "trigger": fired})
+        except BaseException:
+            with suppress(OutputError):
+                self._stream.close()
+            raise
+        self._last_ns: dict[int, int] = {}
+        self._sample_ns = -1
+
+    def put(self, item: _Held | _HeldSample) -> None:
+        self.waiting.append(item)
+        self.waiting_bytes += item.size
+        self.last_s = time.monotonic()
+
+    def write(self, most_bytes: float = _SLICE_BYTES) -> None:
+        """Write some of what waits."""
+        samples: list[Sample] = []
+        messages: list[_Held] = []
+        size = 0
+        while self.waiting and size < most_bytes:
+            item = self.waiting.popleft()
+            size += item.size
+            self.first_ns = item.time_ns if self.first_ns is None else min(self.first_ns, item.time_ns)
+            if isinstance(item, _Held):
+                messages.append(item)
+            elif item.time_ns > self._sample_ns:
+                samples.append(item.sample)
+                self._sample_ns = item.time_ns
+        self.waiting_bytes -= size
+        if not (samples or messages):
+            return
+        beside = Messages()
+        if messages:
+            columns = zip(*(each[:4] for each in messages), strict=True)
+            log_ns, channel, sequence, publish_ns = (np.array(each, np.int64) for each in columns)
+            payloads = [each.payload for each in messages]
+            beside = Messages(self.channels, channel, sequence, log_ns, publish_ns, payloads)
+        self._recording.add(Trace.from_samples(samples), beside)
+
+    def flush(self) -> None:
+        self._writer.flush()
+        self._stream.flush()
+
+    def finish(self, end: RunEnd, before_s: float, after_s: float) -> TriggeredClip:
+        """Write all that waits, and close the log."""
+        try:
+            self.write(math.inf)
+            held_s = 0.0 if self.first_ns is None else max(0.0, (self.at_ns - self.first_ns) / 1e9)
+            record = {
+                "reasons": json.dumps(self.reasons),
+                "time_ns": str(self.at_ns),
+                "before_s": repr(before_s),
+                "after_s": repr(after_s),
+                "held_before_s": repr(held_s),
+            }
+            self._writer.add_metadata(TRIGGER, record)
+            self._recording.end(
+                interrupted=end.interrupted, dropped=end.dropped, messages_dropped=end.messages_dropped
+            )
+            self._writer.close()
+        finally:
+            self._stream.close()
+        return TriggeredClip(self.path, self.reasons[0], self.at_ns, held_s)
+
+
+class ClipLog:
+    """The ring of a recorder with a trigger, and the clips that it leaves; see `RecorderLog`.
+
+    A trigger that fires while a clip is open makes it longer.
+    """
+
+    gather_s = GATHER_S / 4
+
+    def __init__(
+        self,
+        folder: Path,
+        files: Sequence[Specification],
+        about: Mapping[str, str] | None,
+        trigger: Trigger,
+    ) -> None:
+        """Compile everything, and make the folder."""
+        self._folder, self._files, self._about = folder, files, dict(about or {})
+        self._trigger = trigger
+        texts = [trigger.when] if isinstance(trigger.when, str) else list(trigger.when)
+        self._conditions = [(text, _condition(text, files)) for text in texts]
+        self._held_before = dict.fromkeys(texts, False)
+        self._before_ns, self._after_ns = round(trigger.before_s * 1e9), round(trigger.after_s * 1e9)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{folder}: {(error.strerror or str(error)).lower()}") from None
+        self._monitors = [Monitor(file) for file in files]
+        self._changes = VerdictChanges(files)
+        warm_up(files, ())
+        self._samples: deque[_HeldSample] = deque()
+        self._messages: deque[_Held] = deque()
+        self._static: deque[_Held] = deque(maxlen=_MOST_STATIC)
+        self._channels: Mapping[int, Channel] = {}
+        self._bytes = 0
+        self._newest_ns = -1
+        self._open: _Open | None = None
+        self._fired: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._remarks: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._has_overflowed = False
+        self.written: tuple[TriggeredClip, ...] = ()
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a clip waits to be written, or a trigger was fired by hand."""
+        return not self._fired.empty() or (self._open is not None and bool(self._open.waiting))
+
+    @property
+    def held_bytes(self) -> int:
+        """What the ring takes in memory."""
+        return self._bytes
+
+    def fire(self, reason: str) -> None:
+        """Fire by hand, from any thread."""
+        self._fired.put(reason)
+
+    def take_remarks(self) -> tuple[str, ...]:
+        """Return what happened since the last call."""
+        taken: list[str] = []
+        with suppress(queue.Empty):
+            while True:
+                taken.append(self._remarks.get_nowait())
+        return tuple(taken)
+
+    def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
+        """Take the next samples and messages into the ring; write what belongs to an open clip."""
+        self._take_messages(messages)
+        for sample in samples:
+            self._hold(_HeldSample(sample.time_ns, sample, _sample_bytes(sample)), self._samples)
+            self._newest_ns = max(self._newest_ns, sample.time_ns)
+            updates = [monitor.update(sample) for monitor in self._monitors]
+            changes = list(self._changes.after(updates))
+            has_changed = not all(each.is_first for each in changes)
+            for text, condition in self._conditions:
+                reason = condition(updates, has_changed)
+                if reason is not None and not self._held_before[text]:
+                    self._begin(reason, sample.time_ns)
+                self._held_before[text] = reason is not None and text != "event"
+        with suppress(queue.Empty):
+            while True:
+                self._begin(self._fired.get_nowait(), max(self._newest_ns, 0))
+        self._evict()
+        if self._open is not None:
+            self._open.write()
+            while self._open.waiting_bytes > self._trigger.most_bytes:
+                self._open.write()
+            if self._newest_ns > self._open.until_ns + _LATE_NS and not self._open.waiting:
+                self._finish(RunEnd(False, 0, 0))
+
+    def flush(self) -> None:
+        """Hand what was written of a clip to the operating system; end one that nothing follows."""
+        if self._open is None:
+            return
+        self._open.flush()
+        if not self._open.waiting and time.monotonic() - self._open.last_s > self._trigger.after_s + 2.0:
+            self._finish(RunEnd(True, 0, 0))
+
+    def end(self, end: RunEnd) -> None:
+        """Finish the clip that is open."""
+        if self._open is not None:
+            is_whole = self._newest_ns >= self._open.until_ns
+            self._finish(end._replace(interrupted=end.interrupted or not is_whole))
+
+    def break_off(self, end: RunEnd) -> None:
+        """Finish the clip that is open, as far as that is possible."""
+        self.end(end)
+
+    def close(self) -> None:
+        """Let go of the ring."""
+        self._samples.clear()
+        self._messages.clear()
+
+    def _take_messages(self, messages: Messages) -> None:
+        self._channels = messages.channels or self._channels
+        static = {n for n, each in messages.channels.items() if each.topic.rsplit("/", 1)[-1] == _STATIC}
+        columns = zip(
+            messages.log_time_ns.tolist(),
+            messages.channel.tolist(),
+            messages.sequence.tolist(),
+            messages.publish_time_ns.tolist(),
+            messages.payloads,
+            strict=True,
+        )
+        for time_ns, channel, sequence, publish_ns, payload in columns:
+            size = _MESSAGE_BYTES + len(payload)
+            held = _Held(time_ns, channel, sequence, publish_ns, payload, size)
+            self._newest_ns = max(self._newest_ns, time_ns)
+            if channel in static:
+                self._static.append(held)
+            self._hold(held, self._messages)
+
+    def _hold(self, item: _Held | _HeldSample, ring: deque[_Held] | deque[_HeldSample]) -> None:
+        ring.append(item)  # type: ignore[arg-type]
+        self._bytes += item.size
+        clip = self._open
+        if clip is not None and item.time_ns <= clip.until_ns:
+            clip.channels = self._channels
+            clip.put(item)
+
+    def _begin(self, reason: str, at_ns: int) -> None:
+        """Open a clip around a time, or make the open one longer."""
+        if self._open is not None:
+            clip = self._open
+            clip.reasons.append(reason)
+            following = self._between(clip.until_ns + 1, at_ns + self._after_ns)
+        else:
+            self._evict()
+            number = len(self.written) + 1
+            while any(self._folder.glob(f"{number:04d}-*.mcap")):
+                number += 1
+            slug = re.sub(r"[^A-Za-z0-9_]+", "-", reason).strip("-")[:60] or "trigger"
+            path = self._folder / f"{number:04d}-{slug}.mcap"
+            clip = self._open = _Open(path, self._files, self._about, reason, at_ns)
+            clip.channels = self._channels
+            begin_ns = at_ns - self._before_ns
+            for held in self._static:
+                if held.time_ns < begin_ns:
+                    clip.put(held._replace(time_ns=max(begin_ns, 0)))
+            following = self._between(begin_ns, at_ns + self._after_ns)
+        for item in following:
+            clip.put(item)
+        clip.until_ns = max(clip.until_ns, at_ns + self._after_ns)
+
+    def _between(self, begin_ns: int, end_ns: int) -> list[_Held | _HeldSample]:
+        both: list[_Held | _HeldSample] = [*self._messages, *self._samples]
+        chosen = [each for each in both if begin_ns <= each.time_ns <= end_ns]
+        return sorted(chosen, key=lambda each: each.time_ns)
+
+    def _evict(self) -> None:
+        """Let go of what is too old and of what is too much, the oldest first."""
+        oldest_ns = self._newest_ns - self._before_ns - _LATE_NS
+        while self._samples or self._messages:
+            ring: deque[_Held] | deque[_HeldSample] = self._messages
+            if not self._messages or (self._samples and self._samples[0].time_ns < self._messages[0].time_ns):
+                ring = self._samples
+            is_over = self._bytes > self._trigger.most_bytes
+            if ring[0].time_ns >= oldest_ns and not is_over:
+                return
+            dropped = ring.popleft()
+            self._bytes -= dropped.size
+            if is_over and dropped.time_ns >= oldest_ns + _LATE_NS and not self._has_overflowed:
+                self._has_overflowed = True
+                held_s = (self._newest_ns - dropped.time_ns) / 1e9
+                needed = self._trigger.most_bytes * self._trigger.before_s / max(held_s, 1e-3)
+                self._remarks.put(
+                    f"the ring of {_megabytes(self._trigger.most_bytes)} holds {held_s:.1f} s, not the"
+                    f" {self._trigger.before_s:g} s asked for; about {_megabytes(needed * 1.1)} would do"
+                )
+
+    def _finish(self, end: RunEnd) -> None:
+        clip, self._open = self._open, None
+        if clip is None:
+            return
+        written = clip.finish(end, self._trigger.before_s, self._trigger.after_s)
+        self.written = (*self.written, written)
+        more = counted(len(clip.reasons) - 1, "further trigger") if len(clip.reasons) > 1 else ""
+        self._remarks.put(
+            f"wrote {clip.path}: {written.held_s:.1f} s before and up to {self._trigger.after_s:g} s after"
+            f" {written.reason}{f', and {more}' if more else ''}"
+        )
+
+
+def _sample_bytes(sample: Sample) -> int:
+    size = _SAMPLE_BYTES
+    for tracked in sample.objects.values():
+        footprint = tracked if isinstance(tracked, Footprint) else tracked.footprint
+        size += _OBJECT_BYTES + _VERTEX_BYTES * sum(len(part.vertices) for part in footprint.parts)
+    return size
+
+
+def _megabytes(size: float) -> str:
+    return f"{size / 2**20:,.0f} MB"
+
+
+def _condition(text: str, files: Sequence[Specification]) -> _Condition:
+    """Return a function of the updates with a sample that says why a trigger holds, or None.
+
+    Raises:
+        UsageError: it is none, or names no spec.
+    """
+    words = text.strip()
+    if words == "manual":
+        return lambda updates, has_changed: None
+    if words == "event":
+        return lambda updates, has_changed: "event" if has_changed else None
+    names = {
+        node.name
+        for file in files
+        for spec in file.results
+        for _, _, node in iter_nodes(spec.formula)
+        if node.name is not None
+    } | {spec.name for file in files for spec in file.results}
+    if not files:
+        raise UsageError(f"the trigger {text!r} waits for a spec, but there is none; give a specification")
+    if words in _VERDICTS:
+        return lambda updates, _: next(
+            (
+                f"{spec.spec.name} {words}"
+                for update in updates
+                for spec in update.specs
+                if str(spec.verdict) == words
+            ),
+            None,
+        )
+    name, _, verdict = words.rpartition(" ")
+    if verdict in _VERDICTS:
+        name = _known(name.strip(), names, text)
+        return lambda updates, _: f"{name} {verdict}" if _verdict(updates, name) == verdict else None
+    if (found := _BELOW.match(words)) is not None:
+        with suppress(ValueError):
+            number = float(found["number"])
+            name = _known(found["name"], names, text)
+            return lambda updates, _: f"{name} below {number:g}" if _value(updates, name) < number else None
+    raise UsageError(
+        f"the trigger {text!r} is not understood; write 'violated', 'NAME violated', 'NAME satisfied',"
+        " 'NAME < 0.2', 'event' or 'manual'"
+    )
+
+
+def _known(name: str, names: set[str], text: str) -> str:
+    if name not in names:
+        hint = nearest_hint(name, names) or f"the specs are {', '.join(sorted(names))}"
+        raise UsageError(f"the trigger {text!r} names no spec: {name!r}; {hint}")
+    return name
+
+
+def _verdict(updates: Sequence[Update], name: str) -> str:
+    for update in updates:
+        for spec in update.specs:
+            if spec.spec.name == name:
+                return str(spec.verdict)
+        if name in update.places and update.specs[update.places[name][0]].numbers is not None:
+            return str(update.node(name).verdict)
+    return ""
+
+
+def _value(updates: Sequence[Update], name: str) -> float:
+    for update in updates:
+        for spec in update.specs:
+            if spec.spec.name == name and spec.numbers is not None:
+                return float(spec.numbers[0, 0])
+        if name in update.places and update.specs[update.places[name][0]].numbers is not None:
+            return float(update.node(name).value)
+    return math.nan

@@ -1,0 +1,150 @@
+"""What a recorder writes to: a file from the first sample to the last; and the trial run before it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Final, NamedTuple, Protocol
+
+import numpy as np
+
+from spatial_replay.annotate.automaton_state import SpecAutomaton
+from spatial_replay.compiled import compile_ahead
+from spatial_replay.errors import OutputError
+from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.contact import contacts
+from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.geometry.measure import Operand
+from spatial_replay.logs.mcap.writer import LogWriter
+from spatial_replay.logs.messages import MemorySink, Messages
+from spatial_replay.logs.output_file import open_output
+from spatial_replay.recording.recording import Recording
+from spatial_replay.spec import object_names, signal_names
+from spatial_replay.spec.formula import Specification
+from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Trace
+
+GATHER_S: Final = 0.2
+"""How long samples are gathered before they are encoded. A few together cost hardly more than one, and while
+none are encoded, the caller's thread need not wait for the interpreter lock."""
+
+
+class RunEnd(NamedTuple):
+    """How a recording ended: whether early, and how many samples and messages found no place."""
+
+    interrupted: bool
+    dropped: int
+    messages_dropped: int
+
+
+class RecorderLog(Protocol):
+    """What the thread of a recorder writes to; only that thread calls it, but for `close`."""
+
+    @property
+    def gather_s(self) -> float:
+        """How long to gather samples before the next call of `add`."""
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether to call `add` again at once, whatever has come."""
+
+    def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
+        """Write the next samples, given in both forms, and messages."""
+
+    def flush(self) -> None:
+        """Hand everything written so far to the operating system."""
+
+    def end(self, end: RunEnd) -> None:
+        """Write what follows the last sample."""
+
+    def break_off(self, end: RunEnd) -> None:
+        """Write the end after a failure, as far as that is possible."""
+
+    def close(self) -> None:
+        """Let go of files, whatever happened before."""
+
+
+class FileLog:
+    """One log in one file, written in place."""
+
+    gather_s = GATHER_S
+    is_busy = False
+
+    def __init__(self, path: Path, files: Sequence[Specification], about: Mapping[str, str] | None) -> None:
+        """Begin the file, with everything compiled that writing to it takes."""
+        self._stream = open_output(path)
+        try:
+            self._writer = LogWriter(self._stream, clock=time.monotonic)
+            self._recording = Recording(self._writer, files, about)
+            self.flush()
+            warm_up(self._recording.files, self._recording.automata)
+        except BaseException:
+            with suppress(OutputError):
+                self._stream.close()
+            raise
+
+    def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
+        """See `RecorderLog`."""
+        self._recording.add(trace, messages)
+
+    def flush(self) -> None:
+        """See `RecorderLog`."""
+        self._writer.flush()
+        self._stream.flush()
+
+    def end(self, end: RunEnd) -> None:
+        """See `RecorderLog`."""
+        self._recording.end(
+            interrupted=end.interrupted, dropped=end.dropped, messages_dropped=end.messages_dropped
+        )
+        self._writer.close()
+
+    def break_off(self, end: RunEnd) -> None:
+        """See `RecorderLog`."""
+        self._recording.break_off(dropped=end.dropped, messages_dropped=end.messages_dropped)
+        self._writer.close()
+
+    def close(self) -> None:
+        """See `RecorderLog`."""
+        self._stream.close()
+
+
+def warm_up(files: Sequence[Specification], automata: Sequence[SpecAutomaton]) -> None:
+    """Record some samples into memory, so that the code for the specifications is compiled and loaded.
+
+    With an empty compiler cache this takes many seconds, otherwise a fraction of one.
+
+    Args:
+        automata: those of the specifications, which are not compiled again.
+    """
+    compile_ahead()
+    recording = Recording(MemorySink(), files, known=automata)
+    objects = ["object", *(name for file in files for name in object_names(file))]
+    signals = {name: 0.0 for file in files for name in signal_names(file)}
+    samples = [
+        Sample(
+            time_s * 10**9,
+            {
+                name: _tracked(index + time_s, 0.1 * index + time_s)
+                for index, name in enumerate(dict.fromkeys(objects))
+            },
+            signals,
+        )
+        for time_s in range(4)
+    ]
+    recording.add(Trace.from_samples(samples[:1]))
+    recording.add(Trace.from_samples(samples[1:]))
+    # without objects: intervals of unknown atoms run code of their own
+    recording.add(Trace.from_samples([Sample(10**10, {})]))
+    recording.end()
+    # the arrow at a violation, of which these samples may have none
+    shapes = FootprintBatch.from_footprints([Footprint.box(x, 0, x + 1, 1) for x in range(2)])
+    contacts(shapes, *(Operand(np.array([[row]])) for row in range(2)), is_protrusion=False)
+
+
+def _tracked(kind: int, x: float) -> TrackedObject:
+    box, disc = Footprint.box(x, 0, x + 1, 1), Footprint.disc(x + 0.5, 0.5, 0.5)
+    footprint = (box, disc, Footprint((*box.parts, *disc.parts)))[kind % 3]
+    return TrackedObject(footprint, class_name="thing", yaw=x, height=(0.0, 1.0), uncertainty=0.01)
