@@ -42,7 +42,7 @@ MAX_DELAY_S: Final = 0.2
 LATE_S: Final = 0.5
 """A sample that has waited longer than this for its evaluation is dropped if there is a newer one."""
 
-_OFFER_S: Final = 10.0
+_OFFER_S: Final = 5.0
 _SETTLE_S: Final = 0.3
 """How long the topics of the mapping may take to be offered; and further ones, such as transforms."""
 
@@ -75,9 +75,7 @@ class LiveSession:
         for name, value in (("max_delay_s", max_delay_s), ("dead_man_s", dead_man_s)):
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise UsageError(f"{name} is {value!r}; give seconds above 0")
-        self.files = (
-            [specifications] if isinstance(specifications, Specification) else list(specifications)
-        )
+        self.files = [specifications] if isinstance(specifications, Specification) else list(specifications)
         if not self.files:
             raise UsageError("there is no specification to monitor; give one")
         self._address = address
@@ -104,6 +102,7 @@ class LiveSession:
         self._time_ns: int | None = None
         self._stopped = False
         self._inbox: Inbox | None = None
+        self._early = Inbox()
         self._refused: set[str] = set()
         self.remarks: tuple[str, ...] = ()
         self.failure: LogError | None = None
@@ -119,7 +118,7 @@ class LiveSession:
             self._samples,
             self._messages,
             self._dropped,
-            0 if self._inbox is None else self._inbox.dropped,
+            self._early.dropped + (0 if self._inbox is None else self._inbox.dropped),
             0 if self._assembler is None else self._assembler.overdue,
             self._delay_s,
             self._time_ns,
@@ -219,10 +218,14 @@ class LiveSession:
         arrived_s = math.inf
         for item in inbox.take():
             if isinstance(item, Received):
-                self._messages += 1
                 topic = item.channel.topic
-                if self._assembler is None or self._planned.get(topic) is None:
+                if self._assembler is None:
+                    # what comes while further topics are waited for is evaluated afterwards
+                    self._early.put(item)
                     continue
+                if topic not in self._planned:
+                    continue
+                self._messages += 1
                 arrived_s = min(arrived_s, item.arrived_s)
                 self._last_s[topic] = item.arrived_s
                 self._silent.discard(topic)
@@ -257,6 +260,9 @@ class LiveSession:
         now_s = time.monotonic()
         if self._assembler is None and self._is_connected and now_s >= min(self._offered_s, self._settled_s):
             self._begin()
+            self._early, early = Inbox(), self._early
+            for item in early.take():
+                inbox.put(item)
         async for update in self._evaluated(self._fall_silent(now_s), now_s):
             yield update
 
@@ -397,6 +403,6 @@ class LiveSession:
     def _finish(self) -> Trace:
         if self._assembler is None:
             return Trace.from_samples(())
-        trace = self._assembler.finish() if self.failure is None else Trace.from_samples(())
+        trace = self._assembler.finish()
         self.remarks = self._assembler.take_remarks()
         return trace

@@ -1,9 +1,9 @@
-"""A server of the Foxglove SDK in a process of its own, which plays a log to whoever subscribes.
+"""A server of the Foxglove SDK in a process of its own, which plays a part of a log once it is listened to.
 
-    python player.py LOG PORT SPEED TOPIC…
+    python player.py LOG PORT SPEED FROM TO TOPIC…
 
-It prints its port, waits until the topics are subscribed to, plays, says "played", and stays until it is
-ended. A PORT of 0 is any that is free. Speed 0 is as fast as it goes.
+It prints its port (0 takes any that is free), waits until the topics are subscribed to, plays what was logged
+from FROM to TO seconds after the first message, prints "played", and stays until it is ended.
 """
 
 from __future__ import annotations
@@ -18,37 +18,38 @@ from spatial_replay.bags import open_messages
 from spatial_replay.bags.decoders import channel_of
 
 
+def say(text: str) -> None:
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
+
+
 def main() -> None:
-    log, port, speed, *topics = sys.argv[1:]
+    log, port, speed, begin, end, *topics = sys.argv[1:]
     reader = open_messages(Path(log))
-    names = [topic.name for topic in reader.topics() if topic.schema is not None or topic.unreadable is None]
     context = foxglove.Context()
     channels = {}
     for topic in reader.topics():
-        if topic.name in names:
-            declared = channel_of(topic)
-            schema = declared.schema
-            assert schema is not None
+        declared = channel_of(topic)
+        schema = declared.schema
+        if schema is not None:
             described = foxglove.Schema(name=schema.name, encoding=schema.encoding, data=schema.data)
             channels[topic.name] = foxglove.Channel(
                 topic.name, schema=described, message_encoding=declared.encoding, context=context
             )
     server = foxglove.start_server(name="player", host="127.0.0.1", port=int(port), context=context)
-    sys.stdout.write(f"{server.port}\n")
-    sys.stdout.flush()
+    say(str(server.port))
     while not all(channels[topic].has_sinks() for topic in topics):
         time.sleep(0.002)
-    first_ns, began = None, time.monotonic()
-    for message in reader.iter_messages(names):
-        if first_ns is None:
-            first_ns = message.log_time_ns
-        if float(speed):
-            pause = began + (message.log_time_ns - first_ns) / 1e9 / float(speed) - time.monotonic()
-            if pause > 0:
-                time.sleep(pause)
-        channels[message.topic].log(message.payload, log_time=message.log_time_ns)
-    sys.stdout.write("played\n")
-    sys.stdout.flush()
+    messages = list(reader.iter_messages(channels))
+    first_ns = messages[0].log_time_ns
+    span_ns = first_ns + round(float(begin) * 1e9), first_ns + round(float(end) * 1e9)
+    began = time.monotonic()
+    for message in messages:
+        if span_ns[0] <= message.log_time_ns < span_ns[1]:
+            due = began + (message.log_time_ns - span_ns[0]) / 1e9 / float(speed)
+            time.sleep(max(0.0, due - time.monotonic()))
+            channels[message.topic].log(message.payload, log_time=message.log_time_ns)
+    say("played")
     while True:
         time.sleep(60)
 

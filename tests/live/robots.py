@@ -1,0 +1,153 @@
+"""Servers for monitors: a log played by another process, a robot in this one, one that keeps no rules."""
+
+from __future__ import annotations
+
+import json
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import foxglove
+from websockets.exceptions import WebSocketException
+from websockets.sync.server import ServerConnection, serve
+from websockets.typing import Subprotocol
+
+PLAYER = Path(__file__).with_name("player.py")
+MS = 10**6
+
+MAPPING = """
+topics:
+  /robot: {name: robot, position: [x, y], shape: {disc: 0.1}}
+  /vase: {name: vase, position: [x, y], shape: {disc: 0.1}}
+sample: {topic: /robot}
+max_age: 10s
+"""
+SPEC = "spec clear = G (robot dist vase >= 0.5)\nspec seen = F (robot dist vase <= 9)\n"
+
+
+class Player:
+    """A process that plays a log; see player.py."""
+
+    def __init__(
+        self, log: Path, *topics: str, speed: float = 3, begin: float = 0, end: float = 1e6, port: int = 0
+    ) -> None:
+        arguments = [str(each) for each in (log, port, speed, begin, end, *topics)]
+        self.process = subprocess.Popen(
+            [sys.executable, str(PLAYER), *arguments], stdout=subprocess.PIPE, text=True
+        )
+        assert self.process.stdout is not None
+        self.port = int(self.process.stdout.readline())
+        self.address = f"ws://127.0.0.1:{self.port}"
+
+    def wait(self) -> None:
+        """Wait until everything was played."""
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline() == "played\n"
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+
+@contextmanager
+def playing(log: Path, *topics: str, **options: float) -> Iterator[Player]:
+    player = Player(log, *topics, **options)  # type: ignore[arg-type]
+    try:
+        yield player
+    finally:
+        player.kill()
+
+
+class Robot:
+    """A server of the Foxglove SDK with a robot that drives past a vase, as JSON."""
+
+    def __init__(self) -> None:
+        self._context = foxglove.Context()
+        self._channels = {
+            topic: foxglove.Channel(
+                topic,
+                schema={"type": "object", "title": "Pose"},
+                message_encoding="json",
+                context=self._context,
+            )
+            for topic in ("/robot", "/vase", "/note")
+        }
+        self.server = foxglove.start_server(name="robot", host="127.0.0.1", port=0, context=self._context)
+        self.address = f"ws://127.0.0.1:{self.server.port}"
+
+    def is_heard(self) -> bool:
+        return all(self._channels[topic].has_sinks() for topic in ("/robot", "/vase"))
+
+    def send(self, topic: str, time_ns: int, **fields: object) -> None:
+        self._channels[topic].log(json.dumps(fields).encode(), log_time=time_ns)
+
+    def drive(self, tick: int, x: float = 0.0) -> None:
+        """Report both poses at a tick of 10 ms, the vase at the origin."""
+        self.send("/vase", tick * 10 * MS, x=0.0, y=0.0)
+        self.send("/robot", tick * 10 * MS + 1, x=x, y=0.0)
+
+
+@contextmanager
+def robot() -> Iterator[Robot]:
+    own = Robot()
+    try:
+        yield own
+    finally:
+        stopping = threading.Thread(target=own.server.stop, daemon=True)
+        stopping.start()
+        stopping.join(1.0)
+
+
+ADVERTISED = {
+    "op": "advertise",
+    "channels": [
+        {
+            "id": number,
+            "topic": topic,
+            "encoding": "json",
+            "schemaName": "Pose",
+            "schema": '{"type":"object"}',
+        }
+        for number, topic in enumerate(("/robot", "/vase"), 1)
+    ],
+}
+
+
+def frame(number: int, time_ns: int, payload: bytes) -> bytes:
+    return struct.pack("<BIQ", 1, number, time_ns) + payload
+
+
+def pose(number: int, tick: int, x: float = 0.0) -> bytes:
+    return frame(number, tick * 10 * MS + (number == 1), json.dumps({"x": x, "y": 0.0}).encode())
+
+
+@contextmanager
+def rude_server(*sent: str | bytes, protocol: str = "foxglove.websocket.v1") -> Iterator[str]:
+    """A server that sends what it is given once it is subscribed to, whatever it is."""
+
+    def serving(connection: ServerConnection) -> None:
+        with suppress(WebSocketException, OSError):
+            connection.send(json.dumps({"op": "serverInfo", "name": "rude", "capabilities": []}))
+            connection.send(json.dumps(ADVERTISED))
+            assert json.loads(connection.recv(30))["op"] == "subscribe"
+            # a monitor begins once no further topics are offered
+            with suppress(TimeoutError):
+                connection.recv(0.6)
+            for each in sent:
+                connection.send(each)
+            connection.recv(60)
+
+    with serve(serving, "127.0.0.1", 0, subprotocols=[Subprotocol(protocol)], max_size=None) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        try:
+            yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+        finally:
+            server.shutdown()
+            thread.join(5)

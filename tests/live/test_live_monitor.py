@@ -1,0 +1,455 @@
+"""A running robot, over real connections: what a monitor makes of it, and what it leaves on the disk."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from contextlib import aclosing
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+import spatial_replay as sr
+from live.robots import MAPPING, SPEC, Player, Robot, frame, playing, pose, robot, rude_server
+from serve.viewer import Message, viewer
+from spatial_replay import LogError, Sample, Trace, Trigger, UsageError
+from spatial_replay.bags import open_messages
+from spatial_replay.cli.application import run
+from spatial_replay.live import LiveSession, LiveUpdate, monitor
+from spatial_replay.live.client import LARGEST_FRAME
+from spatial_replay.logs.topics import EVENTS, OBJECTS, ROBUSTNESS, SCENE
+
+PATIENCE_S = 90
+TURTLES = """
+topics:
+  /turtle1/pose: {shape: {disc: 0.5}}
+  /turtle2/pose: {shape: {disc: 0.5}}
+sample: {topic: /turtle2/pose}
+"""
+FRAMES = """
+fixed_frame: world
+topics:
+  /tf: {shape: {disc: 0.5}}
+"""
+APART = "spec apart = G (turtle1 dist turtle2 >= 0.5)\nspec near = F (turtle1 dist turtle2 <= 9)\n"
+
+
+def files(folder: Path, mapping: str, spec: str) -> tuple[Path, Path]:
+    (folder / "map.yaml").write_text(mapping)
+    (folder / "safe.spatial").write_text(spec)
+    return folder / "map.yaml", folder / "safe.spatial"
+
+
+async def updates_of(
+    address: str, spec: Path, mapping: Path | None, count: int, **options: object
+) -> list[LiveUpdate]:
+    """The first so many updates of a monitor."""
+    found: list[LiveUpdate] = []
+    async with asyncio.timeout(PATIENCE_S):
+        async with aclosing(monitor(address, sr.load_specification(spec), mapping, **options)) as updates:  # type: ignore[arg-type]
+            async for update in updates:
+                found.append(update)
+                if len(found) == count:
+                    break
+    return found
+
+
+def until(is_over: Callable[[], bool]) -> None:
+    """Wait for something that another thread or process does."""
+    limit = time.monotonic() + PATIENCE_S
+    while not is_over():
+        assert time.monotonic() < limit
+        time.sleep(0.005)
+
+
+@pytest.mark.parametrize(
+    ("name", "mapping", "topics"),
+    [
+        ("two_turtles.bag", TURTLES, ("/turtle1/pose", "/turtle2/pose")),
+        ("two_turtles_mcap", FRAMES, ("/tf",)),
+    ],
+)
+def test_a_bag_that_a_server_plays_gives_the_samples_of_the_bag(
+    data_folder: Path, tmp_path: Path, name: str, mapping: str, topics: tuple[str, ...]
+) -> None:
+    bag, output = data_folder / "bags" / name, tmp_path / "live.mcap"
+    mapped, spec = files(tmp_path, mapping, APART)
+    whole = sr.read_trace(bag, mapping=mapped)
+    first_ns = open_messages(bag).start_ns or 0
+    expected = whole.slice(0, int((whole.times_ns < first_ns + 5 * 10**9).sum()))
+    with playing(bag, *topics, end=5) as player:
+        found = asyncio.run(updates_of(player.address, spec, mapped, len(expected), output=output))
+    assert Trace.from_samples(update.sample for update in found) == expected
+    assert found[-1].dropped == 0
+    # the log of the run gives the same numbers as the monitor, and has the messages as they came
+    replayed = sr.evaluate(sr.load_specification(spec), sr.read_trace(output))
+    for node in ("apart", "near"):
+        ours = [(each.node(node).value, each.node(node).upper) for each in found]
+        assert ours == list(zip(replayed.node(node).value, replayed.node(node).upper, strict=True))
+    wanted = [
+        (each.topic, each.log_time_ns, each.payload)
+        for each in open_messages(bag).iter_messages(topics, None, int(expected.times_ns[-1]) + 1)
+    ]
+    assert set(wanted) <= set(messages_of(output))
+
+
+def messages_of(path: Path) -> list[tuple[str, int, bytes]]:
+    """The messages of a log, as the stock library reads them."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        return [
+            (channel.topic, message.log_time, message.data)
+            for _, channel, message in reader.iter_messages(log_time_order=True)
+        ]
+
+
+def test_a_server_of_ours_needs_no_mapping(tmp_path: Path) -> None:
+    log = Path(__file__).parents[2] / "recordings" / "push.mcap"
+    expected = sr.read_trace(log).slice(0, 20)
+    spec = tmp_path / "far.spatial"
+    spec.write_text("spec far = G (red dist blue >= 0)")
+    with playing(log, OBJECTS, speed=2, end=2) as player:
+        found = asyncio.run(updates_of(player.address, spec, None, len(expected)))
+    assert Trace.from_samples(update.sample for update in found) == expected
+
+
+def test_what_a_lost_connection_hides_is_unknown_until_it_is_back(data_folder: Path, tmp_path: Path) -> None:
+    bag, output = data_folder / "bags" / "two_turtles.bag", tmp_path / "live.mcap"
+    mapped, spec = files(tmp_path, TURTLES, APART)
+    topics = ("/turtle1/pose", "/turtle2/pose")
+    found: list[LiveUpdate] = []
+    ends: list[str] = []
+
+    async def watch(players: list[Player]) -> None:
+        session = LiveSession(players[0].address, sr.load_specification(spec), mapped, recorders=[recorder])
+        async with asyncio.timeout(PATIENCE_S):
+            async for update in session.updates():
+                found.append(update)
+                if update.sample.unknown and len(players) == 1:
+                    again = (bag, *topics)
+                    players.append(
+                        await asyncio.to_thread(lambda: Player(*again, begin=3, end=4, port=players[0].port))
+                    )
+                elif len(players) == 2 and len(found) > lost() + 20:
+                    break
+                elif len(players) == 1 and len(found) == 60:
+                    # in the middle of a message, for all that is known
+                    players[0].kill()
+        ends.extend(str(each.verdict) for each in session.endings())
+
+    def lost() -> int:
+        return next((place for place, each in enumerate(found) if each.sample.unknown), 10**9)
+
+    players = [Player(bag, *topics, end=2)]
+    try:
+        with sr.Recorder(output, specifications=[sr.load_specification(spec)]) as recorder:
+            asyncio.run(watch(players))
+    finally:
+        for player in players:
+            player.kill()
+    gap = found[lost()]
+    assert gap.sample.objects == {} and set(gap.sample.unknown) == {"turtle1", "turtle2"}
+    assert gap.sample.time_ns == found[lost() - 1].sample.time_ns + 1
+    assert any("is lost" in note and "unknown" in note for note in gap.notes)
+    assert set(found[-1].sample.objects) == {"turtle1", "turtle2"}
+    # nothing was violated, and yet nothing is known of the time between
+    assert ends == ["unknown", "satisfied"]
+    replayed = sr.evaluate(sr.load_specification(spec), sr.read_trace(output))
+    assert [str(each.verdict) for each in replayed.results] == ends
+    assert len(messages_of(output)) > 2 * len(found)
+
+
+def test_every_message_around_a_violation_is_in_its_clip(data_folder: Path, tmp_path: Path) -> None:
+    bag, clips = data_folder / "bags" / "two_turtles.bag", tmp_path / "clips"
+    mapped, spec = files(tmp_path, TURTLES, "spec apart = G (turtle1 dist turtle2 >= 1)")
+    topics = ("/turtle1/pose", "/turtle2/pose")
+    command = ["--mapping", str(mapped), "--spec", str(spec), "--clips", str(clips), "--before", "1s"]
+    with playing(bag, *topics, end=8) as player:
+        ending = threading.Timer(0.0, lambda: None)
+
+        def end() -> None:
+            player.wait()
+            time.sleep(0.5)
+            os.kill(os.getpid(), signal.SIGINT)
+
+        ending = threading.Thread(target=end)
+        ending.start()
+        assert run(["monitor", player.address, *command, "--after", "500ms"]) == 1
+        ending.join()
+    [clip] = sorted(clips.iterdir())
+    assert clip.name == "0001-apart-violated.mcap"
+    with clip.open("rb") as stream:
+        records = {each.name: each.metadata for each in make_reader(stream).iter_metadata()}
+    at_ns = int(records["spatial_replay_trigger"]["time_ns"])
+    wanted = [
+        (each.topic, each.log_time_ns, each.payload)
+        for each in open_messages(bag).iter_messages(topics, at_ns - 10**9, at_ns + 5 * 10**8 + 1)
+    ]
+    kept = messages_of(clip)
+    assert [each for each in kept if each[0] in topics] == sorted(wanted, key=lambda each: (each[1], each[0]))
+    assert {SCENE, ROBUSTNESS, OBJECTS} <= {topic for topic, _, _ in kept}
+    assert str(sr.evaluate(sr.load_specification(spec), sr.read_trace(clip)).verdict) == "violated"
+
+
+def drive(own: Robot, ticks: range, pause_s: float = 0.004) -> threading.Thread:
+    """Let a robot drive towards the vase, once it is listened to, from x = 1 by a centimetre each tick."""
+
+    def run_ticks() -> None:
+        until(own.is_heard)
+        for tick in ticks:
+            own.drive(tick, 1.0 - tick / 100)
+            time.sleep(pause_s)
+
+    driving = threading.Thread(target=run_ticks)
+    driving.start()
+    return driving
+
+
+def test_the_program_ends_at_the_violation_and_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    with robot() as own:
+        driving = drive(own, range(120))
+        code = run(
+            ["monitor", own.address, "--mapping", str(mapped), "--spec", str(spec), "--until", "violated"]
+        )
+        driving.join()
+    shown = capsys.readouterr().out
+    assert code == 1
+    assert "`clear` holds so far" in shown
+    assert "vase" in shown.partition("violated")[2] and "too close to vase" in shown
+    assert "clear  violated" in shown and "seen   satisfied" in shown
+
+
+def test_a_viewer_sees_the_run_and_a_service_fires_the_trigger(tmp_path: Path) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    clips = tmp_path / "clips"
+    port = free_port()
+    command = ["monitor", "", "--mapping", str(mapped), "--spec", str(spec), "--serve", "--port", str(port)]
+    command += ["--clips", str(clips), "--trigger", "manual", "--after", "0s", "--topics", "/*"]
+    seen: set[str] = set()
+
+    async def look() -> None:
+        async with viewer(f"ws://127.0.0.1:{port}") as own:
+            await own.subscribe([SCENE, ROBUSTNESS, EVENTS, OBJECTS])
+            for topic in (OBJECTS, ROBUSTNESS, SCENE):
+                seen.add((await own.message(topic)).topic)
+            assert await own.call("trigger", {"reason": "looked odd"}) == {"fired": True}
+            found: Message = await own.message(EVENTS)
+            assert b"clear" in found.data
+
+    with robot() as own:
+
+        def watch() -> None:
+            asyncio.run(look())
+            until(lambda: any(clips.iterdir()))
+            os.kill(os.getpid(), signal.SIGUSR1)
+            until(lambda: len(list(clips.iterdir())) > 1)
+            os.kill(os.getpid(), signal.SIGINT)
+
+        command[1] = own.address
+        driving = drive(own, range(3000))
+        watching = threading.Thread(target=watch)
+        waiting = threading.Thread(target=lambda: (until(lambda: listens(port)), watching.start()))
+        waiting.start()
+        assert run(command) == 1
+        watching.join()
+        own.is_over = True
+        driving.join()
+    assert seen == {OBJECTS, ROBUSTNESS, SCENE}
+    assert [each.name for each in sorted(clips.iterdir())][:2] == [
+        "0001-looked-odd.mcap",
+        "0002-SIGUSR1.mcap",
+    ]
+    assert all({"/robot", "/vase", OBJECTS} <= {m[0] for m in messages_of(each)} for each in clips.iterdir())
+
+
+def free_port() -> int:
+    import socket
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def listens(port: int) -> bool:
+    import socket
+
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def test_what_a_silent_topic_reported_is_unknown(tmp_path: Path) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    with robot() as own:
+        driving = drive(own, range(20))
+        found = asyncio.run(updates_of(own.address, spec, mapped, 21, dead_man_s=0.5))
+        driving.join()
+    last = found[-1]
+    assert set(last.sample.unknown) == {"robot", "vase"}
+    assert any("no message on" in note for note in last.notes)
+    assert last.node("clear").lower == float("-inf")
+    assert last.sample.time_ns == found[-2].sample.time_ns + 1
+
+
+@pytest.mark.parametrize("protocol", ["foxglove.sdk.v1", "foxglove.websocket.v1"])
+def test_frames_that_break_the_protocol_are_left_out_and_said(tmp_path: Path, protocol: str) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    nonsense = ["{", "[]", '{"op": "advertise", "channels": [{"id": "x"}]}', b"", b"\x01\x02", b"\x63abc"]
+    late = frame(1, 2**64 - 1, b"{}")
+    sent = [
+        pose(2, 0),
+        pose(1, 0),
+        *nonsense,
+        late,
+        frame(1, 5, b'{"x": "far"}'),
+        frame(9, 5, b""),
+        pose(1, 3),
+    ]
+    with rude_server(*sent, protocol=protocol) as address:
+        found = asyncio.run(updates_of(address, spec, mapped, 2))
+    assert [each.time_ns for each in found] == [1, 30_000_001]
+    notes = " ".join(note for each in found for note in each.notes)
+    assert "is not JSON" in notes and "such frames are left out" in notes
+
+
+def test_a_huge_frame_ends_the_connection_and_not_the_run(tmp_path: Path) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    huge = bytes(LARGEST_FRAME + 1)
+    with rude_server(pose(2, 0), pose(1, 0), huge, pose(1, 1)) as address:
+        found = asyncio.run(updates_of(address, spec, mapped, 2))
+    assert any("a frame of more than 64 MB" in note for note in found[1].notes)
+    assert set(found[1].sample.unknown) == {"robot", "vase"}
+
+
+def test_a_clock_that_jumps_back_ends_the_run_with_a_whole_log(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    output = tmp_path / "live.mcap"
+    sent = [*(pose(number, tick, 2.0) for tick in range(300, 310) for number in (2, 1)), pose(1, 5)]
+    with rude_server(*sent) as address:
+        code = run(["monitor", address, "--mapping", str(mapped), "--spec", str(spec), "-o", str(output)])
+    assert code == 3
+    assert "time jumps back" in capsys.readouterr().err
+    assert len(sr.read_trace(output)) == 10
+
+
+def test_a_flood_drops_old_samples_counts_them_and_evaluates_the_newest(tmp_path: Path) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    sent = [pose(number, tick, 2.0) for tick in range(12_000) for number in (2, 1)]
+    status = []
+
+    async def watch(address: str) -> None:
+        session = LiveSession(address, sr.load_specification(spec), mapped)
+        async with asyncio.timeout(PATIENCE_S):
+            async for update in session.updates():
+                # a caller that is slower than the robot
+                time.sleep(0.02)
+                if update.time_ns == 11_999 * 10 * 10**6 + 1:
+                    break
+        status.append(session.status)
+
+    with rude_server(*sent) as address:
+        asyncio.run(watch(address))
+    assert status[0].dropped > 0
+    assert status[0].samples + status[0].dropped <= 12_000
+
+
+@pytest.mark.parametrize(
+    ("address", "code", "said"),
+    [
+        ("ws://127.0.0.1:9", 3, "start foxglove_bridge or the server there first"),
+        ("robot:8765", 2, "write it as ws://robot:8765"),
+        ("ws://no such host:1", 2, "write it as ws://robot:8765"),
+    ],
+)
+def test_a_server_that_is_not_there_is_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], address: str, code: int, said: str
+) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    assert run(["monitor", address, "--mapping", str(mapped), "--spec", str(spec)]) == code
+    assert said in capsys.readouterr().err
+
+
+def test_a_mapping_that_does_not_fit_the_server_is_an_error_with_a_hint(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mapped, spec = files(tmp_path, MAPPING.replace("/robot", "/robott"), SPEC)
+    with robot() as own:
+        assert run(["monitor", own.address, "--mapping", str(mapped), "--spec", str(spec)]) == 2
+    assert "did you mean '/robot'?" in capsys.readouterr().err
+    mapped, spec = files(tmp_path, MAPPING.replace("[x, y]", "[east, north]"), SPEC)
+    with rude_server(*(pose(number, tick) for tick in range(120) for number in (2, 1))) as address:
+        assert run(["monitor", address, "--mapping", str(mapped), "--spec", str(spec)]) == 2
+    assert "east" in capsys.readouterr().err
+
+
+def kept_by(folder: Path, trigger: Trigger, count: int = 60, **options: int) -> sr.Recorder:
+    """Record samples every 100 ms, in which a cube comes nearer, and a message of a size with each."""
+    spec = sr.parse_specification("spec far = G (cube dist wall >= 1)")
+    recorder = sr.Recorder(folder, specifications=[spec], trigger=trigger)
+    with recorder:
+        camera = recorder.channel("/camera")
+        for tick in range(count):
+            box = {"cube": sr.Footprint.box(5 - tick / 10, 0, 5.1 - tick / 10, 1)}
+            camera.write(tick * 10**8, {"picture": "x" * options.get("size", 10)})
+            recorder.write(Sample(tick * 10**8, {**box, "wall": sr.Footprint.box(-1, 0, 0, 1)}))
+    return recorder
+
+
+@pytest.mark.parametrize(
+    ("when", "name", "at"),
+    [
+        ("violated", "0001-far-violated.mcap", 41),
+        ("far violated", "0001-far-violated.mcap", 41),
+        ("far < 2.05", "0001-far-below-2-05.mcap", 20),
+        ("event", "0001-event.mcap", 41),
+    ],
+)
+def test_a_recorder_keeps_what_is_around_its_trigger(tmp_path: Path, when: str, name: str, at: int) -> None:
+    recorder = kept_by(tmp_path, Trigger(when, before_s=1, after_s=0.5))
+    [clip] = recorder.clips
+    assert (clip.path.name, clip.time_ns, clip.held_s) == (name, at * 10**8, 1.0)
+    trace = sr.read_trace(clip.path)
+    assert trace.times_ns.tolist() == [tick * 10**8 for tick in range(at - 10, at + 6)]
+    assert len([each for each in messages_of(clip.path) if each[0] == "/camera"]) == 16
+
+
+def test_a_ring_stays_within_its_bytes_and_says_what_it_cannot_hold(tmp_path: Path) -> None:
+    recorder = kept_by(tmp_path, Trigger("violated", before_s=3, after_s=0, most_bytes=2**21), size=2**18)
+    [clip] = recorder.clips
+    assert 0.2 < clip.held_s < 1.0
+    [remark] = [each for each in recorder.take_remarks() if "ring" in each]
+    assert "not the 3 s asked for" in remark
+    kept = [json.loads(data)["picture"] for topic, _, data in messages_of(clip.path) if topic == "/camera"]
+    assert all(len(each) == 2**18 for each in kept) and len(kept) in range(4, 9)
+
+
+@pytest.mark.parametrize(
+    ("when", "said"),
+    [
+        ("fra violated", "did you mean 'far'"),
+        ("far", "is not understood"),
+        ("far < low", "is not understood"),
+    ],
+)
+def test_a_trigger_that_cannot_fire_is_an_error(tmp_path: Path, when: str, said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        kept_by(tmp_path, Trigger(when))
+
+
+def test_time_that_jumps_back_is_an_error_in_python(tmp_path: Path) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    with (
+        rude_server(pose(2, 300), pose(1, 300), pose(1, 5)) as address,
+        pytest.raises(LogError, match="back"),
+    ):
+        asyncio.run(updates_of(address, spec, mapped, 9))
