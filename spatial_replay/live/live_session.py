@@ -39,7 +39,7 @@ from spatial_replay.trace.trace import Trace
 MAX_DELAY_S: Final = 0.2
 """How long a sample waits for transforms, and for topics that lag behind, by default."""
 
-LATE_S: Final = 0.5
+LATE_S: Final = 1.0
 """A sample that has waited longer than this for its evaluation is dropped if there is a newer one."""
 
 _OFFER_S: Final = 5.0

@@ -122,7 +122,7 @@ def _decoded_text(raw: str) -> Frame | None:
 
 def _number(value: object) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**32:
-        raise ValueError(f"{value!r:.40} is no number of a channel")
+        raise ValueError(f"{value!r:.40} is not the number of a channel")
     return value
 
 
@@ -131,7 +131,7 @@ def _channel(described: Any) -> Channel:
     name, text = described.get("schemaName") or "", described.get("schema") or ""
     for each in (topic, encoding, name, text):
         if not isinstance(each, str):
-            raise ValueError(f"{each!r:.40} in a channel is no text")
+            raise ValueError(f"{each!r:.40} in a channel is not a text")
     schema_encoding = described.get("schemaEncoding") or _SCHEMA_ENCODINGS.get(encoding, "")
     if not name and not text:
         return Channel(topic, encoding, None)

@@ -8,7 +8,7 @@ import queue
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +37,7 @@ MOST_BYTES: Final = 256 * 2**20
 _SLICE_BYTES: Final = 8 * 2**20
 """About the most bytes that are written to a clip before what has come is taken in."""
 
+_LATE_S: Final = 1.0
 _LATE_NS: Final = 10**9
 """How far samples may come behind messages, and messages behind samples."""
 
@@ -229,6 +230,7 @@ class ClipLog:
         self._channels: Mapping[int, Channel] = {}
         self._bytes = 0
         self._newest_ns = -1
+        self._progress: dict[type, tuple[int, float]] = {}
         self._open: _Open | None = None
         self._fired: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._remarks: queue.SimpleQueue[str] = queue.SimpleQueue()
@@ -259,27 +261,21 @@ class ClipLog:
 
     def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
         """Take the next samples and messages into the ring; write what belongs to an open clip."""
-        self._take_messages(messages)
-        for sample in samples:
-            self._hold(_HeldSample(sample.time_ns, sample, _sample_bytes(sample)), self._samples)
-            self._newest_ns = max(self._newest_ns, sample.time_ns)
-            updates = [monitor.update(sample) for monitor in self._monitors]
-            changes = list(self._changes.after(updates))
-            has_changed = not all(each.is_first for each in changes)
-            for text, condition in self._conditions:
-                reason = condition(updates, has_changed)
-                if reason is not None and not self._held_before[text]:
-                    self._begin(reason, sample.time_ns)
-                self._held_before[text] = reason is not None and text != "event"
+        come: list[_Held | _HeldSample] = [*self._held_messages(messages)]
+        come += [_HeldSample(each.time_ns, each, _sample_bytes(each)) for each in samples]
+        # in the order of time, so that the ring holds what is around the sample that fires
+        for item in sorted(come, key=lambda each: each.time_ns):
+            self._hold(item)
+            if isinstance(item, _HeldSample):
+                self._evaluate(item.sample)
         with suppress(queue.Empty):
             while True:
                 self._begin(self._fired.get_nowait(), max(self._newest_ns, 0))
-        self._evict()
         if self._open is not None:
             self._open.write()
             while self._open.waiting_bytes > self._trigger.most_bytes:
                 self._open.write()
-            if self._newest_ns > self._open.until_ns + _LATE_NS and not self._open.waiting:
+            if not self._open.waiting and self._is_past(self._open.until_ns):
                 self._finish(RunEnd(False, 0, 0))
 
     def flush(self) -> None:
@@ -305,7 +301,25 @@ class ClipLog:
         self._samples.clear()
         self._messages.clear()
 
-    def _take_messages(self, messages: Messages) -> None:
+    def _evaluate(self, sample: Sample) -> None:
+        """Fire if a condition holds that did not hold before."""
+        updates = [monitor.update(sample) for monitor in self._monitors]
+        changes = list(self._changes.after(updates))
+        has_changed = not all(each.is_first for each in changes)
+        for text, condition in self._conditions:
+            reason = condition(updates, has_changed)
+            if reason is not None and not self._held_before[text]:
+                self._begin(reason, sample.time_ns)
+            self._held_before[text] = reason is not None and text != "event"
+
+    def _is_past(self, time_ns: int) -> bool:
+        """Return whether neither samples nor messages up to a time are expected any more."""
+        now_s = time.monotonic()
+        return all(
+            newest_ns > time_ns or now_s - came_s > _LATE_S for newest_ns, came_s in self._progress.values()
+        )
+
+    def _held_messages(self, messages: Messages) -> Iterator[_Held]:
         self._channels = messages.channels or self._channels
         static = {n for n, each in messages.channels.items() if each.topic.rsplit("/", 1)[-1] == _STATIC}
         columns = zip(
@@ -319,14 +333,21 @@ class ClipLog:
         for time_ns, channel, sequence, publish_ns, payload in columns:
             size = _MESSAGE_BYTES + len(payload)
             held = _Held(time_ns, channel, sequence, publish_ns, payload, size)
-            self._newest_ns = max(self._newest_ns, time_ns)
             if channel in static:
                 self._static.append(held)
-            self._hold(held, self._messages)
+            yield held
 
-    def _hold(self, item: _Held | _HeldSample, ring: deque[_Held] | deque[_HeldSample]) -> None:
-        ring.append(item)  # type: ignore[arg-type]
+    def _hold(self, item: _Held | _HeldSample) -> None:
+        if isinstance(item, _Held):
+            self._messages.append(item)
+        else:
+            self._samples.append(item)
         self._bytes += item.size
+        self._newest_ns = max(self._newest_ns, item.time_ns)
+        kind = type(item)
+        newest_ns = max(self._progress[kind][0], item.time_ns) if kind in self._progress else item.time_ns
+        self._progress[kind] = newest_ns, time.monotonic()
+        self._evict()
         clip = self._open
         if clip is not None and item.time_ns <= clip.until_ns:
             clip.channels = self._channels
@@ -339,7 +360,6 @@ class ClipLog:
             clip.reasons.append(reason)
             following = self._between(clip.until_ns + 1, at_ns + self._after_ns)
         else:
-            self._evict()
             number = len(self.written) + 1
             while any(self._folder.glob(f"{number:04d}-*.mcap")):
                 number += 1
@@ -363,7 +383,11 @@ class ClipLog:
 
     def _evict(self) -> None:
         """Let go of what is too old and of what is too much, the oldest first."""
-        oldest_ns = self._newest_ns - self._before_ns - _LATE_NS
+        # samples may come behind messages, and one of them may fire
+        reached_ns, came_s = self._progress.get(_HeldSample, (self._newest_ns, 0.0))
+        if time.monotonic() - came_s > _LATE_S:
+            reached_ns = self._newest_ns
+        oldest_ns = reached_ns - self._before_ns - _LATE_NS
         while self._samples or self._messages:
             ring: deque[_Held] | deque[_HeldSample] = self._messages
             if not self._messages or (self._samples and self._samples[0].time_ns < self._messages[0].time_ns):
@@ -375,7 +399,7 @@ class ClipLog:
             self._bytes -= dropped.size
             if is_over and dropped.time_ns >= oldest_ns + _LATE_NS and not self._has_overflowed:
                 self._has_overflowed = True
-                held_s = (self._newest_ns - dropped.time_ns) / 1e9
+                held_s = max(0.0, (reached_ns - dropped.time_ns) / 1e9)
                 needed = self._trigger.most_bytes * self._trigger.before_s / max(held_s, 1e-3)
                 self._remarks.put(
                     f"the ring of {_megabytes(self._trigger.most_bytes)} holds {held_s:.1f} s, not the"

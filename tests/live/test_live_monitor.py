@@ -6,12 +6,14 @@ import asyncio
 import json
 import os
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable
 from contextlib import aclosing
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 
@@ -74,6 +76,7 @@ def until(is_over: Callable[[], bool]) -> None:
         ("two_turtles.bag", TURTLES, ("/turtle1/pose", "/turtle2/pose")),
         ("two_turtles_mcap", FRAMES, ("/tf",)),
     ],
+    ids=["ROS 1", "ROS 2, transforms"],
 )
 def test_a_bag_that_a_server_plays_gives_the_samples_of_the_bag(
     data_folder: Path, tmp_path: Path, name: str, mapping: str, topics: tuple[str, ...]
@@ -82,16 +85,17 @@ def test_a_bag_that_a_server_plays_gives_the_samples_of_the_bag(
     mapped, spec = files(tmp_path, mapping, APART)
     whole = sr.read_trace(bag, mapping=mapped)
     first_ns = open_messages(bag).start_ns or 0
-    expected = whole.slice(0, int((whole.times_ns < first_ns + 5 * 10**9).sum()))
-    with playing(bag, *topics, end=5) as player:
+    expected = whole.slice(0, int((whole.times_ns < first_ns + 3 * 10**9).sum()))
+    with playing(bag, *topics, end=3, speed=1.5) as player:
         found = asyncio.run(updates_of(player.address, spec, mapped, len(expected), output=output))
     assert Trace.from_samples(update.sample for update in found) == expected
     assert found[-1].dropped == 0
     # the log of the run gives the same numbers as the monitor, and has the messages as they came
     replayed = sr.evaluate(sr.load_specification(spec), sr.read_trace(output))
     for node in ("apart", "near"):
-        ours = [(each.node(node).value, each.node(node).upper) for each in found]
-        assert ours == list(zip(replayed.node(node).value, replayed.node(node).upper, strict=True))
+        ours = np.array([(each.node(node).value, each.node(node).upper) for each in found]).T
+        theirs = (replayed.node(node).value, replayed.node(node).upper)
+        assert np.array_equal(ours, np.array(theirs), equal_nan=True)
     wanted = [
         (each.topic, each.log_time_ns, each.payload)
         for each in open_messages(bag).iter_messages(topics, None, int(expected.times_ns[-1]) + 1)
@@ -132,10 +136,8 @@ def test_what_a_lost_connection_hides_is_unknown_until_it_is_back(data_folder: P
             async for update in session.updates():
                 found.append(update)
                 if update.sample.unknown and len(players) == 1:
-                    again = (bag, *topics)
-                    players.append(
-                        await asyncio.to_thread(lambda: Player(*again, begin=3, end=4, port=players[0].port))
-                    )
+                    port = players[0].port
+                    players.append(await asyncio.to_thread(Player, bag, *topics, begin=3, end=4, port=port))
                 elif len(players) == 2 and len(found) > lost() + 20:
                     break
                 elif len(players) == 1 and len(found) == 60:
@@ -171,7 +173,6 @@ def test_every_message_around_a_violation_is_in_its_clip(data_folder: Path, tmp_
     topics = ("/turtle1/pose", "/turtle2/pose")
     command = ["--mapping", str(mapped), "--spec", str(spec), "--clips", str(clips), "--before", "1s"]
     with playing(bag, *topics, end=8) as player:
-        ending = threading.Timer(0.0, lambda: None)
 
         def end() -> None:
             player.wait()
@@ -234,7 +235,17 @@ def test_a_viewer_sees_the_run_and_a_service_fires_the_trigger(tmp_path: Path) -
     port = free_port()
     command = ["monitor", "", "--mapping", str(mapped), "--spec", str(spec), "--serve", "--port", str(port)]
     command += ["--clips", str(clips), "--trigger", "manual", "--after", "0s", "--topics", "/*"]
+    command += ["--for", "60s"]
     seen: set[str] = set()
+    moving, over = threading.Event(), threading.Event()
+
+    def drive_when_seen() -> None:
+        until(own.is_heard)
+        for tick in range(6000):
+            own.drive(tick, 0.1 if moving.is_set() else 1.0)
+            time.sleep(0.01)
+            if over.is_set():
+                return
 
     async def look() -> None:
         async with viewer(f"ws://127.0.0.1:{port}") as own:
@@ -242,26 +253,30 @@ def test_a_viewer_sees_the_run_and_a_service_fires_the_trigger(tmp_path: Path) -
             for topic in (OBJECTS, ROBUSTNESS, SCENE):
                 seen.add((await own.message(topic)).topic)
             assert await own.call("trigger", {"reason": "looked odd"}) == {"fired": True}
+            moving.set()
             found: Message = await own.message(EVENTS)
             assert b"clear" in found.data
 
     with robot() as own:
 
         def watch() -> None:
-            asyncio.run(look())
-            until(lambda: any(clips.iterdir()))
-            os.kill(os.getpid(), signal.SIGUSR1)
-            until(lambda: len(list(clips.iterdir())) > 1)
-            os.kill(os.getpid(), signal.SIGINT)
+            try:
+                asyncio.run(look())
+                until(lambda: any(clips.iterdir()))
+                os.kill(os.getpid(), signal.SIGUSR1)
+                until(lambda: len(list(clips.iterdir())) > 1)
+            finally:
+                over.set()
+                os.kill(os.getpid(), signal.SIGINT)
 
         command[1] = own.address
-        driving = drive(own, range(3000))
+        driving = threading.Thread(target=drive_when_seen)
+        driving.start()
         watching = threading.Thread(target=watch)
         waiting = threading.Thread(target=lambda: (until(lambda: listens(port)), watching.start()))
         waiting.start()
         assert run(command) == 1
         watching.join()
-        own.is_over = True
         driving.join()
     assert seen == {OBJECTS, ROBUSTNESS, SCENE}
     assert [each.name for each in sorted(clips.iterdir())][:2] == [
@@ -272,16 +287,12 @@ def test_a_viewer_sees_the_run_and_a_service_fires_the_trigger(tmp_path: Path) -
 
 
 def free_port() -> int:
-    import socket
-
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def listens(port: int) -> bool:
-    import socket
-
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
@@ -368,7 +379,7 @@ def test_a_flood_drops_old_samples_counts_them_and_evaluates_the_newest(tmp_path
     [
         ("ws://127.0.0.1:9", 3, "start foxglove_bridge or the server there first"),
         ("robot:8765", 2, "write it as ws://robot:8765"),
-        ("ws://no such host:1", 2, "write it as ws://robot:8765"),
+        ("http://127.0.0.1:8765", 2, "write it as ws://robot:8765"),
     ],
 )
 def test_a_server_that_is_not_there_is_an_error(
@@ -401,6 +412,7 @@ def kept_by(folder: Path, trigger: Trigger, count: int = 60, **options: int) -> 
         for tick in range(count):
             box = {"cube": sr.Footprint.box(5 - tick / 10, 0, 5.1 - tick / 10, 1)}
             camera.write(tick * 10**8, {"picture": "x" * options.get("size", 10)})
+            time.sleep(options.get("pause_ms", 0) / 1000)
             recorder.write(Sample(tick * 10**8, {**box, "wall": sr.Footprint.box(-1, 0, 0, 1)}))
     return recorder
 
@@ -424,10 +436,12 @@ def test_a_recorder_keeps_what_is_around_its_trigger(tmp_path: Path, when: str, 
 
 
 def test_a_ring_stays_within_its_bytes_and_says_what_it_cannot_hold(tmp_path: Path) -> None:
-    recorder = kept_by(tmp_path, Trigger("violated", before_s=3, after_s=0, most_bytes=2**21), size=2**18)
+    recorder = kept_by(
+        tmp_path, Trigger("violated", before_s=3, after_s=0, most_bytes=2**21), size=2**18, pause_ms=10
+    )
     [clip] = recorder.clips
     assert 0.2 < clip.held_s < 1.0
-    [remark] = [each for each in recorder.take_remarks() if "ring" in each]
+    [remark] = [each for each in recorder.take_remarks() if "the ring of" in each]
     assert "not the 3 s asked for" in remark
     kept = [json.loads(data)["picture"] for topic, _, data in messages_of(clip.path) if topic == "/camera"]
     assert all(len(each) == 2**18 for each in kept) and len(kept) in range(4, 9)

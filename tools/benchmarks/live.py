@@ -1,0 +1,137 @@
+"""A running robot monitored: from a message to its verdict, many messages, and what a ring holds."""
+
+from __future__ import annotations
+
+import asyncio
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import aclosing
+from pathlib import Path
+from typing import Any
+
+import spatial_replay as sr
+from spatial_replay.live import LiveSession
+from spatial_replay.mapping import parse_mapping
+
+OBJECTS = 6
+MAPPING = """
+topics:
+  /tracks: {objects: "objects[*]", name: "o{id}", position: [x, y], shape: {box: [0.3, 0.3]}}
+"""
+SPEC = """
+spec apart = G (o1 dist o2 >= 0.1)
+spec ordered = G (o3 leftof o4)
+spec answers = G (o5 closeto[0.5] o6 -> F[0s, 1s] o1 dist o6 >= 1)
+"""
+
+SERVER = """
+import json, sys, time
+import foxglove
+
+rate, topics, seconds = float(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
+names = ["/tracks", *(f"/more{n}" for n in range(topics - 1))]
+schema = {"type": "object", "title": "Tracks"}
+channels = [foxglove.Channel(name, schema=schema, message_encoding="json") for name in names]
+server = foxglove.start_server(name="robot", host="127.0.0.1", port=0)
+print(server.port, flush=True)
+while not channels[0].has_sinks():
+    time.sleep(0.01)
+time.sleep(0.5)
+began = time.monotonic()
+for tick in range(int(rate * seconds)):
+    time.sleep(max(0.0, began + tick / rate - time.monotonic()))
+    objects = [{"id": each, "x": each + 1e-3 * (tick % 50), "y": 0.0} for each in range(1, 7)]
+    for number, channel in enumerate(channels):
+        at_ns = time.monotonic_ns()
+        fields = {"objects": objects} if not number else {"objects": [], "value": tick}
+        channel.log(json.dumps(fields).encode(), log_time=at_ns)
+time.sleep(1)
+"""
+_LONG_S = 600.0
+
+
+def bench_live_latency(measure: Any) -> None:
+    """100 samples a second of six objects: from the moment a server sends a message to the verdict on it."""
+    delays_s, _, session = _monitored(rate=100.0, topics=1, seconds=12.0)
+    measure.quantile("verdict, median", delays_s, 0.5, limit_s=0.002)
+    measure.quantile("verdict, 99 %", delays_s, 0.99, limit_s=0.010)
+    if session.status.dropped:
+        measure.remark(f"{session.status.dropped} samples were dropped")
+
+
+def bench_live_load(measure: Any) -> None:
+    """1,000 messages a second of ten mapped topics; with --full for ten minutes."""
+    _, memory, session = _monitored(rate=100.0, topics=10, seconds=_LONG_S if measure.full else 20.0)
+    middle = len(memory) // 2
+    measure.size("memory gained, second half", max(0, memory[-1] - memory[middle]), 4 * 2**20)
+    measure.ratio("dropped of 1,000 messages/s", session.status.messages_dropped + session.status.dropped, 0)
+
+
+def bench_live_ring(measure: Any) -> None:
+    """A stream of 20 MB a second in a ring of 60 s, as fast as it is taken, within the bytes given."""
+    most_bytes, piece = (1_400 if measure.full else 350) * 2**20, 2**20
+    seconds = 60 if measure.full else 15
+    with tempfile.TemporaryDirectory() as folder:
+        trigger = sr.Trigger("manual", before_s=seconds, after_s=0, most_bytes=most_bytes)
+        recorder = sr.Recorder(
+            Path(folder, "clips"), trigger=trigger, specifications=[sr.parse_specification(SPEC)]
+        )
+        before = _memory()
+        with recorder:
+            camera = recorder.channel("/camera", encoding="json")
+            began = time.perf_counter()
+            for tick in range(20 * seconds):
+                camera.write(tick * 50_000_000, tick.to_bytes(4, "little") * (piece // 4))
+                if tick % 20 == 0:
+                    recorder.write(sr.Sample(tick * 50_000_000))
+            while recorder.held_bytes < 20 * seconds * piece:
+                time.sleep(0.01)
+            taken_s = time.perf_counter() - began
+            measure.size(f"ring of {seconds} s at 20 MB/s", _memory() - before, most_bytes)
+            recorder.trigger("now")
+        (clip,) = recorder.clips
+        measure.ratio("seconds missing in its clip", seconds - clip.held_s, 0.1)
+        measure.quantile("taking in 1 MB", [taken_s / (20 * seconds)], 0.5, unit="message", limit_s=0.05)
+
+
+def _monitored(*, rate: float, topics: int, seconds: float) -> tuple[list[float], list[int], LiveSession]:
+    """Monitor a server beside; return the delay of each sample, memory over time, and the session."""
+    more = "".join(
+        f"  /more{number}: {{signals: {{value{number}: value}}}}\n" for number in range(topics - 1)
+    )
+    mapping = parse_mapping(MAPPING + more, "bench.yaml")
+    server = subprocess.Popen(
+        [sys.executable, "-c", SERVER, str(rate), str(topics), str(seconds)],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert server.stdout is not None
+    port = int(server.stdout.readline())
+    delays_s: list[float] = []
+    memory: list[int] = []
+    session = LiveSession(f"ws://127.0.0.1:{port}", sr.parse_specification(SPEC), mapping)
+
+    async def watch() -> None:
+        asyncio.get_running_loop().call_later(seconds + 1.5, session.stop)
+        async with aclosing(session.updates()) as updates:
+            async for update in updates:
+                delays_s.append((time.monotonic_ns() - update.time_ns) / 1e9)
+                if len(delays_s) % 100 == 0:
+                    memory.append(_memory())
+
+    try:
+        asyncio.run(watch())
+    finally:
+        server.kill()
+        server.wait()
+    # the first second loads what the first samples take
+    return delays_s[int(rate) :], memory, session
+
+
+def _memory() -> int:
+    """The memory of this process now, in bytes."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize()
