@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 import subprocess
 import sys
@@ -47,16 +48,28 @@ def test_hostile_clients_leave_the_server_to_the_next_viewer() -> None:
         attack.close()
 
 
-def test_processes_are_attacked_by_a_campaign(tmp_path: Path) -> None:
-    command = [str(ROOT / "tools" / "campaign"), "--only", "kills,names,interrupts", "--cases", "1"]
-    ended = subprocess.run(
-        [sys.executable, *command, "--findings", str(tmp_path)], capture_output=True, text=True, check=False
-    )
+def campaign(*arguments: str) -> str:
+    """Run the tool in a process of its own, which forks others."""
+    command = [sys.executable, str(ROOT / "tools" / "campaign"), *arguments]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stdout + ended.stderr
-    rows = [line.split("|")[1:4] for line in ended.stdout.splitlines()[-3:]]
-    assert [[cell.strip() for cell in row] for row in rows] == [
-        [name, "1", "0"] for name in ("kills", "names", "interrupts")
-    ]
+    return ended.stdout
+
+
+def test_hostile_names_and_interruptions_leave_nothing_behind(tmp_path: Path) -> None:
+    printed = campaign("--only", "names,interrupts", "--cases", "1", "--findings", str(tmp_path))
+    rows = [[cell.strip() for cell in line.split("|")[1:4]] for line in printed.splitlines()[-2:]]
+    assert rows == [["names", "1", "0"], ["interrupts", "1", "0"]]
+
+
+def test_what_a_killed_recorder_wrote_a_second_before_is_in_its_log(tmp_path: Path) -> None:
+    recorder = {"rate_hz": 100, "objects": 2, "specified": True, "beside": True}
+    case = {"recorders": [recorder, recorder], "seconds": 1.5, "busy": 0}
+    path = tmp_path / "kills.json"
+    path.write_text(json.dumps({"attack": "kills", "found": [], "case": case}))
+    figures = json.loads(campaign("--replay", str(path)))
+    assert figures["problems"] == []
+    assert figures["counts"]["kills"] == 2
 
 
 class _Broken:
@@ -64,6 +77,7 @@ class _Broken:
 
     name = "broken"
     most_cpu_s = None
+    uses_files = False
 
     def ready(self) -> None:
         pass

@@ -10,6 +10,7 @@ import random
 import resource
 import time
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
@@ -50,10 +51,12 @@ class Attack(Protocol):
     Attributes:
         name: as it is given on the command line.
         most_cpu_s: the processor time that a case may take; None for no limit.
+        uses_files: whether a case needs a folder.
     """
 
     name: str
     most_cpu_s: float | None
+    uses_files: bool
 
     def draw(self, rng: random.Random) -> Case:
         """Return a case."""
@@ -95,7 +98,7 @@ def memory_bytes() -> int:
 
 
 def _timed(attack: Attack, case: Case) -> tuple[Outcome, float]:
-    with TemporaryDirectory(prefix="campaign-") as folder:
+    with TemporaryDirectory(prefix="campaign-") if attack.uses_files else nullcontext("") as folder:
         began_s = time.process_time()
         try:
             outcome = attack.run(case, Path(folder))

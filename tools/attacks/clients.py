@@ -33,6 +33,7 @@ class Clients:
 
     name = "clients"
     most_cpu_s = None
+    uses_files = False
 
     def __init__(self) -> None:
         self._stack = ExitStack()

@@ -25,6 +25,7 @@ class Names:
 
     name = "names"
     most_cpu_s = None
+    uses_files = True
 
     def ready(self) -> None:
         said_by(["--help"])
@@ -89,6 +90,7 @@ class Interrupts:
 
     name = "interrupts"
     most_cpu_s = None
+    uses_files = True
 
     def ready(self) -> None:
         said_by(["--help"])

@@ -58,6 +58,7 @@ class Damage:
 
     name = "damage"
     most_cpu_s = 5.0
+    uses_files = True
 
     def ready(self) -> None:
         for kind in FORMATS:

@@ -16,11 +16,14 @@ import numpy as np
 
 import spatial_replay as sr
 from attacks.cases import Case, Outcome
+from spatial_replay.geometry.arrays import Integers
 
 MOST_LOST_S = 1.0
 RATES_HZ = (30, 100, 250, 500, 1000)
 SPECIFICATION = "spec near = G (a dist b <= 50) and F (a leftof b)"
-_TIMES = struct.Struct("<qq")
+_COUNT = struct.Struct("<q")
+AT_ONCE = 4
+"""Recorders that are killed together: each is a load for the others."""
 _ROOM = 8 * 20_000
 
 
@@ -29,6 +32,7 @@ class Kills:
 
     name = "kills"
     most_cpu_s = None
+    uses_files = True
 
     def ready(self) -> None:
         # a process that is forked finds all code loaded
@@ -41,50 +45,75 @@ class Kills:
             warm_up([], [])
 
     def draw(self, rng: random.Random) -> Case:
-        return {
-            "rate_hz": rng.choice(RATES_HZ),
-            "objects": rng.choice((2, 2, 5, 20)),
-            "specified": rng.random() < 0.6,
-            "beside": rng.random() < 0.3,
-            "seconds": round(rng.uniform(0.2, 3.0), 3),
-            "busy": rng.choice((0, 1, 2)),
-        }
+        recorders = [
+            {
+                "rate_hz": rng.choice(RATES_HZ),
+                "objects": rng.choice((2, 2, 5, 20)),
+                "specified": rng.random() < 0.6,
+                "beside": rng.random() < 0.3,
+            }
+            for _ in range(AT_ONCE)
+        ]
+        seconds, busy = round(rng.uniform(0.2, 2.5), 3), rng.choice((0, 0, 1))
+        return {"recorders": recorders, "seconds": seconds, "busy": busy}
 
     def kept(self, case: Case, folder: Path) -> Case:
         return case
 
     def run(self, case: Case, folder: Path) -> Outcome:
-        path = folder / "run.mcap"
         fork = multiprocessing.get_context("fork")
         busy = [fork.Process(target=_compute, daemon=True) for _ in range(case["busy"])]
-        with mmap.mmap(-1, _TIMES.size + _ROOM) as shared:
-            recorder = fork.Process(target=_record, args=(path, case, shared), daemon=True)
-            for each in (*busy, recorder):
-                each.start()
-            try:
-                _wait_for_samples(recorder, shared, case["seconds"])
-                killed_ns = time.monotonic_ns()
-                recorder.kill()
-                recorder.join()
-            finally:
-                for each in (*busy, recorder):
-                    with suppress(ProcessLookupError):
-                        each.kill()
-                    each.join()
-            count = _TIMES.unpack_from(shared)[0]
-            written = np.frombuffer(bytes(shared[_TIMES.size : _TIMES.size + 8 * count]), "<i8")
-        return _outcome(path, folder, written, killed_ns)
+        runs = [_Run(folder / str(number), each) for number, each in enumerate(case["recorders"])]
+        processes = [fork.Process(target=_record, args=(run,), daemon=True) for run in runs]
+        for each in (*busy, *processes):
+            each.start()
+        try:
+            while any(not run.count for run in runs) and all(each.is_alive() for each in processes):
+                time.sleep(0.005)
+            time.sleep(case["seconds"])
+            for run, process in zip(runs, processes, strict=True):
+                run.killed_ns = time.monotonic_ns()
+                process.kill()
+        finally:
+            for each in (*busy, *processes):
+                with suppress(ProcessLookupError):
+                    each.kill()
+                each.join()
+        outcome = Outcome(counts={"kills": len(runs)})
+        for run in runs:
+            own = _outcome(run.folder, run.written(), run.killed_ns)
+            outcome.take_in(own)
+            outcome.problems += own.problems
+            run.shared.close()
+        return outcome
 
 
-def _wait_for_samples(recorder: multiprocessing.Process, shared: mmap.mmap, seconds: float) -> None:  # type: ignore[name-defined]
-    while not _TIMES.unpack_from(shared)[0] and recorder.is_alive():
-        time.sleep(0.005)
-    time.sleep(seconds)
+class _Run:
+    """A recorder, and the memory in which it leaves the times of the samples that it has written."""
+
+    def __init__(self, folder: Path, about: Case) -> None:
+        folder.mkdir()
+        self.folder, self.about = folder, about
+        self.shared = mmap.mmap(-1, _COUNT.size + _ROOM)
+        self.killed_ns = 0
+
+    @property
+    def count(self) -> int:
+        return int(_COUNT.unpack_from(self.shared)[0])
+
+    def add(self, number: int, time_ns: int) -> None:
+        _COUNT.pack_into(self.shared, _COUNT.size * (1 + number), time_ns)
+        _COUNT.pack_into(self.shared, 0, number + 1)
+
+    def written(self) -> Integers:
+        count = self.count
+        return np.frombuffer(bytes(self.shared[_COUNT.size : _COUNT.size * (1 + count)]), "<i8")
 
 
-def _outcome(path: Path, folder: Path, written: np.ndarray, killed_ns: int) -> Outcome:  # type: ignore[type-arg]
+def _outcome(folder: Path, written: Integers, killed_ns: int) -> Outcome:
     from spatial_replay.sources.recover import recover_log
 
+    path = folder / "run.mcap"
     outcome = Outcome(counts={"samples": len(written)})
     try:
         found = sr.read_trace(path, allow_damage=True).times_ns
@@ -107,18 +136,18 @@ def _outcome(path: Path, folder: Path, written: np.ndarray, killed_ns: int) -> O
     return outcome
 
 
-def _record(path: Path, case: Case, shared: mmap.mmap) -> None:
+def _record(run: _Run) -> None:
     """Write samples at a rate until killed; each time is in the shared memory once it was written."""
-    specifications = [sr.parse_specification(SPECIFICATION)] if case["specified"] else []
-    boxes = [sr.Footprint.box(x, 0, x + 1, 1) for x in range(case["objects"])]
-    names = ["a", "b", *(f"object{index}" for index in range(2, case["objects"]))]
+    about = run.about
+    specifications = [sr.parse_specification(SPECIFICATION)] if about["specified"] else []
+    boxes = [sr.Footprint.box(x, 0, x + 1, 1) for x in range(about["objects"])]
+    names = ["a", "b", *(f"object{index}" for index in range(2, about["objects"]))]
     objects = dict(zip(names, boxes, strict=True))
-    step_ns = 10**9 // case["rate_hz"]
-    count = 0
-    with sr.Recorder(path, specifications=specifications) as recorder:
-        beside = recorder.channel("/joints") if case["beside"] else None
+    step_ns = 10**9 // about["rate_hz"]
+    with sr.Recorder(run.folder / "run.mcap", specifications=specifications) as recorder:
+        beside = recorder.channel("/joints") if about["beside"] else None
         due_ns = time.monotonic_ns()
-        while count * 8 < _ROOM:
+        for number in range(_ROOM // _COUNT.size):
             now_ns = time.monotonic_ns()
             if now_ns < due_ns:
                 time.sleep((due_ns - now_ns) / 1e9)
@@ -126,9 +155,7 @@ def _record(path: Path, case: Case, shared: mmap.mmap) -> None:
             recorder.write(sr.Sample(now_ns, objects))
             if beside is not None:
                 beside.write(now_ns, {"position": [0.1, 0.2]})
-            struct.pack_into("<q", shared, _TIMES.size + 8 * count, now_ns)
-            count += 1
-            struct.pack_into("<q", shared, 0, count)
+            run.add(number, now_ns)
             due_ns += step_ns
         signal.pause()
 

@@ -30,6 +30,7 @@ class Texts:
 
     name = "texts"
     most_cpu_s = 1.0
+    uses_files = False
 
     def ready(self) -> None:
         sr.parse_specification("G (a ovlp b)")
@@ -64,7 +65,7 @@ class Texts:
 
 def _file(rng: random.Random) -> str:
     """Return a valid specification, with or without definitions."""
-    if rng.random() < 0.3:
+    if rng.random() < 0.6:
         return _formula(rng, rng.randint(0, 3), ("a", "b"))
     lines, terms = [], ["a", "b", "cup"]
     if rng.random() < 0.4:
@@ -76,10 +77,10 @@ def _file(rng: random.Random) -> str:
     if rng.random() < 0.2:
         lines.append("group blocks = a, b")
     names = []
-    for index in range(rng.randint(1, 3)):
+    for index in range(rng.choice((1, 1, 2, 3))):
         title = rng.choice(("", "", ' "REQ-1: no one is hit"'))
         used = f" and {rng.choice(names)}" if names and rng.random() < 0.4 else ""
-        lines.append(f"spec s{index}{title} = ({_formula(rng, rng.randint(0, 4), terms)}){used}")
+        lines.append(f"spec s{index}{title} = ({_formula(rng, rng.randint(0, 3), terms)}){used}")
         names.append(f"s{index}")
     if rng.random() < 0.2:
         lines.append("# a comment: é 物")
