@@ -19,6 +19,7 @@ import os
 import shutil
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -247,6 +248,9 @@ class _Process:
         self.only = _required_form()
         self.interprets = True
         self.listeners: list[Callable[[], None]] = []
+        # a module that another thread is still importing is in `sys.modules`, too
+        self._compiler: Any = None
+        self._lock = threading.RLock()
 
     @cached_property
     def _folder(self) -> Path | None:
@@ -270,16 +274,19 @@ class _Process:
 
     def compile(self, function: Callable[..., Any], options: dict[str, Any]) -> Any:
         """Return a function that is compiled for the types of its arguments when it is called."""
-        numba = sys.modules.get("numba") or self._load()
-        if self._folder is None:
-            return numba.njit(error_model="numpy", **options)(function)
-        # the folder is read from the compiler's settings when a function is decorated; they belong to
-        # the user's own functions, too, and are put back
-        before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(self._folder)
-        try:
-            return numba.njit(cache=True, error_model="numpy", **options)(function)
-        finally:
-            numba.config.CACHE_DIR = before
+        with self._lock:
+            if self._compiler is None:
+                self._compiler = self._load()
+            numba = self._compiler
+            if self._folder is None:
+                return numba.njit(error_model="numpy", **options)(function)
+            # the folder is read from the compiler's settings when a function is decorated; they belong to
+            # the user's own functions, too, and are put back
+            before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(self._folder)
+            try:
+                return numba.njit(cache=True, error_model="numpy", **options)(function)
+            finally:
+                numba.config.CACHE_DIR = before
 
     def _load(self) -> Any:
         import numba

@@ -35,3 +35,25 @@ def test_the_command_says_where_the_code_is(tmp_path):
     (folder,) = tmp_path.iterdir()
     assert done.stdout == f"compiled into {folder}\n"
     assert list(folder.rglob("*.nbi"))
+
+
+_THREADS = """
+import sys, threading
+from spatial_replay.compiled import kernel
+
+sys.setswitchinterval(1e-5)
+failed = []
+threading.excepthook = failed.append
+kernels = [kernel(lambda x: x + 1) for _ in range(8)]
+threads = [threading.Thread(target=each.compiled) for each in kernels]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+print(*(each.exc_value for each in failed))
+"""
+
+
+def test_the_compiler_is_loaded_once_whatever_thread_needs_it_first():
+    done = subprocess.run([sys.executable, "-c", _THREADS], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
