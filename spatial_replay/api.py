@@ -381,11 +381,14 @@ def read_results(folder: PathName) -> pa.Table:
     return ResultsFolder.open(folder).read_run()
 
 
-def verify(log: PathName, source: PathName | None = None, **reading: Unpack[Reading]) -> Verified:
+def verify(
+    log: PathName, source: PathName | None = None, *, explain: bool = False, **reading: Unpack[Reading]
+) -> Verified:
     """Recompute a log's certificate, with the log's own specifications and options, and compare.
 
     Args:
         source: the log that it was made from, evaluated in its place.
+        explain: say where it differs first, in `explanation`; takes another evaluation if it differs.
         reading: how to read `source`, as for `read_trace`.
 
     Returns:
@@ -396,7 +399,8 @@ def verify(log: PathName, source: PathName | None = None, **reading: Unpack[Read
     """
     if source is None and reading:
         raise UsageError(f"{', '.join(reading)} applies to the source of the log; give source=…")
-    return verify_certificate(open_source(log), None if source is None else open_source(source, **reading))
+    original = None if source is None else open_source(source, **reading)
+    return verify_certificate(open_source(log), original, explain=explain)
 
 
 def info(log: PathName, **reading: Unpack[Reading]) -> Overview:

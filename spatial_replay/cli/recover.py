@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +17,8 @@ from spatial_replay.text import counted, time_text
 
 if TYPE_CHECKING:
     from spatial_replay.sources.recover import Recovery, SampleGap
+
+_MOST_LISTED = 20
 
 
 @click.command()
@@ -54,14 +56,20 @@ def _lines(recovery: Recovery, output: Path) -> Iterator[str]:
         yield f"{recovery.name}: nothing is missing; {output.name} holds {saved}"
         return
     yield f"{recovery.name}: {saved} saved in {output.name}; {recovery.losses}"
-    first_ns = recovery.start_ns
-    for start_ns, end_ns in recovery.spans:
-        yield f"  time     {_span(start_ns, end_ns, recovery)}"
-    for gap in recovery.samples:
-        yield f"  samples  {_gap(gap, first_ns)}"
-    for topic, missing in recovery.missing.items():
-        declared = counted(missing + recovery.saved[topic], "message")
-        yield f"  topic    {topic}: {missing:,} of {declared}"
+    yield from _listed("time", (_span(*span, recovery) for span in recovery.spans))
+    yield from _listed("samples", (_gap(gap, recovery.start_ns) for gap in recovery.samples))
+    counts = ((topic, missing + recovery.saved[topic]) for topic, missing in recovery.missing.items())
+    yield from _listed(
+        "topic",
+        (f"{topic}: {recovery.missing[topic]:,} of {counted(all_, 'message')}" for topic, all_ in counts),
+    )
+
+
+def _listed(what: str, entries: Iterable[str]) -> Iterator[str]:
+    lines = list(entries)
+    yield from (f"  {what:<8} {entry}" for entry in lines[:_MOST_LISTED])
+    if len(lines) > _MOST_LISTED:
+        yield f"  {what:<8} and {len(lines) - _MOST_LISTED:,} more, in the metadata of the output"
 
 
 def _span(start_ns: int, end_ns: int, recovery: Recovery) -> str:

@@ -23,17 +23,13 @@ _LONGEST_LINE = 80
 
 
 class FirstDifferences:
-    """Compares the messages of a log with those of a new evaluation, topic by topic, as they come.
-
-    Attributes:
-        found: by topic, the first difference, in a clause.
-    """
+    """Compares the messages of a log with those of a new evaluation, topic by topic, as they come."""
 
     def __init__(self, log: LogFile) -> None:
         self._reader = McapLog(log)
         self._recorded: dict[str, Iterator[Message]] = {}
         self._counts: dict[str, int] = {}
-        self.found: dict[str, Sentence] = {}
+        self._found: dict[str, Sentence] = {}
 
     def add(self, messages: Messages) -> None:
         """Compare the next messages of the evaluation."""
@@ -41,30 +37,31 @@ class FirstDifferences:
         rows = zip(messages.channel.tolist(), messages.log_time_ns.tolist(), messages.payloads, strict=True)
         for number, time_ns, payload in rows:
             topic = topics[number]
-            if topic not in self.found:
+            if topic not in self._found:
                 self._compare(topic, time_ns, payload)
 
-    def finish(self) -> None:
-        """Compare what the log has beyond the evaluation."""
+    def finish(self) -> dict[str, Sentence]:
+        """Compare what the log has beyond the evaluation; return the first difference of each topic."""
         for topic in (each.name for each in self._reader.topics()):
             is_compared = topic in self._recorded or topic not in DERIVED
-            if topic not in self.found and is_compared:
+            if topic not in self._found and is_compared:
                 extra = next(self._messages(topic), None)
                 if extra is not None:
                     when = Instant(extra.log_time_ns, 0)
-                    self.found[topic] = Sentence("the one at ", when, " is only in the log")
+                    self._found[topic] = Sentence("the one at ", when, " is only in the log")
+        return self._found
 
     def _compare(self, topic: str, time_ns: int, payload: bytes) -> None:
         recorded = next(self._messages(topic), None)
         if recorded is None:
-            self.found[topic] = Sentence("the one at ", Instant(time_ns, 0), " is not in the log")
+            self._found[topic] = Sentence("the one at ", Instant(time_ns, 0), " is not in the log")
         elif recorded.log_time_ns != time_ns:
             now, then = Instant(time_ns, 0), Instant(recorded.log_time_ns, 0)
-            self.found[topic] = Sentence("one is at ", now, " now, and was at ", then)
+            self._found[topic] = Sentence("one is at ", now, " now, and was at ", then)
         elif recorded.payload != payload:
             what = _difference(topic, payload, recorded.payload)
             if what is not None:
-                self.found[topic] = Sentence("at ", Instant(time_ns, 0), f": {what}")
+                self._found[topic] = Sentence("at ", Instant(time_ns, 0), f": {what}")
 
     def _messages(self, topic: str) -> Iterator[Message]:
         if topic not in self._recorded:
@@ -78,7 +75,7 @@ def explain_differences(
     """Return for each part of a certificate whether it is the same, and where it differs first.
 
     Args:
-        found: see `FirstDifferences`.
+        found: the first difference of each topic, in a clause; see `FirstDifferences`.
     """
     beside = {topic: what for topic, what in found.items() if topic not in DERIVED and topic != OBJECTS}
     first = next((Sentence(f"on {topic}, ", what) for topic, what in sorted(beside.items())), None)

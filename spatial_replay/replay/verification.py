@@ -20,7 +20,7 @@ from spatial_replay.replay.first_differences import FirstDifferences, explain_di
 from spatial_replay.replay.kept_messages import KEEP_ALL
 from spatial_replay.replay.selection import ReplayOptions, Window
 from spatial_replay.spec.formula import Specification
-from spatial_replay.text import counted_from
+from spatial_replay.text import Sentence, counted_from
 
 _HASHES: Mapping[str, str] = MappingProxyType(
     {
@@ -105,15 +105,17 @@ def verify_certificate(
     )
     replayed = run_replay(evaluated, _files(log), chosen, advance=advance)
     verified = Verified(dict(recorded), dict(replayed.certificate), replayed.faults)
-    if explain and verified.differences and isinstance(log, McapSource):
+    if not explain:
+        return verified
+    found: Mapping[str, Sentence] = {}
+    if verified.differences and isinstance(log, McapSource):
         compared = FirstDifferences(log.path)
         Replay(evaluated, _files(log), chosen, certify=False).run(
             compared.add, layer=bool(options.get("layer")), advance=advance
         )
-        compared.finish()
-        explanation = explain_differences(verified.recorded, verified.computed, compared.found)
-        verified = replace(verified, explanation=counted_from(explanation, replayed.first_ns))
-    return verified
+        found = compared.finish()
+    explanation = explain_differences(verified.recorded, verified.computed, found)
+    return replace(verified, explanation=counted_from(explanation, replayed.first_ns))
 
 
 def recorded_reading(log: Source, source: str) -> dict[str, Any]:

@@ -238,6 +238,15 @@ def test_where_results_differ_first_is_explained(recorded: Path, tmp_path: Path)
     assert " now, " in parts["results"] and " recorded" in parts["results"]
 
 
+def test_what_is_equal_is_explained_as_well(recorded: Path) -> None:
+    code, said = call("verify", recorded, "--explain")
+    assert code == 0
+    parts = explained(said)
+    names = ("samples", "messages", "specification", "results", "program")
+    assert [parts[name] for name in names] == ["the same"] * 5
+    assert sr.verify(recorded, explain=True).explanation[-1].split(maxsplit=1) == ["program", "the same"]
+
+
 def test_which_sample_and_message_differ_from_the_source_is_explained(recorded: Path, tmp_path: Path) -> None:
     def change(topic: str, time_ns: int, payload: bytes) -> bytes:
         if topic == OBJECTS and time_ns == 12 * 10**8:

@@ -7,6 +7,7 @@ import random
 import re
 import signal
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from attacks.cases import Case, Outcome
 from attacks.program import interrupt_after, on_terminal, said_by, unprintable
@@ -28,7 +29,10 @@ class Names:
     uses_files = True
 
     def ready(self) -> None:
-        said_by(["--help"])
+        # what is loaded now, no process that is forked has to load
+        with TemporaryDirectory(prefix="campaign-") as folder:
+            for arguments in _commands(Path(folder), "a", "b", "c", "s"):
+                said_by(arguments)
 
     def draw(self, rng: random.Random) -> Case:
         names = [
@@ -159,6 +163,7 @@ def _interruptible(folder: Path, out: Path) -> list[list[str]]:
         ["report", log, *spec, "-o", str(out / "page.html")],
         ["export", str(_RECORDING), "-o", str(out / "table.csv")],
         ["clip", log, *spec, "-o", str(out / "clip.mcap")],
+        ["recover", str(_RECORDING), "-o", str(out / "recovered.mcap")],
         ["explain", log, *spec],
         ["info", log],
     ]
