@@ -35,14 +35,12 @@ class Kills:
     uses_files = True
 
     def ready(self) -> None:
-        # a process that is forked finds all code loaded
-        from spatial_replay.recording.recorder import warm_up
+        # a process that is forked finds all code loaded: a recorder records some samples when it begins
         from spatial_replay.sources.recover import recover_log
 
         assert recover_log
-        recording = sr.parse_specification(SPECIFICATION)
-        with sr.Recorder(os.devnull, specifications=[recording]):
-            warm_up([], [])
+        with sr.Recorder(os.devnull, specifications=sr.parse_specification(SPECIFICATION)):
+            pass
 
     def draw(self, rng: random.Random) -> Case:
         recorders = [
