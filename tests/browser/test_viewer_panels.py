@@ -259,6 +259,13 @@ def test_the_decision_before_the_cursor_shows_candidates_maps_and_edges_given_up
     maps = sum(len(each.maps) for edge in decisions[0].considered for each in edge.candidates)
     expect(page.locator(".candidate canvas")).to_have_count(maps)
     expect(page.locator(".card > figure canvas")).to_have_count(1)
+    # a live source has neither numbers of maps nor, before it is played, the outcome
+    live = open_panel("push", "decisions", "live")
+    live.evaluate("viewer.play({sec: -1, nsec: 0}, {sec: 1, nsec: 0})")
+    expect(live.locator(".candidate canvas")).to_have_count(
+        sum(len(each.maps) for edge in decisions[0].considered for each in edge.candidates)
+    )
+    expect(live.get_by_text("Done at")).to_have_count(0)
 
 
 def test_texts_of_a_log_are_shown_as_text(open_panel: Open, logs: Mapping[str, Path], tmp_path: Path) -> None:
@@ -298,3 +305,47 @@ def test_the_worst_of_several_results_is_shown_first_unless_the_reader_chose(
         page.evaluate("viewer.settled()")
         expect(page.locator("select option:checked")).to_have_text("near")
         assert page.evaluate("viewer.ranges.length") < 10
+
+
+LONG = """async (count) => {
+    const {message: specification} = MESSAGES.find((each) => each.topic === "/spatial/specification");
+    const [{name, object, nodes}] = specification.results;
+    const stamp = (place) => ({sec: Math.floor(place / 1000), nsec: place % 1000 * 1e6});
+    const messages = [{topic: "/spatial/specification", receiveTime: stamp(0), message: specification}];
+    for (let place = 0; place < count; place++) {
+        messages.push({topic: "/spatial/robustness", receiveTime: stamp(place), message: {
+            specification: name, object,
+            get nodes() {
+                const number = place / 1000;
+                return nodes.map(({id}) => ({id, value: number, now: number, lower: number, upper: number}));
+            },
+        }});
+    }
+    window.viewer = new Viewer(CODE, messages, "foxglove");
+    await viewer.show("spatial-replay specification", document.getElementById("panel"));
+}"""
+
+
+def test_of_a_run_too_long_to_keep_the_sample_before_is_shown_and_named(
+    browser: Browser, logs: Mapping[str, Path]
+) -> None:
+    page = browser.new_page(viewport={"width": 700, "height": 800})
+    page.goto(logs["table"].with_suffix(".html").as_uri())
+    samples = 200_000
+    page.evaluate(LONG, samples)
+    now = page.locator(".tree .row").first.locator(".number").last
+    shown = []
+    for sample in (0, 77_777, 123_456, samples - 1):
+        seek(page, sample * 10**6)
+        # a jump gives the sample itself; without it, a pointer finds the one before
+        assert now.text_content() == number_text(sample / 1000)
+        page.evaluate("viewer.hover(undefined)")
+    for sample in (40_001, 40_002, 99_999, samples - 2):
+        page.evaluate("seconds => viewer.hover(seconds)", sample / 1000)
+        said = page.locator(".panel-head").inner_text()
+        [kept] = re.findall(r"at (\d+\.\d+) s, under the pointer", said)
+        shown.append(sample - round(float(kept) * 1000))
+        assert now.text_content() == number_text((sample - shown[-1]) / 1000)
+    assert all(0 <= behind <= 4 for behind in shown)
+    assert any(shown)
+    page.close()
