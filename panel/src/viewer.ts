@@ -28,6 +28,7 @@ interface RenderState {
   readonly startTime?: Stamp;
   readonly previewTime?: number | undefined;
   readonly colorScheme?: "dark" | "light";
+  readonly topics?: readonly { readonly name: string }[];
 }
 
 /** The time that a panel shows, in seconds after the first sample. */
@@ -92,6 +93,7 @@ class Panel implements Viewer {
   /** Messages that came before the specification, the newest of each kind. */
   private readonly early = new Map<string, Received>();
   private frame: readonly Received[] | undefined;
+  private topics: ReadonlySet<string> | undefined;
   private waiting = 0;
   private isClosed = false;
 
@@ -113,9 +115,8 @@ class Panel implements Viewer {
         done();
       }
     };
-    for (const field of ["currentFrame", "currentTime", "startTime", "previewTime", "colorScheme", "didSeek"] as const) {
-      context.watch(field);
-    }
+    const fields = ["currentFrame", "currentTime", "startTime", "previewTime", "colorScheme", "didSeek", "topics"] as const;
+    for (const field of fields) context.watch(field);
     context.subscribe([SPECIFICATION, ...this.view.topics].map((topic) => ({ topic })));
     this.readRange(SPECIFICATION).catch(report);
     this.refresh();
@@ -173,6 +174,7 @@ class Panel implements Viewer {
 
   private render(state: RenderState): void {
     if (state.colorScheme) this.root.dataset.theme = state.colorScheme;
+    if (state.topics) this.topics = new Set(state.topics.map((each) => each.name));
     if (state.startTime) this.start = nanoseconds(state.startTime);
     if (state.currentTime) this.current = nanoseconds(state.currentTime);
     if ("previewTime" in state) this.hover = state.previewTime;
@@ -217,7 +219,10 @@ class Panel implements Viewer {
 
   /** Reads what a file has of topics, one after the other; live sources have nothing to read. */
   private async readAll(topics: readonly string[]): Promise<void> {
-    for (const topic of topics) await this.readRange(topic);
+    for (const topic of topics) {
+      // a viewer need not answer for a topic that it does not have
+      if (!this.topics || this.topics.has(topic)) await this.readRange(topic);
+    }
   }
 
   /** Reads all messages of a topic, now and whenever its data change; resolves once they were read. */

@@ -12,7 +12,7 @@ class Viewer {
     this.open = 0;
     const module = {exports: {}};
     const modules = {react: React, "react-dom": ReactDOM};
-    new Function("module", "exports", "require", code)(module, module.exports, (name) => {
+    new Function("module", "require", code)(module, (name) => {
       if (!modules[name]) throw new Error(`no module ${name}`);
       return modules[name];
     });
@@ -36,6 +36,8 @@ class Viewer {
     };
     const subscribeRange = ({topic, onNewRangeIterator}) => {
       const found = this.messages.filter((each) => each.topic === topic);
+      // what the source does not have is never answered for
+      if (!found.length) return () => undefined;
       const batches = (async function* () {
         for (let place = 0; place < found.length; place += 100) yield found.slice(place, place + 100);
       })();
@@ -51,7 +53,11 @@ class Viewer {
     };
     this.subscribed = () => topics;
     this.close = this.panels.get(name)(this.context);
-    this.render({startTime: this.messages[0].receiveTime, colorScheme: this.scheme ?? "light"});
+    const names = [...new Set(this.messages.map((each) => each.topic))];
+    this.render({
+      startTime: this.messages[0].receiveTime, colorScheme: this.scheme ?? "light",
+      topics: names.map((name) => ({name})),
+    });
     await this.settled();
   }
 
