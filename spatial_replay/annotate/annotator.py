@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from foxglove_schemas_protobuf.Event_pb2 import Event
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
@@ -16,22 +18,26 @@ from spatial_replay.annotate.automaton_state import (
 from spatial_replay.annotate.events import EncodedEvent, EventReporter
 from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.robustness import encode_robustness
+from spatial_replay.annotate.scene_entities import encode_frame
 from spatial_replay.annotate.scene_update import SceneEncoder, SceneFrames, SceneState
 from spatial_replay.annotate.specification import ReportedTree, encode_specification
+from spatial_replay.annotate.standing import StandingEncoder
 from spatial_replay.annotate.violations import EvaluatedResult, leaf_pairs, violated_since
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Channel, Messages, messages_of
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
-from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
+from spatial_replay.logs.schemas.Robustness_pb2 import Robustness, StandingUpdate
 from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
 from spatial_replay.logs.topics import (
     AUTOMATON,
     DERIVED,
     EVENT_LOG,
     EVENTS,
+    FRAME,
     ROBUSTNESS,
     SCENE,
     SPECIFICATION,
+    STANDING,
     protobuf_channel,
 )
 from spatial_replay.monitor.instances import Instance
@@ -76,7 +82,7 @@ class Annotator:
         self._automata = [each.automaton for each in automata]
         self._names = [[node.name for _, _, node in iter_nodes(tree.formula)] for tree in trees]
         self._leaf_pairs = [
-            leaf_pairs(instance, requirements, files[tree.file].regions)
+            leaf_pairs(instance, requirements, files[tree.file].regions, files[tree.file].relations)
             for tree, instance, requirements in zip(trees, instances, self._requirements, strict=True)
         ]
         self._reporters = [
@@ -89,7 +95,9 @@ class Annotator:
             else AutomatonRun(tree.name, tree.object, kept.automaton, tree.formula, instance.program.leaves)
             for tree, instance, kept in zip(trees, instances, automata, strict=True)
         ]
+        self._standing = StandingEncoder(trees, self._runs)
         self._encoder = SceneEncoder(shown_regions(files))
+        self._latest: tuple[Trace, list[SeriesBlock]] | None = None
         self._scene = scene or SceneState()
         self._show = show
         self._written = dict.fromkeys(DERIVED, 0)
@@ -112,12 +120,19 @@ class Annotator:
         if not len(trace):
             return []
         messages = []
+        if not self._written[FRAME]:
+            messages.append(
+                self._messages(_FRAME, trace.times_ns[:1], [encode_frame(int(trace.times_ns[0]))])
+            )
         if self._trees and not self._written[SPECIFICATION]:
             messages.append(self._messages(_SPECIFICATION, trace.times_ns[:1], [self.specification()]))
         messages.append(self._robustness(blocks))
         messages.append(self._automaton_states(blocks))
+        if self._trees:
+            messages.append(self._messages(_STANDING, *self._standing.encode(trace.times_ns, blocks)))
         messages += self._events(self._changes(blocks))
         messages.append(self._scene_messages(trace, blocks))
+        self._remember(trace, blocks)
         return messages
 
     def pass_over(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
@@ -127,12 +142,15 @@ class Annotator:
         for run, block in zip(self._runs, blocks, strict=True):
             if run is not None:
                 run.pass_over(block)
+        self._standing.pass_over(blocks)
+        self._remember(trace, blocks)
         return self._events(self._changes(blocks))
 
     def end(
         self, time_ns: int, finals: Sequence[Floats], vacuous: Sequence[Sequence[Vacuous]] = ()
     ) -> list[Messages]:
-        """Return what to write after the last sample: the verdicts that were still pending, and warnings.
+        """Return what to write after the last sample: events of what was still pending, warnings, and how all
+        results stand, in numbers and in the scene.
 
         Args:
             time_ns: when the log ends, the last sample's time or later.
@@ -146,7 +164,42 @@ class Annotator:
         ]
         for reporter, final, parts in zip(self._reporters, finals, vacuous, strict=False):
             events += reporter.vacuous(time_ns, parts, final_verdict(*final[0].tolist()))
-        return self._events(events)
+        return [*self._events(events), *self._finals(time_ns, finals)]
+
+    def _finals(self, time_ns: int, finals: Sequence[Floats]) -> list[Messages]:
+        """Return the last message on robustness of each result, the last standing and the last scene."""
+        if self._latest is None or not self._trees:
+            return []
+        trace, blocks = self._latest
+        ended = [_ended(block, final) for block, final in zip(blocks, finals, strict=True)]
+        robustness = [
+            payload
+            for tree, names, block in zip(self._trees, self._names, ended, strict=True)
+            for payload in encode_robustness(
+                tree.name, tree.object, names, block.times_ns, block.series, final=True
+            )
+        ]
+        last_ns = int(trace.times_ns[-1])
+        numbers = self._messages(_ROBUSTNESS, np.full(len(robustness), time_ns), robustness)
+        standing = self._messages(_STANDING, np.array([time_ns]), [self._standing.end(last_ns, finals)])
+        self._since_ns = [
+            violated_since(own, block, since_ns)
+            for own, block, since_ns in zip(self._requirements, ended, self._since_ns, strict=True)
+        ]
+        # drawn again at once, now in the colours of the finished log
+        self._scene = replace(self._scene, written_ns=None)
+        scene = self._scene_messages(trace, ended, is_final=True)
+        times_ns = np.full(len(scene), time_ns)
+        return [numbers, standing, replace(scene, log_time_ns=times_ns, publish_time_ns=times_ns)]
+
+    def _remember(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> None:
+        """Keep the last sample, and the last one of each result, for the end."""
+        before = [None] * len(blocks) if self._latest is None else self._latest[1]
+        latest = [
+            _last_of(block) if len(block.times_ns) or earlier is None else earlier
+            for block, earlier in zip(blocks, before, strict=True)
+        ]
+        self._latest = trace.slice(len(trace) - 1, len(trace)), latest
 
     def specification(self) -> bytes:
         """Return the message of the specifications and the trees of their results."""
@@ -189,11 +242,19 @@ class Annotator:
         encoded = [run.encode(block) for run, block in running]
         return self._in_order(_AUTOMATON, [block for _, block in running], encoded)
 
-    def _scene_messages(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> Messages:
+    def _scene_messages(
+        self, trace: Trace, blocks: Sequence[SeriesBlock], *, is_final: bool = False
+    ) -> Messages:
         results = [
-            EvaluatedResult(requirements, block, pairs, since_ns, reporter.settled)
-            for requirements, block, pairs, since_ns, reporter in zip(
-                self._requirements, blocks, self._leaf_pairs, self._since_ns, self._reporters, strict=True
+            EvaluatedResult(requirements, block, pairs, since_ns, reporter.settled, tree.title, is_final)
+            for requirements, block, pairs, since_ns, reporter, tree in zip(
+                self._requirements,
+                blocks,
+                self._leaf_pairs,
+                self._since_ns,
+                self._reporters,
+                self._trees,
+                strict=True,
             )
         ]
         drawn = self._encoder.encode(trace, results, self._scene)
@@ -217,6 +278,20 @@ class Annotator:
         return messages_of(channel, times_ns, payloads, first)
 
 
+def _last_of(block: SeriesBlock) -> SeriesBlock:
+    """Return the last sample of a block, if it has any."""
+    return SeriesBlock(
+        block.times_ns[-1:].copy(), block.series[:, :, -1:].copy(), block.leaves[:, :, -1:].copy()
+    )
+
+
+def _ended(block: SeriesBlock, final: Floats) -> SeriesBlock:
+    """Return a last sample, if there is one, with the interval (N, 2) of each node over the finished log."""
+    series = block.series.copy()
+    series[:, 2:] = final[:, :, None]
+    return replace(block, series=series)
+
+
 def shown_regions(files: Sequence[Specification]) -> Mapping[str, Outline]:
     """Return the regions of all files; where two differ on a name, the later one gets its file's name."""
     shown: dict[str, Outline] = {}
@@ -227,8 +302,10 @@ def shown_regions(files: Sequence[Specification]) -> Mapping[str, Outline]:
     return shown
 
 
+_FRAME = protobuf_channel(FRAME, FrameTransform)
 _SPECIFICATION = protobuf_channel(SPECIFICATION, SpecificationMessage)
 _ROBUSTNESS = protobuf_channel(ROBUSTNESS, Robustness)
+_STANDING = protobuf_channel(STANDING, StandingUpdate)
 _AUTOMATON = protobuf_channel(AUTOMATON, AutomatonState)
 _SCENE = protobuf_channel(SCENE, SceneUpdate)
 _EVENTS = protobuf_channel(EVENTS, Event)
@@ -238,4 +315,5 @@ _EVENT_LOG = protobuf_channel(EVENT_LOG, Log)
 def channels_of_results(trees: Sequence[ReportedTree]) -> tuple[Channel, ...]:
     """Return the channels of the messages that annotate a sample with results."""
     specification = [_SPECIFICATION] if trees else []
-    return (*specification, _ROBUSTNESS, _AUTOMATON, _EVENTS, _EVENT_LOG, _SCENE)
+    standing = [_STANDING] if trees else []
+    return (_FRAME, *specification, _ROBUSTNESS, _AUTOMATON, *standing, _EVENTS, _EVENT_LOG, _SCENE)

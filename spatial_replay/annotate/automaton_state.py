@@ -72,6 +72,8 @@ class AutomatonRun:
         self._templates: dict[bytes, WireTemplate] = {}
         about = (automaton.accepting, automaton.can_accept, automaton.can_reject)
         self._about = np.array([[state in each for each in about] for state in automaton.states], np.bool_)
+        self._after: NDArray[np.bool_] | Integers = np.empty(0, np.int64)
+        self._texts: dict[bytes, str] = {}
 
     def encode(self, block: SeriesBlock) -> list[bytes]:
         """Take in the next samples; return one message for each."""
@@ -103,6 +105,44 @@ class AutomatonRun:
         """Take in the next samples, at least one; return the states after each, (T,) or as sets (T, S)."""
         return self._steps(self._values(block))[1]
 
+    def words(self) -> list[str]:
+        """Return the states after each of the samples last taken in, in words."""
+        kinds, groups = _distinct(self._after, self._after)
+        firsts = [int(np.argmax(groups == number)) for number in range(len(kinds))]
+        texts = [self._text(kind, first) for kind, first in zip(kinds, firsts, strict=True)]
+        return [texts[number] for number in groups.tolist()]
+
+    @property
+    def latest_words(self) -> str:
+        """The states after the last sample, in words."""
+        [kind], _ = _distinct(self._after[-1:], self._after[-1:])
+        return self._text(kind, -1)
+
+    def _text(self, kind: bytes, sample: int) -> str:
+        if kind not in self._texts:
+            if len(self._texts) >= _MOST_TEMPLATES:
+                self._texts.clear()
+            self._texts[kind] = self._described(_members(self._after[sample]).tolist())
+        return self._texts[kind]
+
+    def _described(self, states: list[int]) -> str:
+        """Return some states in words: what they decide, or what is still to be done."""
+        numbers = ", ".join(map(str, states[:_MOST_NAMED])) + (", …" if len(states) > _MOST_NAMED else "")
+        title = f"state {numbers}" if len(states) == 1 else f"one of the states {numbers}"
+        accepting, can_accept, can_reject = self._about[states].T
+        if not can_reject.any():
+            meaning = "satisfied, whatever comes"
+        elif not can_accept.any():
+            meaning = "violated, whatever comes"
+        elif accepting.all():
+            meaning = "satisfied if nothing more came"
+        elif len(states) > 1 or len(self._automaton.states) > _MOST_SEARCHED:
+            meaning = "not satisfied yet"
+        else:
+            [first, *_] = next(self._automaton.paths(states[0]))
+            meaning = f"still to come: {_shortened(self._automaton.guard_words(first), _LONGEST_STEP)}"
+        return f"{title}: {meaning}"
+
     def _values(self, block: SeriesBlock) -> Flags:
         """Return (P, T): whether each proposition is true in each sample, or unknown."""
         now = block.series[list(self.propositions), _NOW]
@@ -120,6 +160,10 @@ class AutomatonRun:
 
     def _steps(self, values: Flags) -> tuple[NDArray[np.bool_] | Integers, NDArray[np.bool_] | Integers]:
         """Return the states before and after each sample: (T,), or as sets of states (T, S)."""
+        before, self._after = self._moved(values)
+        return before, self._after
+
+    def _moved(self, values: Flags) -> tuple[NDArray[np.bool_] | Integers, NDArray[np.bool_] | Integers]:
         states = np.flatnonzero(self._possible)
         if len(states) == 1 and not (values == UNKNOWN).any():
             first = int(states[0])
@@ -164,10 +208,15 @@ class AutomatonRun:
 
 
 _LONGEST_GUARD = 500
+_LONGEST_STEP = 120
+_MOST_NAMED = 5
+"""The most states that are named where a run may be in one of several."""
+_MOST_SEARCHED = 2_000
+"""The most states of an automaton whose way to acceptance is looked for while it runs."""
 
 
-def _shortened(text: str) -> str:
-    return text if len(text) <= _LONGEST_GUARD else f"{text[: _LONGEST_GUARD - 1].rstrip()}…"
+def _shortened(text: str, most: int = _LONGEST_GUARD) -> str:
+    return text if len(text) <= most else f"{text[: most - 1].rstrip()}…"
 
 
 def _members(states: NDArray[np.bool_] | Integers) -> Integers:

@@ -65,18 +65,23 @@ class Thinning:
         return np.column_stack([first, second]).reshape(-1)
 
 
-def encode_curves(times_ns: Integers, results: Sequence[SpecResult], first_ns: int) -> bytes:
+def encode_curves(
+    times_ns: Integers, results: Sequence[SpecResult], first_ns: int, summary: str = ""
+) -> bytes:
     """Return the message with the curves of a whole log.
 
     Args:
         times_ns: (T,) int64, of all samples, at least one.
         first_ns: the time that seconds count from.
+        summary: what the results come to, in words.
     """
     curves = 2 * sum(len(curved_nodes(result.formula)) for result in results)
     most = min(MOST_POINTS, max(_FEWEST_POINTS, _MOST_NUMBERS // max(curves, 1)))
     thinning = Thinning(times_ns, most)
     message = Curves(
-        time=thinning.seconds(first_ns), specifications=[_result(each, thinning) for each in results]
+        time=thinning.seconds(first_ns),
+        specifications=[_result(each, thinning) for each in results],
+        summary=summary,
     )
     return message.SerializeToString(deterministic=True)
 

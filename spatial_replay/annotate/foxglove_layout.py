@@ -6,18 +6,26 @@ The kind of a panel, the part of its identifier before `!`, is one that both vie
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from spatial_replay.annotate.curves import curved_nodes
-from spatial_replay.annotate.scene_entities import FRAME
+from spatial_replay.annotate.scene_entities import FRAMES
 from spatial_replay.annotate.specification import ReportedTree, unit_of
+from spatial_replay.annotate.standing import named_parts, part_title
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.logs.messages import Attachment
+from spatial_replay.logs.schemas.Robustness_pb2 import (
+    FAILS_SO_FAR,
+    HOLDS_SO_FAR,
+    SATISFIED,
+    UNKNOWN,
+    VIOLATED,
+)
 from spatial_replay.logs.topics import (
-    AUTOMATON,
     CURVES_TOPIC,
     EVENT_LOG,
     GRADIENT_MAP,
@@ -27,10 +35,20 @@ from spatial_replay.logs.topics import (
     ROBUSTNESS,
     SCENE,
     SPECIFICATION,
+    STANDING,
 )
 from spatial_replay.monitor.online.operators import looks_ahead
-from spatial_replay.palette import CURVES, lighter
-from spatial_replay.spec.formula import Formula, iter_nodes
+from spatial_replay.palette import (
+    CURVES,
+    FAILING,
+    HOLDING,
+    NEGATIVE,
+    NEUTRAL,
+    POSITIVE,
+    hexadecimal,
+    lighter,
+)
+from spatial_replay.spec.formula import Formula
 from spatial_replay.trace.axes import OUR_AXES, Axes
 from spatial_replay.trace.trace import Trace
 
@@ -38,8 +56,31 @@ _MOST_CURVES: Final = 12
 _MOST_STRIPS: Final = 8
 """More curves, or strips of states, cannot be distinguished."""
 
-_LEGEND_PIXELS: Final = 150
+_MOST_PLOTS: Final = 3
+_MOST_INDICATORS: Final = 24
+_PER_ROW: Final = 6
+
+_LEGEND_PIXELS: Final = 190
 """The width of a legend, beside the curves so that it hides none."""
+
+_LONGEST_LABEL: Final = 24
+"""The most characters of a label: what fits into a legend."""
+
+_INDICATOR_PIXELS: Final = 18
+_ZERO: Final = "#8c8c8c"
+
+_UNIT_WORDS: Final = MappingProxyType({"": "footprint units", "1": "no unit", "mixed": "mixed units"})
+
+STANDING_COLOURS: Final[Mapping[int, tuple[str, str]]] = MappingProxyType(
+    {
+        SATISFIED: ("satisfied", hexadecimal(POSITIVE)),
+        HOLDS_SO_FAR: ("holds so far", hexadecimal(HOLDING)),
+        FAILS_SO_FAR: ("fails so far", hexadecimal(FAILING)),
+        VIOLATED: ("violated", hexadecimal(NEGATIVE)),
+        UNKNOWN: ("unknown", hexadecimal(NEUTRAL)),
+    }
+)
+"""Each number of `Standing` in words, and the colour that it has where a panel lets us choose it."""
 
 Config = dict[str, Any]
 
@@ -57,95 +98,150 @@ def scene_panel(camera: Mapping[str, Any], topics: Collection[str], axes: Axes =
     config = {
         "cameraState": camera,
         "followMode": "follow-none",
-        "followTf": FRAME,
+        "followTf": FRAMES[0],
         "topics": {topic: {"visible": True, **how} for topic, how in shown.items() if topic in topics},
         "scene": {"labelScaleFactor": 1},
         # its axes are a metre long, whatever the scene's size
-        "transforms": {f"frame:{FRAME}": {"visible": False}},
+        "transforms": {f"frame:{frame}": {"visible": False} for frame in FRAMES},
     }
-    if axes != OUR_AXES:
-        # each of the two viewers reads a key of its own
-        title = f"Scene, {axes}"
-        config |= {"foxglovePanelTitle": title, "lichtblickPanelTitle": title}
-    return Panel("3D!scene", config)
+    return _titled("3D!scene", "Scene" if axes == OUR_AXES else f"Scene, {axes}", config)
 
 
-def result_curves(trees: Sequence[ReportedTree]) -> Panel:
-    """Return the curves of each result's value."""
-    paths = [(_label(tree), node_path(tree, id=0)) for tree in trees]
-    return Panel("Plot!robustness", _plot(paths[:_MOST_CURVES]))
-
-
-def part_curves(trees: Sequence[ReportedTree]) -> Panel | None:
-    """Return the curves of named specs: `now` of those that do not look ahead; None without any."""
-    paths = [
-        (f"{name} in {tree.title}", node_path(tree, name=name, field="value" if ahead else "now"))
-        for tree in trees
-        for name, ahead in named_parts(tree).items()
+def indicators(trees: Sequence[ReportedTree]) -> list[Panel]:
+    """Return a light for each result, in the colour of how it stands at the cursor."""
+    rules = [
+        {"operator": "=", "rawValue": str(number), "color": colour, "label": words}
+        for number, (words, colour) in STANDING_COLOURS.items()
     ]
-    return Panel("Plot!parts", _plot(paths[:_MOST_CURVES])) if paths else None
+    return [
+        _titled(
+            f"Indicator!result{index}",
+            tree.title,
+            {
+                "path": _standing_path(tree.title, "standing"),
+                "style": "background",
+                "fontSize": _INDICATOR_PIXELS,
+                "rules": rules,
+                "fallbackColor": STANDING_COLOURS[UNKNOWN][1],
+                "fallbackLabel": "not evaluated",
+            },
+        )
+        for index, tree in enumerate(trees[:_MOST_INDICATORS])
+    ]
 
 
-def whole_curves(trees: Sequence[ReportedTree]) -> Panel:
+def result_curves(trees: Sequence[ReportedTree]) -> list[Panel]:
+    """Return the curves of the results, those of each unit in a panel of their own."""
+    curves = [
+        _Curve(tree.title, _standing_path(tree.title, "robustness"), unit_of(tree.formula, {}))
+        for tree in trees
+    ]
+    return _plots("robustness", "Robustness of results", curves)
+
+
+def part_curves(trees: Sequence[ReportedTree]) -> list[Panel]:
+    """Return the curves of named specs, those of each unit in a panel of their own."""
+    curves = [
+        _Curve(
+            name if is_clear else part_title(name, tree),
+            _standing_path(part_title(name, tree), "robustness"),
+            unit_of(node, {}),
+        )
+        for tree, name, node, is_clear in _parts(trees)
+    ]
+    return _plots("parts", "Robustness of named specs", curves)
+
+
+def whole_curves(trees: Sequence[ReportedTree]) -> list[Panel]:
     """Return the curves over the whole log of each result, then of its named specs."""
-    labelled = [(_label(tree), f"{_curves_path(tree, 0)}.value[:]") for tree in trees]
-    labelled += [
-        (f"{node.name} in {tree.title}", f"{_curves_path(tree, identifier)}.{_shown_number(node)}[:]")
+    curves = [
+        _Curve(tree.title, f"{_curves_path(tree, 0)}.value[:]", unit_of(tree.formula, {})) for tree in trees
+    ]
+    curves += [
+        _Curve(
+            part_title(node.name, tree),
+            f"{_curves_path(tree, identifier)}.{_shown_number(node)}[:]",
+            unit_of(node, {}),
+        )
         for tree in trees
         for identifier, node in curved_nodes(tree.formula).items()
-        if identifier
+        if identifier and node.name
     ]
     times = {"enabled": True, "value": f"{CURVES_TOPIC}.time[:]"}
     whole = {"xAxisVal": "currentCustom", "xAxisPath": times, "isSynced": False}
-    return Panel("Plot!whole", {**_plot(labelled[:_MOST_CURVES]), **whole})
+    return [
+        Panel(panel.identifier, {**panel.config, **whole})
+        for panel in _plots("whole", "Robustness over the whole log", curves)
+    ]
 
 
 def state_strips(trees: Sequence[ReportedTree], has_states: Sequence[bool]) -> Panel:
-    """Return strips of each result's verdict and automaton state, then of its named specs' verdicts."""
-    strips = []
-    for tree, has_state in zip(trees, has_states, strict=True):
-        strips.append((f"{tree.title}: verdict", node_path(tree, id=0, field="verdict")))
-        if has_state:
-            strips.append((f"{tree.title}: state", f"{AUTOMATON}{_of(tree)}.states[0]"))
-    for tree in trees:
-        strips += [
-            (f"{name} in {tree.title}: verdict", node_path(tree, name=name, field="verdict"))
-            for name, ahead in named_parts(tree).items()
-            if ahead
-        ]
-    paths = [
-        {"enabled": True, "label": label, "timestampMethod": "receiveTime", "value": path}
-        for label, path in strips[:_MOST_STRIPS]
+    """Return a strip for how each result stands, then for its automaton's state and its named specs."""
+    strips = [(tree.title, _standing_path(tree.title, "standing"), True) for tree in trees]
+    more = [
+        (f"{_short(tree.title)}: automaton", _standing_path(tree.title, "automaton"), False)
+        for tree, has_state in zip(trees, has_states, strict=True)
+        if has_state
     ]
-    return Panel("StateTransitions!verdicts", {"isSynced": True, "paths": paths})
+    more += [
+        (part_title(name, tree), _standing_path(part_title(name, tree), "standing"), True)
+        for tree, name, node, _ in _parts(trees)
+        if looks_ahead(node)
+    ]
+    # Foxglove takes its colours from here, Lichtblick from the numbers
+    states = [
+        {"value": str(number), "label": words, "color": colour}
+        for number, (words, colour) in STANDING_COLOURS.items()
+    ]
+    paths = [
+        {
+            "enabled": True,
+            "label": label,
+            "timestampMethod": "receiveTime",
+            "value": path,
+            **({"customStates": {"type": "discrete", "states": states}} if is_standing else {}),
+        }
+        for label, path, is_standing in [*strips, *more[:_MOST_STRIPS]]
+    ]
+    return _titled("StateTransitions!verdicts", "How results stand", {"isSynced": True, "paths": paths})
 
 
-def node_table(tree: ReportedTree) -> Panel:
-    """Return the table of a result's nodes, with their numbers and verdicts at the cursor.
-
-    Viewers take the newest message of the topic, so only the table of the last of several results has rows.
-    """
-    return Panel("Table!nodes", {"topicPath": f"{ROBUSTNESS}{_of(tree)}.nodes"})
+def node_table() -> Panel:
+    """Return the table of the worst result's nodes, with their text, numbers and standing at the cursor."""
+    return _titled("Table!nodes", "Nodes of the worst result", {"topicPath": f"{STANDING}.nodes"})
 
 
 def event_list() -> Panel:
     """Return the list of events."""
-    return Panel("RosOut!events", {"minLogLevel": 1, "searchTerms": [], "topicToRender": EVENT_LOG})
+    config = {"minLogLevel": 1, "searchTerms": [], "topicToRender": EVENT_LOG}
+    return _titled("RosOut!events", "Events", config)
 
 
 def specification_text() -> Panel:
     """Return the text of the specification, with its nodes."""
-    return Panel("RawMessages!specification", {"topicPath": SPECIFICATION})
+    return _titled("RawMessages!specification", "Specification", {"topicPath": SPECIFICATION})
 
 
 def decision_reason() -> Panel:
     """Return the reason of the planner's decision."""
-    return Panel("RawMessages!decision", {"topicPath": f"{PLAN_DECISION}.reason"})
+    config = {"topicPath": f"{PLAN_DECISION}.reason"}
+    return _titled("RawMessages!decision", "Why the planner decided so", config)
 
 
 def constants() -> Panel:
-    """Return the constants that a live server lets a viewer edit."""
-    return Panel("Parameters!constants", {"title": "Constants of the specification"})
+    """Return the playback and the constants, which a live server lets a viewer edit."""
+    title = "Playback and constants of the specification"
+    return _titled("Parameters!constants", title, {"title": title})
+
+
+def summary() -> Panel:
+    """Return what the whole log comes to, with the constants as they are set."""
+    return _titled("RawMessages!summary", "The whole log", {"topicPath": f"{CURVES_TOPIC}.summary"})
+
+
+def _titled(identifier: str, title: str, config: Config) -> Panel:
+    # each of the two viewers reads a key of its own
+    return Panel(identifier, {**config, "foxglovePanelTitle": title, "lichtblickPanelTitle": title})
 
 
 def node_path(
@@ -156,36 +252,62 @@ def node_path(
     return f"{ROBUSTNESS}{_of(tree)}.nodes[:]{{{which}}}.{field}"
 
 
-def named_parts(tree: ReportedTree) -> dict[str, bool]:
-    """Return the names that exactly one node below the root has, each with whether it looks ahead.
+def _parts(trees: Sequence[ReportedTree]) -> Iterator[tuple[ReportedTree, str, Formula, bool]]:
+    """Yield the named specs of all results, and whether no two have that name."""
+    names = [name for tree in trees for name in named_parts(tree)]
+    names += [tree.title for tree in trees]
+    for tree in trees:
+        for name, (_, node) in named_parts(tree).items():
+            yield tree, name, node, names.count(name) == 1
 
-    A message path by name would otherwise find several nodes.
-    """
-    named = [(node.name, node) for _, _, node in iter_nodes(tree.formula) if node.name]
-    names = [name for name, _ in named]
-    return {name: looks_ahead(node) for name, node in named[1:] if names.count(name) == 1}
+
+class _Curve(NamedTuple):
+    """A curve: its label, the path of its numbers, and their unit."""
+
+    label: str
+    path: str
+    unit: str
 
 
-def _plot(labelled: Sequence[tuple[str, str]]) -> Config:
-    paths = [
-        {
-            # viewers draw samples as dots of this colour darkened, which cover a dense curve
-            "color": lighter(CURVES[index % len(CURVES)]),
-            "enabled": True,
-            "label": label,
-            "timestampMethod": "receiveTime",
-            "value": path,
+def _plots(name: str, title: str, curves: Sequence[_Curve]) -> list[Panel]:
+    """Return a plot for each unit, with a line at 0: above it, things hold."""
+    panels = []
+    for index, unit in enumerate(list(dict.fromkeys(curve.unit for curve in curves))[:_MOST_PLOTS]):
+        own = [curve for curve in curves if curve.unit == unit][:_MOST_CURVES]
+        words = _UNIT_WORDS.get(unit, unit)
+        paths = [
+            {
+                # viewers draw samples as dots of this colour darkened, which cover a dense curve
+                "color": lighter(CURVES[index % len(CURVES)]),
+                "enabled": True,
+                "label": _short(curve.label),
+                "timestampMethod": "receiveTime",
+                "value": curve.path,
+            }
+            for index, curve in enumerate(own)
+        ]
+        zero = {"color": _ZERO, "enabled": True, "label": "0", "timestampMethod": "receiveTime", "value": "0"}
+        config = {
+            "paths": [*paths, zero],
+            "isSynced": True,
+            "showLegend": True,
+            "legendDisplay": "left",
+            "showPlotValuesInLegend": True,
+            "sidebarDimension": _LEGEND_PIXELS,
+            "xAxisVal": "timestamp",
+            "xAxisLabel": "time [s]",
+            "yAxisLabel": words,
         }
-        for index, (label, path) in enumerate(labelled)
-    ]
-    return {
-        "paths": paths,
-        "isSynced": True,
-        "showLegend": True,
-        "legendDisplay": "left",
-        "sidebarDimension": _LEGEND_PIXELS,
-        "xAxisVal": "timestamp",
-    }
+        panels.append(_titled(f"Plot!{name}{index or ''}", f"{title} [{words}]", config))
+    return panels
+
+
+def _standing_path(title: str, field: str) -> str:
+    return f"{STANDING}.results[:]{{name=={_quoted(title)}}}.{field}"
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _LONGEST_LABEL else f"{text[: _LONGEST_LABEL - 1]}…"
 
 
 def _curves_path(tree: ReportedTree, identifier: int) -> str:
@@ -199,12 +321,6 @@ def _shown_number(node: Formula) -> str:
 
 def _of(tree: ReportedTree) -> str:
     return f"{{specification=={_quoted(tree.name)}}}{{object=={_quoted(tree.object or '')}}}"
-
-
-def _label(tree: ReportedTree) -> str:
-    """Return the title, with the unit where it is not that of footprints."""
-    unit = unit_of(tree.formula, {})
-    return f"{tree.title} [{unit}]" if unit else tree.title
 
 
 def _quoted(text: str) -> str:
@@ -272,17 +388,20 @@ def viewer_layout(contents: LayoutContents) -> dict[str, Any]:
 
     If the log has a planner's decisions, its map lies under the scene, and the reasons are listed below it.
     """
-    return _layout(_scene_panels(contents), _evaluation_panels(contents))
+    return _layout(contents.trees, _scene_panels(contents), _evaluation_panels(contents))
 
 
 def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
     """Return the layout for a server that replays a log: with the curves of the whole log at any time, and
     the constants that a viewer may edit."""
+    left = [*_scene_panels(contents), (constants(), 1.5)]
     panels = _evaluation_panels(contents)
     if panels:
         # the curves of the whole log include those played so far
-        panels[:1] = [(whole_curves(contents.trees), 3.0)]
-    return _layout([*_scene_panels(contents), (constants(), 1.0)], panels)
+        played = len(result_curves(contents.trees))
+        panels[:played] = [(panel, 3.0) for panel in whole_curves(contents.trees)]
+        left.append((summary(), 0.7))
+    return _layout(contents.trees, left, panels)
 
 
 _Weighted = tuple[Panel, float]
@@ -300,14 +419,12 @@ def _evaluation_panels(contents: LayoutContents) -> list[_Weighted]:
     trees = contents.trees
     if not trees:
         return []
-    panels = [(result_curves(trees), 3.0)]
-    parts = part_curves(trees)
-    if parts is not None:
-        panels.append((parts, 2.0))
+    panels = [(panel, 3.0) for panel in result_curves(trees)]
+    panels += [(panel, 2.0) for panel in part_curves(trees)]
     panels.append((state_strips(trees, contents.has_states), 3.0))
     if EVENT_LOG in contents.topics:
         panels.append((event_list(), 2.0))
-    return [*panels, (node_table(trees[-1]), 2.0), (specification_text(), 1.0)]
+    return [*panels, (node_table(), 2.0), (specification_text(), 1.0)]
 
 
 def _attachment(layout: dict[str, Any]) -> Attachment:
@@ -315,12 +432,25 @@ def _attachment(layout: dict[str, Any]) -> Attachment:
     return Attachment(LAYOUT, "application/json", text.encode())
 
 
-def _layout(left: Sequence[_Weighted], right: Sequence[_Weighted]) -> dict[str, Any]:
-    tree: str | dict[str, Any] = _column(left)
+def _layout(
+    trees: Sequence[ReportedTree], left: Sequence[_Weighted], right: Sequence[_Weighted]
+) -> dict[str, Any]:
+    """Return a layout: the lights of the results at the top, and two columns below them."""
+    lights = indicators(trees)
+    rows = [lights[begin : begin + _PER_ROW] for begin in range(0, len(lights), _PER_ROW)]
+    tree = _split("column", [(panel.identifier, share) for panel, share in left])
     if right:
-        tree = {"direction": "row", "first": tree, "second": _column(right), "splitPercentage": 55}
+        second = _split("column", [(panel.identifier, share) for panel, share in right])
+        tree = {"direction": "row", "first": tree, "second": second, "splitPercentage": 45}
+    if rows:
+        lit: list[tuple[_Tree, float]] = [
+            (_split("row", [(panel.identifier, 1.0) for panel in row]), 1.0) for row in rows
+        ]
+        tree = _split("column", [*lit, (tree, _LIT_SHARE)])
     return {
-        "configById": {panel.identifier: panel.config for panel, _ in (*left, *right)},
+        "configById": {
+            panel.identifier: panel.config for panel in (*lights, *(panel for panel, _ in (*left, *right)))
+        },
         "globalVariables": {},
         "layout": tree,
         "playbackConfig": {"speed": 1},
@@ -328,16 +458,21 @@ def _layout(left: Sequence[_Weighted], right: Sequence[_Weighted]) -> dict[str, 
     }
 
 
-def _column(panels: Sequence[_Weighted]) -> str | dict[str, Any]:
-    """Return panels one below the other, as nested splits."""
-    (first, share), *rest = panels
+_Tree = str | dict[str, Any]
+_LIT_SHARE: Final = 9.0
+"""How much higher the panels below the lights are than a row of these."""
+
+
+def _split(direction: str, parts: Sequence[tuple[_Tree, float]]) -> _Tree:
+    """Return panels beside or below each other, as nested splits."""
+    (first, share), *rest = parts
     if not rest:
-        return first.identifier
+        return first
     whole = share + sum(other for _, other in rest)
     return {
-        "direction": "column",
-        "first": first.identifier,
-        "second": _column(rest),
+        "direction": direction,
+        "first": first,
+        "second": _split(direction, rest),
         "splitPercentage": round(100.0 * share / whole),
     }
 

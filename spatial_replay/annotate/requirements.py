@@ -148,6 +148,22 @@ class Requirement(NamedTuple):
         counts = (standing == Standing.HOLDING) | (standing == Standing.VIOLATED)
         return np.where(counts, self.sign * series[self.node, 1, at], np.nan)
 
+    def outcome(self, series: Floats, at: Integers) -> Floats:
+        """Return (S,) the robustness of its obligation over the finished log, in the sign that counts.
+
+        NaN where that is not known, and where its failing violates nothing, as one of several that may hold.
+
+        Args:
+            series: (N, 4, T), of which lower and upper are those of the finished log.
+            at: (S,) indices of samples.
+        """
+        own = self.obligation or Obligation(self.node, self.sign)
+        low, high = (series[own.node, 2, at], series[own.node, 3, at])
+        if own.sign < 0.0:
+            low, high = -high, -low
+        fails = (high < 0.0) & ~self.conjunct.is_open(series, at)
+        return np.where(low >= 0.0, low, np.where(fails, high, np.nan))
+
 
 _Bindings: TypeAlias = Mapping[str, Group]
 

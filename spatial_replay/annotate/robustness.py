@@ -12,14 +12,17 @@ from numpy.typing import NDArray
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.objects.wire import LayoutError, WireTemplate, payloads_of, rows_of
-from spatial_replay.logs.schemas import Robustness_pb2
-from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
-from spatial_replay.monitor.verdict import Verdict
+from spatial_replay.logs.schemas.Robustness_pb2 import (
+    FAILS_SO_FAR,
+    HOLDS_SO_FAR,
+    SATISFIED,
+    UNKNOWN,
+    VIOLATED,
+    Robustness,
+    Standing,
+)
 
 Codes = NDArray[np.uint8]
-
-VERDICTS = (Verdict.UNKNOWN, Verdict.PENDING, Verdict.SATISFIED, Verdict.VIOLATED, Verdict.UNKNOWN)
-"""The verdicts by their codes in messages; 0 is the default of protobuf, a verdict that is not set."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +37,7 @@ class RobustnessSeries:
         messages: (T,) int64, which of the messages decoded these samples are.
         times_ns: (T,) int64.
         series: (N, 4, T): value, now, lower, upper.
-        verdicts: (N, T) uint8, index into `VERDICTS`.
+        codes: (N, T) uint8, numbers of `Standing`.
     """
 
     specification: str
@@ -44,11 +47,17 @@ class RobustnessSeries:
     messages: Integers
     times_ns: Integers
     series: Floats
-    verdicts: Codes
+    codes: Codes
 
 
 def encode_robustness(
-    name: str, object: str | None, names: Sequence[str | None], times_ns: Integers, series: Floats
+    name: str,
+    object: str | None,
+    names: Sequence[str | None],
+    times_ns: Integers,
+    series: Floats,
+    *,
+    final: bool = False,
 ) -> list[bytes]:
     """Return one message for each sample.
 
@@ -58,8 +67,9 @@ def encode_robustness(
         names: of the N nodes, by id; None for a node without one.
         times_ns: (T,) int64.
         series: (N, 4, T): value, now, lower, upper.
+        final: whether lower and upper are those of the finished log.
     """
-    message = Robustness(time_ns=1, specification=name, object=object or "")
+    message = Robustness(time_ns=1, specification=name, object=object or "", final=final)
     for identifier, node in enumerate(names):
         message.nodes.add(
             id=identifier,
@@ -68,31 +78,40 @@ def encode_robustness(
             now=1.0,
             lower=1.0,
             upper=1.0,
-            verdict=Robustness_pb2.VERDICT_PENDING,
+            standing=UNKNOWN,
         )
     words = np.empty((len(times_ns), 1 + 4 * len(names)), np.uint64)
     words[:, 0] = times_ns
     words[:, 1:] = series.reshape(4 * len(names), len(times_ns)).T.view(np.uint64)
-    verdicts = online_codes(series[:, 2], series[:, 3])
-    return payloads_of(WireTemplate.of(message).fill(words, np.ascontiguousarray(verdicts.T)))
+    codes = standing_codes(series, final=final)
+    return payloads_of(WireTemplate.of(message).fill(words, np.ascontiguousarray(codes.T)))
 
 
-def online_codes(lower: Floats, upper: Floats) -> Codes:
-    """Return the codes of the verdicts that `online_verdict` gives while more samples may come."""
-    codes = np.full(lower.shape, Robustness_pb2.VERDICT_PENDING, np.uint8)
-    codes[upper < 0.0] = Robustness_pb2.VERDICT_VIOLATED
-    codes[lower >= 0.0] = Robustness_pb2.VERDICT_SATISFIED
-    codes[np.isnan(lower)] = Robustness_pb2.VERDICT_UNKNOWN
+def standing_codes(series: Floats, *, final: bool = False) -> Codes:
+    """Return the numbers of `Standing` (N, ...) of some nodes.
+
+    Args:
+        series: (N, 4, ...): value, now, lower, upper.
+        final: whether lower and upper are those of the finished log; otherwise more samples may come.
+    """
+    value, lower, upper = series[:, 0], series[:, 2], series[:, 3]
+    codes = np.full(value.shape, UNKNOWN, np.uint8)
+    if not final:
+        codes[value >= 0.0] = HOLDS_SO_FAR
+        codes[value < 0.0] = FAILS_SO_FAR
+    codes[upper < 0.0] = VIOLATED
+    codes[lower >= 0.0] = SATISFIED
     return codes
 
 
 def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:
     """Decode messages: one entry for each specification and object, in order of first appearance.
 
-    Messages of one specification with other nodes than before, as of another run, make another entry.
+    Messages of one specification with other nodes than before, as of another run, make another entry. Final
+    messages, about the finished log, are left out.
 
     Raises:
-        LogError: a message of another type, or with a verdict of a later version.
+        LogError: a message of another type, or with a standing of a later version.
     """
     rows_by_heading: dict[_Heading, list[_Rows]] = {}
     waiting = _by_length(payloads)
@@ -107,7 +126,8 @@ def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:
             encoded = rows_of([payloads[index] for index in indices.tolist()])
             taken = template.matches(encoded)
             rows = _template_rows(template, encoded[taken])
-        rows_by_heading.setdefault(_heading(first), []).append((indices[taken], *rows))
+        if not first.final:
+            rows_by_heading.setdefault(_heading(first), []).append((indices[taken], *rows))
         if not taken.all():
             waiting.append(indices[~taken])
     ordered = sorted(rows_by_heading.items(), key=lambda entry: min(int(rows[0][0]) for rows in entry[1]))
@@ -116,7 +136,7 @@ def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:
 
 _Heading = tuple[str, str, tuple[int, ...], tuple[str, ...]]
 _Rows = tuple[Integers, Integers, Floats, Codes]
-"""Of T messages: their indices (T,), times (T,), numbers (T, N, 4) and verdicts (T, N)."""
+"""Of T messages: their indices (T,), times (T,), numbers (T, N, 4) and standing codes (T, N)."""
 
 
 def _by_length(payloads: Sequence[bytes]) -> list[Integers]:
@@ -165,17 +185,18 @@ def _parsed_row(message: Robustness) -> tuple[Integers, Floats, Codes]:
     return (
         np.array([message.time_ns], np.uint64).astype(np.int64),
         np.array(numbers, np.float64).reshape(1, -1, 4),
-        np.array([[node.verdict for node in message.nodes]], np.uint8),
+        np.array([[node.standing for node in message.nodes]], np.uint8),
     )
 
 
 def _joined(heading: _Heading, rows: list[_Rows]) -> RobustnessSeries:
     name, object, ids, names = heading
-    messages, times, numbers, verdicts = (np.concatenate(column) for column in zip(*rows, strict=True))
+    messages, times, numbers, codes = (np.concatenate(column) for column in zip(*rows, strict=True))
     order = np.argsort(messages, kind="stable")
-    if verdicts.size and verdicts.max() >= len(VERDICTS):
+    unknown = set(np.unique(codes).tolist()) - set(Standing.values())
+    if unknown:
         raise LogError(
-            f"a verdict of {name!r} has the code {verdicts.max()}, which this version does not know; "
+            f"a standing of {name!r} has the number {min(unknown)}, which this version does not know; "
             "read the log with the version that wrote it"
         )
     return RobustnessSeries(
@@ -186,5 +207,5 @@ def _joined(heading: _Heading, rows: list[_Rows]) -> RobustnessSeries:
         messages=messages[order],
         times_ns=times[order],
         series=np.ascontiguousarray(numbers[order].transpose(1, 2, 0)),
-        verdicts=np.ascontiguousarray(verdicts[order].T),
+        codes=np.ascontiguousarray(codes[order].T),
     )

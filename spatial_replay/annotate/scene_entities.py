@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
@@ -28,6 +29,9 @@ from spatial_replay.spec.formula import Outline
 
 FRAME: Final = "world"
 
+FRAMES: Final = (FRAME, "spatial")
+"""The frame of the scene, and the child by which viewers know it."""
+
 ARROW_HEAD: Final = 0.15
 """The length of an arrow's head by the size of the objects in a scene; of a short arrow it is half."""
 
@@ -37,7 +41,16 @@ REGION_OPACITY: Final = 0.3
 
 _LINE_PIXELS: Final = 2.0
 _LABEL_PIXELS: Final = 14.0
+_BANNER_PIXELS: Final = 20.0
 _NAN: Final = float("nan")
+
+
+def encode_frame(time_ns: int) -> bytes:
+    """Return the message that makes the scene's frame known to viewers: a frame in the same place."""
+    message = FrameTransform(parent_frame_id=FRAME, child_frame_id=FRAMES[1])
+    message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, _NS)
+    message.rotation.w = 1.0
+    return message.SerializeToString(deterministic=True)
 
 
 class Elevation(NamedTuple):
@@ -56,7 +69,7 @@ class Elevation(NamedTuple):
 
 def draw(
     entity: SceneEntity,
-    name: str,
+    name: str | None,
     outlines: list[Floats],
     faces: list[Floats],
     anchor: tuple[float, float],
@@ -68,6 +81,7 @@ def draw(
     `words_of_object` fills in the numbers in this order.
 
     Args:
+        name: what the label says; None leaves it out.
         outlines, faces: rings (n, 2); a face is convex.
         anchor: the position of the label.
         opacity: of the faces.
@@ -81,6 +95,8 @@ def draw(
         for ring in outlines:
             if len(ring) > 1:
                 _add_sides(entity, ring, *elevation.sides, opacity)
+    if name is None:
+        return
     label = entity.texts.add(
         billboard=True,
         font_size=_LABEL_PIXELS,
@@ -151,12 +167,44 @@ def _lying_at(z: float) -> Pose:
 OBJECT: Final = "object/"
 REGION: Final = "region/"
 WITNESS: Final = "witness"
+BANNER: Final = "verdict"
+
+LEVELS: Final = 8
+"""How many heights there are between large flat objects and small ones."""
 
 LABEL_LENGTH: Final = 8
-"""Characters of an arrow's number, including the spaces around it."""
+"""Characters of an arrow's number, including the spaces after it."""
 
 _LABEL_LIFT: Final = 0.01
 """The height of a region's name above it, by the region's size."""
+
+
+class Banner(NamedTuple):
+    """The results in a few words, above the scene.
+
+    Attributes:
+        text: "3 violated: near, apart, met; 2 satisfied".
+        colour: of the worst one.
+        place: where its middle is.
+    """
+
+    text: str
+    colour: tuple[float, float, float]
+    place: tuple[float, float]
+
+
+class DrawnObject(NamedTuple):
+    """How an object is drawn.
+
+    Attributes:
+        level: how small it is, 0 to `LEVELS`: what is smaller lies higher, so that nothing larger hides it.
+        has_label: whether its name stands beside it.
+    """
+
+    name: str
+    form: Form
+    level: int
+    has_label: bool
 
 
 class SceneLayout(NamedTuple):
@@ -164,13 +212,16 @@ class SceneLayout(NamedTuple):
 
     Attributes:
         deleted: objects that were in the message before and are gone.
-        objects: name and form of those observed.
-        witness: whether an arrow points at the worst violation; None deletes that of the message before.
+        objects: those observed.
+        witness: what decides the worst violation, which an arrow points at; None deletes the arrow of the
+            message before, and without one it is "".
+        banner: None without any result.
     """
 
     deleted: tuple[str, ...]
-    objects: tuple[tuple[str, Form], ...]
-    witness: bool | None = False
+    objects: tuple[DrawnObject, ...]
+    witness: str | None = ""
+    banner: Banner | None = None
 
 
 class Region(NamedTuple):
@@ -185,6 +236,11 @@ class Region(NamedTuple):
     name: str
     outline: Outline
     rings: tuple[Floats, ...]
+
+    @property
+    def size(self) -> float:
+        """The longer side of its bounding box."""
+        return float(np.ptp(np.concatenate(self.rings), axis=0).max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,16 +276,21 @@ def make_template(layout: SceneLayout, regions: tuple[Region, ...], lift: float)
     if layout.witness is None:
         message.deletions.add(id=WITNESS, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
     for region in regions:
-        _add_region(_add_entity(message, REGION + region.name), region)
-    for name, form in layout.objects:
-        _add_object(_add_entity(message, OBJECT + name), name, form, lift)
+        # larger ones lie lower, so that they hide no smaller one
+        smaller = sum(other.size < region.size for other in regions)
+        depth = _LABEL_LIFT * smaller / len(regions) * min(other.size for other in regions)
+        _add_region(_add_entity(message, REGION + region.name), region, depth)
+    for drawn in layout.objects:
+        _add_object(_add_entity(message, OBJECT + drawn.name), drawn, lift)
+    if layout.banner is not None:
+        _add_banner(_add_entity(message, BANNER), layout.banner, lift)
     if layout.witness:
-        point_at(_add_entity(message, WITNESS), _A_LABEL, lift)
+        point_at(_add_entity(message, WITNESS), f"{layout.witness}: {_A_LABEL}", lift)
     payload = np.frombuffer(message.SerializeToString(deterministic=True), np.uint8).copy()
     words = WireTemplate.of(message).word_offsets
     slots = words[np.isnan(payload[words[:, None] + np.arange(8)].view("<f8")[:, 0])]
     if layout.witness:
-        # the last text of all: names come before it
+        # the end of the last text of all
         slots = np.append(slots, payload.tobytes().rindex(_A_LABEL.encode()))
     payload[slots[:, None] + np.arange(8)] = 0
     return SceneTemplate(
@@ -249,7 +310,7 @@ def border_of(region: Region) -> list[Floats]:
 
 
 def words_of_object(
-    form: Form, points: Floats, bottom: Floats, top: Floats, colour: Floats, lift: float
+    drawn: DrawnObject, points: Floats, bottom: Floats, top: Floats, colour: Floats, lift: float
 ) -> list[Floats]:
     """Return what to fill in for an object, in the order of its primitives' fields.
 
@@ -262,6 +323,7 @@ def words_of_object(
     Returns:
         columns (S, n), each of one or more words.
     """
+    form = drawn.form
     rings = _split(points, form.rings)
     upper = [top[:, None]] if form.has_height else []
     words = []
@@ -274,6 +336,8 @@ def words_of_object(
         for ring in rings:
             if ring.shape[1] > 1:
                 words += [bottom[:, None], _flat(ring), _raised(ring, top - bottom), colour]
+    if not drawn.has_label:
+        return words
     # half the sum of the ends does not depend on the order in which points are added up
     words.append((points.min(axis=1) + points.max(axis=1)) / 2.0)
     return words + [height + lift for height in upper]
@@ -297,7 +361,7 @@ def words_of_witness(points: Floats, z: Floats, scale: float, labels: Sequence[s
     head = np.minimum(0.5 * length, ARROW_HEAD * scale)
     arrow = [begin, z, np.sin(half), np.cos(half), length - head, head]
     middle = [(begin + end) / 2.0, z + ARROW_HEAD * scale]
-    text = "".join([label.center(LABEL_LENGTH) for label in labels]).encode()
+    text = "".join([label.ljust(LABEL_LENGTH) for label in labels]).encode()
     label = np.frombuffer(text, "<f8")
     return [column.reshape(len(points), -1) for column in (*arrow, *middle, label)]
 
@@ -306,10 +370,13 @@ def _add_entity(message: SceneUpdate, identifier: str) -> SceneEntity:
     return message.entities.add(id=identifier, frame_id=FRAME, timestamp=_A_STAMP)
 
 
-def _add_region(entity: SceneEntity, region: Region) -> None:
+def _add_region(entity: SceneEntity, region: Region, depth: float = 0.0) -> None:
     """Add a region: its border, its convex parts as faces, and its name at the upper edge.
 
-    There, objects inside do not cover the name.
+    There, objects inside do not cover the name. The face of a prism is its floor: a roof would hide them.
+
+    Args:
+        depth: of a flat region below the plane.
     """
     bottom, top = region.outline.height or (0.0, 0.0)
     sides = None if region.outline.height is None else (bottom, top - bottom)
@@ -322,7 +389,7 @@ def _add_region(entity: SceneEntity, region: Region) -> None:
         border_of(region),
         list(region.rings),
         ((left + right) / 2.0, high),
-        Elevation(top, sides, label),
+        Elevation(-depth if sides is None else bottom, sides, label),
         REGION_OPACITY,
     )
 
@@ -333,12 +400,21 @@ def _region_entity(region: Region) -> SceneEntity:
     return entity
 
 
-def _add_object(entity: SceneEntity, name: str, form: Form, lift: float) -> None:
-    rings = [np.full((length, 2), np.nan) for length in form.rings]
-    elevation = Elevation(lift, None, 2.0 * lift)
-    if form.has_height:
+def _add_object(entity: SceneEntity, drawn: DrawnObject, lift: float) -> None:
+    rings = [np.full((length, 2), np.nan) for length in drawn.form.rings]
+    elevation = Elevation(lift * (1.0 + drawn.level / LEVELS), None, 2.5 * lift)
+    if drawn.form.has_height:
         elevation = Elevation(np.nan, (np.nan, np.nan), np.nan)
+    name = drawn.name if drawn.has_label else None
     draw(entity, name, rings, rings, (np.nan, np.nan), elevation, OBJECT_OPACITY)
+
+
+def _add_banner(entity: SceneEntity, banner: Banner, lift: float) -> None:
+    text = entity.texts.add(
+        billboard=True, font_size=_BANNER_PIXELS, scale_invariant=True, text=banner.text, pose=_lying_at(lift)
+    )
+    text.pose.position.x, text.pose.position.y = banner.place
+    text.color.r, text.color.g, text.color.b, text.color.a = *banner.colour, 1.0
 
 
 def _split(points: Floats, lengths: tuple[int, ...]) -> list[Floats]:

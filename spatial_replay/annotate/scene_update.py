@@ -14,11 +14,13 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spatial_replay.annotate.rings import Form, Rings, extents, outlines_of, rings_of
+from spatial_replay.annotate.rings import Rings, extents, outlines_of, rings_of
 from spatial_replay.annotate.scene_entities import (
-    LABEL_LENGTH,
+    LEVELS,
     OBJECT,
     REGION,
+    Banner,
+    DrawnObject,
     Region,
     SceneLayout,
     SceneTemplate,
@@ -28,6 +30,7 @@ from spatial_replay.annotate.scene_entities import (
     words_of_region,
     words_of_witness,
 )
+from spatial_replay.annotate.scene_text import banners_of, causes_of, labelled_objects, robustness_text
 from spatial_replay.annotate.violations import (
     EvaluatedResult,
     Presence,
@@ -85,6 +88,10 @@ _UNSCALED: Final = 1.0
 _MOST_TEMPLATES: Final = 256
 _ABSENT, _DELETED, _FIRST_FORM = -1, 0, 1
 
+_NOWHERE: Final = (0.0, 0.0)
+_BANNER_LIFT: Final = 0.06
+"""How far the banner is above the scene, by the scene's height."""
+
 
 @dataclass(frozen=True, eq=False)
 class SceneState:
@@ -96,6 +103,7 @@ class SceneState:
         is_pointing: whether it has an arrow at a violation.
         scale: the robustness at which colours are full: the median size (longer side of the bounding box) of
             the objects in the first message that shows any; None before that.
+        place: where the banner is: above the objects of that message and the regions.
         templates: those of the layouts so far; a cache that changes no message.
     """
 
@@ -103,6 +111,7 @@ class SceneState:
     shown: tuple[str, ...] = ()
     is_pointing: bool = False
     scale: float | None = None
+    place: tuple[float, float] | None = None
     templates: Mapping[SceneLayout, SceneTemplate] = field(default_factory=lambda: MappingProxyType({}))
 
 
@@ -112,7 +121,7 @@ def scene_scale(trace: Trace) -> float | None:
     Args:
         trace: from the first sample on.
     """
-    rows = trace.rows[_spaced(trace.times_ns, None)]
+    rows = trace.rows[spaced(trace.times_ns, None)]
     is_shown = (rows >= 0).any(axis=1)
     return _scale_of(trace, rows[int(is_shown.argmax())]) if is_shown.any() else None
 
@@ -134,7 +143,7 @@ class DrawnViolation(NamedTuple):
 
     Attributes:
         ends: (2, 2), from where to where it points.
-        label: the robustness, as it is written beside the arrow.
+        label: what decides it and the robustness, as it is written beside the arrow.
         result: which of the results is violated.
         node: id of the requirement that is violated.
         robustness: that of the requirement, in the sign that counts.
@@ -201,7 +210,8 @@ class SceneFrames:
         if found.is_shown[index]:
             robustness = float(found.robustness[index])
             which, node, leaf = (int(each[index]) for each in (found.result, found.node, found.leaf))
-            violation = DrawnViolation(found.points[index], _label(robustness), which, node, robustness, leaf)
+            label = f"{content.causes[content.arrow[index] - _FIRST_FORM]}: {robustness_text(robustness)}"
+            violation = DrawnViolation(found.points[index], label, which, node, robustness, leaf)
         is_violated = bool((self.objects[index] < 0.0).any() or (self.regions[index] < 0.0).any())
         return SceneFrame(entities, violation, is_violated)
 
@@ -246,16 +256,20 @@ class SceneEncoder:
             state: what the call before returned, or None to begin.
         """
         state = state or SceneState()
-        written = _spaced(trace.times_ns, state.written_ns)
+        written = spaced(trace.times_ns, state.written_ns)
         times_ns = trace.times_ns[written]
         if not len(written):
             return SceneMessages(times_ns, [], state, None)
-        state, scales = _scaled(state, trace, trace.rows[written])
+        state, scales, first = self._scaled(state, trace, trace.rows[written])
         scale = state.scale or _UNSCALED
         violations = first_violations(results, trace, written)
-        content = _content(trace, trace.rows[written], state, scale, violations)
-        presence = Presence(times_ns, content.names, _class_codes(trace, content.rows), trace.classes)
+        names = tuple(sorted({*trace.names, *state.shown}))
+        rows = _rows_of(names, trace, trace.rows[written])
+        presence = Presence(times_ns, names, _class_codes(trace, rows), trace.classes)
         objects, regions = worst_robustness(results, presence, [region.name for region in self._drawn])
+        has_label = labelled_objects(results, names, rows >= 0, objects)
+        banners = banners_of(results, times_ns, state.place or _NOWHERE, first)
+        content = _content(trace, names, rows, state, scale, violations, results, has_label, banners)
         shades = colours(objects, scales), colours(regions, scales)
         templates = dict(state.templates)
         payloads = [b""] * len(written)
@@ -274,10 +288,35 @@ class SceneEncoder:
             ),
             is_pointing=bool(content.violations.is_shown[-1]),
             scale=state.scale,
+            place=state.place,
             templates=MappingProxyType(dict(list(templates.items())[-_MOST_TEMPLATES:])),
         )
         frames = SceneFrames(times_ns, objects, regions, *shades, content, self._drawn)
         return SceneMessages(times_ns, payloads, after, frames)
+
+    def _scaled(self, state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState, Floats, int]:
+        """Return the state with its scale and place, once an object is shown, the scale (S, 1) of each
+        message, and the first message that has a place."""
+        if state.scale is not None and state.place is not None:
+            return state, np.full((len(rows), 1), state.scale), 0
+        scales = np.full((len(rows), 1), state.scale or _UNSCALED)
+        is_shown = (rows >= 0).any(axis=1)
+        if not is_shown.any():
+            return state, scales, len(rows)
+        first = int(is_shown.argmax())
+        scale = state.scale or _scale_of(trace, rows[first])
+        scales[first:] = scale
+        return replace(state, scale=scale, place=self._place(trace, rows[first], scale)), scales, first
+
+    def _place(self, trace: Trace, rows: Integers, scale: float) -> tuple[float, float]:
+        """Return where the banner is: above the objects of one sample and the regions."""
+        shown = trace.footprints.select(rows[rows >= 0]).vertices
+        points = np.concatenate([shown, *(ring for region in self._drawn for ring in region.rings)])
+        points = points[np.isfinite(points).all(axis=1)]
+        if not len(points):
+            return _NOWHERE
+        (left, low), (right, high) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+        return (left + right) / 2.0, high + max(_BANNER_LIFT * (high - low), scale)
 
     def _words(
         self,
@@ -292,13 +331,14 @@ class SceneEncoder:
         columns = []
         for index, region in enumerate(self._drawn):
             columns += words_of_region(region, regions[samples, index])
-        for name, form in layout.objects:
-            column = content.names.index(name)
+        for drawn in layout.objects:
+            column = content.names.index(drawn.name)
             rows = content.observations[samples, column]
-            points = content.rings.points[content.rings.start[rows][:, None] + np.arange(sum(form.rings))]
+            corners = np.arange(sum(drawn.form.rings))
+            points = content.rings.points[content.rings.start[rows][:, None] + corners]
             bottom, top = content.footprints.bottom[rows], content.footprints.top[rows]
             colour = objects[samples, column]
-            columns += words_of_object(form, points, bottom, top, colour, _LIFT * scale)
+            columns += words_of_object(drawn, points, bottom, top, colour, _LIFT * scale)
         if layout.witness:
             columns += _words_of_arrow(content.violations, samples, scale)
         return np.concatenate([np.empty((len(samples), 0)), *columns], axis=1)
@@ -311,33 +351,32 @@ class _SceneContent(NamedTuple):
         names: objects that are shown, or have just been.
         rows: (S, names), rows of the trace; below 0 where an object is absent.
         forms: (S, names), `_ABSENT`, `_DELETED`, or from `_FIRST_FORM` on the number of its form.
+        styles: (S, names), its level, and whether it has a label as the last bit; -1 where it is absent.
         observations: (S, names), rows of `rings` and `footprints`.
         violations: of the S samples.
-        arrow: (S,), the same as `forms` for the arrow at the worst violation.
+        arrow: (S,), the same as `forms` for the arrow at the worst violation; its forms are `causes`.
+        causes: what decides violations, in words.
+        banner: (S,), which of `banners`.
     """
 
     names: tuple[str, ...]
     rows: Integers
     forms: Integers
+    styles: Integers
     observations: Integers
     footprints: FootprintBatch
     rings: Rings
     violations: Violations
     arrow: Integers
+    causes: tuple[str, ...]
+    banner: Integers
+    banners: tuple[Banner | None, ...]
 
 
 def _words_of_arrow(found: Violations, samples: Integers, scale: float) -> list[Floats]:
     z = np.fmax(found.top[samples], 0.0) + 3.0 * _LIFT * scale
-    labels = [_label(number) for number in found.robustness[samples].tolist()]
+    labels = [robustness_text(number) for number in found.robustness[samples].tolist()]
     return words_of_witness(found.points[samples], z, scale, labels)
-
-
-def _label(number: float) -> str:
-    """Return a number with three digits, or as many as fit."""
-    text = f"{number:.3g}"
-    if len(text) > LABEL_LENGTH:
-        text = next(text for digits in (2, 1) if len(text := f"{number:.{digits}g}") <= LABEL_LENGTH)
-    return text
 
 
 def _region(name: str, outline: Outline) -> Region:
@@ -349,8 +388,12 @@ def _bytes(colour: Floats) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def _spaced(times_ns: Integers, written_ns: int | None) -> Integers:
-    """Return the indices of the samples to write: each at least a period after the one before."""
+def spaced(times_ns: Integers, written_ns: int | None) -> Integers:
+    """Return the indices of the samples to write: each at least `PERIOD_NS` after the one before.
+
+    Args:
+        written_ns: when the last message was written; None before the first.
+    """
     if not len(times_ns):
         return np.empty(0, np.int64)
     earliest = int(times_ns[0]) if written_ns is None else written_ns + PERIOD_NS
@@ -364,42 +407,52 @@ def _spaced(times_ns: Integers, written_ns: int | None) -> Integers:
     return np.array(chosen, np.int64)
 
 
-def _scaled(state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState, Floats]:
-    """Return the state with its scale, once an object is shown, and the scale (S, 1) of each message."""
-    if state.scale is not None:
-        return state, np.full((len(rows), 1), state.scale)
-    scales = np.full((len(rows), 1), _UNSCALED)
-    is_shown = (rows >= 0).any(axis=1)
-    if not is_shown.any():
-        return state, scales
-    first = int(is_shown.argmax())
-    scale = _scale_of(trace, rows[first])
-    scales[first:] = scale
-    return replace(state, scale=scale), scales
-
-
 def _scale_of(trace: Trace, rows: Integers) -> float:
     """Return the median size of the objects in one sample, whose rows are given."""
     return float(np.median(extents(trace.footprints.select(rows[rows >= 0])))) or _UNSCALED
 
 
-def _content(
-    trace: Trace, rows: Integers, before: SceneState, scale: float, found: Violations
-) -> _SceneContent:
-    names = tuple(sorted({*trace.names, *before.shown}))
+def _rows_of(names: Sequence[str], trace: Trace, rows: Integers) -> Integers:
+    """Return (S, names), rows of the trace; below 0 where an object is absent."""
     of_all = np.full((len(rows), len(names)), -1, np.int64)
     of_all[:, [names.index(name) for name in trace.names]] = rows
-    is_present = of_all >= 0
+    return of_all
+
+
+def _content(
+    trace: Trace,
+    names: tuple[str, ...],
+    rows: Integers,
+    before: SceneState,
+    scale: float,
+    found: Violations,
+    results: Sequence[EvaluatedResult],
+    has_label: NDArray[np.bool_],
+    banners: tuple[Integers, tuple[Banner | None, ...]],
+) -> _SceneContent:
+    is_present = rows >= 0
     was_present = np.concatenate([[[name in before.shown for name in names]], is_present[:-1]])
-    footprints = trace.footprints.select(of_all[is_present])
+    footprints = trace.footprints.select(rows[is_present])
     rings = rings_of(footprints, _POINT * scale)
-    observations = np.full(of_all.shape, -1, np.int64)
+    observations = np.full(rows.shape, -1, np.int64)
     observations[is_present] = np.arange(len(footprints))
     forms = np.where(was_present, _DELETED, _ABSENT)
     forms[is_present] = _FIRST_FORM + rings.form
+    styles = np.full(rows.shape, -1, np.int64)
+    styles[is_present] = 2 * _levels(extents(footprints), scale) + has_label[is_present]
     was_pointing = np.append(before.is_pointing, found.is_shown[:-1])
-    witness = np.where(found.is_shown, _FIRST_FORM, np.where(was_pointing, _DELETED, _ABSENT))
-    return _SceneContent(names, of_all, forms, observations, footprints, rings, found, witness)
+    causes, cause = causes_of(results, found)
+    witness = np.where(found.is_shown, _FIRST_FORM + cause, np.where(was_pointing, _DELETED, _ABSENT))
+    return _SceneContent(
+        names, rows, forms, styles, observations, footprints, rings, found, witness, causes, *banners
+    )
+
+
+def _levels(sizes: Floats, scale: float) -> Integers:
+    """Return how small some objects are: one level for each time that the size is halved."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        levels = np.round(LEVELS / 2.0 - np.log2(sizes / scale))
+    return np.clip(np.nan_to_num(levels), 0.0, LEVELS).astype(np.int64)
 
 
 def _class_codes(trace: Trace, rows: Integers) -> Integers:
@@ -410,20 +463,26 @@ def _class_codes(trace: Trace, rows: Integers) -> Integers:
 
 def _by_layout(content: _SceneContent) -> Iterator[tuple[SceneLayout, Integers]]:
     """Yield the layouts, each with its samples (S,)."""
-    forms = np.column_stack([content.forms, content.arrow])
-    if (forms == forms[0]).all():
-        yield _layout(content, forms[0]), np.arange(len(forms))
+    keys = np.column_stack([content.forms, content.styles, content.arrow, content.banner])
+    if (keys == keys[0]).all():
+        yield _layout(content, keys[0]), np.arange(len(keys))
         return
-    rows, which = np.unique(forms, axis=0, return_inverse=True)
+    rows, which = np.unique(keys, axis=0, return_inverse=True)
     for number, row in enumerate(rows):
         yield _layout(content, row), np.flatnonzero(which.reshape(-1) == number)
 
 
-def _layout(content: _SceneContent, forms: NDArray[np.int64]) -> SceneLayout:
-    *of_objects, witness = forms.tolist()
-    listed: list[tuple[str, int]] = list(zip(content.names, of_objects, strict=True))
-    shown: list[tuple[str, Form]] = [
-        (name, content.rings.forms[form - _FIRST_FORM]) for name, form in listed if form >= _FIRST_FORM
-    ]
-    deleted = tuple(name for name, form in listed if form == _DELETED)
-    return SceneLayout(deleted, tuple(shown), None if witness == _DELETED else witness == _FIRST_FORM)
+def _layout(content: _SceneContent, key: NDArray[np.int64]) -> SceneLayout:
+    count = len(content.names)
+    arrow, banner = key[-2:].tolist()
+    listed: list[tuple[str, int, int]] = list(
+        zip(content.names, key[:count].tolist(), key[count : 2 * count].tolist(), strict=True)
+    )
+    shown = tuple(
+        DrawnObject(name, content.rings.forms[form - _FIRST_FORM], style >> 1, bool(style & 1))
+        for name, form, style in listed
+        if form >= _FIRST_FORM
+    )
+    deleted = tuple(name for name, form, _ in listed if form == _DELETED)
+    cause = None if arrow == _DELETED else "" if arrow == _ABSENT else content.causes[arrow - _FIRST_FORM]
+    return SceneLayout(deleted, shown, cause, content.banners[banner])

@@ -5,7 +5,7 @@ The scene is coloured by the one, and an arrow in it points at the other.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.sentences import divisor_of
 from spatial_replay.monitor.stream import SeriesBlock
+from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import (
     ANY_CLASS,
     Atom,
@@ -31,6 +32,7 @@ from spatial_replay.spec.formula import (
     SignedDistance,
     Term,
 )
+from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.walks import iter_expressions, looks_back, substitute
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
@@ -52,12 +54,14 @@ class LeafPairs(NamedTuple):
         below: of each requirement of the formula, its leaves.
         regions: shapes by name.
         divisors: of each leaf, what `scale` divides its number by.
+        texts: of each leaf, in the language.
     """
 
     pairs: tuple[Pair | None, ...]
     below: tuple[LeavesBelow, ...]
     regions: Mapping[str, Outline]
     divisors: Floats
+    texts: tuple[str, ...]
 
 
 class EvaluatedResult(NamedTuple):
@@ -70,6 +74,8 @@ class EvaluatedResult(NamedTuple):
         since_ns: (R,), since when each requirement's conjunct is violated for certain (see
             `violated_since`); None for an equal time.
         settled: what settled the violation of the formula, if it is.
+        title: what the result is known by; "" leaves it out of the banner.
+        is_final: whether the block is about the finished log.
     """
 
     requirements: tuple[Requirement, ...]
@@ -77,6 +83,8 @@ class EvaluatedResult(NamedTuple):
     leaf_pairs: LeafPairs | None = None
     since_ns: Integers | None = None
     settled: SettledViolation | None = None
+    title: str = ""
+    is_final: bool = False
 
 
 class Presence(NamedTuple):
@@ -119,13 +127,23 @@ class Violations(NamedTuple):
 
 
 def leaf_pairs(
-    instance: Instance, requirements: Sequence[Requirement], regions: Mapping[str, Outline]
+    instance: Instance,
+    requirements: Sequence[Requirement],
+    regions: Mapping[str, Outline],
+    relations: frozenset[str] = frozenset(),
 ) -> LeafPairs:
-    """Return what the leaves of an instance relate."""
+    """Return what the leaves of an instance relate.
+
+    Args:
+        relations: the names of those that the file defines.
+    """
     below = leaves_below(instance.formula, instance.program.leaves)
-    pairs = tuple(_pair(substitute(leaf, instance.bindings)) for leaf in instance.program.leaves)
+    leaves = [substitute(leaf, instance.bindings) for leaf in instance.program.leaves]
+    pairs = tuple(map(_pair, leaves))
+    texts = tuple(format_formula(leaf, relations=RELATION_NAMES | relations) for leaf in leaves)
     divisors = np.array([divisor_of(leaf) for leaf in instance.program.leaves])
-    return LeafPairs(pairs, tuple(below[requirement.node] for requirement in requirements), regions, divisors)
+    of_requirements = tuple(below[requirement.node] for requirement in requirements)
+    return LeafPairs(pairs, of_requirements, regions, divisors, texts)
 
 
 def violated_since(requirements: Sequence[Requirement], block: SeriesBlock, before_ns: Integers) -> Integers:
@@ -149,13 +167,16 @@ def worst_robustness(
 ) -> tuple[Floats, Floats]:
     """Return the least robustness of the requirements on each object and region, in the sign that counts.
 
+    Of a finished log that is what their obligations come to, of others how they are met now.
+
     Returns:
         (S, objects) and (S, regions); NaN where no requirement is known.
     """
     objects = np.full(presence.class_code.shape, np.nan)
     places = np.full((len(presence.times_ns), len(regions)), np.nan)
     for result in results:
-        for requirement, now in _robustness(result, presence.times_ns):
+        of = Requirement.outcome if result.is_final else Requirement.robustness
+        for requirement, now in _robustness(result, presence.times_ns, of):
             for column in _columns(requirement.objects, presence.names):
                 objects[:, column] = np.fmin(objects[:, column], now)
             for column in _columns(requirement.regions, regions):
@@ -227,7 +248,11 @@ def _point_at_settled(result: EvaluatedResult, times_ns: Integers, here: Integer
             found.robustness[sample] = -abs(leaf.number)
 
 
-def _robustness(result: EvaluatedResult, times_ns: Integers) -> Iterator[tuple[Requirement, Floats]]:
+def _robustness(
+    result: EvaluatedResult,
+    times_ns: Integers,
+    of: Callable[[Requirement, Floats, Integers], Floats] = Requirement.robustness,
+) -> Iterator[tuple[Requirement, Floats]]:
     """Yield each requirement with its robustness (S,) at some times; NaN where it is not evaluated."""
     own_ns = result.block.times_ns
     if not len(own_ns):
@@ -235,7 +260,8 @@ def _robustness(result: EvaluatedResult, times_ns: Integers) -> Iterator[tuple[R
     at = np.minimum(np.searchsorted(own_ns, times_ns), len(own_ns) - 1)
     is_evaluated = own_ns[at] == times_ns
     for requirement in result.requirements:
-        yield requirement, np.where(is_evaluated, requirement.robustness(result.block.series, at), np.nan)
+        numbers = of(requirement, result.block.series, at)
+        yield requirement, np.where(is_evaluated, numbers, np.nan)
 
 
 def _first(results: Sequence[EvaluatedResult], times_ns: Integers) -> tuple[Integers, Integers, Floats]:

@@ -6,9 +6,11 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from spatial_replay.cli.application import ExitCode, most_severe
+from spatial_replay.cli.output import VERDICT_COLOURS
 from spatial_replay.cli.terminal import Coloured, show, show_file
 from spatial_replay.text import counted, json_number
 
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
 
     from spatial_replay.batch.run_table import By, Total
 
-_COLOURS: Final = {"satisfied": "blue", "violated": "red", "unknown": "yellow", "errors": "red"}
+_COLOURS: Final = MappingProxyType({**VERDICT_COLOURS, "errors": "red"})
 _KIND_CODES: Final = {"usage": ExitCode.USAGE, "log": ExitCode.DAMAGED, "machine": ExitCode.INTERNAL}
 _BATCH: Final = 10_000
 """Rows that are turned into JSON at once."""

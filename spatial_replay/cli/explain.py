@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
+import shutil
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import click
 
@@ -18,8 +21,9 @@ from spatial_replay.cli.options import (
     open_inputs,
     warn_of_input,
 )
+from spatial_replay.cli.output import VERDICT_COLOURS
 from spatial_replay.cli.progress import progress
-from spatial_replay.cli.terminal import show, show_json, warn
+from spatial_replay.cli.terminal import Coloured, Line, fitted, show, show_json, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.text import requirement_text, time_text
 from spatial_replay.trace.time_points import time_point_from_text
@@ -79,8 +83,23 @@ def explain(
         if idle:
             texts.append([each.message for each in idle])
         for number, lines in enumerate(texts):
-            show(*([""] if number else []), *lines)
+            show(*([""] if number else []), *(_lines_on_terminal(lines) if sys.stdout.isatty() else lines))
     return exit_code_from_verdicts((each.verdict for each in results), bool(replayed.faults))
+
+
+def _lines_on_terminal(lines: Sequence[str]) -> Iterator[Line]:
+    """Yield lines that fit onto the terminal, with verdicts in their colours."""
+    width = shutil.get_terminal_size((100, 24)).columns
+    for line in lines:
+        for part in fitted(line, width):
+            pieces = re.split(_VERDICT, part)
+            yield tuple(
+                Coloured(piece, VERDICT_COLOURS[piece]) if number % 2 else piece
+                for number, piece in enumerate(pieces)
+            )
+
+
+_VERDICT: Final = re.compile(r"(?<=is )(satisfied|violated|unknown)\b")
 
 
 def _texts(explanations: Sequence[Explanation]) -> Iterator[list[str]]:

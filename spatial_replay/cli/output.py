@@ -8,10 +8,10 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import accumulate, pairwise
 from pathlib import Path
-from textwrap import wrap
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-from spatial_replay.cli.terminal import Coloured, show, show_json
+from spatial_replay.cli.terminal import Coloured, fitted, show, show_json
 from spatial_replay.text import counted, escaped, json_number, requirement_text, time_text
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _WORST_FIRST: Final = ("violated", "unknown", "satisfied")
 _MANY: Final = 6
 """Results that are printed in the order of the file; more are counted and sorted."""
-_COLOURS = {"satisfied": "blue", "violated": "red", "unknown": "yellow"}
+VERDICT_COLOURS: Final = MappingProxyType({"satisfied": "blue", "violated": "red", "unknown": "yellow"})
 
 
 def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | None = None) -> None:
@@ -41,7 +41,7 @@ def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | Non
     width = max(map(len, titles), default=0)
     titled: set[str] = set()
     for title, result in zip(titles, results, strict=True):
-        verdict = Coloured(f"{result.verdict:<9}", _COLOURS[result.verdict])
+        verdict = Coloured(f"{result.verdict:<9}", VERDICT_COLOURS[result.verdict])
         show((f"  {title:<{width}}  ", verdict, f"  {_numbers(result, replayed.first_ns)}"))
         # results of one template share its words
         if result.spec.title and result.name not in titled:
@@ -146,8 +146,6 @@ def _shown(number: float) -> str:
     return "not determined" if math.isnan(number) else f"{number:.6g}"
 
 
-_LEAST_WIDTH: Final = 60
-"""Width of lines on narrow terminals."""
 _LONGEST: Final = 400
 """Characters of alternatives that are printed; JSON has all."""
 
@@ -159,14 +157,7 @@ def decision_lines(log: LogFile, decisions: Sequence[PlanDecision], width: int) 
         width: of the lines, in characters.
     """
     for line in _whole_lines(log, decisions):
-        indent = " " * (len(line) - len(line.lstrip(" ")) + 4)
-        yield from wrap(
-            line,
-            max(width, _LEAST_WIDTH),
-            subsequent_indent=indent,
-            break_long_words=False,
-            break_on_hyphens=False,
-        )
+        yield from fitted(line, width)
 
 
 def decision_rows(decisions: Sequence[PlanDecision]) -> list[dict[str, Any]]:

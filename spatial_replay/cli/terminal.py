@@ -6,7 +6,9 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from textwrap import wrap
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import click
@@ -20,14 +22,22 @@ if TYPE_CHECKING:
 PROGRAM: Final = "spatial-replay"
 
 
+_HUES: Final = MappingProxyType({"blue": 32, "red": 166, "yellow": 130, "cyan": 30})
+"""Colours of terminals, of 256, that can be read on black and on white."""
+
+
 class Coloured(NamedTuple):
-    """A piece of a line, in one of the colours of `click.style`, and bold."""
+    """A piece of a line, bold and in one of the colours `blue`, `red`, `yellow` and `cyan`."""
 
     text: str
     colour: str
 
 
 Line: TypeAlias = str | tuple[str | Coloured, ...]
+
+
+_LEAST_WIDTH: Final = 60
+"""Width of lines on narrow terminals."""
 
 
 def show(*lines: Line, err: bool = False) -> None:
@@ -44,7 +54,7 @@ def show(*lines: Line, err: bool = False) -> None:
 
 def _piece(piece: str | Coloured) -> str:
     if isinstance(piece, Coloured):
-        return click.style(escaped(piece.text), fg=piece.colour, bold=True)
+        return click.style(escaped(piece.text), fg=_HUES[piece.colour], bold=True)
     return escaped(piece)
 
 
@@ -66,6 +76,18 @@ class StatusLine:
         if self._is_shown:
             click.echo("\r\x1b[K", nl=False, err=True)
             self._is_shown = False
+
+
+def fitted(line: str, width: int) -> Iterator[str]:
+    """Yield a line cut at spaces, so that it fits into a width; its rest is indented."""
+    indent = " " * (len(line) - len(line.lstrip(" ")) + 4)
+    yield from wrap(
+        line,
+        max(width, _LEAST_WIDTH),
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    ) or [line]
 
 
 def show_json(value: Any, indent: int | None = 2) -> None:

@@ -18,12 +18,14 @@ OWN_PREFIX = "/spatial/"
 OBJECTS = "/spatial/objects"
 SCENE = "/spatial/scene"
 SPECIFICATION = "/spatial/specification"
+FRAME = "/spatial/frame"
+STANDING = "/spatial/standing"
 ROBUSTNESS = "/spatial/robustness"
 AUTOMATON = "/spatial/automaton"
 EVENTS = "/spatial/events"
 EVENT_LOG = "/spatial/log"
 
-DERIVED = frozenset({SCENE, SPECIFICATION, ROBUSTNESS, AUTOMATON, EVENTS, EVENT_LOG})
+DERIVED = frozenset({SCENE, FRAME, SPECIFICATION, STANDING, ROBUSTNESS, AUTOMATON, EVENTS, EVENT_LOG})
 """Topics computed from the samples and a specification: a replay replaces them."""
 
 CURVES_TOPIC = "/spatial/curves"

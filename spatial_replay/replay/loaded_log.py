@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
@@ -23,6 +24,7 @@ from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.source import MemorySource, Source
+from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.replay.engine import Replayed, idle_templates, replayed_specs
@@ -241,6 +243,10 @@ class LoadedLog:
             )
 
 
+_MOST_NAMED: Final = 5
+"""The most results, and constants, that a summary names."""
+
+
 @dataclass(frozen=True, eq=False)
 class Evaluated:
     """An evaluation of the whole log with some values for the constants.
@@ -289,7 +295,25 @@ class Evaluated:
     @cached_property
     def curves(self) -> bytes:
         """The message of /spatial/curves."""
-        return encode_curves(self.loaded.inside.times_ns, self.replayed.results, self.loaded.first_ns)
+        times_ns, results = self.loaded.inside.times_ns, self.replayed.results
+        return encode_curves(times_ns, results, self.loaded.first_ns, self.summary)
+
+    @property
+    def summary(self) -> str:
+        """The verdict of each result, the worst first, and which constants differ from the text."""
+        order = (Verdict.VIOLATED, Verdict.UNKNOWN, Verdict.SATISFIED)
+        results = sorted(self.replayed.results, key=lambda result: order.index(result.verdict))
+        text = "; ".join(map(_result_text, results[:_MOST_NAMED])) or "the template matched no objects"
+        if len(results) > _MOST_NAMED:
+            text += f"; and {len(results) - _MOST_NAMED} more, none worse"
+        written = self.loaded.constants
+        changed = [
+            f"{name} = {constant_text(constant)}"
+            for name, constant in self.edited.constants.items()
+            if constant != written[name]
+        ]
+        more = ", …" if len(changed) > _MOST_NAMED else ""
+        return text + (f" ({', '.join(changed[:_MOST_NAMED])}{more})" if changed else "")
 
     @cached_property
     def layout(self) -> Attachment:
@@ -308,6 +332,11 @@ class Evaluated:
             return trace, [stretch.between(0, 0) for stretch in self.stretches]
         first_ns, last_ns = trace.times_ns[[0, -1]].tolist()
         return trace, [stretch.between(first_ns, last_ns + 1) for stretch in self.stretches]
+
+
+def _result_text(result: SpecResult) -> str:
+    number = "not determined" if math.isnan(result.robustness) else f"{result.robustness:.4g}"
+    return f"`{result.title}` is {result.verdict}: robustness {number}"
 
 
 def constant_text(constant: Constant) -> str:

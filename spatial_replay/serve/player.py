@@ -13,9 +13,7 @@ from spatial_replay.annotate.curves import CURVES_CHANNEL
 from spatial_replay.errors import SpatialReplayError
 from spatial_replay.logs.messages import Messages, messages_of, select
 from spatial_replay.logs.topics import CURVES_TOPIC, EVENT_LOG, EVENTS
-from spatial_replay.monitor.result import SpecResult
-from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.replay.loaded_log import EditedFiles, Evaluated, constant_text, constant_values
+from spatial_replay.replay.loaded_log import EditedFiles, constant_values
 from spatial_replay.replay.playback import Playback
 from spatial_replay.serve.pace import PlaybackState
 from spatial_replay.serve.requests import PendingRequests, Values
@@ -56,6 +54,9 @@ class Viewers(Protocol):
     def send_values(self, values: Values) -> None:
         """Send the constants, if they are not the reply to a viewer."""
 
+    def send_playback(self) -> None:
+        """Send the parameters of the playback, if they are not the reply to a viewer."""
+
     def send_note(self, note: Note) -> None:
         """Send a note."""
 
@@ -79,42 +80,10 @@ def thin(messages: Messages, most: int) -> Messages:
     return messages if kept.all() else select(messages, np.flatnonzero(kept))
 
 
-VERDICT = "verdict"
 CONSTANTS = "constants"
 LOG = "log"
 SPECIFICATION = "specification"
 """The subjects of notes."""
-
-_MOST = 5
-"""The most results, and constants, that a note names."""
-
-
-def verdict_note(evaluated: Evaluated) -> Note:
-    """Say the verdict of each result, the worst first, and which constants differ from the text."""
-    order = (Verdict.VIOLATED, Verdict.UNKNOWN, Verdict.SATISFIED)
-    results = sorted(evaluated.replayed.results, key=lambda result: order.index(result.verdict))
-    text = "; ".join(map(_result, results[:_MOST])) or "the template matched no objects"
-    if len(results) > _MOST:
-        text += f"; and {len(results) - _MOST} more, none worse"
-    level = Level.INFO if evaluated.verdict is Verdict.SATISFIED else Level.WARNING
-    return Note(VERDICT, level, text + _changes(evaluated))
-
-
-def _result(result: SpecResult) -> str:
-    number = "not determined" if math.isnan(result.robustness) else f"{result.robustness:.6g}"
-    return f"`{result.title}` is {result.verdict}: robustness {number}"
-
-
-def _changes(evaluated: Evaluated) -> str:
-    written = evaluated.loaded.constants
-    changed = [
-        f"{name} = {constant_text(constant)}"
-        for name, constant in evaluated.edited.constants.items()
-        if constant != written[name]
-    ]
-    more = ", …" if len(changed) > _MOST else ""
-    return f" ({', '.join(changed[:_MOST])}{more})" if changed else ""
-
 
 PERIOD_S: Final = 1 / 30
 """The time between two turns."""
@@ -124,6 +93,9 @@ MOST_A_SECOND: Final = 600
 
 _CURVES_EVERY: Final = 60
 """Turns after which the curves are sent again: some viewers drop them while they open their panels."""
+
+_PLAYBACK_EVERY: Final = 15
+"""Turns after which the parameters of the playback are sent again."""
 
 _MOST_SAMPLES: Final = 4_096
 """The most samples of one turn, so that a slow log does not block other requests."""
@@ -175,7 +147,6 @@ class Player:
             self._viewers.send_values(constant_values(edited.constants))
         # viewers drop what they show of the log when the playback jumps, even to the same time
         self._viewers.send_state(self._session.state._replace(time_ns=time_ns, did_seek=True))
-        self._viewers.send_note(verdict_note(self._playback.evaluated))
 
     def _seek(self, time_ns: int) -> None:
         """Send what is shown at a time, and go on from there."""
@@ -189,7 +160,6 @@ class Player:
         time_ns = self._playback.time_ns
         if CURVES_TOPIC in topics:
             self._send_curves(time_ns)
-            self._viewers.send_note(verdict_note(self._playback.evaluated))
         self._viewers.publish(_on_topics(self._playback.seek(time_ns), topics))
         self._viewers.send_state(self._session.state)
         self._viewers.send_time(time_ns)
@@ -212,8 +182,10 @@ class Player:
         self._turns += 1
         if self._turns % _CURVES_EVERY == 0:
             self._send_curves(time_ns)
+        if self._turns % _PLAYBACK_EVERY == 0 or time_ns == self._playback.end_ns:
+            self._viewers.send_playback()
         if time_ns == self._playback.end_ns:
-            self._viewers.send_state(self._session.pause())
+            self._viewers.send_state(self._session.finish())
 
 
 def _on_topics(messages: Messages, topics: Collection[str]) -> Messages:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import ipaddress
 import json
 import logging
+import os
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from reprlib import repr as shortened
 from threading import Thread
@@ -21,9 +22,10 @@ from spatial_replay.errors import SpatialReplayError, UsageError
 from spatial_replay.logs.messages import Channel, Messages, Schema
 from spatial_replay.serve.pace import PlaybackState, Status
 from spatial_replay.serve.player import CONSTANTS, Level, Note
+from spatial_replay.serve.relay import Relay
 from spatial_replay.serve.requests import Questions, Values
 from spatial_replay.serve.services import SERVICES, answer, asset
-from spatial_replay.serve.session import Session
+from spatial_replay.serve.session import PLAYBACK, Session
 
 # viewers get their errors in replies; the SDK would print them on standard error, too
 logging.getLogger("foxglove").addHandler(logging.NullHandler())
@@ -31,6 +33,9 @@ logging.getLogger("foxglove").addHandler(logging.NullHandler())
 _LONGEST_TEXT: Final = 64
 _LONGEST_NOTE: Final = 2_000
 """The most characters of a duration, and of a note."""
+
+_BEHIND: Final = "127.0.0.1"
+"""Where the SDK listens, behind the relay."""
 
 _STOP_S: Final = 1.0
 """How long the SDK, which waits for every viewer, may take to stop."""
@@ -81,10 +86,12 @@ class PublishingServer:
             self._advertise(channel)
         self._host = f"[{host}]" if _is_v6(host) else host
         self._started: Future[protocol.WebSocketServer] = Future()
+        self._started.set_result(self._start())
         try:
-            self._started.set_result(self._start(port))
-        except RuntimeError as error:
-            reason = str(error).rpartition("bind port: ")[2].partition(" (os error")[0]
+            self._relay = Relay(host, port, self._server.port)
+        except (OSError, UnicodeError) as error:
+            self._server.stop()
+            reason = _reason(error)
             raise UsageError(
                 f"cannot listen at {host}, port {port}: {reason}; choose another with --port, 0 for any"
                 if _is_own(host)
@@ -95,13 +102,14 @@ class PublishingServer:
     @property
     def address(self) -> str:
         """The address that viewers connect to."""
-        return f"ws://{self._host}:{self._server.port}"
+        return f"ws://{self._host}:{self._relay.port}"
 
     def stop(self) -> None:
         """Disconnect all viewers; one that does not respond is waited for only briefly."""
         stopping = Thread(target=self._server.stop, daemon=True)
         stopping.start()
         stopping.join(_STOP_S)
+        self._relay.stop()
         for channel in self._channels.values():
             channel.close()
 
@@ -138,11 +146,11 @@ class PublishingServer:
         """The server; a fast viewer may send a request before the SDK has returned it."""
         return self._started.result()
 
-    def _start(self, port: int) -> protocol.WebSocketServer:
+    def _start(self) -> protocol.WebSocketServer:
         return foxglove.start_server(
             name=self._name,
-            host=self._host,
-            port=port,
+            host=_BEHIND,
+            port=0,
             capabilities=[protocol.Capability.Time],
             context=self._context,
         )
@@ -194,11 +202,16 @@ class LiveServer(PublishingServer):
         """See `Viewers.send_values`."""
         self._server.publish_parameter_values(_parameters(values))
 
-    def _start(self, port: int) -> protocol.WebSocketServer:
+    def send_playback(self) -> None:
+        """See `Viewers.send_playback`."""
+        self._server.publish_parameter_values(_parameters(self._session.playback))
+
+    def _start(self) -> protocol.WebSocketServer:
         return foxglove.start_server(
             name=self._name,
-            host=self._host,
-            port=port,
+            host=_BEHIND,
+            port=0,
+            supported_encodings=["json"],
             capabilities=list(_CAPABILITIES),
             server_listener=_Listener(self._session, self),
             services=[self._service(name) for name in SERVICES],
@@ -254,13 +267,14 @@ class RunServer(PublishingServer):
                 self._advertise(channel)
         super().publish(messages)
 
-    def _start(self, port: int) -> protocol.WebSocketServer:
+    def _start(self) -> protocol.WebSocketServer:
         services = [] if self._fire is None else [_trigger_service(self._fire)]
         capabilities = [protocol.Capability.Time, *([protocol.Capability.Services] if services else [])]
         return foxglove.start_server(
             name=self._name,
-            host=self._host,
-            port=port,
+            host=_BEHIND,
+            port=0,
+            supported_encodings=["json"],
             capabilities=capabilities,
             services=services,
             server_listener=_Subscriptions(self._subscribed),
@@ -314,7 +328,7 @@ class _Listener(protocol.ServerListener):
     def on_get_parameters(
         self, client: protocol.Client, param_names: list[str], request_id: str | None = None
     ) -> list[Parameter]:
-        chosen = _parameters(self._session.values)
+        chosen = _parameters({**self._session.playback, **self._session.values})
         return [each for each in chosen if each.name in param_names] if param_names else chosen
 
     def on_set_parameters(
@@ -322,10 +336,16 @@ class _Listener(protocol.ServerListener):
     ) -> list[Parameter]:
         self._server.remove_note(CONSTANTS)
         try:
-            self._session.set_constants({each.name: _value(each) for each in parameters})
+            values = {each.name: _value(each) for each in parameters}
+            playback = {name: value for name, value in values.items() if name in PLAYBACK}
+            constants = {name: value for name, value in values.items() if name not in PLAYBACK}
+            if constants:
+                self._session.set_constants(_without_flags(constants))
+            if playback:
+                self._server.send_state(self._session.steer(playback))
         except SpatialReplayError as error:
             self._server.send_note(Note(CONSTANTS, Level.ERROR, str(error)))
-        return _parameters(self._session.values)
+        return _parameters({**self._session.playback, **self._session.values})
 
     def on_playback_control_request(
         self, playback_control_request: protocol.PlaybackControlRequest
@@ -343,23 +363,39 @@ def _playback_state(state: PlaybackState, request: str | None) -> protocol.Playb
     return protocol.PlaybackState(_STATUS[state.status], state.time_ns, state.speed, state.did_seek, request)
 
 
-def _parameters(values: Values) -> list[Parameter]:
+def _parameters(values: Mapping[str, float | str | bool]) -> list[Parameter]:
     return [Parameter(name, value=value) for name, value in values.items()]
 
 
-def _value(parameter: Parameter) -> float | str:
+def _value(parameter: Parameter) -> float | str | bool:
     """Return the value that a viewer sets.
 
     Raises:
-        UsageError: neither a number nor a short text.
+        UsageError: neither a number nor a short text, true or false.
     """
     value = parameter.get_value()
-    if isinstance(value, str) and len(value) <= _LONGEST_TEXT:
+    if isinstance(value, bool) or (isinstance(value, str) and len(value) <= _LONGEST_TEXT):
         return value
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
+    if isinstance(value, (int, float)):
         return float(value)
+    raise _misfit(parameter.name, value)
+
+
+def _without_flags(values: Mapping[str, float | str | bool]) -> Values:
+    """Return values of constants.
+
+    Raises:
+        UsageError: one is true or false.
+    """
+    for name, value in values.items():
+        if isinstance(value, bool):
+            raise _misfit(name, value)
+    return values
+
+
+def _misfit(name: str, value: object) -> UsageError:
     remedy = "give a number or, for a duration, a text such as '2s'"
-    raise UsageError(f"{shortened(parameter.name)} cannot be {shortened(value)}: {remedy}")
+    return UsageError(f"{shortened(name)} cannot be {shortened(value)}: {remedy}")
 
 
 def _is_v6(host: str) -> bool:
@@ -367,6 +403,14 @@ def _is_v6(host: str) -> bool:
         return ipaddress.ip_address(host).version == 6
     except ValueError:
         return False
+
+
+def _reason(error: OSError | UnicodeError) -> str:
+    """Return why nothing can listen at an address, in the words of the system."""
+    if isinstance(error, UnicodeError):
+        return "no such name"
+    is_of_name = isinstance(error, socket.gaierror) or error.errno is None
+    return str(error.strerror or error) if is_of_name else os.strerror(error.errno or 0)
 
 
 def _is_own(host: str) -> bool:

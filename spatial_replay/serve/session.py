@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from threading import Condition
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
-from spatial_replay.errors import SpatialReplayError
+from spatial_replay.errors import SpatialReplayError, UsageError
 from spatial_replay.replay.loaded_log import EditedFiles, Evaluated, LoadedLog, constant_values
 from spatial_replay.serve.pace import Pace, PlaybackState, Status, Transport
 from spatial_replay.serve.requests import PendingRequests, Values, session_over
+
+PLAYBACK: Final = ("playback.time", "playback.play", "playback.speed", "playback.loop")
+"""The parameters that steer the playback, for viewers without controls of their own: seconds after the first
+sample, whether it plays, seconds of the log in a second, whether it begins again at the end."""
+
+
+_LONGEST_S: Final = 9e9
 
 
 class PlaySpan(NamedTuple):
@@ -48,6 +55,7 @@ class Session:
         self._awaited: Future[Evaluated] | None = None
         self._requested = Condition()
         self._is_over = False
+        self._loops = False
         self.failure: SpatialReplayError | None = None
 
     @property
@@ -76,6 +84,14 @@ class Session:
         with self._requested:
             return self._transport.state(self._pace.now())
 
+    @property
+    def playback(self) -> Mapping[str, float | bool]:
+        """The values of `PLAYBACK`."""
+        state = self.state
+        seconds = round((state.time_ns - self._transport.start_ns) / 1e9, 3)
+        is_playing = state.status is Status.PLAYING
+        return dict(zip(PLAYBACK, (seconds, is_playing, state.speed, self._loops), strict=True))
+
     # ------------------------------------------------------------------------ called for viewers
 
     def control(self, *, is_playing: bool, speed: float, seek_ns: int | None = None) -> PlaybackState:
@@ -95,6 +111,31 @@ class Session:
             self._pending.is_controlled = True
             self._requested.notify()
             return self._transport.state(now, did_seek=seek_ns is not None)
+
+    def steer(self, values: Mapping[str, float | str | bool]) -> PlaybackState:
+        """Play, pause, seek, change the speed or begin again at the end, as some of `PLAYBACK` say.
+
+        Raises:
+            UsageError: a value of another kind, or a number that is out of the question.
+        """
+        now = self.playback
+        for name, value in values.items():
+            is_flag = isinstance(now[name], bool)
+            if isinstance(value, str) or isinstance(value, bool) != is_flag:
+                kind = "true or false" if is_flag else "a number"
+                raise UsageError(f"{name} cannot be {value!r}: give {kind}")
+            if not is_flag and not (0.0 <= value < float("inf")):
+                raise UsageError(f"{name} cannot be {value!r}: give a number of seconds, at least 0")
+        time, play, speed, loop = PLAYBACK
+        self._loops = bool(values.get(loop, self._loops))
+        seek_ns = None
+        if time in values:
+            seek_ns = self._transport.start_ns + round(min(float(values[time]), _LONGEST_S) * 1e9)
+        return self.control(
+            is_playing=bool(values.get(play, now[play])),
+            speed=float(values.get(speed, now[speed])),
+            seek_ns=seek_ns,
+        )
 
     def set_constants(self, values: Values) -> None:
         """Give constants other values; all of them or, with an error, none.
@@ -207,6 +248,12 @@ class Session:
             if self._pending.seek_ns is None:
                 self._transport.pause(now)
             return self._transport.state(now)
+
+    def finish(self) -> PlaybackState:
+        """Pause at the end, or begin again."""
+        if self._loops:
+            return self.control(is_playing=True, speed=self.state.speed, seek_ns=self._transport.start_ns)
+        return self.pause()
 
     def provide_evaluation(self, evaluated: Evaluated) -> None:
         """Let `wait_for_evaluation` return."""

@@ -316,8 +316,17 @@ def test_a_goal_that_is_still_to_come_is_neither_pointed_at_nor_red(tmp_path):
     output = tmp_path / "annotated.mcap"
     spec = sr.parse_specification("spec delivered = F robot enclosedin bin")
     run_replay(MemorySource.from_samples(samples), [spec], output=output)
-    for message in _messages(output, "/spatial/scene"):
-        entities = {each.id: each for each in SceneUpdate.FromString(message.data).entities}
+    *pending, ended = [
+        {each.id: each for each in SceneUpdate.FromString(message.data).entities}
+        for message in _messages(output, "/spatial/scene")
+    ]
+    for entities in pending:
         assert "witness" not in entities
         colour = entities["object/robot"].lines[0].color
         assert colour.r == colour.b
+        assert entities["verdict"].texts[0].text == "delivered failing so far"
+    # the end of the log violates it
+    colour = ended["object/robot"].lines[0].color
+    assert colour.r > colour.b
+    assert ended["witness"].texts[0].text.strip() == "robot enclosedin bin: -87"
+    assert ended["verdict"].texts[0].text == "delivered violated"

@@ -14,6 +14,7 @@ from annotate.layouts import layout_of, panels, paths_of
 from annotate.message_paths import split, values
 from spatial_replay.annotate.foxglove_layout import LayoutContents, layout_for_live
 from spatial_replay.logs import MemorySource
+from spatial_replay.logs.schemas.Robustness_pb2 import Standing
 from spatial_replay.replay import ReplayOptions, run_replay
 from spatial_replay.sources import open_source
 
@@ -50,7 +51,7 @@ def test_every_path_of_a_layout_finds_something_in_its_log(tmp_path, specificati
     run_replay(open_source(RECORDINGS / "table.jsonl"), files, output=output)
     layout = check_layout(output)
     kinds = {panel.partition("!")[0] for panel in layout["configById"]}
-    assert kinds == {"3D", "Plot", "RawMessages", "RosOut", "StateTransitions", "Table"}
+    assert kinds == {"3D", "Indicator", "Plot", "RawMessages", "RosOut", "StateTransitions", "Table"}
 
 
 def test_a_layout_shows_nothing_that_its_log_has_not(tmp_path):
@@ -60,9 +61,8 @@ def test_a_layout_shows_nothing_that_its_log_has_not(tmp_path):
         recorder.write(sr.Sample(0, {}, {"battery": -1.0}))
         recorder.write(sr.Sample(10**8, {}, {"battery": 1.0}))
     layout = check_layout(log)
-    assert [path["label"] for path in layout["configById"]["Plot!robustness"]["paths"]] == [
-        "settled [units of battery]"
-    ]
+    assert curves(layout).keys() == {"settled"}
+    assert layout["configById"]["Plot!robustness"]["yAxisLabel"] == "units of battery"
 
 
 def test_any_node_is_found_by_name_and_by_id(tmp_path):
@@ -79,16 +79,18 @@ def test_any_node_is_found_by_name_and_by_id(tmp_path):
         by_id = values(
             log, f'/spatial/robustness{{specification=="so near"}}.nodes[:]{{id=={close.id}}}.{field}'
         )
-        assert by_name == by_id == getattr(close, field).tolist()
+        # and once more about the finished log
+        assert by_name[:-1] == by_id[:-1] == getattr(close, field).tolist()
 
 
 def test_parts_that_look_ahead_are_plotted_by_their_value_and_others_as_they_are_now(tmp_path):
     text = "spec close = a closeto[2] b\nspec met = F close\nspec all_of_it = met and G a farfrom[0] b"
-    parts = layout_of(run(tmp_path, text))["configById"]["Plot!parts"]["paths"]
-    assert [(path["label"], path["value"].rpartition("}")[2]) for path in parts] == [
-        ("met in all_of_it", ".value"),
-        ("close in all_of_it", ".now"),
-    ]
+    log = run(tmp_path, text)
+    parts = curves(layout_of(log), "Plot!parts")
+    assert list(parts) == ["met", "close"]
+    result = sr.evaluate(sr.parse_specification(text), sr.read_trace(log)).results[0]
+    for name, field in (("met", "value"), ("close", "now")):
+        assert values(log, parts[name])[:-1] == getattr(result.node(name), field).tolist()
 
 
 def test_a_planned_run_has_its_map_path_and_decision(tmp_path):
@@ -117,7 +119,7 @@ def test_a_planned_run_has_its_map_path_and_decision(tmp_path):
     shown = layout["configById"]["3D!scene"]["topics"]
     assert set(shown) == {"/spatial/scene", "/plan/gradient_map", "/plan/path"}
     assert shown["/plan/gradient_map"]["colorMode"] == "rgba-fields"
-    assert layout["configById"]["RawMessages!decision"] == {"topicPath": "/plan/decision.reason"}
+    assert layout["configById"]["RawMessages!decision"]["topicPath"] == "/plan/decision.reason"
     assert panels(layout["layout"]) == set(layout["configById"])
     assert "/plan/" not in json.dumps(layout_of(layer))
 
@@ -133,26 +135,53 @@ def test_what_is_no_path_is_not_taken_for_one(path):
         split(path)
 
 
-def test_every_result_has_its_curve_under_its_name(tmp_path):
+def curves(layout: dict, panel: str = "Plot!robustness") -> dict[str, str]:
+    """The paths of a plot's curves by their labels, without the line at 0."""
+    *own, zero = layout["configById"][panel]["paths"]
+    assert zero["value"] == "0"
+    return {path["label"]: path["value"] for path in own}
+
+
+def test_every_result_has_its_curve_its_light_and_its_strip_under_its_name(tmp_path):
     layout = layout_of(run(tmp_path, TEXT))
-    paths = {path["label"]: path["value"] for path in layout["configById"]["Plot!robustness"]["paths"]}
-    assert paths == {
-        name: f'/spatial/robustness{{specification=="{name}"}}{{object==""}}.nodes[:]{{id==0}}.value'
-        for name in ("near", "apart")
+    panels = layout["configById"]
+    assert curves(layout) == {
+        name: f'/spatial/standing.results[:]{{name=="{name}"}}.robustness' for name in ("near", "apart")
     }
+    lights = [panel for name, panel in panels.items() if name.startswith("Indicator!")]
+    assert [light["lichtblickPanelTitle"] for light in lights] == ["near", "apart"]
+    assert [light["foxglovePanelTitle"] for light in lights] == ["near", "apart"]
+    strips = panels["StateTransitions!verdicts"]["paths"]
+    assert [strip["value"] for strip in strips[:2]] == [light["path"] for light in lights]
+    rules = {rule["rawValue"]: rule["label"] for rule in lights[0]["rules"]}
+    states = {state["value"]: state["label"] for state in strips[0]["customStates"]["states"]}
+    numbers = {str(number): name.lower().replace("_", " ") for name, number in Standing.items() if number}
+    assert rules == states == numbers
+
+
+def test_results_of_different_units_are_plotted_apart_with_a_line_at_0(tmp_path):
+    layout = layout_of(run(tmp_path, TEXT + "\nspec turned = G a oriented[1] b"))
+    assert list(curves(layout)) == ["near", "apart"]
+    assert list(curves(layout, "Plot!robustness1")) == ["turned"]
+    axes = [layout["configById"][name]["yAxisLabel"] for name in ("Plot!robustness", "Plot!robustness1")]
+    assert axes == ["footprint units", "no unit"]
+
+
+def test_there_are_as_many_strips_as_results(tmp_path):
+    text = "\n".join(f"spec s{index} = G a farfrom[{index}] b" for index in range(30))
+    layout = check_layout(run(tmp_path, text))
+    labels = [path["label"] for path in layout["configById"]["StateTransitions!verdicts"]["paths"]]
+    assert labels[:30] == [f"s{index}" for index in range(30)]
 
 
 def test_an_instance_of_a_template_has_a_curve_of_its_own(tmp_path):
-    layout = layout_of(run(tmp_path, "spec calm(x) = G x dist x <= 0", each={"x": "all"}))
-    paths = {path["label"]: path["value"] for path in layout["configById"]["Plot!robustness"]["paths"]}
-    assert set(paths) == {"calm(a)", "calm(b)"}
-    assert '{object=="b"}' in paths["calm(b)"]
+    layout = check_layout(run(tmp_path, "spec calm(x) = G x dist x <= 0", each={"x": "all"}))
+    assert set(curves(layout)) == {"calm(a)", "calm(b)"}
 
 
 def test_a_curve_is_labelled_with_the_id_of_its_requirement(tmp_path):
     layout = check_layout(run(tmp_path, 'spec near "REQ-2: they meet" = F a closeto[2] b'))
-    [path] = layout["configById"]["Plot!robustness"]["paths"]
-    assert path["label"] == "REQ-2 near"
+    assert list(curves(layout)) == ["REQ-2 near"]
 
 
 def test_the_camera_looks_at_everything_from_above(tmp_path):

@@ -9,9 +9,16 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from spatial_replay import LogError
-from spatial_replay.annotate.robustness import VERDICTS, decode_robustness, encode_robustness
-from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
-from spatial_replay.monitor.verdict import online_verdict
+from spatial_replay.annotate.robustness import decode_robustness, encode_robustness
+from spatial_replay.logs.schemas.Robustness_pb2 import (
+    FAILS_SO_FAR,
+    HOLDS_SO_FAR,
+    SATISFIED,
+    UNKNOWN,
+    VIOLATED,
+    Robustness,
+)
+from spatial_replay.monitor.verdict import Verdict, online_verdict
 
 NAMES = st.lists(st.none() | st.text(min_size=1, max_size=5), min_size=1, max_size=6)
 NUMBERS = st.floats(width=64)
@@ -27,6 +34,10 @@ def numbered(draw: st.DrawFn):
     return names, times, np.concatenate([values, np.sort(ends, axis=1)], axis=1)
 
 
+def open_standing(value: float) -> int:
+    return UNKNOWN if np.isnan(value) else HOLDS_SO_FAR if value >= 0.0 else FAILS_SO_FAR
+
+
 @given(numbered(), st.none() | st.text(min_size=1, max_size=5))
 def test_the_protobuf_library_reads_every_number(given_numbers, instance):
     names, times, series = given_numbers
@@ -40,7 +51,12 @@ def test_the_protobuf_library_reads_every_number(given_numbers, instance):
             assert (node.id, node.name) == (index, name or "")
             numbers = [node.value, node.now, node.lower, node.upper]
             assert np.array_equal(numbers, series[index, :, sample], equal_nan=True)
-            assert VERDICTS[node.verdict] == online_verdict(node.lower, node.upper)
+            verdict = online_verdict(node.lower, node.upper)
+            assert node.standing == {
+                Verdict.SATISFIED: SATISFIED,
+                Verdict.VIOLATED: VIOLATED,
+                Verdict.PENDING: open_standing(node.value),
+            }.get(verdict, UNKNOWN)
 
 
 @given(numbered())
@@ -74,7 +90,7 @@ def test_a_writer_that_leaves_out_zeros_is_read_too():
     [read] = decode_robustness([message.SerializeToString(), *full])
     assert read.times_ns.tolist() == [0, 7]
     assert read.series[0].T.tolist() == [[1.5, 0.0, -2.0, 2.0], [1.0, 2.0, 3.0, 4.0]]
-    assert [VERDICTS[code] for code in read.verdicts[0]] == ["unknown", "satisfied"]
+    assert read.codes[0].tolist() == [0, SATISFIED]
 
 
 def test_what_is_no_message_of_ours_is_named():
@@ -82,8 +98,16 @@ def test_what_is_no_message_of_ours_is_named():
         decode_robustness([b"\xff\xff\xff"])
 
 
-def test_a_verdict_of_another_version_is_named():
+def test_the_message_about_the_finished_log_is_no_sample():
+    series = np.array([[[1.0], [2.0], [3.0], [4.0]]])
+    once = encode_robustness("s", None, [None], np.array([7]), series)
+    final = encode_robustness("s", None, [None], np.array([7]), series, final=True)
+    [read] = decode_robustness([*once, *final])
+    assert read.times_ns.tolist() == [7]
+
+
+def test_a_standing_of_another_version_is_named():
     message = Robustness(specification="s")
-    message.nodes.add(verdict=9)
-    with pytest.raises(LogError, match="code 9"):
+    message.nodes.add(standing=9)
+    with pytest.raises(LogError, match="number 9"):
         decode_robustness([message.SerializeToString()])

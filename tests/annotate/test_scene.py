@@ -237,7 +237,7 @@ def test_regions_are_in_every_message():
         goal, shelf, corner = (entity(message, f"region/{name}") for name in ("goal", "shelf", "corner"))
         assert points(goal.lines[0]) == list(REGIONS["goal"].vertices)
         assert len(shelf.lines[0].points) == 32
-        assert [face.pose.position.z for face in shelf.triangles] == [1.5, 1.0]
+        assert [face.pose.position.z for face in shelf.triangles] == [1.0, 1.0]
         assert len(corner.lines) == 1
         assert len(corner.triangles) > 1
         assert [each.texts[0].text for each in (goal, shelf, corner)] == ["goal", "shelf", "corner"]
@@ -399,33 +399,33 @@ def test_an_arrow_with_its_number_points_at_the_worst_violation():
     assert ["witness" in each for each in identifiers] == [True, False, False, True]
     assert [each.id for each in shown[1].deletions] == ["witness"]
     assert not shown[2].deletions
-    assert arrow(shown[0])[2] == "-1"
+    assert arrow(shown[0])[2] == "a closeto[1] b: -1"
     begin, end, label = arrow(shown[3])
-    assert (begin[0], end[0], label) == (1.0, 9.0, "-7")
+    assert (begin[0], end[0], label) == (1.0, 9.0, "a closeto[1] b: -7")
     assert begin[1] == end[1]
 
 
 def test_the_number_of_an_arrow_is_in_the_unit_of_the_log():
     [message] = pointed("scale lengths = 4\nspec s = G a closeto[1] b", {"a": box_at(0.0), "b": box_at(9.0)})
-    assert arrow(message)[2] == "-7"
+    assert arrow(message)[2] == "a closeto[1] b: -7"
 
 
 def test_the_arrow_of_an_enclosure_shows_what_sticks_out():
     text = "region goal = box(0, 0, 2, 2)\nspec s = G a enclosedin goal"
     [message] = pointed(text, {"a": Footprint.box(1.0, 0.5, 3.5, 1.0)})
     begin, end, label = arrow(message)
-    assert (begin[0], end[0], label) == (3.5, 2.0, "-1.5")
+    assert (begin[0], end[0], label) == (3.5, 2.0, "a enclosedin goal: -1.5")
 
 
 def test_the_arrow_of_a_direction_joins_what_is_nearest():
     [message] = pointed("spec s = G a leftof b", {"a": box_at(4.0), "b": box_at(0.0)})
     begin, end, label = arrow(message)
-    assert (begin[0], end[0], label) == (4.0, 1.0, "-5")
+    assert (begin[0], end[0], label) == (4.0, 1.0, "a leftof b: -5")
 
 
 def test_a_requirement_not_to_hold_is_pointed_at_too():
     [message] = pointed("spec s = G not a closeto[3] b", {"a": box_at(0.0), "b": box_at(2.0)})
-    assert arrow(message)[2] == "-2"
+    assert arrow(message)[2] == "a closeto[3] b: -2"
 
 
 def test_a_constant_has_no_arrow():
@@ -451,7 +451,7 @@ def test_a_fulfilled_obligation_has_no_requirements(text):
 def test_an_empty_group_hides_no_arrow():
     drink = 'group drinks = class "drink"\nspec s = F (exists o in drinks: o closeto[1] a)\n'
     [message] = pointed(drink + "spec t = G a closeto[1] b", {"a": box_at(0.0), "b": box_at(3.0)})
-    assert arrow(message)[2] == "-1"
+    assert arrow(message)[2] == "a closeto[1] b: -1"
 
 
 def test_cutting_a_run_moves_no_arrow():
@@ -462,3 +462,32 @@ def test_cutting_a_run_moves_no_arrow():
     whole = pointed("spec s = G (a closeto[1] b)", *samples)
     assert pointed("spec s = G (a closeto[1] b)", *samples, cuts=tuple(range(1, 7))) == whole
     assert entity(whole[0], "witness").arrows[0].pose.position.z > 2.0
+
+
+# ------------------------------------------------------------------------------------------- crowded scenes
+
+
+def test_a_crowd_has_labels_only_where_something_is_said_or_wrong():
+    many = {
+        f"o{index}": TrackedObject(Footprint.box(3.0 * index, 9.0, 3.0 * index + 1.0, 10.0), "crowd")
+        for index in range(40)
+    }
+    text = 'group crowd = class "crowd"\nspec s = G a closeto[2] b\n'
+    text += "spec t = G forall o in crowd: o dist a >= 1"
+    [message] = pointed(text, {**many, "a": box_at(0.0), "b": box_at(1.0)})
+    labelled = {each.id for each in message.entities if each.texts and each.id.startswith("object/")}
+    assert labelled == {"object/a", "object/b"}
+    [sparse] = pointed(text, {"a": box_at(0.0), "b": box_at(1.0), "o1": many["o1"]})
+    assert all(each.texts for each in sparse.entities)
+
+
+def test_small_things_lie_above_large_ones():
+    small, large = Footprint.box(0.0, 0.0, 0.1, 0.1), Footprint.box(-9.0, -9.0, 9.0, 9.0)
+    regions = {"town": (-99.0, 99.0), "room": (-9.0, 9.0)}
+    text = "\n".join(f"region {name} = box({a}, {a}, {b}, {b})" for name, (a, b) in regions.items())
+    [message] = pointed(f"{text}\nspec s = G (a enclosedin town)", {"a": small, "b": large})
+    heights = [
+        entity(message, name).triangles[0].pose.position.z
+        for name in ("region/town", "region/room", "object/b", "object/a")
+    ]
+    assert heights == sorted(set(heights))

@@ -33,10 +33,16 @@ def run_program(*arguments: str, cwd: Path, **variables: str) -> subprocess.Comp
 
 def standard_error_on_terminal(command: tuple[str, ...], cwd: Path, variables: Mapping[str, str]) -> str:
     """What a command writes to standard error if that is a terminal."""
+    return written_on_terminal(command, cwd, variables, subprocess.DEVNULL)
+
+
+def written_on_terminal(
+    command: tuple[str, ...], cwd: Path, variables: Mapping[str, str], stdout: int | None = None
+) -> str:
+    """What a command writes to a terminal, to standard output unless that goes elsewhere, too."""
     ours, theirs = pty.openpty()
-    with subprocess.Popen(
-        command, cwd=cwd, env=environment(**variables), stdout=subprocess.DEVNULL, stderr=theirs
-    ):
+    output = theirs if stdout is None else stdout
+    with subprocess.Popen(command, cwd=cwd, env=environment(**variables), stdout=output, stderr=theirs):
         os.close(theirs)
         written = bytearray()
         try:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from cli.program import PROGRAM, run_program, written_on_terminal
 from spatial_replay.cli import run as run_in_process
 
 TRACKS = """\
@@ -182,3 +184,25 @@ def test_json_has_templates_without_objects_and_may_name_standard_output(
         "near", None, "no instances",
     )  # fmt: skip
     assert idle["explanation"] == ["`near(ego)` was never evaluated: no object stands for ego."]
+
+
+def luminance(number: int) -> float:
+    """The relative luminance of one of the 216 colours of the cube of xterm."""
+    red, green, blue = ((0, 95, 135, 175, 215, 255)[(number - 16) // place % 6] / 255 for place in (36, 6, 1))
+    linear = [
+        each / 12.92 if each <= 0.04045 else ((each + 0.055) / 1.055) ** 2.4 for each in (red, green, blue)
+    ]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def test_on_a_terminal_lines_fit_and_verdicts_have_colours_for_black_and_for_white(folder: Path) -> None:
+    shown = written_on_terminal((*PROGRAM, *EXPLAIN), folder, {"COLUMNS": "72"})
+    colours = {int(each) for each in re.findall(r"\x1b\[38;5;(\d+)m", shown)}
+    assert len(colours) == 3  # satisfied, violated and unknown
+    for each in colours:
+        assert (luminance(each) + 0.05) / 0.05 >= 4.0  # on black
+        assert 1.05 / (luminance(each) + 0.05) >= 3.5  # on white
+    plain = re.sub(r"\x1b\[[\d;]*m", "", shown).replace("\r", "")
+    assert max(map(len, plain.splitlines())) <= 72
+    piped = run_program(*EXPLAIN, cwd=folder).stdout
+    assert plain.split() == piped.split()

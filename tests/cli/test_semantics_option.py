@@ -12,6 +12,7 @@ from cli.program import run_program
 from replay.runs import SPECIFICATION, content_of, record, run, write_tracks
 from spatial_replay.annotate.robustness import decode_robustness
 from spatial_replay.cli import run as run_in_process
+from spatial_replay.logs.schemas.Robustness_pb2 import SATISFIED, UNKNOWN, VIOLATED
 from spatial_replay.logs.topics import METADATA, ROBUSTNESS
 
 REPLAY = ("replay", "run.jsonl", "--spec", "blocks.spatial")
@@ -68,11 +69,10 @@ def test_an_annotated_log_names_its_semantics_and_is_replayed_with_the_default(f
     assert dict(written.metadata)[METADATA]["semantics"] == "paper"
     series = decode_robustness([message[-1] for message in written.of(ROBUSTNESS)])
     for each in series:
-        unknown, satisfied, violated = (4, 2, 3)
         value = each.series[:, 0]
-        assert ((each.verdicts == unknown) == (value != value)).all()
-        assert ((each.verdicts == satisfied) == (value >= 0)).all()
-        assert ((each.verdicts == violated) == (value < 0)).all()
+        assert ((each.codes == UNKNOWN) == (value != value)).all()
+        assert ((each.codes == SATISFIED) == (value >= 0)).all()
+        assert ((each.codes == VIOLATED) == (value < 0)).all()
     assert run_in_process(["replay", "out.mcap", "-o", "again.mcap"]) == 4
     assert dict(content_of(Path("again.mcap")).metadata)[METADATA]["semantics"] == "ltlf"
 

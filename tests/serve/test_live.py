@@ -14,17 +14,29 @@ import pytest
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from websockets.asyncio.client import connect
 from websockets.exceptions import WebSocketException
+from websockets.typing import Subprotocol
 
 import spatial_replay as sr
 from replay.runs import STEP_NS, PiecewiseSource, content_of, record, run
-from serve.viewer import ENDED, PATIENCE_S, PAUSED, PLAYING, PROTOCOL, Message, State, Viewer, viewer
+from serve.viewer import (
+    ENDED,
+    OLD_PROTOCOL,
+    PATIENCE_S,
+    PAUSED,
+    PLAYING,
+    PROTOCOL,
+    Message,
+    State,
+    Viewer,
+    viewer,
+)
 from spatial_replay import UsageError
 from spatial_replay.annotate.curves import MOST_POINTS
 from spatial_replay.logs import Channel, LogWriter, Schema, encode_objects
 from spatial_replay.logs.output_file import open_output
 from spatial_replay.logs.schemas.Curves_pb2 import Curves
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
+from spatial_replay.logs.schemas.Robustness_pb2 import Robustness, StandingUpdate
 from spatial_replay.logs.schemas.Specification_pb2 import Specification
 from spatial_replay.logs.topics import (
     CURVES_TOPIC,
@@ -32,6 +44,7 @@ from spatial_replay.logs.topics import (
     ROBUSTNESS,
     SCENE,
     SPECIFICATION,
+    STANDING,
     protobuf_channel,
 )
 from spatial_replay.replay import LoadedLog, run_replay
@@ -130,7 +143,7 @@ def test_a_log_played_from_the_start_is_the_annotated_log(server: Serving, tmp_p
         await own.subscribe(topic for topic in own.channels if topic != CURVES_TOPIC)
         await own.message(SCENE)
         assert (await own.control(play=True, speed=10.0, seek_ns=0, request="play")).status == PLAYING
-        found = await own.until(lambda each: isinstance(each, Message) and each[:2] == last[:2])
+        found = await own.until(lambda each: isinstance(each, Message) and tuple(each) == last)
         # a new subscriber may be sent the first sample twice
         assert {tuple(each) for each in found if isinstance(each, Message)} == set(expected)
 
@@ -182,9 +195,10 @@ def test_a_changed_constant_changes_the_verdict_the_curves_and_the_messages(serv
         before = Curves.FromString((await own.message(CURVES_TOPIC)).data)
         await own.control(seek_ns=2 * STEP_NS)
         assert await own.set(far=3.0) == {"far": 3.0, "soon": "10s"}
-        assert "`apart` is violated" in await own.note("verdict", "(far = 3)")
         changed = await own.message(CURVES_TOPIC, lambda each: Curves.FromString(each.data) != before)
         curves = Curves.FromString(changed.data)
+        assert "`apart` is violated" in curves.summary
+        assert "(far = 3)" in curves.summary
         assert [each.verdict for each in before.specifications] == ["satisfied", "unknown"]
         assert [each.verdict for each in curves.specifications] == ["satisfied", "violated"]
         edited = sr.parse_specification(TEXT.replace("far = 0.5", "far = 3.0"))
@@ -204,9 +218,60 @@ def test_a_changed_constant_makes_viewers_drop_what_they_show(server: Serving) -
         await own.set(soon="1s")
         state = await own.next_of(State, lambda each: each.did_seek)
         assert (state.time_ns, state.request) == (STEP_NS, "")
-        assert "`reach` is violated" in await own.note("verdict", "(soon = 1s)")
+        assert "`reach` is violated" in await own.summary("(soon = 1s)")
 
     watch(server, looking)
+
+
+@pytest.mark.parametrize("protocols", [(OLD_PROTOCOL,), (OLD_PROTOCOL, PROTOCOL)])
+def test_a_viewer_without_playback_control_steers_by_parameters(
+    server: Serving, protocols: tuple[Subprotocol, ...]
+) -> None:
+    async def session() -> None:
+        async with viewer(server.address, *protocols) as own:
+            received = own.record()
+            assert own.connection.subprotocol in protocols
+            await own.subscribe([ROBUSTNESS, STANDING])
+            before = {"playback.time": 0.0, "playback.play": False, "playback.speed": 1.0}
+            assert (await own.parameters()).items() >= before.items()
+            assert (await own.steer(time=2.0, speed=FAST))["playback.time"] == 2.0
+            assert (await own.message(ROBUSTNESS, lambda each: each.time_ns > 0)).time_ns == 2 * 10**9
+            assert (await own.steer(play=True))["playback.play"] is True
+            last = await own.message(STANDING, lambda each: each.time_ns == END_NS)
+            assert StandingUpdate.FromString(last.data).results
+            # it begins again at the end
+            await own.steer(loop=True, play=True)
+            await own.message(ROBUSTNESS, lambda each: each.time_ns == END_NS)
+            await own.message(ROBUSTNESS, lambda each: each.time_ns == 0)
+            assert (await own.steer(play=False, loop=False))["playback.play"] is False
+            assert not any(isinstance(each, State) for each in received)
+            # one that asks for playback control understands it
+            assert (await own.control(seek_ns=STEP_NS)).time_ns == STEP_NS
+
+    asyncio.run(session())
+
+
+@pytest.mark.parametrize(
+    ("name", "given"), [("time", -1.0), ("time", "soon"), ("play", 1.0), ("loop", "x"), ("speed", True)]
+)
+def test_a_playback_that_cannot_be_is_refused(server: Serving, name: str, given: object) -> None:
+    async def looking(own: Viewer) -> None:
+        before = await own.parameters()
+        assert await own.steer(**{name: given}) == before
+        assert f"playback.{name} cannot be" in await own.note("constants")
+
+    watch(server, looking)
+
+
+def test_a_specification_without_constants_has_parameters_too() -> None:
+    loaded = LoadedLog(PiecewiseSource(run(5), 7), [sr.parse_specification("spec reach = F cube ovlp cube")])
+    with open_server(loaded.evaluate(), port=0) as server:
+
+        async def looking(own: Viewer) -> None:
+            names = ["playback.time", "playback.play", "playback.speed", "playback.loop"]
+            assert sorted(await own.parameters()) == sorted(names)
+
+        watch(server, looking)
 
 
 @pytest.mark.parametrize(
@@ -248,7 +313,7 @@ def test_a_change_that_fails_in_evaluation_restores_the_former_values() -> None:
             await own.next_of(dict, lambda each: [of["value"] for of in each.get("parameters", ())] == [1])
             assert await own.constants() == {"wide": 1}
             assert await own.set(wide=2) == {"wide": 2}
-            await own.note("verdict", "(wide = 2)")
+            await own.summary("(wide = 2)")
 
         watch(server, looking)
 
@@ -265,7 +330,7 @@ def test_the_last_of_many_changes_counts(server: Serving) -> None:
     async def looking(own: Viewer) -> None:
         for number in range(50):
             await own.send(op="setParameters", parameters=[{"name": "far", "value": number / 10}])
-        await own.note("verdict", "(far = 4.9)")
+        await own.summary("(far = 4.9)")
         assert (await own.constants())["far"] == 4.9
 
     watch(server, looking)
@@ -282,8 +347,7 @@ def test_viewers_share_one_time_and_one_set_of_constants(server: Serving) -> Non
             await first.set(far=3.0)
             update = await second.next_of(dict, lambda each: each["op"] == "parameterValues")
             assert update["parameters"] == [{"name": "far", "type": "float64", "value": 3.0}]
-            await second.note("verdict", "(far = 3)")
-            await second.message(CURVES_TOPIC)
+            await second.summary("(far = 3)")
 
     asyncio.run(session())
 

@@ -23,6 +23,7 @@ from replay.runs import STEP_NS, PiecewiseSource, run
 from spatial_replay import UsageError
 from spatial_replay.annotate.curves import CURVES_CHANNEL
 from spatial_replay.logs import Messages
+from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
 from spatial_replay.logs.topics import ROBUSTNESS
 from spatial_replay.replay import Evaluated, LoadedLog, Playback
 from spatial_replay.serve.pace import MOST_LATE_S, PlaybackState, Status
@@ -57,6 +58,9 @@ class RecordingViewers:
 
     def send_values(self, values: Mapping[str, float | str]) -> None:
         self.sent.put(values)
+
+    def send_playback(self) -> None:
+        pass
 
     def send_note(self, note: Note) -> None:
         self.sent.put(note)
@@ -99,12 +103,15 @@ def playing(loaded: LoadedLog, clock: Clock) -> Iterator[tuple[Session, Recordin
 
 
 def robustness_times(sent: list[object]) -> list[int]:
+    """The times of samples; the last message of all is about the finished log."""
     return [
         time_ns
         for each in sent
         if isinstance(each, Messages)
-        for time_ns, number in zip(each.log_time_ns.tolist(), each.channel.tolist(), strict=True)
-        if each.channels[number].topic == ROBUSTNESS
+        for time_ns, number, payload in zip(
+            each.log_time_ns.tolist(), each.channel.tolist(), each.payloads, strict=True
+        )
+        if each.channels[number].topic == ROBUSTNESS and not Robustness.FromString(payload).final
     ]
 
 

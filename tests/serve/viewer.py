@@ -1,4 +1,4 @@
-"""A viewer of the live server: a WebSocket client that speaks the protocol of `foxglove.sdk.v1`."""
+"""A viewer of the live server: a WebSocket client of `foxglove.sdk.v1` or `foxglove.websocket.v1`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,12 @@ from typing import Any, NamedTuple
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
+from spatial_replay.logs.schemas.Curves_pb2 import Curves
+
 PROTOCOL = Subprotocol("foxglove.sdk.v1")
+OLD_PROTOCOL = Subprotocol("foxglove.websocket.v1")
+"""Of viewers that know no playback state: Lichtblick, which offers both names, and older ones."""
+
 PATIENCE_S = 60.0
 """How long a viewer waits for what has to come."""
 
@@ -58,7 +63,9 @@ class Viewer:
     channels: dict[str, int] = field(default_factory=dict)
     services: dict[str, int] = field(default_factory=dict)
     info: dict[str, Any] = field(default_factory=dict)
+    _subscribed: set[str] = field(default_factory=set)
     _waiting: list[Received] = field(default_factory=list)
+    _record: list[Received] = field(default_factory=list)
     _received: asyncio.Queue[Received] = field(default_factory=asyncio.Queue)
 
     async def listen(self) -> None:
@@ -72,7 +79,12 @@ class Viewer:
                     self.channels |= {each["topic"]: each["id"] for each in channels}
                 case {"op": "advertiseServices", "services": services}:
                     self.services |= {each["name"]: each["id"] for each in services}
+            self._record.append(received)
             self._received.put_nowait(received)
+
+    def record(self) -> list[Received]:
+        """All that comes from now on, as it comes."""
+        return self._record
 
     async def until(self, is_wanted: Callable[[Any], bool]) -> list[Received]:
         """All that comes up to the first that is wanted, which is the last of the list."""
@@ -106,9 +118,19 @@ class Viewer:
         text: str = found["message"]
         return text
 
+    async def summary(self, says: str = "") -> str:
+        """What the next message about the whole log says that it comes to."""
+        if "/spatial/curves" not in self._subscribed:
+            await self.subscribe(["/spatial/curves"])
+        found = await self.message(
+            "/spatial/curves", lambda each: says in Curves.FromString(each.data).summary
+        )
+        return Curves.FromString(found.data).summary
+
     async def subscribe(self, topics: Iterable[str] | None = None) -> None:
         """Subscribe to topics, or to all."""
-        chosen = self.channels if topics is None else topics
+        chosen = list(self.channels if topics is None else topics)
+        self._subscribed.update(chosen)
         subscriptions = [{"id": self.channels[topic], "channelId": self.channels[topic]} for topic in chosen]
         await self.send(op="subscribe", subscriptions=subscriptions)
 
@@ -126,11 +148,22 @@ class Viewer:
 
     async def set(self, **values: Any) -> dict[str, Any]:
         """Give constants other values; the values that they have then."""
-        parameters = [{"name": name, "value": value} for name, value in values.items()]
+        return constants_of(await self.steer(**values))
+
+    async def constants(self) -> dict[str, Any]:
+        return constants_of(await self.parameters())
+
+    async def steer(self, **values: Any) -> dict[str, Any]:
+        """Set parameters, `play` for `playback.play`; the values of all of them then."""
+        own = {"time", "play", "speed", "loop"}
+        parameters = [
+            {"name": f"playback.{name}" if name in own else name, "value": value}
+            for name, value in values.items()
+        ]
         await self.send(op="setParameters", parameters=parameters, id="set")
         return await self._parameters("set")
 
-    async def constants(self) -> dict[str, Any]:
+    async def parameters(self) -> dict[str, Any]:
         await self.send(op="getParameters", parameterNames=[], id="get")
         return await self._parameters("get")
 
@@ -182,10 +215,15 @@ class Viewer:
         raise ValueError(f"{raw[0]} is no message of a server")
 
 
+def constants_of(parameters: dict[str, Any]) -> dict[str, Any]:
+    """The parameters that do not steer the playback."""
+    return {name: value for name, value in parameters.items() if not name.startswith("playback.")}
+
+
 @asynccontextmanager
-async def viewer(address: str) -> AsyncIterator[Viewer]:
+async def viewer(address: str, *protocols: Subprotocol) -> AsyncIterator[Viewer]:
     """Connect, and wait until the server has said what it has."""
-    async with connect(address, subprotocols=[PROTOCOL], max_size=None) as connection:
+    async with connect(address, subprotocols=protocols or [PROTOCOL], max_size=None) as connection:
         own = Viewer(connection)
         listening = asyncio.create_task(own.listen())
         try:

@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1bspatial_replay/Curves.proto\x12\x0espatial_replay\"S\n\x06\x43urves\x12\x0c\n\x04time\x18\x01 \x03(\x01\x12;\n\x0especifications\x18\x02 \x03(\x0b\x32#.spatial_replay.SpecificationCurves\"\x97\x01\n\x13SpecificationCurves\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06object\x18\x02 \x01(\t\x12\x0f\n\x07verdict\x18\x03 \x01(\t\x12\x17\n\nrobustness\x18\x04 \x01(\x01H\x00\x88\x01\x01\x12)\n\x05nodes\x18\x05 \x03(\x0b\x32\x1a.spatial_replay.NodeCurvesB\r\n\x0b_robustness\"N\n\nNodeCurves\x12\x0f\n\x02id\x18\x01 \x01(\rH\x00\x88\x01\x01\x12\x0c\n\x04name\x18\x02 \x01(\t\x12\r\n\x05value\x18\x03 \x03(\x01\x12\x0b\n\x03now\x18\x04 \x03(\x01\x42\x05\n\x03_idb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1bspatial_replay/Curves.proto\x12\x0espatial_replay\"d\n\x06\x43urves\x12\x0c\n\x04time\x18\x01 \x03(\x01\x12;\n\x0especifications\x18\x02 \x03(\x0b\x32#.spatial_replay.SpecificationCurves\x12\x0f\n\x07summary\x18\x03 \x01(\t\"\x97\x01\n\x13SpecificationCurves\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06object\x18\x02 \x01(\t\x12\x0f\n\x07verdict\x18\x03 \x01(\t\x12\x17\n\nrobustness\x18\x04 \x01(\x01H\x00\x88\x01\x01\x12)\n\x05nodes\x18\x05 \x03(\x0b\x32\x1a.spatial_replay.NodeCurvesB\r\n\x0b_robustness\"N\n\nNodeCurves\x12\x0f\n\x02id\x18\x01 \x01(\rH\x00\x88\x01\x01\x12\x0c\n\x04name\x18\x02 \x01(\t\x12\r\n\x05value\x18\x03 \x03(\x01\x12\x0b\n\x03now\x18\x04 \x03(\x01\x42\x05\n\x03_idb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -32,9 +32,9 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'spatial_replay.Curves_pb2',
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_CURVES']._serialized_start=47
-  _globals['_CURVES']._serialized_end=130
-  _globals['_SPECIFICATIONCURVES']._serialized_start=133
-  _globals['_SPECIFICATIONCURVES']._serialized_end=284
-  _globals['_NODECURVES']._serialized_start=286
-  _globals['_NODECURVES']._serialized_end=364
+  _globals['_CURVES']._serialized_end=147
+  _globals['_SPECIFICATIONCURVES']._serialized_start=150
+  _globals['_SPECIFICATIONCURVES']._serialized_end=301
+  _globals['_NODECURVES']._serialized_start=303
+  _globals['_NODECURVES']._serialized_end=381
 # @@protoc_insertion_point(module_scope)

@@ -22,6 +22,9 @@ class Curves(google.protobuf.message.Message):
 
     TIME_FIELD_NUMBER: builtins.int
     SPECIFICATIONS_FIELD_NUMBER: builtins.int
+    SUMMARY_FIELD_NUMBER: builtins.int
+    summary: builtins.str
+    """What each comes to, the worst first, and the constants that differ from the text."""
     @property
     def time(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.float]:
         """Times that every curve has numbers for, in seconds after the log's first sample. A long log is thinned to
@@ -37,8 +40,9 @@ class Curves(google.protobuf.message.Message):
         *,
         time: collections.abc.Iterable[builtins.float] | None = ...,
         specifications: collections.abc.Iterable[global___SpecificationCurves] | None = ...,
+        summary: builtins.str = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["specifications", b"specifications", "time", b"time"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["specifications", b"specifications", "summary", b"summary", "time", b"time"]) -> None: ...
 
 global___Curves = Curves
 

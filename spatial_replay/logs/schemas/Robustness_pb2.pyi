@@ -19,39 +19,42 @@ else:
 
 DESCRIPTOR: google.protobuf.descriptor.FileDescriptor
 
-class _Verdict:
+class _Standing:
     ValueType = typing.NewType("ValueType", builtins.int)
     V: typing_extensions.TypeAlias = ValueType
 
-class _VerdictEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._EnumTypeWrapper[_Verdict.ValueType], builtins.type):
+class _StandingEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._EnumTypeWrapper[_Standing.ValueType], builtins.type):
     DESCRIPTOR: google.protobuf.descriptor.EnumDescriptor
-    VERDICT_UNSPECIFIED: _Verdict.ValueType  # 0
-    VERDICT_PENDING: _Verdict.ValueType  # 1
-    """The samples that may follow can still decide either way."""
-    VERDICT_SATISFIED: _Verdict.ValueType  # 2
+    STANDING_UNSPECIFIED: _Standing.ValueType  # 0
+    SATISFIED: _Standing.ValueType  # 28
     """Satisfied, whatever follows."""
-    VERDICT_VIOLATED: _Verdict.ValueType  # 3
+    HOLDS_SO_FAR: _Standing.ValueType  # 32
+    """The value is at least 0, and the samples that may follow can still decide either way."""
+    FAILS_SO_FAR: _Standing.ValueType  # 42
+    """The value is below 0, and the samples that may follow can still decide either way."""
+    VIOLATED: _Standing.ValueType  # 29
     """Violated, whatever follows."""
-    VERDICT_UNKNOWN: _Verdict.ValueType  # 4
-    """The log has ended, and what was not seen in it leaves the verdict open. Under the paper's semantics,
-    at any sample: the value is not determined.
+    UNKNOWN: _Standing.ValueType  # 47
+    """The value is not determined, and nothing is decided. In a final message: what was not seen leaves it open."""
+
+class Standing(_Standing, metaclass=_StandingEnumTypeWrapper):
+    """How a result or a node stands. Viewers colour a state by its number modulo 28: satisfied and holding are blue
+    and light blue there, failing is amber and violated is vermillion; unknown is the palest colour that they have,
+    which has no grey.
     """
 
-class Verdict(_Verdict, metaclass=_VerdictEnumTypeWrapper):
-    """What is known of a node."""
-
-VERDICT_UNSPECIFIED: Verdict.ValueType  # 0
-VERDICT_PENDING: Verdict.ValueType  # 1
-"""The samples that may follow can still decide either way."""
-VERDICT_SATISFIED: Verdict.ValueType  # 2
+STANDING_UNSPECIFIED: Standing.ValueType  # 0
+SATISFIED: Standing.ValueType  # 28
 """Satisfied, whatever follows."""
-VERDICT_VIOLATED: Verdict.ValueType  # 3
+HOLDS_SO_FAR: Standing.ValueType  # 32
+"""The value is at least 0, and the samples that may follow can still decide either way."""
+FAILS_SO_FAR: Standing.ValueType  # 42
+"""The value is below 0, and the samples that may follow can still decide either way."""
+VIOLATED: Standing.ValueType  # 29
 """Violated, whatever follows."""
-VERDICT_UNKNOWN: Verdict.ValueType  # 4
-"""The log has ended, and what was not seen in it leaves the verdict open. Under the paper's semantics,
-at any sample: the value is not determined.
-"""
-global___Verdict = Verdict
+UNKNOWN: Standing.ValueType  # 47
+"""The value is not determined, and nothing is decided. In a final message: what was not seen leaves it open."""
+global___Standing = Standing
 
 @typing.final
 class Robustness(google.protobuf.message.Message):
@@ -63,12 +66,17 @@ class Robustness(google.protobuf.message.Message):
     SPECIFICATION_FIELD_NUMBER: builtins.int
     OBJECT_FIELD_NUMBER: builtins.int
     NODES_FIELD_NUMBER: builtins.int
+    FINAL_FIELD_NUMBER: builtins.int
     time_ns: builtins.int
     """Time of the sample in nanoseconds; equal to the log time of the message."""
     specification: builtins.str
     """Name of the specification."""
     object: builtins.str
     """The object for which a template stands here; empty for a specification that is none."""
+    final: builtins.bool
+    """Whether this is about the finished log: lower and upper end and standing are those without any continuation.
+    Each specification has one such message, its last, besides that of its last sample.
+    """
     @property
     def nodes(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___NodeRobustness]:
         """In the order of their ids."""
@@ -80,9 +88,10 @@ class Robustness(google.protobuf.message.Message):
         specification: builtins.str = ...,
         object: builtins.str = ...,
         nodes: collections.abc.Iterable[global___NodeRobustness] | None = ...,
+        final: builtins.bool = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "time_ns", b"time_ns"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "nodes", b"nodes", "object", b"object", "specification", b"specification", "time_ns", b"time_ns"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "final", b"final", "nodes", b"nodes", "object", b"object", "specification", b"specification", "time_ns", b"time_ns"]) -> None: ...
     def WhichOneof(self, oneof_group: typing.Literal["_time_ns", b"_time_ns"]) -> typing.Literal["time_ns"] | None: ...
 
 global___Robustness = Robustness
@@ -99,7 +108,7 @@ class NodeRobustness(google.protobuf.message.Message):
     NOW_FIELD_NUMBER: builtins.int
     LOWER_FIELD_NUMBER: builtins.int
     UPPER_FIELD_NUMBER: builtins.int
-    VERDICT_FIELD_NUMBER: builtins.int
+    STANDING_FIELD_NUMBER: builtins.int
     id: builtins.int
     """Number of the node, from the root, 0, in the order of the text."""
     name: builtins.str
@@ -113,7 +122,7 @@ class NodeRobustness(google.protobuf.message.Message):
     semantics both are the value.
     """
     upper: builtins.float
-    verdict: global___Verdict.ValueType
+    standing: global___Standing.ValueType
     def __init__(
         self,
         *,
@@ -123,10 +132,10 @@ class NodeRobustness(google.protobuf.message.Message):
         now: builtins.float | None = ...,
         lower: builtins.float | None = ...,
         upper: builtins.float | None = ...,
-        verdict: global___Verdict.ValueType = ...,
+        standing: global___Standing.ValueType = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["_id", b"_id", "_lower", b"_lower", "_now", b"_now", "_upper", b"_upper", "_value", b"_value", "id", b"id", "lower", b"lower", "now", b"now", "upper", b"upper", "value", b"value"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_id", b"_id", "_lower", b"_lower", "_now", b"_now", "_upper", b"_upper", "_value", b"_value", "id", b"id", "lower", b"lower", "name", b"name", "now", b"now", "upper", b"upper", "value", b"value", "verdict", b"verdict"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["_id", b"_id", "_lower", b"_lower", "_now", b"_now", "_upper", b"_upper", "_value", b"_value", "id", b"id", "lower", b"lower", "name", b"name", "now", b"now", "standing", b"standing", "upper", b"upper", "value", b"value"]) -> None: ...
     @typing.overload
     def WhichOneof(self, oneof_group: typing.Literal["_id", b"_id"]) -> typing.Literal["id"] | None: ...
     @typing.overload
@@ -139,3 +148,119 @@ class NodeRobustness(google.protobuf.message.Message):
     def WhichOneof(self, oneof_group: typing.Literal["_value", b"_value"]) -> typing.Literal["value"] | None: ...
 
 global___NodeRobustness = NodeRobustness
+
+@typing.final
+class StandingUpdate(google.protobuf.message.Message):
+    """How all results stand after one sample, on the topic /spatial/standing: at most 50 times a second, and once more
+    when the log has ended.
+    """
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    TIME_NS_FIELD_NUMBER: builtins.int
+    RESULTS_FIELD_NUMBER: builtins.int
+    WORST_FIELD_NUMBER: builtins.int
+    NODES_FIELD_NUMBER: builtins.int
+    FINAL_FIELD_NUMBER: builtins.int
+    time_ns: builtins.int
+    """Time of the sample in nanoseconds; equal to the log time of the message, unless that is final."""
+    worst: builtins.str
+    """Name of the worst result: of those violated, the one that was so for certain first."""
+    final: builtins.bool
+    """Whether this is about the finished log."""
+    @property
+    def results(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___ResultStanding]:
+        """Every result, then the named specs that the results are made of, as far as a name is clear."""
+
+    @property
+    def nodes(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___NodeStanding]:
+        """The nodes of the worst result, in the order of their ids."""
+
+    def __init__(
+        self,
+        *,
+        time_ns: builtins.int | None = ...,
+        results: collections.abc.Iterable[global___ResultStanding] | None = ...,
+        worst: builtins.str = ...,
+        nodes: collections.abc.Iterable[global___NodeStanding] | None = ...,
+        final: builtins.bool = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "time_ns", b"time_ns"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "final", b"final", "nodes", b"nodes", "results", b"results", "time_ns", b"time_ns", "worst", b"worst"]) -> None: ...
+    def WhichOneof(self, oneof_group: typing.Literal["_time_ns", b"_time_ns"]) -> typing.Literal["time_ns"] | None: ...
+
+global___StandingUpdate = StandingUpdate
+
+@typing.final
+class ResultStanding(google.protobuf.message.Message):
+    """How one result stands."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    NAME_FIELD_NUMBER: builtins.int
+    STANDING_FIELD_NUMBER: builtins.int
+    ROBUSTNESS_FIELD_NUMBER: builtins.int
+    UNIT_FIELD_NUMBER: builtins.int
+    AUTOMATON_FIELD_NUMBER: builtins.int
+    name: builtins.str
+    """What a reader knows it by: "table_set", "calm(bike)", "laid in table_set". No two are equal."""
+    standing: global___Standing.ValueType
+    robustness: builtins.float
+    """Its robustness: the value of a result and of a spec that looks ahead, of others the present one; in its
+    unit, NaN where it is not determined.
+    """
+    unit: builtins.str
+    """Unit of the robustness; empty for footprint units."""
+    automaton: builtins.str
+    """Of a result with an automaton, its state in words."""
+    def __init__(
+        self,
+        *,
+        name: builtins.str = ...,
+        standing: global___Standing.ValueType = ...,
+        robustness: builtins.float | None = ...,
+        unit: builtins.str = ...,
+        automaton: builtins.str = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["_robustness", b"_robustness", "robustness", b"robustness"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_robustness", b"_robustness", "automaton", b"automaton", "name", b"name", "robustness", b"robustness", "standing", b"standing", "unit", b"unit"]) -> None: ...
+    def WhichOneof(self, oneof_group: typing.Literal["_robustness", b"_robustness"]) -> typing.Literal["robustness"] | None: ...
+
+global___ResultStanding = ResultStanding
+
+@typing.final
+class NodeStanding(google.protobuf.message.Message):
+    """One node with its text, for tables: numbers are rounded to four digits."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    TEXT_FIELD_NUMBER: builtins.int
+    NOW_FIELD_NUMBER: builtins.int
+    VALUE_FIELD_NUMBER: builtins.int
+    UNIT_FIELD_NUMBER: builtins.int
+    STANDING_FIELD_NUMBER: builtins.int
+    text: builtins.str
+    now: builtins.float
+    """Robustness at the newest sample; NaN where it is not determined."""
+    value: builtins.float
+    """Robustness at the first sample, of the samples seen so far; NaN where it is not determined."""
+    unit: builtins.str
+    """Unit of both; empty for footprint units."""
+    standing: global___Standing.ValueType
+    def __init__(
+        self,
+        *,
+        text: builtins.str = ...,
+        now: builtins.float | None = ...,
+        value: builtins.float | None = ...,
+        unit: builtins.str = ...,
+        standing: global___Standing.ValueType = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["_now", b"_now", "_value", b"_value", "now", b"now", "value", b"value"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_now", b"_now", "_value", b"_value", "now", b"now", "standing", b"standing", "text", b"text", "unit", b"unit", "value", b"value"]) -> None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_now", b"_now"]) -> typing.Literal["now"] | None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_value", b"_value"]) -> typing.Literal["value"] | None: ...
+
+global___NodeStanding = NodeStanding

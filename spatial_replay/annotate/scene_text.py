@@ -1,0 +1,112 @@
+"""What is written into the scene: which objects have labels, what arrows say, and the banner above it all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spatial_replay.annotate.robustness import standing_codes
+from spatial_replay.annotate.scene_entities import LABEL_LENGTH, Banner
+from spatial_replay.annotate.violations import EvaluatedResult, Violations
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.logs.schemas.Robustness_pb2 import (
+    FAILS_SO_FAR,
+    HOLDS_SO_FAR,
+    SATISFIED,
+    UNKNOWN,
+    VIOLATED,
+)
+from spatial_replay.palette import FAILING, HOLDING, NEGATIVE, NEUTRAL, POSITIVE
+
+
+def labelled_objects(
+    results: Sequence[EvaluatedResult],
+    names: Sequence[str],
+    is_present: NDArray[np.bool_],
+    robustness: Floats,
+) -> NDArray[np.bool_]:
+    """Return (S, objects), which objects have their names beside them.
+
+    Where a sample has very many, these are the ones that a specification names and those that violate it.
+    """
+    named = {each for result in results for own in result.requirements for each in own.objects}
+    is_chosen = (robustness < 0.0) | np.array([name in named for name in names], np.bool_)
+    is_crowded = is_present.sum(axis=1) >= _CROWD
+    is_first = np.cumsum(is_chosen, axis=1) <= _MOST_LABELS
+    return np.asarray(np.where(is_crowded[:, None], is_chosen & is_first, True))
+
+
+_CROWD: Final = 40
+_MOST_LABELS: Final = 20
+"""From so many objects on, not all have labels; the most that then have."""
+
+_MOST_TITLES: Final = 3
+_STANDING_WORDS: Final = MappingProxyType(
+    {
+        VIOLATED: ("violated", NEGATIVE),
+        FAILS_SO_FAR: ("failing so far", FAILING),
+        UNKNOWN: ("unknown", NEUTRAL),
+        HOLDS_SO_FAR: ("holding so far", HOLDING),
+        SATISFIED: ("satisfied", POSITIVE),
+    }
+)
+"""How results stand, the worst first, each in words and as a colour."""
+
+
+def banners_of(
+    results: Sequence[EvaluatedResult], times_ns: Integers, place: tuple[float, float], first: int
+) -> tuple[Integers, tuple[Banner | None, ...]]:
+    """Return which of some banners (S,) each message has: all results that it evaluates, the worst first.
+
+    Args:
+        first: the first message that has any.
+    """
+    titled = [each for each in results if each.title and len(each.block.times_ns)]
+    if not titled:
+        return np.zeros(len(times_ns), np.int64), (None,)
+    codes = np.zeros((len(times_ns), len(titled)), np.uint8)
+    for column, result in enumerate(titled):
+        own_ns = result.block.times_ns
+        at = np.minimum(np.searchsorted(own_ns, times_ns), len(own_ns) - 1)
+        now = standing_codes(result.block.series[:1], final=result.is_final)[0, at]
+        codes[:, column] = np.where((own_ns[at] == times_ns) | result.is_final, now, 0)
+    codes[:first] = 0
+    kinds, which = np.unique(codes, axis=0, return_inverse=True)
+    return which.reshape(-1), tuple(_banner([each.title for each in titled], kind, place) for kind in kinds)
+
+
+def _banner(titles: Sequence[str], codes: NDArray[np.uint8], place: tuple[float, float]) -> Banner | None:
+    parts, colour = [], None
+    for code, (words, hue) in _STANDING_WORDS.items():
+        own = [title for title, each in zip(titles, codes.tolist(), strict=True) if each == code]
+        if own:
+            few = own if len(own) <= _MOST_TITLES else [*own[:_MOST_TITLES], "…"]
+            parts.append(f"{len(own)} {words}: {', '.join(few)}" if len(titles) > 1 else f"{own[0]} {words}")
+            colour = colour or hue
+    return None if colour is None else Banner("; ".join(parts), colour, place)
+
+
+def causes_of(results: Sequence[EvaluatedResult], found: Violations) -> tuple[tuple[str, ...], Integers]:
+    """Return what decides violations, in words, and which of them (S,) decides each."""
+    pairs, which = np.unique(np.stack([found.result, found.leaf], axis=1), axis=0, return_inverse=True)
+    texts = []
+    for result, leaf in pairs.tolist():
+        known = results[result].leaf_pairs if result >= 0 and leaf >= 0 else None
+        text = "" if known is None else known.texts[leaf]
+        texts.append(text if len(text) <= _LONGEST_CAUSE else f"{text[: _LONGEST_CAUSE - 1]}…")
+    return tuple(texts), which.reshape(-1)
+
+
+_LONGEST_CAUSE: Final = 60
+
+
+def robustness_text(number: float) -> str:
+    """Return a number with three digits, or as many as fit."""
+    text = f"{number:.3g}"
+    if len(text) > LABEL_LENGTH:
+        text = next(text for digits in (2, 1) if len(text := f"{number:.{digits}g}") <= LABEL_LENGTH)
+    return text

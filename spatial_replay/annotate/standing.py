@@ -1,0 +1,220 @@
+"""How all results stand, in one message → /spatial/standing.
+
+Viewers need no other topic of numbers: one message has every result, and of the worst one every node.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from spatial_replay.annotate.automaton_state import AutomatonRun
+from spatial_replay.annotate.robustness import Codes, standing_codes
+from spatial_replay.annotate.scene_update import spaced
+from spatial_replay.annotate.specification import ReportedTree, unit_of
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.logs.objects.wire import WireTemplate, payloads_of
+from spatial_replay.logs.schemas.Robustness_pb2 import (
+    FAILS_SO_FAR,
+    HOLDS_SO_FAR,
+    SATISFIED,
+    UNKNOWN,
+    VIOLATED,
+    StandingUpdate,
+)
+from spatial_replay.monitor.online.operators import looks_ahead
+from spatial_replay.monitor.stream import SeriesBlock
+from spatial_replay.spec.format import format_formula
+from spatial_replay.spec.formula import Formula, iter_nodes
+from spatial_replay.trace.sample import LATEST_NS
+
+_MOST_ROWS: Final = 60
+"""The most nodes of the worst result: a table of more is no longer looked at."""
+
+_MOST_TEMPLATES: Final = 1024
+
+_RANKS: Final = np.full(256, 2, np.uint8)
+for _rank, _code in enumerate((VIOLATED, FAILS_SO_FAR, UNKNOWN, HOLDS_SO_FAR, SATISFIED)):
+    _RANKS[_code] = _rank
+_RANKS.flags.writeable = False
+"""How bad each number of `Standing` is; 0 is the worst."""
+
+
+def worst_results(codes: Codes, violated_ns: Integers) -> Integers:
+    """Return (S,) the worst of R results: of those violated, the one that was so for certain first.
+
+    Robustness of different results is not compared: their units may differ.
+
+    Args:
+        codes: (R, S), numbers of `Standing`.
+        violated_ns: (R,), since when each is violated whatever comes, or `LATEST_NS`.
+    """
+    ranks = _RANKS[codes]
+    since_ns = np.where(codes == VIOLATED, violated_ns[:, None], LATEST_NS)
+    order = np.where(ranks == ranks.min(axis=0), since_ns - 1, LATEST_NS)
+    return np.asarray(order.argmin(axis=0), np.int64)
+
+
+class StandingEncoder:
+    """Encodes how results stand, sample after sample.
+
+    Its state is the last numbers of each result. Cutting the samples into blocks changes no message.
+    """
+
+    def __init__(self, trees: Sequence[ReportedTree], runs: Sequence[AutomatonRun | None]) -> None:
+        """Start before the first sample.
+
+        Args:
+            runs: of each tree, the run of its automaton, which takes in the same samples.
+        """
+        self._trees, self._runs = trees, runs
+        self._parts = [named_parts(tree) for tree in trees]
+        self._nodes = [[node for _, _, node in iter_nodes(tree.formula)] for tree in trees]
+        self._last = [np.full((len(nodes), 4, 1), np.nan) for nodes in self._nodes]
+        self._words = [""] * len(trees)
+        self._violated_ns = np.full(len(trees), LATEST_NS)
+        self._written_ns: int | None = None
+        self._templates: dict[tuple[int, tuple[str, ...], bool], WireTemplate] = {}
+
+    def encode(self, times_ns: Integers, blocks: Sequence[SeriesBlock]) -> tuple[Integers, list[bytes]]:
+        """Take in the next samples; return the times and contents of their messages.
+
+        Args:
+            times_ns: (T,), of all samples.
+            blocks: of each tree; an object's result may have fewer samples.
+        """
+        chosen = spaced(times_ns, self._written_ns)
+        shown_ns = times_ns[chosen]
+        series, words = [], []
+        for index, block in enumerate(blocks):
+            at = np.searchsorted(block.times_ns, shown_ns, side="right")
+            series.append(np.concatenate([self._last[index], block.series], axis=2)[:, :, at])
+            words.append(self._described(index, block, at))
+        self.pass_over(blocks)
+        if not len(chosen):
+            return shown_ns, []
+        self._written_ns = int(shown_ns[-1])
+        return shown_ns, self._messages(shown_ns, series, np.array(words, object).reshape(len(words), -1))
+
+    def pass_over(self, blocks: Sequence[SeriesBlock]) -> None:
+        """Take in the next samples without a message."""
+        for index, block in enumerate(blocks):
+            if not len(block.times_ns):
+                continue
+            self._last[index] = block.series[:, :, -1:].copy()
+            run = self._runs[index]
+            if run is not None:
+                self._words[index] = run.latest_words
+            certain = block.series[0, 3] < 0.0
+            if self._violated_ns[index] == LATEST_NS and certain.any():
+                self._violated_ns[index] = block.times_ns[certain.argmax()]
+
+    def end(self, time_ns: int, finals: Sequence[Floats]) -> bytes:
+        """Return the message about the finished log.
+
+        Args:
+            time_ns: of the last sample.
+            finals: for each tree, (N, 2), lower and upper end of each node's value over the finished log.
+        """
+        series = []
+        for last, final in zip(self._last, finals, strict=True):
+            ended = last.copy()
+            ended[:, 2:, 0] = final
+            series.append(ended)
+        words = np.array(self._words, object)[:, None]
+        [payload] = self._messages(np.array([time_ns], np.int64), series, words, final=True)
+        return payload
+
+    def _described(self, index: int, block: SeriesBlock, at: Integers) -> list[str]:
+        """Return (S,) the state of a result's automaton in words, `at` samples into a block."""
+        run = self._runs[index]
+        if run is None:
+            return [""] * len(at)
+        of_block = run.words() if len(block.times_ns) else []
+        every = [self._words[index], *of_block]
+        return [every[place] for place in at.tolist()]
+
+    def _messages(
+        self, times_ns: Integers, series: Sequence[Floats], words: np.ndarray, *, final: bool = False
+    ) -> list[bytes]:
+        codes = [standing_codes(each, final=final) for each in series]
+        worst = worst_results(np.array([each[0] for each in codes]), self._violated_ns)
+        marks, numbers = self._rows(series, codes)
+        payloads = [b""] * len(times_ns)
+        groups: dict[tuple[int, tuple[str, ...]], list[int]] = {}
+        for sample, key in enumerate(zip(worst.tolist(), map(tuple, words.T.tolist()), strict=True)):
+            groups.setdefault(key, []).append(sample)
+        for (which, said), members in groups.items():
+            rows = series[which][:_MOST_ROWS, :, members]
+            own = rounded(rows[:, [1, 0]]).reshape(-1, len(members))
+            filled = np.concatenate([numbers[:, members], own]).T
+            stamps = times_ns[members].astype(np.uint64)[:, None]
+            bits = np.concatenate([stamps, np.ascontiguousarray(filled).view(np.uint64)], axis=1)
+            own_marks = codes[which][:_MOST_ROWS, members]
+            template = self._template(which, said, final)
+            encoded = template.fill(bits, np.concatenate([marks[:, members], own_marks]).T)
+            for sample, payload in zip(members, payloads_of(encoded), strict=True):
+                payloads[sample] = payload
+        return payloads
+
+    def _rows(self, series: Sequence[Floats], codes: Sequence[Codes]) -> tuple[Codes, Floats]:
+        """Return the standing (E, S) and the robustness (E, S) of each entry of `results`."""
+        marks = [each[0] for each in codes]
+        numbers = [each[0, 0] for each in series]
+        for own, numbered, parts in zip(codes, series, self._parts, strict=True):
+            for identifier, node in parts.values():
+                marks.append(own[identifier])
+                numbers.append(numbered[identifier, 0 if looks_ahead(node) else 1])
+        return np.array(marks, np.uint8), np.array(numbers)
+
+    def _template(self, worst: int, words: tuple[str, ...], final: bool) -> WireTemplate:
+        key = worst, words, final
+        if key not in self._templates:
+            if len(self._templates) >= _MOST_TEMPLATES:
+                self._templates.clear()
+            self._templates[key] = WireTemplate.of(self._message(*key))
+        return self._templates[key]
+
+    def _message(self, worst: int, words: tuple[str, ...], final: bool) -> StandingUpdate:
+        """Return a message with a value in every field that differs between samples."""
+        message = StandingUpdate(time_ns=1, worst=self._trees[worst].title, final=final)
+        for tree, said in zip(self._trees, words, strict=True):
+            unit = unit_of(tree.formula, {})
+            message.results.add(name=tree.title, standing=UNKNOWN, robustness=1.0, unit=unit, automaton=said)
+        for tree, parts in zip(self._trees, self._parts, strict=True):
+            for name, (_, node) in parts.items():
+                unit = unit_of(node, {})
+                message.results.add(name=part_title(name, tree), standing=UNKNOWN, robustness=1.0, unit=unit)
+        for node in self._nodes[worst][:_MOST_ROWS]:
+            unit = unit_of(node, {})
+            text = format_formula(node) if node.name is None else node.name
+            message.nodes.add(text=text, now=1.0, value=1.0, unit=unit, standing=UNKNOWN)
+        return message
+
+
+def named_parts(tree: ReportedTree) -> dict[str, tuple[int, Formula]]:
+    """Return the names that exactly one node below the root has, each with its id and node."""
+    named = [(node.name, identifier, node) for identifier, _, node in iter_nodes(tree.formula) if node.name]
+    names = [name for name, _, _ in named]
+    return {
+        name: (identifier, node) for name, identifier, node in named if identifier and names.count(name) == 1
+    }
+
+
+def part_title(name: str, tree: ReportedTree) -> str:
+    """Return what a named spec within a result is known by."""
+    return f"{name} in {tree.title}"
+
+
+def rounded(numbers: Floats) -> Floats:
+    """Return numbers with four digits, so that viewers print them short; very large and small ones stay."""
+    size = np.abs(numbers)
+    is_usual = (size >= 1e-15) & (size < 1e15)
+    digits = 3.0 - np.floor(np.log10(np.where(is_usual, size, 1.0)))
+    power = 10.0 ** np.abs(digits)
+    usual = np.where(is_usual, numbers, 0.0)
+    # quotients and products of whole numbers, so that the result is the number nearest to those digits
+    shown = np.where(digits < 0.0, np.round(usual / power) * power, np.round(usual * power) / power)
+    return np.asarray(np.where(is_usual, shown, numbers))

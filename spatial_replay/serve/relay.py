@@ -1,0 +1,195 @@
+"""The door of the server: connections of viewers, each passed on as its viewer understands it.
+
+The Foxglove SDK speaks `foxglove.sdk.v1` alone, and sends the state of the playback to every viewer. Viewers
+of `foxglove.websocket.v1`, such as Lichtblick, do not know that message, and need not know that name. So
+connections come in here: the name is translated, and such a viewer gets the state only once it has asked for
+playback itself.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from collections.abc import Coroutine
+from contextlib import suppress
+from threading import Thread
+from typing import Any, Final, NamedTuple
+
+OLD_PROTOCOL: Final = "foxglove.websocket.v1"
+PROTOCOL: Final = "foxglove.sdk.v1"
+
+_OFFER: Final = re.compile(rb"^sec-websocket-protocol:[ \t]*(.*?)[ \t]*\r\n", re.IGNORECASE | re.MULTILINE)
+_MOST_HEAD: Final = 1 << 16
+_PIECE: Final = 1 << 16
+_PATIENCE_S: Final = 10.0
+"""How long a viewer may take for its request, and to read what is waiting for it."""
+
+_BINARY: Final = 2
+_CONTROL_REQUEST: Final = 3
+_PLAYBACK_STATE: Final = 5
+"""The first byte of a viewer's request for playback, and of the message with its state."""
+
+
+class Relay:
+    """Listens for viewers and connects each to the server behind it, on a thread of its own."""
+
+    def __init__(self, host: str, port: int, behind: int) -> None:
+        """Listen.
+
+        Args:
+            port: 0 for any that is free.
+            behind: the port of the server on this machine.
+
+        Raises:
+            OSError: nothing can listen there.
+        """
+        if not host:
+            raise OSError("it is empty")
+        self._behind = behind
+        self._loop = asyncio.new_event_loop()
+        self._connections: set[asyncio.Task[None]] = set()
+        self._thread = Thread(target=self._loop.run_forever, name="relay", daemon=True)
+        self._thread.start()
+        listening = asyncio.start_server(self._accept, host, port, limit=_MOST_HEAD)
+        try:
+            self._server = asyncio.run_coroutine_threadsafe(listening, self._loop).result()
+        except BaseException:
+            self._end()
+            raise
+        self.port: int = self._server.sockets[0].getsockname()[1]
+
+    def stop(self) -> None:
+        """Close all connections, and listen no more."""
+        asyncio.run_coroutine_threadsafe(self._close(), self._loop).result()
+        self._end()
+
+    def _end(self) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    async def _close(self) -> None:
+        self._server.close()
+        for task in self._connections:
+            task.cancel()
+        await asyncio.gather(*self._connections, return_exceptions=True)
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._connections.add(task)
+        try:
+            await self._connect(reader, writer)
+        except (OSError, EOFError, TimeoutError, ValueError):
+            pass  # the viewer or the server is gone, or what came is no request
+        finally:
+            self._connections.discard(task)
+            writer.transport.abort()
+
+    async def _connect(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        async with asyncio.timeout(_PATIENCE_S):
+            request = await reader.readuntil(b"\r\n\r\n")
+        offered = {each.strip() for found in _OFFER.findall(request) for each in found.decode().split(",")}
+        is_old = OLD_PROTOCOL in offered
+        if is_old and PROTOCOL not in offered:
+            request = _OFFER.sub(f"Sec-WebSocket-Protocol: {PROTOCOL}\r\n".encode(), request)
+        inner, outer = await asyncio.open_connection("127.0.0.1", self._behind, limit=_MOST_HEAD)
+        try:
+            outer.write(request)
+            response = await inner.readuntil(b"\r\n\r\n")
+            if is_old and PROTOCOL not in offered:
+                response = response.replace(PROTOCOL.encode(), OLD_PROTOCOL.encode())
+            writer.write(response)
+            viewer = _Viewer(understands_state=not is_old)
+            await _until_one_ends(_from_viewer(reader, outer, viewer), _to_viewer(inner, writer, viewer))
+            # what the server said last, such as why it closes
+            await _drained(writer)
+        finally:
+            outer.transport.abort()
+
+
+class _Viewer:
+    """What is known of a viewer: whether it understands the state of the playback."""
+
+    def __init__(self, *, understands_state: bool) -> None:
+        self.understands_state = understands_state
+
+
+async def _until_one_ends(*both: Coroutine[Any, Any, None]) -> None:
+    tasks = [asyncio.create_task(each) for each in both]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            with suppress(OSError, EOFError, TimeoutError):
+                task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _from_viewer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, viewer: _Viewer) -> None:
+    """Pass on what a viewer sends, up to its end."""
+    while not viewer.understands_state:
+        frame = await _read_head(reader)
+        viewer.understands_state = frame.kind == (_BINARY, _CONTROL_REQUEST)
+        await _pass_on(frame, reader, writer)
+    await _copy(reader, writer)
+
+
+async def _to_viewer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, viewer: _Viewer) -> None:
+    """Pass on what the server sends, up to its end."""
+    while not viewer.understands_state:
+        frame = await _read_head(reader)
+        is_known = viewer.understands_state or frame.kind != (_BINARY, _PLAYBACK_STATE)
+        await _pass_on(frame, reader, writer if is_known else None)
+    await _copy(reader, writer)
+
+
+class _Frame(NamedTuple):
+    """The beginning of a WebSocket frame, and how many bytes follow; neither side splits its messages.
+
+    Attributes:
+        kind: its opcode, and the first byte of its content, -1 if it has none.
+    """
+
+    begin: bytes
+    rest: int
+    kind: tuple[int, int]
+
+
+async def _read_head(reader: asyncio.StreamReader) -> _Frame:
+    begin = await reader.readexactly(2)
+    is_masked, length = begin[1] & 0x80, begin[1] & 0x7F
+    if length >= 126:
+        begin += await reader.readexactly(2 if length == 126 else 8)
+        length = int.from_bytes(begin[2:], "big")
+    mask = await reader.readexactly(4) if is_masked else b"\0"
+    first = await reader.readexactly(min(length, 1))
+    content = first[0] ^ mask[0] if first else -1
+    begin += (mask if is_masked else b"") + first
+    return _Frame(begin, length - len(first), (begin[0] & 0x0F, content))
+
+
+async def _pass_on(frame: _Frame, reader: asyncio.StreamReader, writer: asyncio.StreamWriter | None) -> None:
+    """Pass on a frame, or leave it out."""
+    if writer is not None:
+        writer.write(frame.begin)
+    left = frame.rest
+    while left:
+        piece = await reader.readexactly(min(left, _PIECE))
+        left -= len(piece)
+        if writer is not None:
+            writer.write(piece)
+            await _drained(writer)
+
+
+async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    while piece := await reader.read(_PIECE):
+        writer.write(piece)
+        await _drained(writer)
+
+
+async def _drained(writer: asyncio.StreamWriter) -> None:
+    async with asyncio.timeout(_PATIENCE_S):
+        await writer.drain()
