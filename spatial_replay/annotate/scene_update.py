@@ -277,8 +277,8 @@ class SceneEncoder:
             if layout not in templates:
                 templates[layout] = make_template(layout, self._drawn, _LIFT * scale)
             words = self._words(layout, samples, content, *shades, scale)
-            rows = templates[layout].fill(times_ns[samples], words)
-            for sample, payload in zip(samples.tolist(), payloads_of(rows), strict=True):
+            encoded = templates[layout].fill(times_ns[samples], words)
+            for sample, payload in zip(samples.tolist(), payloads_of(encoded), strict=True):
                 payloads[sample] = payload
         last = content.forms[-1] >= _FIRST_FORM
         after = SceneState(

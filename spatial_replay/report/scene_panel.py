@@ -43,6 +43,7 @@ class SceneCollector:
     def __init__(self) -> None:
         self._frames: list[tuple[int, SceneFrame]] = []
         self._count, self._stride, self._corners = 0, 1, 0
+        self._last_ns: int | None = None
 
     def add(self, frames: SceneFrames) -> None:
         """Take in what the next messages show."""
@@ -50,7 +51,16 @@ class SceneCollector:
             self.add_frame(time_ns, partial(frames.frame, index))
 
     def add_frame(self, time_ns: int, frame_of: Callable[[], SceneFrame]) -> None:
-        """Take in the next frame, which is made only if it has a place."""
+        """Take in the next frame, which is made only if it has a place.
+
+        One of the same time as the frame before, that of the finished log, is the last and replaces it.
+        """
+        if time_ns == self._last_ns:
+            while self._frames and self._frames[-1][0] == time_ns:
+                self._frames.pop()
+            self._frames.append((time_ns, frame_of()))
+            return
+        self._last_ns = time_ns
         if self._count % self._stride == 0:
             frame = frame_of()
             self._frames.append((time_ns, frame))
