@@ -193,7 +193,9 @@ class LiveAssembler:
     def _upto_ns(self, now_s: float) -> int:
         """Return the time up to which nothing is waited for any more."""
         newest_ns = self._assembler.newest_ns
-        upto_ns = min((self._latest_ns[topic] for topic in self._in_step), default=newest_ns)
+        # several programs send transforms, often at the same time; another topic has one message at a time
+        reached = (self._latest_ns[topic] - (topic in self._moving) for topic in self._in_step)
+        upto_ns = min(reached, default=newest_ns)
         if self._plan.by_log_time:
             upto_ns = max(upto_ns, newest_ns - 1)
         while self._silent and self._silent[0][0] <= now_s:

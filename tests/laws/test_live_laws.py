@@ -27,12 +27,16 @@ spec near = (everyone[-{samples}] dist b <= 3) S[0, {duration}ms] (a oriented[0.
 
 @st.composite
 def crowds(draw, max_size=10):
-    """Samples in which objects appear and vanish, change their shape and class, and new names come up."""
+    """Samples in which objects appear and vanish, change their shape and class, new names come up, and
+    some are there, though not known where."""
     shapes = draw(st.lists(tracked_objects(certain=draw(st.booleans())), min_size=2, max_size=5))
     time_ns, samples = draw(st.integers(0, 10**9)), []
     for _ in range(draw(st.integers(1, max_size))):
         objects = {name: draw(st.sampled_from(shapes)) for name in sorted(draw(ANYONE))}
-        samples.append(Sample(time_ns, objects, {"battery": 1.5} if draw(st.booleans()) else {}))
+        hidden = draw(ANYONE) if draw(st.booleans()) else ()
+        unknown = {name: each.class_name for name, each in objects.items() if name in hidden}
+        known = {name: each for name, each in objects.items() if name not in hidden}
+        samples.append(Sample(time_ns, known, {"battery": 1.5} if draw(st.booleans()) else {}, unknown))
         time_ns += draw(st.sampled_from([100, 250, 400])) * 10**6
     return samples
 

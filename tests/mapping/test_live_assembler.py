@@ -1,0 +1,109 @@
+"""Samples while their messages come: those of the log, or unknown."""
+
+from __future__ import annotations
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapping.feeding import SECOND, Feed, make, pose_stamped, tf, transform
+from spatial_replay import Trace
+from spatial_replay.mapping import LiveAssembler, ReadingPlan, parse_mapping
+
+MS = 10**6
+TWO = """
+topics:
+  /a: {shape: {disc: 1}}
+  /b: {shape: {disc: 1}}
+sample: {topic: /a}
+max_age: 300ms
+"""
+FRAMED = """
+fixed_frame: map
+topics: {/a: {shape: {disc: 1}}}
+"""
+
+
+def live(mapping: str, feed: Feed, *, max_delay_s: float = 0.2) -> tuple[LiveAssembler, Feed]:
+    plan = ReadingPlan.of(parse_mapping(mapping, "test.yaml"), feed.topics())
+    return LiveAssembler(plan, feed.decoder, name="robot", max_delay_s=max_delay_s), feed
+
+
+@st.composite
+def feeds(draw: st.DrawFn) -> tuple[Feed, list[int]]:
+    """Messages of two topics in the order of time, often at equal times, and how they are divided."""
+    feed, time_ns = Feed(), SECOND
+    for _ in range(draw(st.integers(1, 10))):
+        for topic in draw(st.sampled_from([["/a"], ["/b"], ["/a", "/b"], ["/b", "/a"]])):
+            feed.add(topic, time_ns, pose_stamped(draw(st.integers(0, 3)), 0))
+        time_ns += draw(st.sampled_from([1, 20, 400])) * MS
+    count = len(feed.messages)
+    feed.add("/a", time_ns + SECOND, pose_stamped(0, 0)).add("/b", time_ns + SECOND, pose_stamped(0, 0))
+    return feed, sorted(draw(st.sets(st.integers(1, count), max_size=6)))
+
+
+@settings(max_examples=40)
+@given(drawn=feeds(), every=st.booleans())
+def test_a_log_gives_the_same_samples_while_it_comes(drawn: tuple[Feed, list[int]], every: bool) -> None:
+    feed, cuts = drawn
+    mapping = TWO.replace("{topic: /a}", "{every: 70ms}") if every else TWO
+    assembler, _ = live(mapping, feed)
+    raw = feed.raw()
+    traces = []
+    for begin, end in zip([0, *cuts], [*cuts, len(raw)], strict=True):
+        # in its own time, but that what has one time comes in one moment
+        part = raw[begin:end]
+        traces.append(assembler.add(part, part[-1].log_time_ns / SECOND if part else 0.0))
+    traces.append(assembler.finish())
+    assert Trace.concatenate(traces) == make(mapping, feed).trace
+
+
+def test_a_sample_is_there_with_the_message_that_completes_it() -> None:
+    feed = Feed().add("/b", SECOND, pose_stamped(0, 0)).add("/a", SECOND + MS, pose_stamped(1, 0))
+    feed.add("/b", SECOND + 2 * MS, pose_stamped(2, 0))
+    assembler, _ = live(TWO, feed)
+    first, second, third = feed.raw()
+    assert len(assembler.add([first], 1.0)) == 0
+    assert len(assembler.add([second], 1.001)) == 0
+    assert len(assembler.add([third], 1.0012)) == 1
+    assembler, _ = live(TWO, feed)
+    assembler.add([first, second], 1.0)
+    due_s = assembler.due_s()
+    assert due_s is not None and due_s <= 1.002
+    assert len(assembler.add([], due_s)) == 1
+
+
+def test_an_observation_waits_for_its_transform_and_then_is_unknown() -> None:
+    feed = Feed()
+    for tick in range(3):
+        at = SECOND + tick * 100 * MS
+        feed.add("/tf", at, tf(transform("map", "cam", (tick, 0, 0), time_ns=at)))
+        feed.add("/a", at + 10 * MS, pose_stamped(0, 0, "cam", time_ns=at + 5 * MS))
+    assembler, _ = live(FRAMED, feed)
+    raw = feed.raw()
+    # the first transform lies before the stamp: the next one makes it known
+    assert len(assembler.add(raw[:2], 1.0)) == 0
+    (placed,) = assembler.add(raw[2:3], 1.1).samples()
+    assert set(placed.objects) == {"a"} and assembler.overdue == 0
+    assert len(assembler.add(raw[3:4], 1.11)) == 0
+    assert len(assembler.add([], 1.3)) == 0
+    assert assembler.due_s() == 1.11 + 0.2
+    (late,) = assembler.add([], 1.31).samples()
+    assert (dict(late.objects), dict(late.unknown)) == ({}, {"a": None})
+    assert (assembler.overdue, assembler.overdue_frame) == (1, ("/a", "cam"))
+
+
+def test_what_is_lost_is_unknown_until_it_is_reported_again() -> None:
+    feed = Feed().add("/b", SECOND, pose_stamped(0, 0)).add("/a", SECOND + MS, pose_stamped(1, 0))
+    feed.add("/a", 2 * SECOND, pose_stamped(1, 0)).add("/b", 2 * SECOND + MS, pose_stamped(1, 0))
+    feed.add("/a", 2 * SECOND + 2 * MS, pose_stamped(1, 0)).add("/b", 3 * SECOND, pose_stamped(1, 0))
+    assembler, _ = live(TWO.replace("300ms", "forever"), feed)
+    raw = feed.raw()
+    assembler.add(raw[:2], 1.0)
+    *_, lost = assembler.lose(["/a", "/b"], 1.5).samples()
+    assert (lost.time_ns, dict(lost.objects), set(lost.unknown)) == (SECOND + MS + 1, {}, {"a", "b"})
+    assert len(assembler.lose(["/a", "/b"], 1.6)) == 0
+    after = [each for raw_one in raw[2:] for each in assembler.add([raw_one], 2.0).samples()]
+    assert [(set(each.objects), set(each.unknown)) for each in after] == [
+        ({"a"}, {"b"}),
+        ({"a", "b"}, set()),
+    ]
