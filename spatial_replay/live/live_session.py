@@ -27,6 +27,7 @@ from spatial_replay.live.objects_topic import ObjectsAssembler
 from spatial_replay.logs.messages import Channel
 from spatial_replay.logs.topics import OBJECTS, is_kept
 from spatial_replay.mapping import LiveAssembler, LogMapping, ReadingPlan, load_mapping
+from spatial_replay.mapping.live_assembler import rehearse
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
 from spatial_replay.monitor.monitor import Ending, Monitor
 from spatial_replay.recording.changes import VerdictChanges
@@ -87,6 +88,7 @@ class LiveSession:
         self._max_delay_s, self._dead_man_s = max_delay_s, dead_man_s
         self._monitors = [Monitor(file) for file in self.files]
         self._changes = VerdictChanges(self.files)
+        rehearse()
         self._assembler: LiveAssembler | ObjectsAssembler | None = None
         self._channels: tuple[Channel, ...] = ()
         self._planned: dict[str, Channel] = {}

@@ -20,10 +20,11 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from spatial_replay.bags.columns import Message
-from spatial_replay.bags.topic import Decoder
+from spatial_replay.bags.topic import Decoder, Topic
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.mapping.assemble import Assembler
+from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.mapping.topic_reader import MISFITS, TopicReader
 from spatial_replay.trace.trace import Trace
@@ -33,6 +34,36 @@ _MOMENT_S: Final = 0.001
 
 _MOST_HELD: Final = 4_096
 """Observations that may wait for transforms at once; beyond that, none does."""
+
+
+_TRIAL = """
+fixed_frame: map
+topics:
+  /boxes: {objects: "of[*]", name: "box{id}", position: [x, y], yaw: yaw, shape: {box: [1, 1, 1]}, uncertainty: 0.1}
+  /discs: {name: disc, position: [x, y], shape: {disc: 1}}
+  /rings: {name: ring, polygon: corners, max_age: 10ms}
+  /charge: {signals: {charge: value}}
+sample: {topic: /boxes}
+"""
+
+
+def rehearse() -> None:
+    """Assemble a few samples of messages made up, so that no real one waits for code to be compiled."""
+    ring = [[0, 0], [2, 0], [2, 2], [1, 1]]
+    contents: dict[str, Any] = {
+        "/boxes": {"frame_id": "map", "of": [{"id": each, "x": each, "y": 0, "yaw": each} for each in (1, 2)]},
+        "/discs": {"x": 0, "y": 0},
+        "/rings": {"corners": [{"x": x, "y": y} for x, y in ring]},
+        "/charge": {"value": 1},
+    }
+    topics = [Topic(topic, "trial", "json") for topic in contents]
+    plan = ReadingPlan.of(parse_mapping(_TRIAL), topics)
+    assembler = LiveAssembler(plan, lambda topic: lambda _: contents[topic], name="", max_delay_s=1.0)
+    for tick in range(4):
+        for topic in contents:
+            assembler.add([Message(topic, tick * 10**9, tick * 10**9, 0, b"")], tick)
+    assembler.lose(tuple(contents), 5.0)
+    assembler.finish()
 
 
 class _Held(NamedTuple):
