@@ -65,8 +65,10 @@ export interface RobustnessMessage {
     readonly now?: number;
     readonly lower?: number;
     readonly upper?: number;
-    readonly verdict: number;
+    readonly standing: number;
   }[];
+  /** Whether this is about the finished log, which no more samples follow. */
+  readonly final: boolean;
 }
 
 export interface AutomatonStateMessage {

@@ -25,7 +25,8 @@ const SIGNS: Record<string, (operand: number) => number[]> = {
   xor: () => [1, -1],
   "<->": () => [1, -1],
 };
-const VERDICTS: Status[] = ["unknown", "pending", "satisfied", "violated", "unknown"];
+/** How nodes stand, by the numbers of spatial_replay.Standing. */
+const STANDING: Record<number, Status> = { 28: "satisfied", 29: "violated", 32: "holding", 42: "pending", 47: "unknown" };
 
 export class SpecificationView implements View {
   readonly topics = [EVENTS, ROBUSTNESS];
@@ -149,8 +150,7 @@ class TreeNode implements DrawnNode {
   }
 
   get verdict(): Status {
-    const status = VERDICTS[this.last[this.index]!] ?? "unknown";
-    return status === "pending" && this.final >= 0 ? "holding" : status;
+    return STANDING[this.last[this.index]!] ?? "unknown";
   }
 
   get value(): string {
@@ -224,12 +224,16 @@ class Tree {
   take(time: number, message: RobustnessMessage): void {
     const { name, object, nodes } = this.message;
     if (message.specification !== name || message.object !== object || message.nodes.length !== nodes.length) return;
+    if (message.final) {
+      message.nodes.forEach((node, index) => { this.last[index] = node.standing; });
+      return;
+    }
     const numbers = new Float64Array(4 * nodes.length);
     message.nodes.forEach((node, index) => {
       numbers.set([node.value ?? NaN, node.now ?? NaN, node.lower ?? NaN, node.upper ?? NaN], 4 * index);
     });
     const place = this.series.put(time, numbers);
-    if (place >= this.series.samples - 1) message.nodes.forEach((node, index) => { this.last[index] = node.verdict; });
+    if (place >= this.series.samples - 1) message.nodes.forEach((node, index) => { this.last[index] = node.standing; });
   }
 
   /** Shows the numbers at a time; returns the nodes on the path to the atom that decides. */

@@ -115,15 +115,14 @@ class SceneState:
     templates: Mapping[SceneLayout, SceneTemplate] = field(default_factory=lambda: MappingProxyType({}))
 
 
-def scene_scale(trace: Trace) -> float | None:
-    """Return the scale of a run's scene (see `SceneState`); None if no message shows an object.
+def scene_start(trace: Trace, regions: Mapping[str, Outline]) -> SceneState:
+    """Return the scale and the banner's place of a run's scene (see `SceneState`), before its first message.
 
     Args:
         trace: from the first sample on.
     """
     rows = trace.rows[spaced(trace.times_ns, None)]
-    is_shown = (rows >= 0).any(axis=1)
-    return _scale_of(trace, rows[int(is_shown.argmax())]) if is_shown.any() else None
+    return SceneEncoder(regions).scaled(SceneState(), trace, rows)[0]
 
 
 class DrawnEntity(NamedTuple):
@@ -260,7 +259,7 @@ class SceneEncoder:
         times_ns = trace.times_ns[written]
         if not len(written):
             return SceneMessages(times_ns, [], state, None)
-        state, scales, first = self._scaled(state, trace, trace.rows[written])
+        state, scales, first = self.scaled(state, trace, trace.rows[written])
         scale = state.scale or _UNSCALED
         violations = first_violations(results, trace, written)
         names = tuple(sorted({*trace.names, *state.shown}))
@@ -294,7 +293,7 @@ class SceneEncoder:
         frames = SceneFrames(times_ns, objects, regions, *shades, content, self._drawn)
         return SceneMessages(times_ns, payloads, after, frames)
 
-    def _scaled(self, state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState, Floats, int]:
+    def scaled(self, state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState, Floats, int]:
         """Return the state with its scale and place, once an object is shown, the scale (S, 1) of each
         message, and the first message that has a place."""
         if state.scale is not None and state.place is not None:

@@ -7,7 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from spatial_replay.annotate.scene_update import SceneState, scene_scale
+from spatial_replay.annotate.annotator import shown_regions
+from spatial_replay.annotate.scene_update import scene_start
 from spatial_replay.logs.messages import Channel, Messages, join, merge, select
 from spatial_replay.replay.loaded_log import Evaluated
 from spatial_replay.replay.own_messages import MessageCursor, latest_messages
@@ -38,7 +39,9 @@ class Playback:
         self.start_ns, self.end_ns = int(self._times_ns[0]), own.end_ns
         self.time_ns = self.start_ns
         self.evaluated = evaluated
-        self._annotator = evaluated.annotator(SceneState(scale=scene_scale(evaluated.loaded.inside)))
+        self._start = scene_start(evaluated.loaded.inside, shown_regions(evaluated.edited.files))
+        self._started = evaluated
+        self._annotator = evaluated.annotator(self._start)
         self._own = MessageCursor(own, self.start_ns)
         self._next = 0
         self._has_ended = False
@@ -63,7 +66,11 @@ class Playback:
         self.time_ns = min(max(time_ns, self.start_ns), self.end_ns)
         self._next = int(np.searchsorted(self._times_ns, self.time_ns, side="right"))
         shown = max(self._next - 1, 0)
-        self._annotator = self.evaluated.annotator(replace(self._annotator.scene, written_ns=None))
+        if self._started is not self.evaluated:
+            regions = shown_regions(self.evaluated.edited.files)
+            self._start, self._started = scene_start(self.evaluated.loaded.inside, regions), self.evaluated
+        scene = replace(self._annotator.scene, written_ns=None, place=self._start.place)
+        self._annotator = self.evaluated.annotator(scene)
         self._has_ended = False
         events = _last(merge(self._annotator.pass_over(*self.evaluated.part(0, shown))))
         derived = self._annotator.messages(*self.evaluated.part(shown, self._next))

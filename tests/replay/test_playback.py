@@ -32,6 +32,7 @@ from spatial_replay.logs.topics import (
     ROBUSTNESS,
     SCENE,
     SPECIFICATION,
+    STANDING,
     protobuf_channel,
 )
 from spatial_replay.replay import LoadedLog, Playback, ReplayOptions, Window, run_replay
@@ -192,13 +193,13 @@ def test_a_playback_starts_at_the_first_sample_with_the_messages_before_it(tmp_p
 def test_the_end_of_the_log_comes_last_and_once(tmp_path: Path) -> None:
     source = open_source(talking(tmp_path / "talking.mcap"))
     expected = apart(annotated(source, tmp_path / "annotated.mcap"))
-    assert [(topic, time_ns) for topic, time_ns, _ in expected[-3:]] == [
-        ("/words", COUNT * STEP_NS),
-        (EVENTS, COUNT * STEP_NS),
-        (EVENT_LOG, COUNT * STEP_NS),
+    ended = (EVENTS, EVENT_LOG, ROBUSTNESS, ROBUSTNESS, SCENE, STANDING)
+    count = len(ended)
+    assert [(topic, time_ns) for topic, time_ns, _ in expected[-count - 1 :]] == [
+        (topic, COUNT * STEP_NS) for topic in ("/words", *ended)
     ]
     player = playback(source)
-    assert sent(player.seek(player.end_ns))[-2:] == expected[-2:]
+    assert sent(player.seek(player.end_ns))[-count:] == expected[-count:]
     assert not len(player.advance_to(player.end_ns))
 
 

@@ -31,7 +31,9 @@ from spatial_replay.sources import open_source
 SPEC = parse_specification(SPECIFICATION, filename="blocks.spatial")
 ANNOTATION = {
     "/spatial/scene",
+    "/spatial/frame",
     "/spatial/specification",
+    "/spatial/standing",
     "/spatial/robustness",
     "/spatial/automaton",
     "/spatial/events",
@@ -93,10 +95,12 @@ def test_messages_are_in_order_of_time_then_topic_and_those_of_the_end_come_last
     read = [(time_ns, topic) for topic, time_ns, *_ in content_of(output).messages]
     assert [time_ns for time_ns, _ in read] == sorted(time_ns for time_ns, _ in read)
     # in chunks of their own, so that others come before or after them at the same time
-    *ours, event, sentence = [each for each in read if each[1].startswith("/spatial/")]
+    every = [each for each in read if each[1].startswith("/spatial/")]
+    ours, ended = every[:-6], every[-6:]
     theirs = [each for each in read if not each[1].startswith("/spatial/")]
     assert ours == sorted(ours) and theirs == sorted(theirs)
-    assert [event, sentence] == [(ours[-1][0], "/spatial/events"), (ours[-1][0], "/spatial/log")]
+    topics = ("events", "log", "robustness", "robustness", "scene", "standing")
+    assert ended == [(ours[-1][0], f"/spatial/{topic}") for topic in topics]
 
 
 def test_our_metadata_comes_first_and_the_certificate_last(log: Path, tmp_path: Path) -> None:

@@ -136,7 +136,7 @@ def test_the_scene_is_that_of_the_messages(tmp_path: Path) -> None:
     assert np.allclose(corners[4].min(axis=0), [0, 0], atol=1e-3)
     # the first and the last two samples violate it, and are pointed at
     assert page.numbers(scene["violations"]["frames"]).tolist() == [0, 1, 7, 8]
-    assert scene["violations"]["labels"][0] == "-2"
+    assert scene["violations"]["labels"][0] == "a enclosedin here: -2"
     assert page.numbers(scene["is_violated"]).tolist() == [1, 1, 0, 0, 0, 0, 0, 1, 1]
     assert page.numbers(scene["violations"]["robustness"])[0] == -2
     [result] = page.facts["results"]
