@@ -158,7 +158,9 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
     size = path.stat().st_size
     try:
         uri = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
-        with closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as database:
+        # one thread reads, but garbage collection in another may close it
+        connected = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
+        with closing(connected) as database:
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(10**6, size))
             database.text_factory = lambda text: text.decode("utf-8", "replace")
             # a file that was cut is refused without this; nothing is ever written

@@ -28,6 +28,7 @@ from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.logs.topics import ENDING, METADATA, RECOVERY
 from spatial_replay.sources.open_log import format_of, is_bag_folder, readable_file
 from spatial_replay.text import Instant, Sentence, counted, counted_from
+from spatial_replay.trace.sample import FOREVER
 
 _MOST_GAPS = 1_000
 """Gaps among samples that are listed; the samples in later ones are counted in the last one listed."""
@@ -135,19 +136,33 @@ def recover_log(
     inputs, output = local_files([log]), Path(output)
     refuse_inputs(output, inputs)
     reader, faults = _opened(readable_file(log))
+    recovery, is_ordered = _write(reader, faults, output, inputs, advance)
+    if not is_ordered:
+        # a message whose time is damaged is where its chunk was; in what was written, each is at its own time
+        _write(McapLog(output), FaultList(), output, (), advance)
+    return recovery
+
+
+def _write(
+    reader: MessageReader,
+    faults: FaultList,
+    output: Path,
+    inputs: Sequence[Path],
+    advance: Callable[[int], object],
+) -> tuple[Recovery, bool]:
+    """Write all that a reader gives; return what was saved, and whether it came in the order of time."""
     try:
         topics = reader.topics()
     except LogError as error:
         raise LogError(f"nothing of {reader.name} can be recovered: {error}") from None
     names = {topic.name for topic in topics}
     channels, metadata = reader.channels(names), reader.metadata()
-    begun = [each for each in metadata if each[0] != RECOVERY]
-    earlier = [data for name, data in metadata if name == RECOVERY]
-    saved = Counter[str]()
+    saved, start_ns, end_ns, is_ordered = Counter[str](), FOREVER, -1, True
     samples = _Samples(reader.name, channels, dict(metadata), faults)
     with replacing(output, inputs) as stream, LogWriter(stream, profile=reader.profile) as writer:
-        for name, data in begun:
-            writer.add_metadata(name, data)
+        for name, data in metadata:
+            if name != RECOVERY:
+                writer.add_metadata(name, data)
         for attachment in reader.attachments():
             writer.add_attachment(
                 attachment.name,
@@ -156,23 +171,24 @@ def recover_log(
                 log_time_ns=attachment.log_time_ns,
                 create_time_ns=attachment.create_time_ns,
             )
-        times: list[int] = []
         for columns in reader.iter_columns(names):
             messages = samples.usable(_messages(columns, channels))
             writer.write_messages(messages)
             for number, count in zip(*np.unique(messages.channel, return_counts=True), strict=True):
                 saved[channels[int(number)].topic] += int(count)
             if len(messages):
-                times = [*times[:1], int(messages.log_time_ns[0]), int(messages.log_time_ns[-1])]
+                times = messages.log_time_ns
+                is_ordered &= bool(times[0] >= end_ns and (times[1:] >= times[:-1]).all())
+                start_ns, end_ns = min(start_ns, int(times.min())), max(end_ns, int(times.max()))
             advance(len(columns))
         reader.move_faults(faults)
-        if not times:
+        if end_ns < 0:
             reason = next(iter(faults.take()), "it has none")
             raise LogError(f"no message of {reader.name} can be recovered: {reason}")
         recovery = Recovery(
             reader.name,
-            start_ns=times[0],
-            end_ns=times[-1],
+            start_ns,
+            end_ns,
             saved={name: saved[name] for name in sorted(names)},
             missing={
                 topic.name: topic.count - saved[topic.name]
@@ -181,14 +197,15 @@ def recover_log(
             },
             spans=(),
             samples=(),
-            faults=counted_from(faults.take(last=True), times[0]),
-            remarks=counted_from(reader.take_remarks(), times[0]),
+            faults=counted_from(faults.take(last=True), start_ns),
+            remarks=counted_from(reader.take_remarks(), start_ns),
         )
         if not recovery.is_whole:
             recovery = replace(recovery, spans=_spans(recovery.faults), samples=samples.gaps())
+        earlier = [data for name, data in metadata if name == RECOVERY]
         for record in [*earlier, *([] if recovery.is_whole else [recovery.metadata()])]:
             writer.add_metadata(RECOVERY, record)
-    return recovery
+    return recovery, is_ordered
 
 
 def _opened(file: LogFile) -> tuple[MessageReader, FaultList]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import random
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -22,6 +24,7 @@ from bags.bag_files import (
 )
 from spatial_replay import LogError
 from spatial_replay.bags import Message, open_messages
+from spatial_replay.cli import run
 
 SENT = drive(60)
 
@@ -191,3 +194,18 @@ def test_junk_after_a_good_beginning_is_reported(tmp_path: Path, magic: bytes, j
     path.write_bytes(magic + junk)
     messages, reported = read(path)
     assert not messages and reported
+
+
+def test_a_refused_bag_is_closed_by_whatever_thread_collects_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent = [*drive(40), *drive(20)]
+    folder = write_ros2(tmp_path / "drive", sent, storage="sqlite3")
+    (tmp_path / "m.yaml").write_text("topics: {/a: {position: [x, y], shape: {disc: 1}}}\n")
+    (tmp_path / "s.spatial").write_text("G (a ovlp a)\n")
+    ignored: list[object] = []
+    monkeypatch.setattr(sys, "unraisablehook", ignored.append)
+    spec = ["--spec", str(tmp_path / "s.spatial"), "--mapping", str(tmp_path / "m.yaml")]
+    assert run(["replay", str(folder), *spec]) == 3
+    gc.collect()
+    assert not ignored
