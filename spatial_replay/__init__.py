@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
     from spatial_replay.monitor.causes import Cause, LeastPart
     from spatial_replay.monitor.evaluate import Evaluation, evaluate
-    from spatial_replay.monitor.monitor import Monitor, NodeUpdate, SpecUpdate, Update
+    from spatial_replay.monitor.monitor import Ending, Monitor, NodeUpdate, SpecUpdate, Update
     from spatial_replay.monitor.result import NodeResult, SpecResult
     from spatial_replay.monitor.vacuity import Vacuous
     from spatial_replay.monitor.verdict import Verdict
@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Step
     from spatial_replay.planning.planner import Planner
     from spatial_replay.planning.settings import Settings
-    from spatial_replay.recording.clip_log import Trigger
+    from spatial_replay.recording.clip_log import Trigger, TriggeredClip
     from spatial_replay.recording.message_channel import MessageChannel
     from spatial_replay.recording.recorder import Recorder
     from spatial_replay.replay.engine import Replayed
@@ -94,6 +94,7 @@ __all__ = [
     "Diagnostic",
     "Edit",
     "EditOutcome",
+    "Ending",
     "Evaluation",
     "FirstDifference",
     "Footprint",
@@ -142,6 +143,7 @@ __all__ = [
     "TrackedObject",
     "Transition",
     "Trigger",
+    "TriggeredClip",
     "Tuning",
     "Update",
     "UsageError",
@@ -201,7 +203,7 @@ __getattr__, __dir__ = loaded_when_used(
         "geometry.footprint": ("ConvexPart", "Footprint", "TrackedObject"),
         "monitor.causes": ("Cause", "LeastPart"),
         "monitor.evaluate": ("Evaluation", "evaluate"),
-        "monitor.monitor": ("Monitor", "NodeUpdate", "SpecUpdate", "Update"),
+        "monitor.monitor": ("Ending", "Monitor", "NodeUpdate", "SpecUpdate", "Update"),
         "monitor.result": ("NodeResult", "SpecResult"),
         "monitor.vacuity": ("Vacuous",),
         "monitor.verdict": ("Verdict",),
@@ -214,7 +216,7 @@ __getattr__, __dir__ = loaded_when_used(
         "planning.decisions": ("Candidate", "Consideration", "Guards", "Step"),
         "planning.planner": ("Planner",),
         "planning.settings": ("Settings",),
-        "recording.clip_log": ("Trigger",),
+        "recording.clip_log": ("Trigger", "TriggeredClip"),
         "recording.message_channel": ("MessageChannel",),
         "recording.recorder": ("Recorder",),
         "replay.engine": ("Replayed",),

@@ -51,7 +51,10 @@ def rehearse() -> None:
     """Assemble a few samples of messages made up, so that no real one waits for code to be compiled."""
     ring = [[0, 0], [2, 0], [2, 2], [1, 1]]
     contents: dict[str, Any] = {
-        "/boxes": {"frame_id": "map", "of": [{"id": each, "x": each, "y": 0, "yaw": each} for each in (1, 2)]},
+        "/boxes": {
+            "frame_id": "map",
+            "of": [{"id": each, "x": each, "y": 0, "yaw": each} for each in (1, 2)],
+        },
         "/discs": {"x": 0, "y": 0},
         "/rings": {"corners": [{"x": x, "y": y} for x, y in ring]},
         "/charge": {"value": 1},
