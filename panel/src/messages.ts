@@ -67,8 +67,6 @@ export interface RobustnessMessage {
     readonly upper?: number;
     readonly standing: number;
   }[];
-  /** Whether this is about the finished log, which no more samples follow. */
-  readonly final: boolean;
 }
 
 export interface AutomatonStateMessage {

@@ -304,6 +304,13 @@ def test_the_worst_of_several_results_is_shown_first_unless_the_reader_chose(
         page.locator("select").select_option(label="near")
         page.evaluate("viewer.settled()")
         expect(page.locator("select option:checked")).to_have_text("near")
+        if panel == "specification":
+            page.locator("select").select_option(label="met")
+            page.evaluate("viewer.settled()")
+            # nothing can come after the last sample
+            for time_ns, words in ((38 * 10**8, "pending"), (39 * 10**8, "violated")):
+                seek(page, time_ns)
+                expect(page.locator(".chip")).to_have_text(words)
         assert page.evaluate("viewer.ranges.length") < 10
 
 
