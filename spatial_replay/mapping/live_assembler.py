@@ -39,7 +39,8 @@ _MOST_HELD: Final = 4_096
 _TRIAL = """
 fixed_frame: map
 topics:
-  /boxes: {objects: "of[*]", name: "box{id}", position: [x, y], yaw: yaw, shape: {box: [1, 1, 1]}, uncertainty: 0.1}
+  /boxes:
+    {objects: "of[*]", name: "box{id}", position: [x, y], yaw: yaw, shape: {box: [1, 1, 1]}, uncertainty: 0.1}
   /discs: {name: disc, position: [x, y], shape: {disc: 1}}
   /rings: {name: ring, polygon: corners, max_age: 10ms}
   /charge: {signals: {charge: value}}
