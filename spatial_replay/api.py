@@ -53,6 +53,7 @@ class Reading(TypedDict, total=False):
     rate: float | None
     lost: Literal["drop", "keep"]
     y_down: bool | None
+    late: str
 
 
 class Evaluating(Reading, total=False):
@@ -60,7 +61,7 @@ class Evaluating(Reading, total=False):
 
     Attributes:
         constants: values in place of those that files and the log's own specifications give their constants.
-        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
+        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME" or a name.
         semantics: "ltlf" unless given, or "paper": Def. 16 of the paper to the letter.
         start_ns, end_ns, every: evaluate every `every`th sample from `start_ns` to before `end_ns`.
         strict_names: objects and signals that the log never has are errors; otherwise they are unknown.
@@ -284,7 +285,7 @@ def tune(
         vary: the values to try, by name: `{"near": (40, 100), "hold": ("1s", "4s")}`; None takes the range in
             the text. Without it all constants are tuned that have a range there.
         constants: values of others, in place of those in the file.
-        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
+        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME" or a name.
         seed: of the search over several constants; the same seed finds the same values.
         reading: how to read the logs, as for `read_trace`.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
@@ -61,6 +62,22 @@ def counted_from(texts: Iterable[str], first_ns: int) -> tuple[str, ...]:
         else text
         for text in texts
     )
+
+
+_NUMBER = re.compile(r"\d[\d.,]*")
+_FEW: Final = 3
+
+
+def without_repetition(texts: Iterable[str]) -> list[str]:
+    """Return texts with one in place of several that differ in their numbers only, and how many those are."""
+    alike: dict[str, list[str]] = {}
+    for text in texts:
+        alike.setdefault(_NUMBER.sub("0", text), []).append(text)
+    return [
+        text
+        for group in alike.values()
+        for text in (group if len(group) <= _FEW else [f"{group[0]} (and {len(group) - 1:,} more like it)"])
+    ]
 
 
 def counted(count: int, noun: str) -> str:

@@ -205,8 +205,16 @@ class EvaluationHashes:
 
     def add(self, trace: Trace, own: Messages, results: Sequence[SeriesBlock]) -> None:
         """Take in the next samples, the log's own messages, and the numbers of each result."""
+        self.add_samples(trace, own)
+        self.add_results(results)
+
+    def add_samples(self, trace: Trace, own: Messages) -> None:
+        """Take in the next samples and the log's own messages; their results follow, in any pieces."""
         self._samples.add(trace)
         self._messages.add(own)
+
+    def add_results(self, results: Sequence[SeriesBlock]) -> None:
+        """Take in the next numbers of each result."""
         for index, block in enumerate(results):
             self._results.add(index, block.series)
 

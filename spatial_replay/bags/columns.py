@@ -22,7 +22,7 @@ import numpy as np
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.read_options import FaultList
-from spatial_replay.text import time_text
+from spatial_replay.text import Instant
 
 _TOGETHER = 512
 """Messages made at once: fewer than the garbage collector lets pass before it runs."""
@@ -250,33 +250,41 @@ def iter_counted(
 
 
 DISORDER_NS = 10**9
-"""How far messages may be out of order: recorders write topics from several threads."""
+"""How far messages may be out of order by default: recorders write topics from several threads."""
+JUMP_REMEDY = (
+    "late='5s' (--late 5s) takes messages that come later, 'all' sorts the whole log; on_time_jump='split'"
+    " (--on-time-jump split) ends it where its clock jumps"
+)
 
 
-def without_jumps(columns: Columns, name: str, checked: Collection[str]) -> Columns:
+def without_jumps(
+    columns: Columns, name: str, checked: Collection[str], disorder_ns: int = DISORDER_NS
+) -> Columns:
     """Yield the messages as they are, which are in the order of time.
 
     Args:
         checked: the topics to check; others are only copied, in any order.
+        disorder_ns: how far they may have been recorded out of order.
 
     Raises:
-        LogError: those of a topic were not recorded in that order: some of them come more than a second
-            before others that were recorded earlier.
+        LogError: those of a topic were not recorded in that order: some of them come more than that before
+            others that were recorded earlier.
     """
+    first_ns: int | None = None
     # logs put together topic by topic are in order all the same, so each topic counts by itself
     topics = dict[str, _Recorded]()
     for each in columns:
+        first_ns = int(each.log_time_ns[0]) if first_ns is None and len(each) else first_ns
         for topic, rows in _rows_by_topic(each.topics):
             if topic not in checked:
                 continue
-            recorded = topics.setdefault(topic, _Recorded())
+            recorded = topics.setdefault(topic, _Recorded(disorder_ns))
             jump = recorded.first_jump(each.log_time_ns[rows], each.place[rows])
             if jump is not None:
-                logged = time_text(int(each.log_time_ns[rows][jump]))
+                at = Instant(int(each.log_time_ns[rows][jump]), first_ns or 0)
                 raise LogError(
-                    f"{name}: time jumps back: the message on {topic!r} logged at {logged} was recorded"
-                    " before others that were logged more than a second earlier; on_time_jump='split'"
-                    " (--on-time-jump split) ends the log where it jumps"
+                    f"{name}: time jumps back: the message on {topic!r} logged at {at} was recorded before"
+                    f" others that were logged more than {disorder_ns / 1e9:g} s earlier; {JUMP_REMEDY}"
                 )
         yield each
 
@@ -293,9 +301,10 @@ def _rows_by_topic(topics: Sequence[str]) -> Iterator[tuple[str, Integers | slic
 
 
 class _Recorded:
-    """How far the recording had come at each message of the last second and a little more."""
+    """How far the recording had come at each message of the last moments, as long as the disorder."""
 
-    def __init__(self) -> None:
+    def __init__(self, disorder_ns: int) -> None:
+        self._disorder_ns = disorder_ns
         self._latest: deque[tuple[Integers, Integers]] = deque()
         self._before = -1
         self._furthest = -1
@@ -313,13 +322,13 @@ class _Recorded:
         self._latest.append((times_ns, furthest))
         self._furthest = int(furthest[-1])
         jump = None if is_ordered else self._search(times_ns, places)
-        while self._latest[0][0][-1] < times_ns[-1] - DISORDER_NS:
+        while self._latest[0][0][-1] < times_ns[-1] - self._disorder_ns:
             self._before = int(self._latest.popleft()[1][-1])
         return jump
 
     def _search(self, times_ns: Integers, places: Integers) -> int | None:
         times = np.concatenate([times for times, _ in self._latest])
         furthest = np.concatenate([[self._before], *(furthest for _, furthest in self._latest)])
-        earlier = np.searchsorted(times, times_ns - DISORDER_NS)
+        earlier = np.searchsorted(times, times_ns - self._disorder_ns)
         jumps = np.flatnonzero(places < furthest[earlier])
         return int(jumps[0]) if len(jumps) else None

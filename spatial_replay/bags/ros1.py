@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Mapping
 from functools import cached_property
+from itertools import pairwise
 from types import MappingProxyType
 from typing import BinaryIO
 
@@ -70,11 +71,22 @@ class Ros1Bag(MessageReader):
         ]
         if not as_recorded:
             chunks.sort(key=lambda ranked: ranked[1].start_ns)
+            if self._is_in_parts:
+                chunks = [(rank, chunk) for rank, (_, chunk) in enumerate(chunks)]
         with self._path.open("rb") as stream:
             contents = (self._messages(stream, *ranked, wanted, first, last) for ranked in chunks)
             yield from (
                 contents if as_recorded else in_order([chunk.start_ns for _, chunk in chunks], contents)
             )
+
+    @cached_property
+    def _is_in_parts(self) -> bool:
+        """Whether no chunk overlaps another in time: then their order in the file means nothing.
+
+        Bags are played by their index, and tools that merge or repair them write chunks in any order.
+        """
+        ordered = sorted(self._directory.chunks, key=lambda chunk: (chunk.start_ns, chunk.end_ns))
+        return all(one.end_ns <= other.start_ns for one, other in pairwise(ordered))
 
     def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
         return {

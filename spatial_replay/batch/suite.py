@@ -26,7 +26,7 @@ from spatial_replay.trace.time_points import time_point_from_text
 LARGEST_SUITE: Final = 8 * 2**20
 """Bytes of a suite file."""
 _Value = TypeVar("_Value")
-_READING: Final = ("on_time_jump", "rate", "lost", "y_down", "concave")
+_READING: Final = ("on_time_jump", "late", "rate", "lost", "y_down", "concave")
 Pairs: TypeAlias = tuple[tuple[str, _Value], ...]
 """A table that can be hashed, and sent to another process."""
 
@@ -40,7 +40,7 @@ class Conditions:
         reading: further keyword arguments of `open_source`.
         start, end: the window, as people write times; None for the whole log.
         every: every `every`th sample is evaluated.
-        each: for each parameter of a template its objects: "all", "class:NAME".
+        each: for each parameter of a template its objects: "all", "class:NAME" or a name.
         semantics: "ltlf" or "paper".
         strict_names: names that a log never has are errors.
         constants: values in place of those that the specifications give their constants.

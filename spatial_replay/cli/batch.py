@@ -207,6 +207,7 @@ def _suite(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantic
 
 _READING_DEFAULTS: Mapping[str, Any] = {
     "on_time_jump": "error",
+    "late": "1s",
     "rate": None,
     "lost": "drop",
     "y_down": None,

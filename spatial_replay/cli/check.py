@@ -148,7 +148,7 @@ class _Compared:
 
 def _refuse_log_options(reading: ReadArguments, strict_names: bool) -> None:
     """Refuse options that say something about a log where there is none."""
-    defaults = {"on_time_jump": "error", "lost": "drop", "concave": "decompose"}
+    defaults = {"on_time_jump": "error", "lost": "drop", "concave": "decompose", "late": "1s"}
     given = [name for name, value in reading.items() if value not in (None, defaults.get(name))]
     for name in [*given, *(["strict_names"] if strict_names else [])]:
         option = (

@@ -21,7 +21,7 @@ from spatial_replay.cli.options import (
     open_inputs,
     warn_of_input,
 )
-from spatial_replay.cli.output import VERDICT_COLOURS
+from spatial_replay.cli.output import VERDICT_COLOURS, are_many, others_text, worst_of
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import Coloured, Line, fitted, show, show_json, warn
 from spatial_replay.errors import UsageError
@@ -29,6 +29,7 @@ from spatial_replay.text import requirement_text, time_text
 from spatial_replay.trace.time_points import time_point_from_text
 
 if TYPE_CHECKING:
+    from spatial_replay.monitor.result import SpecResult
     from spatial_replay.replay import Explanation
 
 
@@ -56,7 +57,13 @@ def explain(
     """
     # imported here so that --help stays fast
     from spatial_replay.logs.topics import MAPPED
-    from spatial_replay.replay import explain_results, has_samples_from, idle_document, run_replay
+    from spatial_replay.replay import (
+        explain_results,
+        has_samples_from,
+        idle_document,
+        run_replay,
+        verdict_of,
+    )
 
     if at is not None and request.end is not None:
         raise UsageError("--at and --to both set the last sample; give only one")
@@ -74,6 +81,12 @@ def explain(
     goes_on = at is not None and has_samples_from(inputs.source, inputs.window.end_ns)
     if at is not None and not goes_on and replayed.end_ns < inputs.window.end_ns - 1:
         warn(f"--at {at} is after the last sample, at {time_text(replayed.end_ns, replayed.first_ns)}")
+    others: Sequence[SpecResult] = ()
+    if not as_json and object_name is None:
+        fitting = [each for each in replayed.results if verdict_of(each, node, goes_on=goes_on) is not None]
+        if are_many(fitting):
+            shown, others = worst_of(fitting)
+            replayed = replace(replayed, results=tuple(shown))
     results = explain_results(replayed, node=node, object=object_name, goes_on=goes_on)
     idle = replayed.vacuous if node is None and object_name is None else ()
     if as_json:
@@ -82,9 +95,13 @@ def explain(
         texts = list(_texts(results))
         if idle:
             texts.append([each.message for each in idle])
+        if others:
+            texts.append([others_text(others)])
         for number, lines in enumerate(texts):
             show(*([""] if number else []), *(_lines_on_terminal(lines) if sys.stdout.isatty() else lines))
-    return exit_code_from_verdicts((each.verdict for each in results), bool(replayed.faults))
+    verdicts = [each.verdict for each in results]
+    verdicts += [v for each in others if (v := verdict_of(each, node, goes_on=goes_on)) is not None]
+    return exit_code_from_verdicts(verdicts, bool(replayed.faults))
 
 
 def _lines_on_terminal(lines: Sequence[str]) -> Iterator[Line]:

@@ -88,6 +88,15 @@ def log_output_option(text: str) -> Callable[[_Command], _Command]:
     return click.option("-o", "--output", type=_LogOutput(path_type=Path), required=True, help=text)
 
 
+durability_option = click.option(
+    "--durability",
+    type=click.Choice(["process", "disk"]),
+    default="process",
+    show_default=True,
+    help="What written chunks survive: the end of this process, or that of the machine, too (fsync).",
+)
+
+
 def specs_option(text: str) -> Callable[[_Command], _Command]:
     """Return the repeatable option `--spec SPEC`, with its help."""
     return click.option("--spec", "specs", metavar="SPEC", multiple=True, type=LogPath(), help=text)
@@ -193,6 +202,7 @@ class ReadArguments(TypedDict):
     lost: Literal["drop", "keep"]
     y_down: bool | None
     concave: Literal["decompose", "hull"]
+    late: str
 
 
 _READING = (
@@ -207,6 +217,12 @@ _READING = (
         type=click.Choice(["error", "split"]),
         default="error",
         help="External logs whose clock jumps back: refuse, or end the log there.  [default: error]",
+    ),
+    click.option(
+        "--late",
+        metavar="T|all",
+        default="1s",
+        help="External logs: how late messages may come, such as 2s; all sorts the whole log.  [default: 1s]",
     ),
     click.option(
         "--rate", metavar="N", type=float, help="Drone annotations: frames per second.  [default: 30]"
@@ -280,8 +296,8 @@ choices_option = click.option(
     "--each",
     "choices",
     multiple=True,
-    metavar="VAR=class:C",
-    help="Objects to evaluate a template for: one class, or VAR=all.",
+    metavar="VAR=class:C|NAME",
+    help="Objects to evaluate a template for: a class, one object, or VAR=all.",
 )
 
 _CONDITIONS = (
@@ -372,7 +388,7 @@ def objects_by_parameter(choices: tuple[str, ...]) -> dict[str, str]:
     for choice in choices:
         parameter, equals, objects = choice.partition("=")
         if not equals or not parameter:
-            raise UsageError(f"--each {choice!r} is incomplete; write VAR=class:NAME or VAR=all")
+            raise UsageError(f"--each {choice!r} is incomplete; write VAR=class:NAME, VAR=OBJECT or VAR=all")
         if parameter in each:
             raise UsageError(f"--each gives {parameter!r} twice: {each[parameter]!r} and {objects!r}")
         each[parameter] = objects

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 _WORST_FIRST: Final = ("violated", "unknown", "satisfied")
 _MANY: Final = 6
 """Results that are printed in the order of the file; more are counted and sorted."""
+_MOST_SHOWN: Final = 20
+"""Results that are printed; of more, as templates have, the worst of them, and how many others there are."""
+_SHOWN: Final = 12
 VERDICT_COLOURS: Final = MappingProxyType({"satisfied": "blue", "violated": "red", "unknown": "yellow"})
 
 
@@ -32,10 +35,9 @@ def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | Non
     """Print one line for each result, and another one for a sliding window."""
     span = time_text(replayed.end_ns, replayed.start_ns)
     damaged = ", damaged: verdicts are over what could be read" if replayed.faults else ""
-    are_many = len(replayed.results) > _MANY
-    counts = f": {_counts(replayed.results)}" if are_many else ""
+    counts = f": {_counts(replayed.results)}" if len(replayed.results) > _MANY else ""
     show(f"{replayed.log}: {counted(replayed.samples, 'sample')} over {span}{damaged}{counts}")
-    results = sorted(replayed.results, key=_severity) if are_many else replayed.results
+    results, others = worst_of(replayed.results)
     # escaped here, so that what is printed is as wide as what is measured
     titles = [escaped(_titled(result)) for result in results]
     width = max(map(len, titles), default=0)
@@ -51,6 +53,8 @@ def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | Non
             show(f"  {'':<{width}}  {line}")
         if window_ns is not None:
             show(f"  {'':<{width}}  {_over_window(result, replayed.first_ns, window_ns)}")
+    if others:
+        show(f"  {others_text(others)}")
     for part in replayed.vacuous:
         show(f"  vacuous: {part.message}")
     if output is not None:
@@ -77,6 +81,24 @@ def _counts(results: Sequence[SpecResult]) -> str:
     """Return how many results have each verdict, the worst first."""
     counts = Counter(str(result.verdict) for result in results)
     return ", ".join(f"{counts[verdict]:,} {verdict}" for verdict in _WORST_FIRST if counts[verdict])
+
+
+def are_many(results: Sequence[SpecResult]) -> bool:
+    """Return whether only the worst of some results are printed."""
+    return len(results) > _MOST_SHOWN
+
+
+def worst_of(results: Sequence[SpecResult]) -> tuple[Sequence[SpecResult], Sequence[SpecResult]]:
+    """Return the results to print and, of too many, the others; the worst first where they are several."""
+    if len(results) > _MANY:
+        results = sorted(results, key=_severity)
+    shown = _SHOWN if are_many(results) else len(results)
+    return results[:shown], results[shown:]
+
+
+def others_text(others: Sequence[SpecResult]) -> str:
+    """Return the line about results that are not printed."""
+    return f"… and {len(others):,} more: {_counts(others)}; --json has all, --each VAR=OBJECT shows one"
 
 
 def _severity(result: SpecResult) -> tuple[int, float]:

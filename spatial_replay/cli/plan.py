@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -12,6 +13,7 @@ from spatial_replay.cli.application import exit_code_from_verdicts
 from spatial_replay.cli.options import (
     LogPath,
     constants_option,
+    durability_option,
     load_spec_options,
     log_output_option,
     profile_option,
@@ -22,6 +24,9 @@ from spatial_replay.cli.record import SCENARIOS, SimulationArguments, parse_inje
 from spatial_replay.cli.terminal import show
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.text import counted
+
+if TYPE_CHECKING:
+    from spatial_replay.logs.output_file import Durability
 
 
 @click.group()
@@ -53,6 +58,7 @@ def planning_command(scenario: str) -> click.Command:
 
     @click.command(scenario, help=help_text)
     @log_output_option("Log to write (MCAP).")
+    @durability_option
     @click.option(
         "--spec",
         metavar="SPEC",
@@ -65,6 +71,7 @@ def planning_command(scenario: str) -> click.Command:
     @simulation_options
     def command(
         output: Path,
+        durability: Durability,
         spec: LogFile | None,
         of: str | None,
         constants: Mapping[str, float | str],
@@ -92,6 +99,7 @@ def planning_command(scenario: str) -> click.Command:
                 gui=simulation["gui"],
                 inputs=local_files(named),
                 advance=advance,
+                durability=durability,
             )
         show(
             f"wrote {output}: {counted(planned.samples, 'sample')} over {planned.seconds:.3f} s; "

@@ -15,6 +15,7 @@ from spatial_replay.cli.options import (
     ReadArguments,
     add_options,
     constants_option,
+    durability_option,
     gather,
     input_files,
     load_spec_options,
@@ -31,6 +32,7 @@ from spatial_replay.text import counted
 from spatial_replay.trace.time_points import duration_ns_from_text
 
 if TYPE_CHECKING:
+    from spatial_replay.logs.output_file import Durability
     from spatial_replay.simulation.injection import Injection
 
 SCENARIOS: Mapping[str, str] = MappingProxyType(
@@ -110,6 +112,7 @@ def recording_command(scenario: str) -> click.Command:
 
     @click.command(scenario, help=help_text)
     @log_output_option("Log to write (MCAP).")
+    @durability_option
     @specs_option(
         "Specification to evaluate while recording; repeat for several.  [default: the scenario's own]"
     )
@@ -123,6 +126,7 @@ def recording_command(scenario: str) -> click.Command:
     @simulation_options
     def command(
         output: Path,
+        durability: Durability,
         specs: tuple[LogFile, ...],
         constants: Mapping[str, float | str],
         profile: str | None,
@@ -146,6 +150,7 @@ def recording_command(scenario: str) -> click.Command:
                 gui=simulation["gui"],
                 inputs=local_files(specs),
                 advance=advance,
+                durability=durability,
             )
         show(
             f"wrote {output}: {counted(recorded.samples, 'sample')} over {recorded.seconds:.3f} s of "
@@ -175,6 +180,7 @@ for _scenario in SCENARIOS:
 @record.command()
 @click.argument("file", type=LogPath())
 @log_output_option("Log to write (MCAP).")
+@durability_option
 @specs_option("Specification to evaluate while recording; repeat for several.")
 @constants_option
 @profile_option
@@ -182,6 +188,7 @@ for _scenario in SCENARIOS:
 def tracks(
     file: LogFile,
     output: Path,
+    durability: Durability,
     specs: tuple[LogFile, ...],
     constants: Mapping[str, float | str],
     profile: str | None,
@@ -205,7 +212,7 @@ def tracks(
     source = open_source(file, **reading)
     files = load_spec_options(specs, profile, constants)
     with progress("samples") as advance:
-        recorded = record_source(source, output, files, inputs=inputs, advance=advance)
+        recorded = record_source(source, output, files, inputs=inputs, advance=advance, durability=durability)
     warn_of_input(recorded)
     seconds = (recorded.end_ns - recorded.start_ns) / 1e9
     show(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 from typing import TYPE_CHECKING
 
 import click
@@ -43,7 +42,14 @@ if TYPE_CHECKING:
     metavar="ADDRESS",
     default="127.0.0.1",
     show_default=True,
-    help="Address to listen on; anyone who can reach it can read the log.",
+    help="Address to listen on; beyond this machine, viewers need the token in the printed address.",
+)
+@click.option(
+    "--allow-origin",
+    "origins",
+    metavar="ORIGIN",
+    multiple=True,
+    help="Web page that may connect, such as https://viewer.example.org; repeat for several.",
 )
 @click.option("--play", is_flag=True, help="Start playing at once instead of waiting for a viewer.")
 @click.option("--layout", is_flag=True, help="Print the layout to import in the viewer, and exit.")
@@ -54,6 +60,7 @@ def serve(
     request: EvaluationArguments,
     port: int,
     host: str,
+    origins: tuple[str, ...],
     play: bool,
     layout: bool,
     watch: bool,
@@ -84,22 +91,28 @@ def serve(
         return None
     warn_of_input(evaluated.replayed)
     try:
-        return _serve(evaluated, files, host, port, play)
+        return _serve(evaluated, files, host, port, play, origins)
     except KeyboardInterrupt:
         # the regular way to stop the server
         return ExitCode.INTERRUPTED
 
 
 def _serve(
-    evaluated: Evaluated, files: SpecificationFiles | None, host: str, port: int, play: bool
+    evaluated: Evaluated,
+    files: SpecificationFiles | None,
+    host: str,
+    port: int,
+    play: bool,
+    origins: tuple[str, ...],
 ) -> ExitCode | None:
     # imported here so that --help stays fast
     from spatial_replay.serve import open_server
+    from spatial_replay.serve.gate import is_loopback
 
-    with open_server(evaluated, host=host, port=port, play=play) as server:
+    with open_server(evaluated, host=host, port=port, play=play, origins=origins) as server:
         print_verdicts(evaluated.replayed, None)
-        if not _is_loopback(host):
-            warn(f"anyone who can reach {server.address} can read this log")
+        if not is_loopback(host):
+            warn("who has this address, with its token, can read this log and change its constants")
         show(f"serving at {server.address}; stop with Ctrl-C")
         show(f"  in Foxglove or Lichtblick: Open connection, Foxglove WebSocket, {server.address}")
         show("  layout to import there: run the same command with --layout > live.json")
@@ -112,10 +125,3 @@ def _serve(
             return edited.loaded.write_constants(edited.given)
 
         return follow_saves(files, server.show_saved, write, refuse=server.show_error, check=server.check)
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

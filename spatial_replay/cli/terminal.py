@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 import click
 
 from spatial_replay.errors import UsageError
-from spatial_replay.text import escaped
+from spatial_replay.text import escaped, without_repetition
 
 if TYPE_CHECKING:
     from spatial_replay.errors import Diagnosis
@@ -130,6 +130,6 @@ def show_message(severity: str, message: str, colour: str) -> None:
 
 
 def warn(*messages: str) -> None:
-    """Print warnings to standard error, each as "spatial-replay: warning: …"."""
-    for message in messages:
+    """Print warnings to standard error, each as "spatial-replay: warning: …"; one of many alike."""
+    for message in without_repetition(messages):
         show_message("warning", message, "yellow")

@@ -124,8 +124,8 @@ class Footprint:
         """Return the polygon with the given corners (n, 2), in either order.
 
         Raises:
-            GeometryError: no corner, coordinates that are not finite, a boundary that crosses itself
-                (unless `concave="hull"`).
+            GeometryError: no corner, coordinates that are not finite; unless `concave="hull"`, a boundary
+                that crosses itself, or more than 2,000 corners that are not those of a convex polygon.
         """
         if concave not in ("decompose", "hull"):
             raise GeometryError(f"concave={concave!r}; choose 'decompose' or 'hull'")

@@ -18,6 +18,9 @@ SOUND, EMPTY, NOT_FINITE, NOT_CONVEX = 0, 1, 2, 3
 LARGEST_COORDINATE = 1e100
 """Larger coordinates are rejected: products of a few of them must stay finite."""
 
+MOST_CORNERS = 2_000
+"""Of a polygon that is split: its parts are measured one by one, in each sample."""
+
 # A vertex counts as on a line within the greatest of these: relative to the outline's extent, to the
 # resolution of its coordinates, and a floor that keeps squares of the tolerance above zero.
 _FLATNESS = 1e-9
@@ -177,14 +180,17 @@ def _tidy(vertices: Floats, count: int, tolerance: float) -> int:
     changed = True
     while changed and count > 2:
         changed = False
-        i = 0
-        while i < count and count > 2:
-            if _strays(vertices, i, (i + count - 1) % count, (i + 1) % count) <= tolerance:
-                _copy(vertices, i + 1, vertices, i, count - i - 1)
-                count -= 1
+        left, kept = count, 0
+        for i in range(count):
+            before = kept - 1 if kept else count - 1
+            after = i + 1 if i + 1 < count else 0
+            if left > 2 and _strays(vertices, i, before, after) <= tolerance:
+                left -= 1
                 changed = True
             else:
-                i += 1
+                _copy(vertices, i, vertices, kept, 1)
+                kept += 1
+        count = left
     return count
 
 
@@ -235,8 +241,13 @@ def convex_pieces(vertices: Floats) -> list[Floats]:
         vertices: (n, 2) float64, corners in either order, no two equal in a row.
 
     Raises:
-        GeometryError: a boundary that crosses or touches itself.
+        GeometryError: a boundary that crosses or touches itself, more than `MOST_CORNERS` corners.
     """
+    if len(vertices) > MOST_CORNERS:
+        raise GeometryError(
+            f"a polygon that is not convex has {len(vertices):,} corners, and at most {MOST_CORNERS:,} are"
+            " split; simplify it, or take its hull (concave='hull')"
+        )
     from shapely import Polygon, constrained_delaunay_triangles, get_coordinates
 
     polygon = Polygon(vertices)

@@ -34,6 +34,7 @@ class _ViewerLog:
 
     gather_s = _GATHER_S
     is_busy = False
+    backlog = 0
 
     def __init__(self, files: Sequence[Specification], about: Mapping[str, str], server: RunServer) -> None:
         self._server = server

@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal, TypeAlias, get_args
 
 from spatial_replay.errors import OutputError, UsageError
 
@@ -56,12 +56,22 @@ def _move(partial: Path, output: Path) -> None:
     partial.replace(output)
 
 
-def open_output(output: Path) -> BinaryIO:
+Durability: TypeAlias = Literal["process", "disk"]
+"""What a flushed file survives: the end of the process, or that of the machine, too."""
+
+
+def open_output(output: Path, durability: Durability = "process") -> BinaryIO:
     """Open a file to write in place; opening, writing and closing it fail with an OutputError.
 
+    Args:
+        durability: "disk" for a file whose every flush waits until the disk has it.
+
     Raises:
+        UsageError: another durability.
         OutputError: it cannot be written, or another program, or another part of this one, is writing it.
     """
+    if durability not in get_args(Durability):
+        raise UsageError(f"durability is {durability!r}; give 'process' or 'disk'")
     with _writing(output):
         descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
     try:
@@ -70,7 +80,7 @@ def open_output(output: Path) -> BinaryIO:
                 # only the owner of the lock may empty the file
                 _lock(descriptor, output)
                 os.ftruncate(descriptor, 0)
-        return _stream(descriptor, output)
+        return _stream(descriptor, output, durability)
     except BaseException:
         os.close(descriptor)
         raise
@@ -93,9 +103,21 @@ def _lock(descriptor: int, output: Path) -> None:
         return
 
 
-def _stream(file: int, output: Path) -> BinaryIO:
+def _stream(file: int, output: Path, durability: Durability = "process") -> BinaryIO:
     with _writing(output):
-        return io.BufferedWriter(_OutputFile(file, output), 1 << 20)
+        kind = io.BufferedWriter if durability == "process" else _DurableWriter
+        return kind(_OutputFile(file, output), 1 << 20)
+
+
+class _DurableWriter(io.BufferedWriter):
+    """A stream whose every flush, the one that closing it makes included, waits for the disk."""
+
+    def flush(self) -> None:
+        super().flush()
+        # pipes and devices have no disk
+        if stat.S_ISREG(os.fstat(self.fileno()).st_mode):
+            with _writing(Path(str(self.name))):
+                os.fsync(self.fileno())
 
 
 class _OutputFile(io.FileIO):

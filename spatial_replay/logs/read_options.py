@@ -12,6 +12,7 @@ from typing import Literal, cast, get_args
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Concave
+from spatial_replay.trace.sample import LATEST_NS
 
 Lost = Literal["drop", "keep"]
 """Whether rows marked as out of the picture are dropped."""
@@ -33,6 +34,7 @@ class ReadOptions:
         concave: how polygons that are not convex are handled.
         mapping: the mapping file, which says which topics carry which objects.
         on_time_jump: whether a clock that jumps back is an error or ends the log.
+        late: how late messages may come, such as "2s"; "all" for any lateness: the whole log is sorted.
         rate: frames a second, for formats that count frames.
         lost: whether rows marked as out of the picture are dropped or kept.
         y_down: whether y points down in the file, as in images; None for what is usual in its format.
@@ -47,6 +49,7 @@ class ReadOptions:
     rate: float | None = None
     lost: Lost = "drop"
     y_down: bool | None = None
+    late: str = "1s"
 
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
@@ -57,6 +60,7 @@ class ReadOptions:
             raise UsageError(f"mapping is {shortened(self.mapping)}; give the path of a mapping file")
         if self.y_down not in (None, True, False):
             raise UsageError(f"y_down is {shortened(self.y_down)}; give True, False or None")
+        late_ns(self.late)
         if self.rate is not None:
             _check_rate(self.rate)
 
@@ -82,9 +86,27 @@ class ReadOptions:
                 )
 
 
+_LATENESS = re.compile(r"(\d{1,9}(?:\.\d{1,9})?)(ms|s)", re.ASCII)
+
+
+def late_ns(text: object) -> int:
+    """Return how late messages may come, from "2s", "500ms" or "all".
+
+    Raises:
+        UsageError: anything else.
+    """
+    if text == "all":
+        return LATEST_NS
+    match = _LATENESS.fullmatch(text) if isinstance(text, str) else None
+    if match is None:
+        raise UsageError(f"late is {shortened(text)}; give a duration such as 2s or 500ms, or all")
+    return int(Fraction(match[1]) * (10**9 if match[2] == "s" else 10**6))
+
+
 _REASONS = {
     "mapping": "it names its objects itself",
     "on_time_jump": "its times never go back",
+    "late": "its times never go back",
     "rate": "it has times, not numbers of frames",
     "lost": "it has no rows marked as lost",
     "y_down": (

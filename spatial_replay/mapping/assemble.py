@@ -20,18 +20,18 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from spatial_replay.bags.columns import Message, MessageColumns
+from spatial_replay.bags.columns import DISORDER_NS, JUMP_REMEDY, Message, MessageColumns
 from spatial_replay.bags.topic import Decoder
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.read_options import FaultList, OnTimeJump
 from spatial_replay.mapping.names import Codes
-from spatial_replay.mapping.reading_plan import DISORDER_NS, ReadingPlan
+from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.mapping.topic_reader import MISFITS, TopicReader
 from spatial_replay.mapping.tracker import Remarks, Tracker
 from spatial_replay.mapping.transforms import HISTORY_NS, FrameTree
-from spatial_replay.text import Instant, Sentence, time_text, times_apart
+from spatial_replay.text import Instant, Sentence, times_apart
 from spatial_replay.trace.sample import FOREVER, LATEST_NS
 from spatial_replay.trace.trace import Trace
 
@@ -60,7 +60,8 @@ class Assembler:
         decoder: returns the decoder of a topic.
         start_ns, end_ns: only samples from `start_ns` up to, not including, `end_ns` come out. Messages
             before and after the window may be added, and count.
-        on_time_jump: whether a log whose time jumps back by more than a second is refused, or ends there.
+        on_time_jump: whether a log whose time jumps back by more than the plan's `late_ns` is refused, or
+            ends there.
         arrived: takes the messages of each topic as they arrive: its reader, their times on its clock, and
             their contents, decoded where frames matter.
     """
@@ -116,6 +117,7 @@ class Assembler:
             report=self._add_fault,
         )
         self._sample_times = _SampleTimes(plan, name, self._window_ns[0])
+        self._begin_ns: int | None = None
         self._newest_ns = -1
         self._latest_ns = self._settled_ns = self._forgot_ns = -1
         self._count = self._bytes = 0
@@ -131,7 +133,7 @@ class Assembler:
         """Add messages in the order of the log; return the samples that are final now.
 
         Raises:
-            LogError: time jumps back by more than a second, and `on_time_jump` is "error".
+            LogError: time jumps back too far, and `on_time_jump` is "error".
             UsageError: the mapping does not fit what the messages hold.
         """
         columns = messages if isinstance(messages, MessageColumns) else _columns(messages)
@@ -272,26 +274,29 @@ class Assembler:
         times_ns = np.concatenate([each.times_ns for each in moving])
         order = np.argsort(places, kind="stable")
         places, times_ns = places[order], times_ns[order]
+        if self._begin_ns is None and len(times_ns):
+            self._begin_ns = int(times_ns[0])
         newest = np.maximum.accumulate(np.concatenate([[self._newest_ns], times_ns]))
-        late = np.flatnonzero(times_ns < newest[:-1] - DISORDER_NS)
+        late = np.flatnonzero(times_ns < newest[:-1] - self._plan.late_ns)
         if not len(late):
             self._newest_ns = int(newest[-1])
             return len(arrived)
         at = int(late[0])
         self._newest_ns = int(newest[at])
         place = int(places[at])
-        start, end, logged = (int(each) for each in (newest[at], times_ns[at], arrived.log_time_ns[place]))
-        where = (
-            f"time jumps back by {time_text(start, end)}, from {time_text(start)} to {time_text(end)}, at a"
-            f" message of {arrived.topics[place]} logged at {time_text(logged)}"
+        where = Sentence(
+            f"time jumps back by {(int(newest[at]) - int(times_ns[at])) / 1e9:.3f} s, from ",
+            Instant(int(newest[at]), self._begin_ns or 0),
+            " to ",
+            Instant(int(times_ns[at]), self._begin_ns or 0),
+            f", at a message of {arrived.topics[place]}",
         )
         if self._on_time_jump == "error":
-            raise LogError(
-                f"{self._name}: {where}; on_time_jump='split' (--on-time-jump split) ends the log there, and"
-                " another clock in the mapping may not jump"
-            )
+            raise LogError(f"{self._name}: {where}; {JUMP_REMEDY}, and another clock may not jump")
         self._has_split = True
-        self._remarks.add(f"{where}: the log is taken to end there; cut it to evaluate what comes after")
+        self._remarks.add(
+            Sentence(where, ": the log is taken to end there; cut it to evaluate what comes after")
+        )
         return place
 
     def _put(self, stamped: _Stamped, arrived: MessageColumns) -> None:

@@ -201,8 +201,11 @@ def _poses(layout: MessageLayout, binding: Binding, numbers: Floats) -> Poses:
     """Return the poses in the numbers (R, W); objects without an orientation have the frame's axes."""
     count = len(numbers)
     position = np.zeros((count, 3))
-    for axis, column in enumerate(binding.position):
-        position[:, axis] = numbers[:, column]
+    if layout.origin is not None:
+        position[:, :2] = _local_metres(numbers[:, list(binding.position)], layout.origin)
+    else:
+        for axis, column in enumerate(binding.position):
+            position[:, axis] = numbers[:, column]
     if binding.orientation:
         rotation, yaw = matrices_from_quaternions(numbers[:, list(binding.orientation)])
         return Poses(position, rotation, yaw)
@@ -210,6 +213,37 @@ def _poses(layout: MessageLayout, binding: Binding, numbers: Floats) -> Poses:
         yaw = numbers[:, binding.yaw] * layout.angle_scale
         return Poses(position, matrices_from_yaw(yaw), yaw)
     return Poses(position, np.broadcast_to(np.eye(3), (count, 3, 3)), np.full(count, np.nan))
+
+
+_EQUATOR_M, _ECCENTRICITY_SQUARED = 6_378_137.0, 6.694379990141316e-3
+"""The ellipsoid of WGS 84."""
+
+
+def _local_metres(fixes: Floats, origin: tuple[float, float]) -> Floats:
+    """Return metres east and north of an origin, in the plane that touches the ellipsoid there, (R, 2).
+
+    Args:
+        fixes: latitude and longitude in degrees and, maybe, a status, (R, 2 or 3); below 0 there is no fix.
+        origin: latitude and longitude.
+    """
+
+    def earth_fixed(degrees: Floats) -> Floats:
+        latitude, longitude = np.radians(degrees[:, :2]).T
+        radius = _EQUATOR_M / np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(latitude) ** 2)
+        level = radius * np.cos(latitude)
+        up = radius * (1 - _ECCENTRICITY_SQUARED) * np.sin(latitude)
+        return np.stack([level * np.cos(longitude), level * np.sin(longitude), up], axis=1)
+
+    latitude, longitude = np.radians(origin)
+    east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
+    north = np.array(
+        [-np.sin(latitude) * np.cos(longitude), -np.sin(latitude) * np.sin(longitude), np.cos(latitude)]
+    )
+    offsets = earth_fixed(fixes) - earth_fixed(np.array([origin]))
+    metres: Floats = offsets @ np.stack([east, north], axis=1)
+    is_fixed: Booleans = (np.abs(fixes[:, :2]) <= (90.0, 360.0)).all(axis=1) & ~(fixes[:, 2:] < 0).any(axis=1)
+    metres[~is_fixed] = np.nan
+    return metres
 
 
 def _heights(binding: Binding, numbers: Floats) -> Floats | None:

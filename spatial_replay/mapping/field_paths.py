@@ -1,12 +1,13 @@
 """Field paths such as `poses[*].position.x`, and name templates such as `tag{id}` that contain them.
 
     path      =  ["$."] step { step }      "$." starts at the message, not at the object in it
-    step      =  name | "." name | "[" number "]" | "[*]"
+    step      =  name | "." name | "[" number "]" | "[*]" | name "[" name "=" text "]"
     template  =  { text | "{" path { "|" path } "}" }
 
-Messages may be decoded ROS, protobuf or JSON. `walk` follows a path step by step and explains errors;
-`getter` compiles it to nested calls. A path comes from a file, so nothing in it is evaluated: it reaches only
-fields that the message declares.
+`position[name=elbow]` is the element of `position` where the list `name` beside it has `elbow`; only signals
+have such steps. Messages may be decoded ROS, protobuf or JSON. `walk` follows a path step by step and
+explains errors; `getter` compiles it to nested calls. A path comes from a file, so nothing in it is
+evaluated: it reaches only fields that the message declares.
 """
 
 from __future__ import annotations
@@ -68,10 +69,13 @@ def type_name(value: object) -> str:
 Get: TypeAlias = Callable[[Any], Any]
 
 EACH: Final = "*"
-PATTERN: Final = r"(\$\.)?[A-Za-z_][\w-]*(\.[A-Za-z_][\w-]*|\[(\d{1,9}|\*)\])*"
+_KEYED = r"[A-Za-z_][\w-]*\[[A-Za-z_][\w-]*=[^\[\]{}|=\s]{1,100}\]"
+PATTERN: Final = rf"(\$\.)?(?=[A-Za-z_])(\.?(?:{_KEYED}|[A-Za-z_][\w-]*)|\[(\d{{1,9}}|\*)\])+"
 """A path, as a regular expression."""
 
-_STEP = re.compile(r"\.?([A-Za-z_][\w-]*)|\[(\d{1,9}|\*)\]", re.ASCII)
+_STEP = re.compile(
+    r"\.?([A-Za-z_][\w-]*)(?:\[([A-Za-z_][\w-]*)=([^\[\]{}|=\s]+)\])?|\[(\d{1,9}|\*)\]", re.ASCII
+)
 _PATH = re.compile(PATTERN, re.ASCII)
 
 
@@ -88,7 +92,21 @@ class Each:
     """The step `[*]`: every element of a list."""
 
 
-Step: TypeAlias = str | int | Each
+@dataclass(frozen=True, slots=True)
+class Keyed:
+    """The step `field[names=key]`: the element of one list where another one beside it has a text."""
+
+    field: str
+    names: str
+    key: str
+
+    def read(self, value: Any) -> object:
+        """Return the element; None, for an unknown number, where the key is not in the list."""
+        keys = list(get_field(value, self.names))  # type: ignore[call-overload]
+        return get_field(value, self.field)[keys.index(self.key)] if self.key in keys else None  # type: ignore[index]
+
+
+Step: TypeAlias = str | int | Each | Keyed
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,8 +136,11 @@ class FieldPath:
             )
         steps: list[Step] = []
         for match in _STEP.finditer(text.removeprefix("$.")):
-            name, index = match.groups()
-            steps.append(name if name else Each() if index == EACH else int(index))
+            name, names, key, index = match.groups()
+            if names:
+                steps.append(Keyed(name, names, key))
+            else:
+                steps.append(name if name else Each() if index == EACH else int(index))
         return cls(text, tuple(steps), text.startswith("$."))
 
 
@@ -134,6 +155,8 @@ def walk(path: FieldPath, value: object) -> object:
             value = _named(path, value, step)
         elif isinstance(step, int):
             value = _numbered(path, value, step)
+        elif isinstance(step, Keyed):
+            value = _keyed(path, value, step)
     return value
 
 
@@ -167,6 +190,18 @@ def _numbered(path: FieldPath, value: object, index: int) -> object:
     return value[index]
 
 
+def _keyed(path: FieldPath, value: object, step: Keyed) -> object:
+    lists = [_named(path, value, name) for name in (step.names, step.field)]
+    for name, each in zip((step.names, step.field), lists, strict=True):
+        if not is_list(each):
+            raise FieldError(f"{path.text}: {name} has to be a list, got {type_name(each)}")
+    keys = [str(key) for key in lists[0]]  # type: ignore[attr-defined]
+    if step.key not in keys:
+        hint = nearest_hint(step.key, keys) or f"it has {', '.join(keys[:20]) or 'nothing'}"
+        raise FieldError(f"{path.text}: {step.names} has no {step.key!r}; {hint}")
+    return step.read(value)
+
+
 def is_list(value: object) -> TypeGuard[Sequence[object]]:
     """Return whether a value is a list of ROS (or a NumPy array), protobuf or JSON."""
     return (
@@ -184,7 +219,11 @@ def getter(path: FieldPath, style: Style) -> Get:
     if style == "attributes" and path.steps and all(isinstance(step, str) for step in path.steps):
         return attrgetter(".".join(map(str, path.steps)))
     chain: list[Get] = [
-        attrgetter(step) if style == "attributes" and isinstance(step, str) else itemgetter(step)
+        step.read
+        if isinstance(step, Keyed)
+        else attrgetter(step)
+        if style == "attributes" and isinstance(step, str)
+        else itemgetter(step)
         for step in path.steps
     ]
     if len(chain) == 1:
@@ -219,6 +258,8 @@ def iter_elements(path: FieldPath, message: object) -> Iterator[object]:
             values = [_named(path, value, step) for value in values]
         elif isinstance(step, int):
             values = [_numbered(path, value, step) for value in values]
+        elif isinstance(step, Keyed):
+            values = [_keyed(path, value, step) for value in values]
         else:
             for value in values:
                 if not is_list(value):

@@ -22,14 +22,14 @@ from spatial_replay.bags.topic import Topic
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import Attachment, Block, Channel, Messages
-from spatial_replay.logs.read_options import FaultList, OnTimeJump
+from spatial_replay.logs.read_options import FaultList, OnTimeJump, late_ns
 from spatial_replay.logs.remote import LogFile, RemoteFile
 from spatial_replay.logs.topics import DERIVED, MAPPED, OBJECTS, is_kept
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.model import LogMapping
 from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.trace.axes import Axes
-from spatial_replay.trace.sample import FOREVER
+from spatial_replay.trace.sample import FOREVER, LATEST_NS
 from spatial_replay.trace.trace import Trace
 
 _WAITING_BYTES = 2**26
@@ -46,6 +46,7 @@ class MappedSource:
     Attributes:
         keep: which messages its blocks hold for a copy, byte for byte: "mapped" for those of the topics that
             the mapping reads, "all", or patterns of topics such as "/camera/*"; several add up.
+        late: how late messages may come, or "all".
     """
 
     path: LogFile
@@ -54,6 +55,7 @@ class MappedSource:
     concave: Concave = "decompose"
     on_time_jump: OnTimeJump = "error"
     keep: tuple[str, ...] = (MAPPED,)
+    late: str = "1s"
 
     @property
     def name(self) -> str:
@@ -68,7 +70,8 @@ class MappedSource:
     def options(self) -> Mapping[str, object]:
         """The options of reading, for the metadata of a copy."""
         mapping = {"mapping": self.mapping.name, "mapping_sha256": self.mapping.sha256}
-        return mapping | ({} if self.on_time_jump == "error" else {"on_time_jump": self.on_time_jump})
+        given = {} if self.on_time_jump == "error" else {"on_time_jump": self.on_time_jump}
+        return mapping | given | ({} if self.late == "1s" else {"late": self.late})
 
     @property
     def begin_ns(self) -> int | None:
@@ -107,8 +110,8 @@ class MappedSource:
         blocks.remarks.extend(_unread(self.name, topics, plan))
         as_recorded = self.on_time_jump == "split"
         columns = _columns(reader, plan, read, start_ns, end_ns, as_recorded=as_recorded)
-        if not as_recorded:
-            columns = without_jumps(columns, self.name, mapped)
+        if not as_recorded and plan.late_ns < LATEST_NS:
+            columns = without_jumps(columns, self.name, mapped, plan.late_ns)
         for piece in in_pieces(columns):
             # what is only copied neither makes samples nor moves their time
             evaluated = piece if read == mapped else piece.of_topics(mapped)
@@ -132,7 +135,7 @@ class MappedSource:
         if reasons:
             raise LogError("\n".join(f"{self.name}: {reason}" for reason in reasons))
         try:
-            return ReadingPlan.of(self.mapping, topics)
+            return ReadingPlan.of(self.mapping, topics, late_ns(self.late))
         except UsageError as error:
             faults = reader.take_faults()
             if faults:

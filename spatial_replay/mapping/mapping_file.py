@@ -22,6 +22,7 @@ from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.checked_yaml import checked_document, read_yaml_text
 from spatial_replay.mapping.field_paths import FieldPath, NameTemplate
 from spatial_replay.mapping.model import (
+    NO_TOPIC,
     UNITS_NS,
     ClassMapping,
     LogMapping,
@@ -88,6 +89,7 @@ def _mapping(document: Document, name: str) -> LogMapping:
         clock=value.get("clock", "log"),
         sampling=Sampling(sample.get("topic"), duration_ns(sample["every"]) if "every" in sample else None),
         max_age_ns=age_ns(value["max_age"]) if "max_age" in value else None,
+        origin=_origin(value.get("origin")),
         axes=Axes(value.get("axes", {}).get("y", "up"), float(value.get("scale", 1.0))),
     )
 
@@ -95,6 +97,8 @@ def _mapping(document: Document, name: str) -> LogMapping:
 def _contradictions(document: Document) -> list[tuple[Place, str]]:
     """Find what a schema cannot express: unknown shapes, keys that exclude each other, durations of 0."""
     value = document.value
+    if isinstance(value, dict) and "topics" in value and not value["topics"]:
+        return [(("topics",), NO_TOPIC)]
     if not isinstance(value, dict) or not isinstance(value.get("topics"), dict):
         return []
     listed = value.get("shapes")
@@ -164,6 +168,10 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
         clock=entry.get("clock"),
         optional=entry.get("optional", False),
     )
+
+
+def _origin(value: Any) -> tuple[float, float] | None:
+    return None if value is None else (float(value[0]), float(value[1]))
 
 
 def _class(value: Any) -> str | ClassMapping | None:

@@ -34,6 +34,7 @@ class MessageLayout:
         frame, stamp: in the object, or with `$.` in the message.
         solids: the kind of message that lists the solids of an object; "" for objects with a single shape.
         is_generic: whether the fields are guesses for an unknown type.
+        origin: where positions that are latitudes and longitudes are counted from; None for metres.
     """
 
     objects: str = ""
@@ -60,6 +61,7 @@ class MessageLayout:
     height: tuple[Measure, Measure] | None = None
     uncertainty: Uncertainty | None = None
     is_generic: bool = False
+    origin: tuple[float, float] | None = None
 
 
 _UNKNOWN = ("unknown", "unknown_small", "unknown_medium", "unknown_big")
@@ -103,6 +105,11 @@ _MARKER = MessageLayout(
     frame=("header.frame_id",),
     stamp=(Stamp("header.stamp"),),
 )
+
+GEODETIC: Alternatives = ("latitude", "longitude")
+"""The fields of a fix, in degrees."""
+# the receiver's frame says nothing about where latitude and longitude are counted from
+_FIX = MessageLayout(position=((*GEODETIC, "status.status"), GEODETIC), frame=())
 
 BUILT_IN: Table[str, MessageLayout] = MappingProxyType(
     {
@@ -159,11 +166,15 @@ BUILT_IN: Table[str, MessageLayout] = MappingProxyType(
         "foxglove/PosesInFrame": replace(_POSES, frame=("$.frame_id",), stamp=(Stamp("$.timestamp"),)),
         "foxglove/PoseInFrame": replace(_POSE, frame=("$.frame_id",), stamp=(Stamp("$.timestamp"),)),
         "foxglove/FrameTransform": _FRAME_TRANSFORM,
+        "sensor_msgs/NavSatFix": _FIX,
+        "foxglove/LocationFix": replace(_FIX, stamp=(Stamp("$.timestamp"),)),
         "foxglove/FrameTransforms": replace(_FRAME_TRANSFORM, objects="transforms[*]"),
     }
 )
 
 TRANSFORM_TYPES = frozenset(kind for kind, layout in BUILT_IN.items() if layout.name == "{child_frame_id}")
+
+GEODETIC_TYPES = frozenset(kind for kind, layout in BUILT_IN.items() if GEODETIC in layout.position)
 
 _POINTS = ("pose.pose.position", "pose.position", "position", "base.position", "pose", "center", "centre")
 

@@ -21,6 +21,9 @@ DEFAULT_MAX_AGE_NS = 10**9
 FOREVER_NS = 2**63 - 1
 """The `max_age` of observations that stay valid forever."""
 
+NO_TOPIC = "no topic was chosen: name one with objects or signals"
+"""What is wrong with a mapping without topics."""
+
 Measure: TypeAlias = float | str
 """A number, or the field path of one."""
 
@@ -146,6 +149,7 @@ class LogMapping:
         fixed_frame: the frame that coordinates are transformed into; None leaves them as they are.
         topics: in the file's order.
         axes: those of the fixed frame, or of the messages without one.
+        origin: latitude and longitude in degrees where the fixes of satellite receivers have (0, 0).
     """
 
     name: str
@@ -156,6 +160,7 @@ class LogMapping:
     sampling: Sampling = Sampling()
     max_age_ns: int | None = None
     axes: Axes = OUR_AXES
+    origin: tuple[float, float] | None = None
 
 
 UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}

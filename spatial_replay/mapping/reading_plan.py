@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Container, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from spatial_replay.bags.columns import DISORDER_NS
 from spatial_replay.bags.topic import Topic
 from spatial_replay.errors import UsageError
 from spatial_replay.mapping.message_types import (
     BUILT_IN,
+    GEODETIC,
+    GEODETIC_TYPES,
     TRANSFORM_TYPES,
     MessageLayout,
     layout_of_topic,
@@ -17,9 +20,6 @@ from spatial_replay.mapping.message_types import (
 from spatial_replay.mapping.model import DEFAULT_MAX_AGE_NS, FOREVER_NS, Clock, LogMapping, TopicMapping
 from spatial_replay.mapping.transforms import HISTORY_NS
 from spatial_replay.text import nearest_hint
-
-DISORDER_NS = 10**9
-"""How far messages may be out of order; it is also how long samples wait for late messages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +54,7 @@ class ReadingPlan:
         topics: every topic to read: those mapped, and those with transforms if frames are needed.
         by_log_time: whether the times of samples are log times. If not, the messages of a window are known
             only when all have been decoded.
+        late_ns: how far messages may be out of order; it is also how long samples wait for late messages.
         margin_ns: how far beyond the end of a window messages still count.
         planned: how each topic is read, in the order of `topics`.
         lost: topics with transforms that cannot be decoded, with the reason.
@@ -65,13 +66,14 @@ class ReadingPlan:
     topics: tuple[str, ...]
     by_log_time: bool
     margin_ns: int
+    late_ns: int = DISORDER_NS
     planned: tuple[PlannedTopic, ...] = ()
     sampled_topic: str | None = None
     lost: tuple[tuple[str, str], ...] = ()
     absent: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, mapping: LogMapping, topics: Sequence[Topic]) -> ReadingPlan:
+    def of(cls, mapping: LogMapping, topics: Sequence[Topic], late_ns: int = DISORDER_NS) -> ReadingPlan:
         """Compare a mapping with the topics of a log.
 
         Raises:
@@ -98,7 +100,8 @@ class ReadingPlan:
             mapping=mapping,
             topics=tuple(names),
             by_log_time=all(topic.clock == "log" for topic in planned),
-            margin_ns=DISORDER_NS + (HISTORY_NS if waits_for_frames else 0),
+            late_ns=late_ns,
+            margin_ns=late_ns + (HISTORY_NS if waits_for_frames else 0),
             planned=planned,
             sampled_topic=sampled,
             lost=tuple(lost),
@@ -120,7 +123,7 @@ class ReadingPlan:
             own = max(own, HISTORY_NS + max(ages, default=0))
             if any(each.is_lasting and each.layout is not None for each in self.planned):
                 return None
-        return None if planned.is_lasting or own >= FOREVER_NS else own + DISORDER_NS
+        return None if planned.is_lasting or own + self.late_ns >= FOREVER_NS else own + self.late_ns
 
 
 def _faults(mapping: LogMapping, known: dict[str, Topic]) -> list[str]:
@@ -148,6 +151,17 @@ def _faults(mapping: LogMapping, known: dict[str, Topic]) -> list[str]:
         listed = ", ".join(sorted(known)[:20]) or "none"
         faults.append(f"topics: the log has none of these optional topics; its topics are {listed}")
     for entry in mapping.topics:
+        kind = short_type(entry.type or (known[entry.topic].type if entry.topic in known else ""))
+        if (
+            kind in GEODETIC_TYPES
+            and entry.reads_objects
+            and entry.position is None
+            and mapping.origin is None
+        ):
+            faults.append(
+                f"topics.{entry.topic}: {kind} holds degrees; give the file an"
+                " `origin: [latitude, longitude]`, and positions are metres east and north of it"
+            )
         if entry.type is not None and short_type(entry.type) not in BUILT_IN:
             hint = nearest_hint(short_type(entry.type), BUILT_IN) or f"known are {', '.join(BUILT_IN)}"
             faults.append(f"topics.{entry.topic}.type: {entry.type!r} is not a known type; {hint}")
@@ -166,6 +180,8 @@ def _planned(
     is_transforms = needs_frames and short_type(topic.type) in TRANSFORM_TYPES
     is_static = is_transforms and (topic.latched or topic.name.rsplit("/", 1)[-1] == "tf_static")
     layout = layout_of_topic(topic.type, entry) if entry is not None and entry.reads_objects else None
+    if layout is not None and GEODETIC in layout.position:
+        layout = replace(layout, origin=mapping.origin)
     stays = topic.latched or (layout is not None and layout.stays)
     default = mapping.max_age_ns or (FOREVER_NS if stays else DEFAULT_MAX_AGE_NS)
     max_age_ns = (entry.max_age_ns if entry is not None else None) or default

@@ -8,15 +8,32 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import isfinite
 from operator import itemgetter
 from types import MappingProxyType
 
 from spatial_replay.bags.topic import Topic
 from spatial_replay.logs.topics import DERIVED
-from spatial_replay.mapping.field_paths import field_names, get_field, is_list, name_from_topic
-from spatial_replay.mapping.message_types import BUILT_IN, TRANSFORM_TYPES, short_type
+from spatial_replay.mapping.field_paths import (
+    FieldPath,
+    field_names,
+    get_field,
+    getter,
+    name_from_topic,
+    style_of,
+)
+from spatial_replay.mapping.message_types import (
+    BUILT_IN,
+    GEODETIC,
+    GEODETIC_TYPES,
+    TRANSFORM_TYPES,
+    short_type,
+)
+from spatial_replay.mapping.model import NO_TOPIC
+from spatial_replay.mapping.recognise import Guess, frame_of, guess_objects, numbers_in
 from spatial_replay.text import counted
 from spatial_replay.trace.sample import FOREVER
 
@@ -26,24 +43,12 @@ EXAMPLES = 20
 _RADIUS = "0.5"
 _TOGETHER_NS = 10**9
 _NOT_KNOWN: Mapping[str, int] = MappingProxyType({})
-_MOST_SIGNALS = 8
+_MOST_SIGNALS = 12
 _PLAIN = re.compile(r"/?[A-Za-z_][\w/.-]*", re.ASCII)
 _MIDDLEWARE = frozenset({"rosout", "rosout_agg", "parameter_events", "clock", "diagnostics"})
 """Topics about programs rather than objects, by the last part of their names."""
-
-_DEEPEST = 4
-"""Levels of nested fields to search."""
-_POSITIONS = ("position", "center", "centre", "translation", "location", "point")
-_TURNS = ("orientation", "rotation", "quaternion")
-_YAWS = ("yaw", "theta", "heading", "angle")
-_SIZES = ("dimension", "dimensions", "size", "scale", "extent", "shape", "bbox")
-_OUTLINES = ("corners", "polygon", "points", "vertices", "outline", "footprint", "contour")
-_NAMES = ("name", "id", "track_id", "object_id", "tracking_id", "child_frame_id", "uuid", "label")
-_CLASSES = ("class", "class_name", "classification", "category", "label", "object_type", "type")
-_LISTS = re.compile("object|detection|track|tag|agent|obstacle|pose|vehicle|pedestrian|marker")
-_NOT_PLACES = frozenset(
-    {"velocity", "acceleration", "twist", "linear", "angular", "header", "stamp", "covariance"}
-)
+_SENSORS = re.compile("camera|optical|lidar|laser|velodyne|radar|imu|gps|gnss|sensor", re.IGNORECASE)
+"""Names of frames that are mounted on an object."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +56,8 @@ class TopicSuggestion:
     """A suggestion for one topic.
 
     Attributes:
-        entry: its entry in a mapping, in YAML's flow style; empty if nothing looks like an object.
+        fields: its entry in a mapping, by key, in YAML's flow style; None if nothing looks like an object.
+        name: the template of its objects' names, by default or as in the entry.
         remarks: what a reader should know or change.
         is_transforms: whether it carries transforms. They are suggested as objects only if there are no
             others.
@@ -60,11 +66,25 @@ class TopicSuggestion:
     """
 
     topic: Topic
-    entry: str = ""
+    fields: Mapping[str, str] | None = None
+    name: str = ""
     remarks: tuple[str, ...] = ()
     is_transforms: bool = False
     frame: str | None = None
     numbers: tuple[str, ...] = ()
+
+    @property
+    def entry(self) -> str:
+        """The entry in YAML's flow style; empty if nothing looks like an object."""
+        return "" if self.fields is None else _flow(self.fields)
+
+    @property
+    def signals(self) -> str:
+        """An entry that takes the numbers as signals; empty without any."""
+        prefix = _topic_words(self.topic.name)
+        names = {f"{prefix}_{_signal_name(path)}": path for path in self.numbers[:_MOST_SIGNALS]}
+        listed = _flow({_text(name): _text(path) for name, path in names.items()})
+        return f"{{signals: {listed}}}" if names else ""
 
 
 def suggest_topics(
@@ -94,24 +114,58 @@ def suggest_mapping(
     suggestions = suggest_topics(topics, examples)
     mapped = [each for each in suggestions if each.entry and not each.is_transforms]
     transforms = [each for each in suggestions if each.is_transforms]
-    active = mapped or [each for each in transforms if each.entry]
+    active = _distinguished(mapped or [each for each in transforms if each.entry])
+    signals = [] if active else [each for each in suggestions if each.signals]
+    chosen = {each.topic.name: each.entry for each in active} | {e.topic.name: e.signals for e in signals}
     lines = [f"# How messages of {_comment(log)} become objects: a start, made from the first of them."]
+    if not active:
+        lines.append(f"# Nothing looks like an object{': these are signals' if signals else ''}.")
     lines += [
         *_frame_lines(active, transforms, examples),
         *_axes_lines(active),
-        *_time_lines(active, first_ns),
+        *_origin_lines(active, examples),
+        *_time_lines(active or signals, first_ns),
         "topics:",
     ]
-    if not active:
-        lines.append("  # nothing looks like an object; name the fields of a topic that is one, such as")
+    if not chosen:
+        lines.append(f"  # {NO_TOPIC}, such as")
         lines.append("  # /robot/state: {name: robot, position: [x, y], yaw: theta, shape: {disc: 0.5}}")
-    for each in active:
+    for each in active or signals:
         lines += [f"  # {_described(each.topic)}", *(f"  # {remark}" for remark in each.remarks)]
-        lines.append(f"  {_text(each.topic.name)}: {each.entry}")
-    rest = [each for each in suggestions if each not in active]
+        lines.append(f"  {_text(each.topic.name)}: {chosen[each.topic.name]}")
+    rest = [each for each in suggestions if each.topic.name not in chosen]
     if rest:
         lines += ["", "  # not used:", *(line for each in rest for line in _unused(each))]
     return "\n".join(lines) + "\n"
+
+
+def _distinguished(active: Sequence[TopicSuggestion]) -> list[TopicSuggestion]:
+    """Return suggestions with the topic in those names that several topics share."""
+    shared = Counter(each.name for each in active)
+    return [_with_own_name(each) if shared[each.name] > 1 else each for each in active]
+
+
+def _with_own_name(each: TopicSuggestion) -> TopicSuggestion:
+    prefix = _topic_words(each.topic.name)
+    name = f"{prefix}_{each.name}" if "{" in each.name else prefix
+    fields = {**(each.fields or {}), "name": _text(name)}
+    # of a list, its path comes first
+    ordered = sorted(fields.items(), key=lambda field: {"objects": 0, "name": 1}.get(field[0], 2))
+    return replace(each, fields=dict(ordered))
+
+
+def _origin_lines(
+    active: Sequence[TopicSuggestion], examples: Mapping[str, Sequence[object]]
+) -> Iterator[str]:
+    """Yield the line about where local metres are counted from: the first fix."""
+    for each in active:
+        if short_type(each.topic.type) in GEODETIC_TYPES:
+            for message in examples.get(each.topic.name, ()):
+                place = [float(getter(FieldPath.of(name), style_of(message))(message)) for name in GEODETIC]
+                if all(map(isfinite, place)):
+                    yield "# where (0, 0) is, here at the first fix; x is in metres east of it, y north"
+                    yield f"origin: [{place[0]!r}, {place[1]!r}]"
+                    return
 
 
 def _axes_lines(active: Sequence[TopicSuggestion]) -> Iterator[str]:
@@ -125,21 +179,36 @@ def _suggestion(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
     if topic.name in DERIVED or topic.name.rstrip("/").split("/")[-1] in _MIDDLEWARE:
         return TopicSuggestion(topic)
     kind = short_type(topic.type)
-    frame = next((name for each in examples if (name := _frame_of(each)) is not None), None)
+    frame = next((name for each in examples if (name := frame_of(each)) is not None), None)
     if topic.unreadable is not None:
         return TopicSuggestion(topic, remarks=(f"cannot be read: {_comment(topic.unreadable)}",))
     if kind in TRANSFORM_TYPES:
-        return TopicSuggestion(topic, f"{{shape: {{disc: {_RADIUS}}}}}", _SIZELESS, is_transforms=True)
+        return _of_transforms(topic, examples)
     if kind in BUILT_IN:
         reading = BUILT_IN[kind]
         has_outline = bool(reading.polygon or reading.sizes or reading.solids)
-        entry = "{}" if has_outline else f"{{shape: {{disc: {_RADIUS}}}}}"
-        return TopicSuggestion(topic, entry, () if has_outline else _SIZELESS, frame=frame)
-    guesses = [guess for each in examples if (guess := _guess(each)) is not None]
-    if not guesses:
-        return TopicSuggestion(topic, numbers=_numbers_in(examples[0]) if examples else ())
-    best = max(guesses, key=lambda guess: guess.score)
-    return TopicSuggestion(topic, _entry(topic, best), _remarks(best), frame=frame)
+        name = reading.name.replace("{topic}", name_from_topic(topic.name))
+        return TopicSuggestion(
+            topic, {} if has_outline else _POINT, name, () if has_outline else _SIZELESS, frame=frame
+        )
+    guess = guess_objects(topic.name, topic.type, examples)
+    if guess is None:
+        return TopicSuggestion(topic, numbers=numbers_in(examples[0]) if examples else ())
+    name = _name(topic, guess)
+    return TopicSuggestion(topic, _fields(name, guess), name, _remarks(guess), frame=frame)
+
+
+def _of_transforms(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
+    """Suggest the frames of transforms, without those that are mounted on others."""
+    if topic.latched or topic.name.rsplit("/", 1)[-1] == "tf_static":
+        remark = "static transforms place frames, such as those of sensors; they are no objects"
+        return TopicSuggestion(topic, remarks=(remark,), is_transforms=True)
+    children = {child for message in examples for _, child in _edges(message)}
+    mounted = sorted(child for child in children if _SENSORS.search(child))
+    left_out = (
+        {"except": f"[{', '.join(map(_text, mounted))}]"} if mounted and len(mounted) < len(children) else {}
+    )
+    return TopicSuggestion(topic, {**left_out, **_POINT}, "{child_frame_id}", _SIZELESS, is_transforms=True)
 
 
 _IN_IMAGES = frozenset({"vision_msgs/Detection2DArray", "apriltag_msgs/AprilTagDetectionArray"})
@@ -148,20 +217,36 @@ _IN_IMAGES = frozenset({"vision_msgs/Detection2DArray", "apriltag_msgs/AprilTagD
 _SIZELESS = (f"messages have no size: {_RADIUS} is a guess, {{box: [length, width]}} is another shape",)
 
 
-def _entry(topic: Topic, guess: _Guess) -> str:
+_POINT = MappingProxyType({"shape": f"{{disc: {_RADIUS}}}"})
+_INDEXED = "only the places in the list distinguish objects: objects swap where these change"
+
+
+def _fields(name: str, guess: Guess) -> dict[str, str]:
     parts: list[tuple[str, str | tuple[str, ...] | None]] = [
         ("objects", guess.objects),
-        ("name", _name(topic, guess)),
+        ("name", name),
         ("class", guess.class_name),
         ("position", guess.position),
         ("orientation", guess.orientation),
         ("yaw", guess.yaw),
         ("polygon", guess.polygon),
     ]
-    texts = [f"{key}: {_value(key, value)}" for key, value in parts if value is not None]
-    if guess.polygon is None:
-        texts.append(f"shape: {_shape(guess)}")
-    return "{" + ", ".join(texts) + "}"
+    fields = {key: _value(key, value) for key, value in parts if value is not None}
+    return fields if guess.polygon is not None else {**fields, "shape": _shape(guess)}
+
+
+def _flow(fields: Mapping[str, str]) -> str:
+    return "{" + ", ".join(f"{key}: {value}" for key, value in fields.items()) + "}"
+
+
+def _topic_words(topic: str) -> str:
+    return "_".join(word for word in topic.split("/") if word) or "object"
+
+
+def _signal_name(path: str) -> str:
+    """Return a name for a path: `position[name=elbow]` → elbow_position."""
+    before, _, key = path.removesuffix("]").partition("[name=")
+    return re.sub(r"\W", "_", f"{key}_{before}" if key else path, flags=re.ASCII)
 
 
 def _value(key: str, value: str | tuple[str, ...]) -> str:
@@ -170,23 +255,24 @@ def _value(key: str, value: str | tuple[str, ...]) -> str:
     return f"{{field: {_text(value)}}}" if key == "class" else _text(value)
 
 
-def _shape(guess: _Guess) -> str:
+def _shape(guess: Guess) -> str:
     if not guess.size:
         return f"{{disc: {_RADIUS}}}"
     return f"{{disc: {guess.size[0]}}}" if len(guess.size) == 1 else f"{{box: [{', '.join(guess.size)}]}}"
 
 
-def _name(topic: Topic, guess: _Guess) -> str:
+def _name(topic: Topic, guess: Guess) -> str:
     if guess.objects is None:
         return name_from_topic(topic.name)
     word = guess.objects.removesuffix("[*]").split(".")[-1].removesuffix("s") or "object"
-    return f"{word}{{{guess.name or 'index'}}}"
+    return f"{word}{{{guess.names[0] if guess.names else 'index'}}}"
 
 
-def _remarks(guess: _Guess) -> tuple[str, ...]:
+def _remarks(guess: Guess) -> tuple[str, ...]:
     sizeless = () if guess.polygon is not None or guess.size else _SIZELESS
     others = (f"other lists that look like objects: {', '.join(guess.others[:6])}",) if guess.others else ()
-    return sizeless + others
+    indexed = (_INDEXED,) if guess.objects is not None and not guess.names else ()
+    return sizeless + indexed + others
 
 
 def _frame_lines(
@@ -216,7 +302,7 @@ def _edges(message: object) -> Iterator[tuple[str, str]]:
         listed = message.get("transforms")
     for each in [message] if listed is None else listed:
         known = field_names(each)
-        parent = _frame_of(each) or ("parent_frame_id" in known and get_field(each, "parent_frame_id"))
+        parent = frame_of(each) or ("parent_frame_id" in known and get_field(each, "parent_frame_id"))
         child = "child_frame_id" in known and get_field(each, "child_frame_id")
         if isinstance(parent, str) and isinstance(child, str) and parent and child:
             yield parent.removeprefix("/"), child.removeprefix("/")
@@ -247,10 +333,8 @@ def _unused(each: TopicSuggestion) -> Iterator[str]:
     topic = _text(each.topic.name)
     if each.entry:
         yield f"  # {topic}: {each.entry}    # {_described(each.topic)}"
-    elif each.numbers:
-        prefix, numbers = name_from_topic(each.topic.name), each.numbers[:_MOST_SIGNALS]
-        signals = ", ".join(f"{prefix}_{_text(path.replace('.', '_'))}: {path}" for path in numbers)
-        yield f"  # {topic}: {{signals: {{{signals}}}}}    # {_described(each.topic)}"
+    elif each.signals:
+        yield f"  # {topic}: {each.signals}    # {_described(each.topic)}"
     else:
         remark = "".join(f"; {remark}" for remark in each.remarks)
         yield f"  # {topic}: {_described(each.topic)}{remark}"
@@ -269,162 +353,3 @@ def _comment(text: str) -> str:
 def _text(text: str) -> str:
     """Return a text as a YAML scalar."""
     return text if _PLAIN.fullmatch(text) else json.dumps(text, ensure_ascii=True)
-
-
-@dataclass(frozen=True, slots=True)
-class _Guess:
-    """Fields of a message that look like those of an object; texts are field paths.
-
-    Attributes:
-        objects: of the list of objects, or None for a single one.
-        position: of a point, or of x and y.
-        size: of length, width and maybe height; or of a radius.
-        others: of further lists whose elements look like objects.
-    """
-
-    objects: str | None = None
-    position: str | tuple[str, ...] | None = None
-    orientation: str | None = None
-    yaw: str | None = None
-    polygon: str | None = None
-    size: tuple[str, ...] = ()
-    name: str | None = None
-    class_name: str | None = None
-    others: tuple[str, ...] = ()
-
-    @property
-    def score(self) -> int:
-        """How many fields of an object there are; a place counts most."""
-        parts = (self.polygon, self.size, self.name, self.orientation or self.yaw, self.class_name)
-        return 10 * (self.polygon is not None or self.position is not None) + sum(map(bool, parts))
-
-
-def _guess(message: object) -> _Guess | None:
-    """Find an object, or a list of them, in a message; None if nothing looks like one."""
-    itself = _object_in(message)
-    lists = sorted(
-        ((guess, path) for path, guess in _iter_lists(message)),
-        key=lambda each: (-_list_rank(each[1]), -each[0].score),
-    )
-    if lists and (itself is None or itself.polygon is None):
-        best, path = lists[0]
-        return replace(best, objects=path, others=tuple(other for _, other in lists[1:]))
-    return itself
-
-
-def _numbers_in(message: object) -> tuple[str, ...]:
-    """Return the paths of the numbers in a message, except those in lists and in the header."""
-    fields = _iter_fields(message, skipped=frozenset({"header", "stamp"}))
-    return tuple(path for path, value in fields if _is_number(value))
-
-
-def _frame_of(message: object) -> str | None:
-    """Return the frame of a message's coordinates, if the message names it."""
-    for path, value in _iter_fields(message, skipped=frozenset()):
-        if path.split(".")[-1] == "frame_id" and isinstance(value, str) and value:
-            return value.removeprefix("/")
-    return None
-
-
-def _iter_lists(message: object) -> Iterator[tuple[str, _Guess]]:
-    for path, value in _iter_fields(message):
-        if is_list(value) and len(value) and field_names(value[0]):
-            guess = _object_in(value[0])
-            # the corners of an outline are points, not objects
-            if guess is not None and not (path.split(".")[-1] in _OUTLINES and guess.score <= 10):
-                yield f"{path}[*]", guess
-
-
-def _object_in(value: object) -> _Guess | None:
-    """Find the fields of one object in a message or an element of a list."""
-    fields = dict(_iter_fields(value))
-    polygon = next((path for path in _named(fields, _OUTLINES) if _is_outline(fields[path])), None)
-    position = _position_in(fields)
-    if polygon is None and position is None:
-        return None
-    yaw = _first(fields, _YAWS, _is_number) if polygon is None else None
-    turn = next((path for path in _named(fields, _TURNS) if _has(fields[path], "xyzw")), None)
-    return _Guess(
-        position=position if polygon is None else None,
-        orientation=turn if polygon is None else None,
-        yaw=None if turn else yaw,
-        polygon=polygon,
-        size=_size_in(fields) if polygon is None else (),
-        name=_name_in(fields),
-        class_name=_first(fields, _CLASSES, lambda each: isinstance(each, str)),
-    )
-
-
-def _position_in(fields: dict[str, object]) -> str | tuple[str, ...] | None:
-    for path in _named(fields, _POSITIONS):
-        if _has(fields[path], "xy"):
-            return path
-    if _is_number(fields.get("x")) and _is_number(fields.get("y")) and not _is_number(fields.get("w")):
-        return ("x", "y")
-    return None
-
-
-def _size_in(fields: dict[str, object]) -> tuple[str, ...]:
-    for path in _named(fields, _SIZES):
-        for names in (("length", "width", "height"), ("x", "y", "z"), ("size_x", "size_y", "size_z")):
-            known = field_names(fields[path])
-            if all(name in known and _is_number(get_field(fields[path], name)) for name in names[:2]):
-                return tuple(f"{path}.{name}" for name in names if name in known)
-    for names in (("length", "width", "height"), ("size_x", "size_y", "size_z")):
-        if all(_is_number(fields.get(name)) for name in names[:2]):
-            return tuple(name for name in names if name in fields)
-    return ("radius",) if _is_number(fields.get("radius")) else ()
-
-
-def _name_in(fields: dict[str, object]) -> str | None:
-    for path in _named(fields, _NAMES):
-        value = fields[path]
-        if isinstance(value, str | int) and not isinstance(value, bool):
-            return path
-        if "value" in field_names(value):
-            return f"{path}.value"
-    return None
-
-
-def _named(fields: dict[str, object], names: tuple[str, ...]) -> list[str]:
-    """Return the paths that end in one of some names, by depth, then in the order of the names."""
-    paths = [path for path in fields if path.split(".")[-1].lower() in names]
-    return sorted(paths, key=lambda path: (path.count("."), names.index(path.split(".")[-1].lower())))
-
-
-def _first(fields: dict[str, object], names: tuple[str, ...], fits: Callable[[object], bool]) -> str | None:
-    return next((path for path in _named(fields, names) if fits(fields[path])), None)
-
-
-def _iter_fields(
-    value: object, path: str = "", depth: int = 0, *, skipped: frozenset[str] = _NOT_PLACES
-) -> Iterator[tuple[str, object]]:
-    """Iterate over the fields of a message and its parts, with their paths; lists are not entered."""
-    for name in field_names(value) if depth < _DEEPEST else ():
-        inner = get_field(value, name)
-        full = f"{path}.{name}" if path else name
-        if name not in skipped:
-            yield full, inner
-            yield from _iter_fields(inner, full, depth + 1, skipped=skipped)
-
-
-def _list_rank(path: str) -> int:
-    """Return how well the name of a list suits objects that move."""
-    last = path.removesuffix("[*]").split(".")[-1].lower()
-    return 2 * ("moving" in last or "dynamic" in last) + bool(_LISTS.search(last))
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _has(value: object, names: str) -> bool:
-    """Return whether a message has numbers as fields with these names of one letter."""
-    known = field_names(value)
-    return all(name in known and _is_number(get_field(value, name)) for name in names)
-
-
-def _is_outline(value: object) -> bool:
-    if not is_list(value):
-        return "points" in field_names(value) and _is_outline(get_field(value, "points"))
-    return len(value) >= 3 and _has(value[0], "xy")

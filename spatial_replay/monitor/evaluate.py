@@ -163,7 +163,7 @@ def evaluate(
         semantics: "ltlf", finite-trace robustness, or "paper", Def. 16 of the paper to the letter.
         start_ns, end_ns: evaluate the samples from start to before end; terms that look back (`a[-3]`) may
             look before the start.
-        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
+        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME" or a name.
         strict_names: names that the trace never has are errors; otherwise objects and signals are unknown, a
             template has no result for a class, and `Evaluation.remarks` warns of them.
 

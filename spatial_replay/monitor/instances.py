@@ -45,31 +45,38 @@ class Instance:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The objects that a template's parameter stands for: all, or those of a class.
+    """The objects that a template's parameter stands for: all, those of a class, or one by its name.
 
     Attributes:
-        class_name: the class, in any case; None for all objects.
+        class_name: the class, in any case; None for objects of any.
+        name: of the one object; None for objects of any.
     """
 
     class_name: str | None
+    name: str | None = None
 
     @classmethod
     def parse(cls, parameter: str, text: str) -> Choice:
-        """Read `all` or `class:NAME`.
+        """Read `all`, `class:NAME`, or the name of an object.
 
         Raises:
-            UsageError: anything else.
+            UsageError: there is no name.
         """
         if text == "all":
             return cls(None)
-        kind, _, name = text.partition(":")
-        if kind == "class" and name:
+        kind, colon, name = text.partition(":")
+        if colon and kind == "class" and name:
             return cls(name)
+        if text and not (colon and kind == "class"):
+            return cls(None, text)
         raise UsageError(
-            f"{parameter}={text!r} chooses no objects; write {parameter}=all or {parameter}=class:NAME"
+            f"{parameter}={text!r} chooses no objects; write {parameter}=all, {parameter}=class:NAME or"
+            f" {parameter}=OBJECT"
         )
 
-    def fits(self, class_name: str | None) -> bool:
+    def fits(self, name: str, class_name: str | None) -> bool:
+        if self.name is not None:
+            return self.name == name
         return self.class_name is None or (class_name or "").casefold() == self.class_name.casefold()
 
 
@@ -112,7 +119,8 @@ def check_choices(templates: list[NamedSpec], each: Mapping[str, str]) -> None:
         if spec.parameter not in each:
             raise UsageError(
                 f"{spec.name}({spec.parameter}) is a template: say what {spec.parameter} stands for, "
-                f"--each {spec.parameter}=class:NAME or --each {spec.parameter}=all"
+                f"--each {spec.parameter}=class:NAME, --each {spec.parameter}=OBJECT or"
+                f" --each {spec.parameter}=all"
             )
     for parameter in each:
         if parameter not in {spec.parameter for spec in templates}:
@@ -137,6 +145,6 @@ def _appearances(
             spans[name] = (first_ns, int(times[seen[-1]]))
             codes = np.unique(trace.class_code[np.where(rows < ABSENT, -2 - rows, rows)[seen]])
             for parameter, choice in choices.items():
-                if any(choice.fits(trace.classes[code]) for code in codes.tolist()):
+                if any(choice.fits(name, trace.classes[code]) for code in codes.tolist()):
                     fitting[parameter].add(name)
     return {parameter: {name: spans[name] for name in names} for parameter, names in fitting.items()}

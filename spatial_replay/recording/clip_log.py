@@ -202,6 +202,7 @@ class ClipLog:
     """
 
     gather_s = GATHER_S / 4
+    backlog = 0
 
     def __init__(
         self,

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from spatial_replay.errors import LogError, OutputError
 from spatial_replay.logs.mcap.writer import LogWriter
-from spatial_replay.logs.output_file import open_output, refuse_inputs
+from spatial_replay.logs.output_file import Durability, open_output, refuse_inputs
 from spatial_replay.logs.source import Source, axes_of, read_blocks, reading_options
 from spatial_replay.recording.interruption import leaving, uninterrupted
 from spatial_replay.recording.recording import Recording, refuse_templates
@@ -53,6 +53,7 @@ def record_source(
     *,
     inputs: Sequence[Path] = (),
     advance: Callable[[int], None] = lambda samples: None,
+    durability: Durability = "process",
 ) -> Recorded:
     """Record the samples of a source, in place under the final name.
 
@@ -62,6 +63,7 @@ def record_source(
     Args:
         inputs: files that the output must not be.
         advance: called with the number of samples of each block that is done.
+        durability: "disk" for a log of which the disk has each chunk as soon as it is written.
 
     Raises:
         UsageError: the output is an input, or a specification cannot be recorded.
@@ -76,7 +78,7 @@ def record_source(
     first = next(traces)
     about = {"source": source.name, "options": json.dumps(reading_options(source))}
     about |= axes_of(source).metadata()
-    stream = open_output(output)
+    stream = open_output(output, durability)
     try:
         with leaving(output), stream:
             _record(LogWriter(stream), about, files, chain([first], traces), advance)

@@ -15,7 +15,7 @@ from typing import Self
 
 from spatial_replay.errors import OutputError, SpatialReplayError, TraceError, UsageError
 from spatial_replay.logs.messages import Channel, Messages
-from spatial_replay.logs.output_file import refuse_inputs
+from spatial_replay.logs.output_file import Durability, refuse_inputs
 from spatial_replay.recording.clip_log import ClipLog, Trigger, TriggeredClip
 from spatial_replay.recording.interruption import terminable, uninterrupted
 from spatial_replay.recording.message_channel import MessageChannel, MessageQueue
@@ -27,8 +27,11 @@ from spatial_replay.text import times_apart
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
-FLUSH_S = 0.4
+FLUSH_S = 0.3
 """About the longest time from writing a sample until the operating system has it."""
+
+MOST_LOST_S = 0.8
+"""Samples of more time than this are never on their way: then `write` waits or, if it may not, drops."""
 
 _TOGETHER = 1024
 """The most samples that are encoded at once."""
@@ -46,7 +49,8 @@ class SampleWriter:
         Args:
             name: of the log, for errors.
             waiting: how many samples, and how many messages, may wait for the writing thread.
-            block: when that many wait, let `write` wait, too; otherwise drop what comes, and count it.
+            block: when that many wait, or 0.8 s of them, let `write` wait, too; otherwise drop what comes,
+                and count it.
         """
         self._log, self._name = log, name
         # unlike a queue with a limit of its own, an interruption never leaves this one locked
@@ -58,6 +62,7 @@ class SampleWriter:
         self._messages = MessageQueue(name, waiting, blocks=block, ring=self._ring)
         self._dropped = 0
         self._last_ns = -1
+        self._unsafe_s: float | None = None
         self._closed = False
         self._failure: SpatialReplayError | None = None
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
@@ -98,15 +103,24 @@ class SampleWriter:
             at, last = times_apart(sample.time_ns, self._last_ns)
             raise TraceError(f"a sample at {at} follows one at {last}; give times that increase")
         self._last_ns = sample.time_ns
-        while self._queue.qsize() >= self._waiting:
+        while self._is_behind():
             if not self._blocks:
                 self._dropped += 1
                 return
             self._raise_failure()
             time.sleep(_PAUSE_S)
+        if self._unsafe_s is None:
+            self._unsafe_s = time.monotonic()
         self._queue.put(sample)
         if self._queue.qsize() >= self._enough:
             self._ring()
+
+    def _is_behind(self) -> bool:
+        """Return whether too many samples wait, or too much time of them could be lost."""
+        if self._queue.qsize() + self._log.backlog >= self._waiting:
+            return True
+        since = self._unsafe_s
+        return since is not None and time.monotonic() - since > MOST_LOST_S
 
     def close(self, *, interrupted: bool = False) -> None:
         """Write all waiting samples and finish the log; closing twice does nothing.
@@ -145,14 +159,18 @@ class SampleWriter:
             self._fail(error)
 
     def _write_waiting(self) -> None:
-        flushed = time.monotonic()
+        flushed = taken = time.monotonic()
         ended = False
         while not ended:
+            now = time.monotonic()
             samples, ended = self._waiting_samples()
+            # those that are left came before the others
+            taken = now if len(samples) < _TOGETHER else taken
             self._record(samples, self._messages.take())
             if self._failure is None and time.monotonic() - flushed >= FLUSH_S:
                 self._try(self._log.flush)
                 flushed = time.monotonic()
+                self._unsafe_s = taken if self._queue.qsize() else None
         while len(messages := self._messages.take()):
             self._record([], messages)
 
@@ -220,10 +238,11 @@ class SampleWriter:
 class Recorder(SampleWriter):
     """Record samples into an MCAP log, with the robustness of specifications beside them.
 
-    The log is written in place: if the process is killed, all but the last second can be read. Leaving the
-    `with` block closes the log properly, also after an error or Ctrl-C; the log then says that it was
-    interrupted. So does SIGTERM: in a `with` block of the main thread it raises SystemExit(143), unless the
-    program has a handler of its own. A signal that arrives while the log is closed waits until that is done.
+    The log is written in place: if the process is killed, all but the last second can be read, however busy
+    the machine is. Leaving the `with` block closes the log properly, also after an error or Ctrl-C; the log
+    then says that it was interrupted. So does SIGTERM: in a `with` block of the main thread it raises
+    SystemExit(143), unless the program has a handler of its own. A signal that arrives while the log is
+    closed waits until that is done.
 
     With a trigger, nothing is written until it fires. What came before it waits in memory, and each firing
     leaves one log around it.
@@ -245,6 +264,7 @@ class Recorder(SampleWriter):
         waiting: int = 4096,
         block: bool = True,
         trigger: Trigger | None = None,
+        durability: Durability = "process",
     ) -> None:
         """Begin a log.
 
@@ -256,9 +276,11 @@ class Recorder(SampleWriter):
             specifications: evaluated as the samples arrive, without templates; one or several.
             about: further metadata of the log: a seed, where the samples come from.
             waiting: how many samples, and how many messages of channels, may wait for the writing thread.
-            block: when that many wait, let `write` wait, too; otherwise drop what comes, and count it in the
-                log.
+            block: when that many wait, or more than 0.8 s of them have not reached the operating system, let
+                `write` wait, too; otherwise drop what comes, and count it in the log.
             trigger: when to write what, instead of everything.
+            durability: "process" for a log that survives the end of the process; "disk" for one that
+                survives that of the machine, too: then each flush waits for the disk (fsync).
 
         Raises:
             UsageError: a specification that cannot be recorded, a limit below 1, a trigger that names none of
@@ -273,7 +295,7 @@ class Recorder(SampleWriter):
         self._clips: ClipLog | None = None
         if trigger is None:
             refuse_inputs(self._path, ())
-            log: RecorderLog = FileLog(self._path, files, about)
+            log: RecorderLog = FileLog(self._path, files, about, durability)
         else:
             log = self._clips = ClipLog(self._path, files, about, trigger)
         self._entered = ExitStack()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -19,7 +20,7 @@ from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.geometry.measure import Operand
 from spatial_replay.logs.mcap.writer import LogWriter
 from spatial_replay.logs.messages import MemorySink, Messages
-from spatial_replay.logs.output_file import open_output
+from spatial_replay.logs.output_file import Durability, open_output
 from spatial_replay.recording.recording import Recording
 from spatial_replay.spec import object_names, signal_names
 from spatial_replay.spec.formula import Specification
@@ -29,6 +30,12 @@ from spatial_replay.trace.trace import Trace
 GATHER_S: Final = 0.2
 """How long samples are gathered before they are encoded. A few together cost hardly more than one, and while
 none are encoded, the caller's thread need not wait for the interpreter lock."""
+
+
+_EVALUATING_S: Final = 0.05
+"""About how long samples are evaluated before those that have come are written."""
+_AT_FIRST, _MOST_AT_ONCE = 16, 1024
+"""How many samples are evaluated at first before that time is known, and at most."""
 
 
 class RunEnd(NamedTuple):
@@ -50,6 +57,10 @@ class RecorderLog(Protocol):
     def is_busy(self) -> bool:
         """Whether to call `add` again at once, whatever has come."""
 
+    @property
+    def backlog(self) -> int:
+        """How many of the samples given so far wait for their evaluation."""
+
     def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
         """Write the next samples, given in both forms, and messages."""
 
@@ -67,14 +78,26 @@ class RecorderLog(Protocol):
 
 
 class FileLog:
-    """One log in one file, written in place."""
+    """One log in one file, written in place.
+
+    Samples are written before they are evaluated, a few at a time: an evaluation can be repeated from the
+    log, samples cannot.
+    """
 
     gather_s = GATHER_S
-    is_busy = False
 
-    def __init__(self, path: Path, files: Sequence[Specification], about: Mapping[str, str] | None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        files: Sequence[Specification],
+        about: Mapping[str, str] | None,
+        durability: Durability = "process",
+    ) -> None:
         """Begin the file, with everything compiled that writing to it takes."""
-        self._stream = open_output(path)
+        self.backlog = 0
+        self._unevaluated: deque[Trace] = deque()
+        self._at_once = _AT_FIRST
+        self._stream = open_output(path, durability)
         try:
             self._writer = LogWriter(self._stream, clock=time.monotonic)
             self._recording = Recording(self._writer, files, about)
@@ -87,7 +110,30 @@ class FileLog:
 
     def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
         """See `RecorderLog`."""
-        self._recording.add(trace, messages)
+        if len(trace) or len(messages):
+            self._recording.add_samples(trace, messages)
+        if len(trace):
+            self.backlog += len(trace)
+            self._unevaluated.append(trace)
+        if self._unevaluated:
+            self._evaluate_some()
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether samples wait for their evaluation."""
+        return bool(self._unevaluated)
+
+    def _evaluate_some(self) -> None:
+        """Evaluate the next samples, as many as take the time that there is."""
+        trace = self._unevaluated.popleft()
+        count = min(self._at_once, len(trace))
+        if count < len(trace):
+            self._unevaluated.appendleft(trace.slice(count, len(trace)))
+        begun = time.monotonic()
+        self._recording.evaluate(trace.slice(0, count))
+        self.backlog -= count
+        took_s = max(time.monotonic() - begun, 1e-6)
+        self._at_once = max(1, min(int(count * _EVALUATING_S / took_s), _MOST_AT_ONCE))
 
     def flush(self) -> None:
         """See `RecorderLog`."""
@@ -96,6 +142,8 @@ class FileLog:
 
     def end(self, end: RunEnd) -> None:
         """See `RecorderLog`."""
+        while self._unevaluated:
+            self._evaluate_some()
         self._recording.end(
             interrupted=end.interrupted, dropped=end.dropped, messages_dropped=end.messages_dropped
         )

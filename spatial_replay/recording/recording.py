@@ -100,7 +100,7 @@ class Recording:
         self._evaluation.redraw()
 
     def add(self, trace: Trace, beside: Messages | None = None) -> None:
-        """Write the next samples.
+        """Write the next samples, with the messages of their evaluation.
 
         Args:
             beside: messages of other topics that are not derived from samples, those of each topic in the
@@ -110,17 +110,32 @@ class Recording:
             TraceError: samples that are not after those before.
         """
         stretches = self._evaluation.extend(trace)
+        own = self._own(trace, beside)
+        self._sink.write_messages(merge([own, *self._evaluation.messages(trace, stretches)]))
+        self._hashes.add_results(stretches)
+
+    def add_samples(self, trace: Trace, beside: Messages | None = None) -> None:
+        """Write the next samples alone; `evaluate` them later, in any pieces, before more than these."""
+        self._sink.write_messages(self._own(trace, beside))
+
+    def evaluate(self, trace: Trace) -> None:
+        """Write the messages of the evaluation of samples that were added before."""
+        stretches = self._evaluation.extend(trace)
+        self._sink.write_messages(merge(self._evaluation.messages(trace, stretches)))
+        self._hashes.add_results(stretches)
+
+    def _own(self, trace: Trace, beside: Messages | None) -> Messages:
+        """Return samples and messages beside them as they are written; count and hash them."""
         own = messages_of(_OBJECTS, trace.times_ns, encode_objects(trace), self._samples)
         if beside is not None and len(beside):
             own = merge([own, beside])
             self._topics.update(channel.topic for channel in beside.channels.values())
             self._messages += len(beside)
-        derived = self._evaluation.messages(trace, stretches)
-        self._sink.write_messages(merge([own, *derived]))
         if len(own):
             self._end_ns = max(self._end_ns, int(own.log_time_ns[-1]))
         self._samples += len(trace)
-        self._hashes.add(trace, own, stretches)
+        self._hashes.add_samples(trace, own)
+        return own
 
     def end(self, *, interrupted: bool = False, dropped: int = 0, messages_dropped: int = 0) -> None:
         """Write what follows the last sample; the certificate is that of a replay of the log.

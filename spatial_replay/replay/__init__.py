@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         document_from_replay,
         explain_results,
         idle_document,
+        verdict_of,
     )
     from spatial_replay.replay.engine import Replay, Replayed
     from spatial_replay.replay.loaded_log import Evaluated, LoadedLog, constant_text, constant_values
@@ -58,6 +59,7 @@ __all__ = [
     "load_files",
     "recorded_texts",
     "run_replay",
+    "verdict_of",
     "verify_certificate",
     "write_constants",
 ]
@@ -66,7 +68,13 @@ __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
         "annotated": ("load_files", "recorded_texts", "run_replay"),
-        "document": ("Explanation", "document_from_replay", "explain_results", "idle_document"),
+        "document": (
+            "Explanation",
+            "document_from_replay",
+            "explain_results",
+            "idle_document",
+            "verdict_of",
+        ),
         "engine": ("Replay", "Replayed"),
         "playback": ("Playback",),
         "selection": ("LogNames", "ReplayOptions", "Window", "first_sample_ns", "has_samples_from"),

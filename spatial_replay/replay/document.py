@@ -267,13 +267,26 @@ def _nodes_named(result: SpecResult, name: str | None) -> Iterator[int]:
             return
 
 
+def verdict_of(result: SpecResult, node: str | None, *, goes_on: bool) -> Verdict | None:
+    """Return the verdict that `explain_results` explains, without the reasons; None without such a node."""
+    for identifier in _nodes_named(result, node):
+        is_open = _is_open(result, identifier, goes_on=goes_on)
+        return Verdict.PENDING if is_open else result.nodes[identifier].verdict
+    return None
+
+
+def _is_open(result: SpecResult, node: int, *, goes_on: bool) -> bool:
+    """Return whether samples that follow decide the verdict of a node."""
+    _, _, lower, upper = result.series[node]
+    return goes_on and online_verdict(float(lower[-1]), float(upper[-1])) is Verdict.PENDING
+
+
 def explain_node(result: SpecResult, node: int = 0, *, first_ns: int, goes_on: bool = False) -> Explanation:
     """Explain the verdict of one node of a result; see `explain_results`."""
     if not result.has_series:
         raise ValueError("the replay did not keep series and leaves")
-    _, _, lower, upper = result.series[node]
     about = result.nodes[node]
-    is_open = goes_on and online_verdict(float(lower[-1]), float(upper[-1])) is Verdict.PENDING
+    is_open = _is_open(result, node, goes_on=goes_on)
     # a goal that later samples may still reach is no cause
     causes = [each for each in result.causes_of(node) if not goes_on or each.settled_ns is not None]
     if is_open:

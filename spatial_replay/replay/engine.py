@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from spatial_replay.annotate.automaton_state import SpecAutomaton
     from spatial_replay.annotate.scene_update import SceneFrames
 
-_MOST_KEPT_BYTES: Final = 2**22
-"""Samples of up to so many bytes stay in memory."""
+_KEPT_BYTES, _MOST_KEPT_BYTES = 2**22, 2**26
+"""Samples of up to so many bytes for each result, and in all, stay in memory: each is explained by itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ class Replay:
         self._names = LogNames()
         self._samples = self._unreadable = self._encoded = self._end_ns = 0
         self._times: list[int] = []
-        self._traces = _KeptTraces(self._selection)
+        self._traces = _KeptTraces(self._selection, min(_KEPT_BYTES * len(self.trees), _MOST_KEPT_BYTES))
 
     def run(
         self,
@@ -248,17 +248,18 @@ class Replay:
 
 
 class _KeptTraces:
-    """The samples of a short log, so that explaining a verdict does not read it again."""
+    """The samples of a log that is not very long, so that explaining a verdict does not read it again."""
 
-    def __init__(self, selection: Selection) -> None:
+    def __init__(self, selection: Selection, most_bytes: int) -> None:
         self._selection = selection
+        self._most_bytes = most_bytes
         self._traces: list[Trace] | None = []
         self._bytes = 0
 
     def add(self, trace: Trace) -> None:
         """Take in the next samples; too many are dropped, all of them."""
         self._bytes += trace.nbytes
-        if self._bytes > _MOST_KEPT_BYTES:
+        if self._bytes > self._most_bytes:
             self._traces = None
         elif self._traces is not None:
             self._traces.append(trace)

@@ -52,7 +52,7 @@ class ReplayOptions:
 
     Attributes:
         window: the samples to evaluate.
-        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME".
+        each: for each parameter of a template, the objects that it stands for: "all", "class:NAME" or a name.
         semantics: "ltlf", or "paper": Def. 16 of the paper to the letter.
         strict_names: names that the log never has are errors; otherwise objects and signals are unknown, and
             a template has no result for a class.

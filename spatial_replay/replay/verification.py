@@ -32,7 +32,7 @@ _HASHES: Mapping[str, str] = MappingProxyType(
 )
 """The meaning of a difference, for each hash of a certificate."""
 
-_READING = ("on_time_jump", "rate", "lost", "y_down", "concave")
+_READING = ("on_time_jump", "late", "rate", "lost", "y_down", "concave")
 _WINDOW = ("start_ns", "end_ns", "every")
 
 

@@ -18,6 +18,7 @@ from spatial_replay.automata.automaton import Automaton
 from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.logs.output_file import Durability
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.planning.decision_log import PLAN_METADATA, BlackBox
 from spatial_replay.planning.decisions import Executor, Kind, Outcome, Step
@@ -221,6 +222,7 @@ def record_plan(
     gui: bool = False,
     inputs: Sequence[Path] = (),
     advance: Callable[[int], None] = lambda samples: None,
+    durability: Durability = "process",
 ) -> PlannedRun:
     """Let a planner satisfy a specification in a scenario's world; equal arguments give equal bytes.
 
@@ -229,6 +231,7 @@ def record_plan(
         name: the result to plan for, if there are several. All are evaluated.
         inputs: files that the output must not be.
         advance: called with the number of new samples.
+        durability: "disk" for a log of which the disk has each chunk as soon as it is written.
 
     Raises:
         NoAutomatonError: a specification without an automaton.
@@ -246,7 +249,8 @@ def record_plan(
         refuse_unknown_names([kept], world.sample())
         planner = Planner(kept, settings_for(world), name=name)
         warm_up_planner()
-        with run_log(output, [kept], about, inputs, _known(kept, planner.automaton)) as log:
+        known = _known(kept, planner.automaton)
+        with run_log(output, [kept], about, inputs, known, durability) as log:
             log.add_metadata(PLAN_METADATA, _plan(planner, kept))
             loop = PlanLoop(BlackBox(planner), log, WorldExecutor(world, world.skill), world.step)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.logs.mcap.writer import LogWriter
 from spatial_replay.logs.messages import Messages, merge
-from spatial_replay.logs.output_file import open_output, refuse_inputs
+from spatial_replay.logs.output_file import Durability, open_output, refuse_inputs
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.recording import Recording
 from spatial_replay.recording.interruption import leaving, terminable, uninterrupted
@@ -117,6 +117,7 @@ def run_log(
     about: Mapping[str, str] | None = None,
     inputs: Sequence[Path] = (),
     known: Sequence[SpecAutomaton] = (),
+    durability: Durability = "process",
 ) -> Iterator[RunLog]:
     """Open the log of a run, in place under its final name, and close it properly however the run ends.
 
@@ -127,6 +128,7 @@ def run_log(
         about: further metadata: the scenario, a seed.
         inputs: files that the output must not be.
         known: automata of specs of these files, which are not compiled again.
+        durability: "disk" for a log of which the disk has each chunk as soon as it is written.
 
     Raises:
         UsageError: the output is an input, or a specification cannot be recorded.
@@ -135,7 +137,7 @@ def run_log(
     refuse_inputs(output, inputs)
     refuse_templates(files)
     interrupted = True
-    with leaving(output), terminable(), open_output(output) as stream, ExitStack() as ending:
+    with leaving(output), terminable(), open_output(output, durability) as stream, ExitStack() as ending:
         # an interruption between these lines would leave a log without an end
         with uninterrupted():
             writer = LogWriter(stream)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from spatial_replay.errors import SpecificationError, UsageError
+from spatial_replay.logs.output_file import Durability
 from spatial_replay.runs.run_log import RunLog, run_log
 from spatial_replay.simulation.injection import Injection
 from spatial_replay.simulation.tabletop import Tabletop
@@ -64,6 +65,7 @@ def record_script(
     gui: bool = False,
     inputs: Sequence[Path] = (),
     advance: Callable[[int], None] = lambda samples: None,
+    durability: Durability = "process",
 ) -> SimulatedRun:
     """Record a scenario's world while its robot follows the script; equal arguments give equal bytes.
 
@@ -72,6 +74,7 @@ def record_script(
         duration_ns: duration in simulated time; None ends with the script.
         inputs: files that the output must not be.
         advance: called with the number of new samples.
+        durability: "disk" for a log of which the disk has each chunk as soon as it is written.
 
     Raises:
         SpecificationError: names that the world does not have.
@@ -85,7 +88,7 @@ def record_script(
     # an error in the world or a missing name leaves the output untouched
     with closing(make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, gui=gui)) as world:
         refuse_unknown_names(files, world.sample())
-        with run_log(output, files, about, inputs) as log:
+        with run_log(output, files, about, inputs, durability=durability) as log:
             result = _follow_script(world, log, duration_ns, advance)
         outcome = "stopped in the middle of its motion" if result is None else result.reason
         return SimulatedRun(log.samples, log.seconds, tuple(world.scene.bodies), outcome)

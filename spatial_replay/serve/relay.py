@@ -15,12 +15,15 @@ from contextlib import suppress
 from threading import Thread
 from typing import Any, Final, NamedTuple
 
+from spatial_replay.serve.gate import Gate
+
 OLD_PROTOCOL: Final = "foxglove.websocket.v1"
 PROTOCOL: Final = "foxglove.sdk.v1"
 
 _OFFER: Final = re.compile(rb"^sec-websocket-protocol:[ \t]*(.*?)[ \t]*\r\n", re.IGNORECASE | re.MULTILINE)
 _MOST_HEAD: Final = 1 << 16
 _PIECE: Final = 1 << 16
+_MOST_CONNECTIONS: Final = 64
 _PATIENCE_S: Final = 10.0
 """How long a viewer may take for its request, and to read what is waiting for it."""
 
@@ -33,19 +36,20 @@ _PLAYBACK_STATE: Final = 5
 class Relay:
     """Listens for viewers and connects each to the server behind it, on a thread of its own."""
 
-    def __init__(self, host: str, port: int, behind: int) -> None:
+    def __init__(self, host: str, port: int, behind: tuple[str, int], gate: Gate) -> None:
         """Listen.
 
         Args:
             port: 0 for any that is free.
-            behind: the port of the server on this machine.
+            behind: host and port of the server on this machine.
+            gate: which requests are passed on.
 
         Raises:
             OSError: nothing can listen there.
         """
         if not host:
             raise OSError("it is empty")
-        self._behind = behind
+        self._behind, self._gate = behind, gate
         self._loop = asyncio.new_event_loop()
         self._connections: set[asyncio.Task[None]] = set()
         self._thread = Thread(target=self._loop.run_forever, name="relay", daemon=True)
@@ -89,11 +93,19 @@ class Relay:
     async def _connect(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         async with asyncio.timeout(_PATIENCE_S):
             request = await reader.readuntil(b"\r\n\r\n")
+        is_full = len(self._connections) > _MOST_CONNECTIONS
+        refusal = "503 Too Many Viewers" if is_full else self._gate.refusal(request)
+        if refusal is not None:
+            writer.write(f"HTTP/1.1 {refusal}\r\nConnection: close\r\nContent-Length: 0\r\n\r\n".encode())
+            writer.close()
+            await writer.wait_closed()
+            return
+        request = self._gate.without_token(request)
         offered = {each.strip() for found in _OFFER.findall(request) for each in found.decode().split(",")}
         is_old = OLD_PROTOCOL in offered
         if is_old and PROTOCOL not in offered:
             request = _OFFER.sub(f"Sec-WebSocket-Protocol: {PROTOCOL}\r\n".encode(), request)
-        inner, outer = await asyncio.open_connection("127.0.0.1", self._behind, limit=_MOST_HEAD)
+        inner, outer = await asyncio.open_connection(*self._behind, limit=_MOST_HEAD)
         try:
             outer.write(request)
             response = await inner.readuntil(b"\r\n\r\n")

@@ -6,6 +6,7 @@ import ipaddress
 import json
 import logging
 import os
+import secrets
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
@@ -20,6 +21,7 @@ from foxglove import websocket as protocol
 
 from spatial_replay.errors import SpatialReplayError, UsageError
 from spatial_replay.logs.messages import Channel, Messages, Schema
+from spatial_replay.serve.gate import Gate
 from spatial_replay.serve.pace import PlaybackState, Status
 from spatial_replay.serve.player import CONSTANTS, Level, Note
 from spatial_replay.serve.relay import Relay
@@ -33,9 +35,6 @@ logging.getLogger("foxglove").addHandler(logging.NullHandler())
 _LONGEST_TEXT: Final = 64
 _LONGEST_NOTE: Final = 2_000
 """The most characters of a duration, and of a note."""
-
-_BEHIND: Final = "127.0.0.1"
-"""Where the SDK listens, behind the relay."""
 
 _STOP_S: Final = 1.0
 """How long the SDK, which waits for every viewer, may take to stop."""
@@ -68,16 +67,20 @@ class PublishingServer:
     A viewer that reads too slowly loses the oldest messages; one that reads nothing is disconnected.
     """
 
-    def __init__(self, name: str, channels: Sequence[Channel], host: str, port: int) -> None:
+    def __init__(
+        self, name: str, channels: Sequence[Channel], host: str, port: int, origins: Sequence[str] = ()
+    ) -> None:
         """Listen.
 
         Args:
             channels: those known before; others are added with their first message.
             port: 0 for any that is free.
+            origins: of pages that may connect, besides viewers' own and those of this machine.
 
         Raises:
-            UsageError: nothing can listen there.
+            UsageError: nothing can listen there, or a text that is no origin.
         """
+        self._gate = Gate.of(host, origins)
         self._name = name
         self._context = foxglove.Context()
         self._sent: dict[tuple[str, str, Schema | None], foxglove.Channel] = {}
@@ -86,9 +89,10 @@ class PublishingServer:
             self._advertise(channel)
         self._host = f"[{host}]" if _is_v6(host) else host
         self._started: Future[protocol.WebSocketServer] = Future()
+        self._behind = _inner_host()
         self._started.set_result(self._start())
         try:
-            self._relay = Relay(host, port, self._server.port)
+            self._relay = Relay(host, port, (self._behind, self._server.port), self._gate)
         except (OSError, UnicodeError) as error:
             self._server.stop()
             reason = _reason(error)
@@ -101,8 +105,9 @@ class PublishingServer:
 
     @property
     def address(self) -> str:
-        """The address that viewers connect to."""
-        return f"ws://{self._host}:{self._relay.port}"
+        """The address that viewers connect to, with the token that it takes from other machines."""
+        token = "" if self._gate.token is None else f"/?token={self._gate.token}"
+        return f"ws://{self._host}:{self._relay.port}{token}"
 
     def stop(self) -> None:
         """Disconnect all viewers; one that does not respond is waited for only briefly."""
@@ -149,7 +154,7 @@ class PublishingServer:
     def _start(self) -> protocol.WebSocketServer:
         return foxglove.start_server(
             name=self._name,
-            host=_BEHIND,
+            host=self._behind,
             port=0,
             capabilities=[protocol.Capability.Time],
             context=self._context,
@@ -179,7 +184,13 @@ class LiveServer(PublishingServer):
     """A session that viewers connect to; see `Viewers`."""
 
     def __init__(
-        self, session: Session, questions: Questions, channels: Sequence[Channel], host: str, port: int
+        self,
+        session: Session,
+        questions: Questions,
+        channels: Sequence[Channel],
+        host: str,
+        port: int,
+        origins: Sequence[str] = (),
     ) -> None:
         """Listen.
 
@@ -192,7 +203,7 @@ class LiveServer(PublishingServer):
             UsageError: nothing can listen there.
         """
         self._session, self._questions = session, questions
-        super().__init__(f"spatial-replay: {session.name}", channels, host, port)
+        super().__init__(f"spatial-replay: {session.name}", channels, host, port, origins)
 
     def send_state(self, state: PlaybackState) -> None:
         """See `Viewers.send_state`."""
@@ -209,7 +220,7 @@ class LiveServer(PublishingServer):
     def _start(self) -> protocol.WebSocketServer:
         return foxglove.start_server(
             name=self._name,
-            host=_BEHIND,
+            host=self._behind,
             port=0,
             supported_encodings=["json"],
             capabilities=list(_CAPABILITIES),
@@ -272,7 +283,7 @@ class RunServer(PublishingServer):
         capabilities = [protocol.Capability.Time, *([protocol.Capability.Services] if services else [])]
         return foxglove.start_server(
             name=self._name,
-            host=_BEHIND,
+            host=self._behind,
             port=0,
             supported_encodings=["json"],
             capabilities=capabilities,
@@ -396,6 +407,13 @@ def _without_flags(values: Mapping[str, float | str | bool]) -> Values:
 def _misfit(name: str, value: object) -> UsageError:
     remedy = "give a number or, for a duration, a text such as '2s'"
     return UsageError(f"{shortened(name)} cannot be {shortened(value)}: {remedy}")
+
+
+def _inner_host() -> str:
+    """Return an address for the SDK behind the relay, where no page that tries ports finds it."""
+    drawn = f"127.{'.'.join(str(1 + secrets.randbelow(254)) for _ in range(3))}"
+    # of the loopback network, some systems have one address alone
+    return drawn if _is_own(drawn) else "127.0.0.1"
 
 
 def _is_v6(host: str) -> bool:

@@ -84,18 +84,25 @@ class Serving:
 
 @contextmanager
 def open_server(
-    evaluated: Evaluated, *, host: str = LOOPBACK, port: int = PORT, play: bool = False
+    evaluated: Evaluated,
+    *,
+    host: str = LOOPBACK,
+    port: int = PORT,
+    play: bool = False,
+    origins: Sequence[str] = (),
 ) -> Iterator[Serving]:
     """Serve a log to viewers, which play it and change the constants of its specifications.
 
     Args:
         evaluated: the evaluation to show first, with the constants as they are written.
-        host: the address to listen at; anyone who can connect can read the log.
+        host: the address to listen at; from beyond this machine, the address with its token is needed.
         port: 0 for any that is free.
         play: play at once; otherwise wait at the start for a viewer to do so.
+        origins: of web pages that may connect, besides those of Foxglove and of this machine.
 
     Raises:
-        UsageError: nothing can listen there, or the library for it is not installed.
+        UsageError: nothing can listen there, a text that is no origin, or the library for it is not
+            installed.
         LogError: the log cannot be read.
     """
     try:
@@ -108,7 +115,7 @@ def open_server(
     playback.seek(playback.start_ns)
     session = Session(evaluated.loaded, playback.start_ns, playback.end_ns)
     questions = Questions(session.wait_for_evaluation)
-    server = LiveServer(session, questions, (*playback.channels, CURVES_CHANNEL), host, port)
+    server = LiveServer(session, questions, (*playback.channels, CURVES_CHANNEL), host, port, origins)
     loop = _in_background(Player(playback, session, server).run, "player")
     answering = _in_background(questions.run, "questions")
     try:

@@ -49,6 +49,7 @@ def open_source(
     rate: float | None = None,
     lost: Lost = "drop",
     y_down: bool | None = None,
+    late: str = "1s",
 ) -> Source:
     """Open the log in a file of any format; the content decides, not the name.
 
@@ -63,6 +64,8 @@ def open_source(
         lost: whether annotations that are marked as lost are dropped or kept.
         y_down: whether y points down in a file of tracks or annotations, as in images; samples have y up. By
             default, it points down in drone annotations, and up in all other files.
+        late: how late messages of an external log may come, such as "2s"; "all" sorts the whole log, which
+            is then in memory.
 
     Raises:
         UsageError: no path was given, or an option that means nothing to this format.
@@ -71,7 +74,7 @@ def open_source(
         RemoteError: an address does not answer.
     """
     _require_path(path)
-    options = ReadOptions(concave, mapping, on_time_jump, rate, lost, y_down)
+    options = ReadOptions(concave, mapping, on_time_jump, rate, lost, y_down, late)
     path = readable_file(path)
     if isinstance(path, Path) and is_bag_folder(path):
         options.refuse_except(_MESSAGES, "ROS 2 bag", path.name)
@@ -94,13 +97,14 @@ def read_trace(
     rate: float | None = None,
     lost: Lost = "drop",
     y_down: bool | None = None,
+    late: str = "1s",
     allow_damage: bool = False,
 ) -> Trace:
     """Read a whole log into memory.
 
     Args:
         path: a log in any format that `open_source` knows.
-        mapping, concave, on_time_jump, rate, lost, y_down: how to read it, as for `open_source`.
+        mapping, concave, on_time_jump, rate, lost, y_down, late: how to read it, as for `open_source`.
         allow_damage: return what can be read of a damaged log, with its `faults`.
 
     Raises:
@@ -109,7 +113,14 @@ def read_trace(
         LogError: the file is not a log, or is damaged and `allow_damage` is not set.
     """
     source = open_source(
-        path, concave=concave, mapping=mapping, on_time_jump=on_time_jump, rate=rate, lost=lost, y_down=y_down
+        path,
+        concave=concave,
+        mapping=mapping,
+        on_time_jump=on_time_jump,
+        rate=rate,
+        lost=lost,
+        y_down=y_down,
+        late=late,
     )
     blocks = reading_only(source).iter_blocks()
     traces = [replace(block.trace, remarks=block.remarks) for block in blocks]
@@ -305,7 +316,8 @@ def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
     # readers of external logs are loaded when there is one
     from spatial_replay.mapping import MappedSource, load_mapping
 
-    return MappedSource(path, load_mapping(options.mapping), kind, options.concave, options.on_time_jump)
+    mapping = load_mapping(options.mapping)
+    return MappedSource(path, mapping, kind, options.concave, options.on_time_jump, late=options.late)
 
 
 def _open_mcap(path: LogFile, kind: str, options: ReadOptions) -> Source:
@@ -320,7 +332,7 @@ def _open_mcap(path: LogFile, kind: str, options: ReadOptions) -> Source:
     return _open_messages(path, kind, options)
 
 
-_MESSAGES = frozenset({"mapping", "on_time_jump"})
+_MESSAGES = frozenset({"mapping", "on_time_jump", "late"})
 
 FORMATS: dict[str, Format] = {
     "MCAP": Format(lambda head: head.startswith(MAGIC), _open_mcap, _MESSAGES),

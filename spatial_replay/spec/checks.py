@@ -211,7 +211,7 @@ def check_names(
         signals: names of its numeric signals.
         where: what has them, if not a log.
         classes: of its objects.
-        each: for parameters of templates, the objects that they stand for: "all", "class:NAME".
+        each: for parameters of templates, the objects that they stand for: "all", "class:NAME" or a name.
 
     Returns:
         An error for each object and signal that the log never has, and each class that a template is to be
@@ -235,7 +235,13 @@ def check_names(
         for kind, name, candidates in missing
     ]
     for spec in specification.results:
-        kind, _, name = each.get(spec.parameter or "", "all").partition(":")
+        chosen = each.get(spec.parameter or "", "all")
+        kind, _, name = chosen.partition(":")
+        if chosen not in ("all", *objects) and kind != "class":
+            hint = " ".join(filter(None, (nearest_hint(chosen, objects), _listing("object", objects))))
+            found.append(
+                source.diagnostic("error", spec.span, f"the {where} never has the object {chosen!r}", hint)
+            )
         if kind == "class" and name.casefold() not in {known.casefold() for known in known_classes}:
             hint = " ".join(
                 filter(None, (nearest_hint(name, known_classes), _listing("class", known_classes)))

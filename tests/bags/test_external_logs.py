@@ -349,6 +349,27 @@ def test_messages_late_by_less_than_a_second_are_in_order(tmp_path: Path, mappin
         assert read_trace(write_ros1(tmp_path / f"{on_time_jump}.bag", late), **options) == expected
 
 
+def test_messages_may_be_as_late_as_is_said(tmp_path: Path, mapping: Path) -> None:
+    sent = drive(60)
+    expected = read_trace(write_ros2(tmp_path / "bag", sent), mapping=mapping)
+    # a detector that takes three seconds
+    late = [*sent[:20], *sent[24:90], *sent[20:24], *sent[90:]]
+    log = write_ros1(tmp_path / "late.bag", late, chunk_bytes=10**6)
+    with pytest.raises(LogError, match=r"time jumps back.* at \d\.\d{3} s.*--late 5s"):
+        read_trace(log, mapping=mapping)
+    assert read_trace(log, mapping=mapping, late="5s") == expected
+    assert read_trace(log, mapping=mapping, late="all") == expected
+    with pytest.raises(UsageError, match="late is 'soon'; give a duration such as 2s or 500ms, or all"):
+        read_trace(log, mapping=mapping, late="soon")
+
+
+def test_chunks_of_a_ros_1_bag_may_come_in_any_order(tmp_path: Path, mapping: Path) -> None:
+    sent = drive(60)
+    expected = read_trace(write_ros1(tmp_path / "a.bag", sent), mapping=mapping)
+    mixed = write_ros1(tmp_path / "b.bag", [*sent[80:], *sent[:40], *sent[40:80]], chunk_bytes=1)
+    assert read_trace(mixed, mapping=mapping) == expected
+
+
 def test_objects_are_where_their_messages_say(tmp_path: Path, mapping: Path) -> None:
     sent = [Sent("/a", POINT, START_NS, point(1.0, 2.0)), Sent("/b", POINT, START_NS, point(3.0, 4.0))]
     (sample,) = read_trace(write_ros2(tmp_path / "bag", sent), mapping=mapping).samples()

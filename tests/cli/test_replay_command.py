@@ -289,6 +289,39 @@ def test_an_interrupted_replay_leaves_no_file(tmp_path: Path, number: signal.Sig
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.spatial", "run.jsonl"]
 
 
+def test_many_warnings_that_differ_in_numbers_only_are_one(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Path("run.jsonl").open("a") as stream:
+        stream.write("{\n" * 60)
+    assert run_in_process(["replay", "run.jsonl", "--spec", "blocks.spatial", "--json", "all.json"]) == 3
+    said = capsys.readouterr().err
+    assert said.count("run.jsonl:") == 1
+    assert "(and 59 more like it)" in said
+    assert len(json.loads(Path("all.json").read_text())["log"]["faults"]) == 60
+
+
+@pytest.mark.parametrize(("count", "shown"), [(20, 20), (125, 12)])
+def test_of_many_results_the_worst_are_printed(
+    folder: Path, capsys: pytest.CaptureFixture[str], count: int, shown: int
+) -> None:
+    Path("crowd.csv").write_text(
+        "time_ns,name,class,x,y,yaw,length,width\n"
+        + "".join(f"{tick},p{k},person,{k % 7},0,0,1,1\n" for tick in range(2) for k in range(count))
+    )
+    Path("crowd.spatial").write_text(
+        "region gate = box(3, -1, 4, 1)\nspec out(ego) = G not (ego ovlp gate)\n"
+    )
+    arguments = ["crowd.csv", "--spec", "crowd.spatial", "--each", "ego=all"]
+    for command in ("replay", "explain"):
+        assert run_in_process([command, *arguments]) == 1
+        printed = capsys.readouterr().out
+        assert len(re.findall(r"^ *`?out`?(?:\(| for )", printed, re.MULTILINE)) == shown
+        assert (f"and {count - 12} more: " in printed) == (count > shown)
+    assert run_in_process(["replay", *arguments[:-1], "ego=p5", "--json", "-"]) == 0
+    assert [each["object"] for each in json.loads(capsys.readouterr().out)["specifications"]] == ["p5"]
+
+
 def test_a_log_is_replayed_with_its_own_specification(folder: Path) -> None:
     assert (
         run_in_process(["record", "tracks", "run.jsonl", "--spec", "blocks.spatial", "-o", "run.mcap"]) == 0

@@ -72,10 +72,11 @@ def test_play_starts_playing_at_once() -> None:
 
 
 def test_an_address_that_others_can_reach_is_a_warning() -> None:
-    with running("--port", "0", "--host", "0.0.0.0") as (process, _, _):
+    with running("--port", "0", "--host", "0.0.0.0") as (process, address, _):
         process.send_signal(signal.SIGINT)
         _, warned = process.communicate(timeout=60)
-    assert "anyone who can reach ws://0.0.0.0" in warned
+    assert re.fullmatch(r"ws://0\.0\.0\.0:\d+/\?token=[\w-]{20,}", address)
+    assert "who has this address, with its token, can read this log" in warned
 
 
 def test_the_server_evaluates_with_the_chosen_semantics(tmp_path: Path) -> None:

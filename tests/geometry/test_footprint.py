@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -63,6 +64,20 @@ def test_a_polygon_that_is_not_convex_becomes_few_convex_parts_or_its_hull():
     assert vertices_of(Footprint.polygon(L_SHAPE, concave="hull")) == [
         *[(0, 2), (0, 0), (2, 0), (2, 1), (1, 2)]
     ]
+
+
+def test_a_polygon_of_very_many_corners_is_split_only_up_to_a_number():
+    turns = np.linspace(0, 2 * np.pi, 20_000, endpoint=False)
+    radius = 10 + np.arange(20_000) % 2
+    cog = np.stack([radius * np.cos(turns), radius * np.sin(turns)], axis=1)
+    with pytest.raises(
+        GeometryError, match=r"has 20,000 corners, and at most 2,000 are split.*concave='hull'"
+    ):
+        Footprint.polygon(cog)
+    assert len(Footprint.polygon(cog, concave="hull").parts[0].vertices) == 10_000
+    along = np.linspace(0, 1, 5_000, endpoint=False)
+    sides = [np.add(a, np.outer(along, np.subtract(b, a))) for a, b in pairwise([*SQUARE, SQUARE[0]])]
+    assert Footprint.polygon(np.concatenate(sides)) == Footprint.polygon(SQUARE)
 
 
 def test_a_boundary_that_crosses_itself_is_refused_by_place_and_remedy():

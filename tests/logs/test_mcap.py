@@ -5,12 +5,16 @@ from __future__ import annotations
 import io
 import random
 import re
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
 from mcap.writer import IndexType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 from mcap_protobuf.schema import build_file_descriptor_set
@@ -32,6 +36,7 @@ from spatial_replay.logs import (
     McapSource,
     MemorySource,
     Messages,
+    Schema,
     encode_objects,
     summarise_mcap,
 )
@@ -188,6 +193,42 @@ def test_a_damaged_chunk_costs_its_samples_only(log):
     assert f"between {first:.3f} s and {last:.3f} s" in part.faults[0]
     with pytest.raises(LogError, match="at byte"):
         read_trace(log(bytes(content)))
+
+
+def test_no_broken_chunk_of_a_log_that_was_never_closed_costs_another(log):
+    trace = moving_cup(40)
+    beside = messages(
+        Channel("/joints", "json", Schema("Joints", "jsonschema", b"{}")), trace.times_ns, [b"{}"] * 40
+    )
+    stream = io.BytesIO()
+    writer = LogWriter(stream)
+    writer.write_messages(messages(SAMPLES, trace.times_ns, encode_objects(trace)))
+    writer.write_messages(beside)
+    writer.flush()
+    killed = stream.getvalue()
+    writer.close()
+    chunks = make_reader(io.BytesIO(stream.getvalue())).get_summary().chunk_indexes
+    ours = sorted(
+        (chunk for chunk in chunks if 1 in chunk.message_index_offsets), key=lambda c: c.message_start_time
+    )
+    assert len(ours) == 14
+    for broken in (ours[:1], ours[:2], ours[6:8]):
+        content = bytearray(killed)
+        for chunk in broken:
+            content[chunk.chunk_start_offset + chunk.chunk_length - 5] ^= 1
+        part = read_trace(log(bytes(content)), allow_damage=True)
+        lost = [*range(3 * ours.index(broken[0]), 3 * ours.index(broken[-1]) + 3)]
+        assert part == trace.take(np.setdiff1d(np.arange(40), lost))
+        for chunk in broken:
+            assert any(f"at byte {chunk.chunk_start_offset}" in fault for fault in part.faults)
+    # other readers, too, understand what follows a chunk that they leave out
+    gap = slice(ours[0].chunk_start_offset, ours[0].chunk_start_offset + ours[0].chunk_length)
+    without = io.BytesIO(killed[: gap.start] + killed[gap.stop :])
+    times = []
+    with suppress(EndOfFile):
+        for record in StreamReader(without).records:
+            times += [record.log_time] if isinstance(record, Message) and record.channel_id == 1 else []
+    assert times == trace.times_ns[3:].tolist()
 
 
 @pytest.mark.parametrize("cut", [0, 60])

@@ -175,9 +175,9 @@ class Made:
         return "".join("+" if row >= 0 else "-" if row == -1 else "?" for row in rows)
 
 
-def make(mapping: str, feed: Feed, *, batch: int = 1000, **options: Any) -> Made:
+def make(mapping: str, feed: Feed, *, batch: int = 1000, late_ns: int = SECOND, **options: Any) -> Made:
     """Map the messages of a feed to samples."""
-    plan = ReadingPlan.of(parse_mapping(mapping, "test.yaml"), feed.topics())
+    plan = ReadingPlan.of(parse_mapping(mapping, "test.yaml"), feed.topics(), late_ns)
     assembler = Assembler(plan, feed.decoder, name="test.bag", **options)
     raw = [message for message in feed.raw() if message.topic in plan.topics]
     traces = [assembler.add(raw[begin : begin + batch]) for begin in range(0, len(raw), batch)]

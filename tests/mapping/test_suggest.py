@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from spatial_replay import UsageError, read_trace
 from spatial_replay.bags import Topic
+from spatial_replay.cli import run
 from spatial_replay.mapping import LogMapping, parse_mapping, suggest_mapping
 from spatial_replay.mapping.model import ShapeMapping
+from spatial_replay.sources import open_source
 
 POINT = {"x": 1.0, "y": 2.0, "z": 0.0}
 TURN = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
@@ -122,6 +126,101 @@ def test_numbers_are_suggested_as_signals() -> None:
     text, mapping = suggested(robot={"position": POINT}, battery={"header": {"seq": 1}, "percentage": 0.8})
     assert len(mapping.topics) == 1
     assert "# /battery: {signals: {battery_percentage: percentage}}" in text
+
+
+def test_ids_distinguish_objects_rather_than_places_in_a_list() -> None:
+    for name, values in {"fiducial_id": (4, 9), "trackId": (1, 2), "tag_id": ("a", "b")}.items():
+        listed = [{name: value, "class_id": 1, "position": POINT} for value in values]
+        _, mapping = suggested(detector={"tags": listed})
+        assert mapping.topics[0].name == f"tag{{{name}}}"
+    # a name that two objects share distinguishes neither
+    twins = [{"name": "cup", "id": 1, "position": POINT}, {"name": "cup", "id": 2, "position": POINT}]
+    assert suggested(detector={"tags": twins})[1].topics[0].name == "tag{id}"
+    text, mapping = suggested(detector={"tags": [{"class_id": 1, "position": POINT}] * 2})
+    assert mapping.topics[0].name == "tag{index}"
+    assert "objects swap" in text
+
+
+def test_names_that_several_topics_share_get_the_topic_as_prefix() -> None:
+    tag = {"id": 3, "corners": [POINT] * 4}
+    _, mapping = suggested(left={"tags": [tag]}, right={"tags": [tag]})
+    assert [each.name for each in mapping.topics] == ["left_tag{id}", "right_tag{id}"]
+    kinds = {"/a/odom": "nav_msgs/msg/Odometry", "/a/pose": "geometry_msgs/msg/PoseStamped"}
+    topics = [Topic(name, kind, "cdr") for name, kind in kinds.items()]
+    names = [each.name for each in parse_mapping(suggest_mapping("run", topics, {})).topics]
+    assert names == ["a_odom", "a_pose"]
+
+
+def test_mounts_velocities_and_times_are_no_objects() -> None:
+    _, mapping = suggested(
+        camera={"mounting_position": POINT, "sensor": {"position": POINT}, "gain": 2.0},
+        cmd_vel={"x": 1.0, "y": 0.0},
+        map={"info": {"origin": {"position": POINT}}},
+        tracker={"tracks": [{"id": 1, "velocity": POINT, "camera_pose": {"position": POINT}}]},
+        gripper={"closed": True, "stamp": 3, "header": {"seq": 1}, "time_of_day": 4.0, "force": 0.5},
+    )
+    assert not any(each.reads_objects for each in mapping.topics)
+    signals = {each.name: each.field for topic in mapping.topics for each in topic.signals}
+    assert {"gripper_closed": "closed", "gripper_force": "force"}.items() <= signals.items()
+    assert not any("stamp" in name or "time" in name or "seq" in name for name in signals)
+    mounts = [{**TRANSFORM, "child_frame_id": name} for name in ("base", "front_camera", "lidar")]
+    topics = [Topic(name, "tf2_msgs/msg/TFMessage", "cdr") for name in ("/tf", "/tf_static")]
+    (topic,) = parse_mapping(suggest_mapping("run", topics, {"/tf": [{"transforms": mounts}]})).topics
+    assert (topic.topic, topic.without) == ("/tf", ("front_camera", "lidar"))
+
+
+def test_joints_are_signals_by_their_names() -> None:
+    joints = {"header": {"seq": 1}, "name": ["elbow", "wrist"], "position": [0.5, 1.5], "effort": []}
+    _, mapping = suggested(joint_states=joints)
+    (topic,) = mapping.topics
+    assert {each.name: each.field for each in topic.signals} == {
+        "joint_states_elbow_position": "position[name=elbow]",
+        "joint_states_wrist_position": "position[name=wrist]",
+    }
+
+
+def test_a_log_without_objects_and_numbers_has_no_topic_chosen() -> None:
+    text = suggest_mapping("run", [Topic("/text", "std_msgs/msg/String", "cdr")], {"/text": [{"data": "a"}]})
+    assert "# no topic was chosen" in text
+    with pytest.raises(UsageError, match="topics: no topic was chosen"):
+        parse_mapping(text)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "apriltags_table.bag",
+        "pose_db3",
+        "talker_mcap",
+        "two_turtles.bag",
+        "two_turtles_mcap",
+        "two_turtles_sqlite3",
+    ],
+)
+def test_what_is_suggested_for_a_log_is_accepted_as_it_is(
+    data_folder: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, file = data_folder / "bags" / name, tmp_path / "suggested.yaml"
+    assert run(["info", str(log), "--suggest-mapping"]) == 0
+    printed = capsys.readouterr().out
+    file.write_text(printed)
+    if name == "talker_mcap":
+        assert "no topic was chosen" in printed
+    else:
+        trace = next(
+            block.trace for block in open_source(log, mapping=file).iter_blocks() if len(block.trace)
+        )
+        assert trace.names
+        assert trace.faults == ()
+
+
+def test_what_is_suggested_for_protobuf_is_accepted_as_it_is(
+    data_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, file = data_folder / "osi" / "osi_centerline_example.mcap", tmp_path / "suggested.yaml"
+    assert run(["info", str(log), "--suggest-mapping"]) == 0
+    file.write_text(capsys.readouterr().out)
+    assert len(read_trace(log, mapping=file).names) == 14
 
 
 def test_topics_without_objects_are_listed_as_comments() -> None:

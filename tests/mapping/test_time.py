@@ -11,6 +11,7 @@ from mapping.feeding import SECOND, Feed, header, make, pose_stamped, ros
 from spatial_replay import LogError, Trace, UsageError
 from spatial_replay.bags.columns import MessageColumns
 from spatial_replay.mapping import Assembler, ReadingPlan, parse_mapping
+from spatial_replay.trace.sample import LATEST_NS
 
 MS = 10**6
 
@@ -172,7 +173,7 @@ def restarted() -> Feed:
 
 def test_a_longer_jump_back_is_an_error_that_says_where() -> None:
     with pytest.raises(
-        LogError, match=r"test.bag: time jumps back by 109.000 s, from 109.000 s to 0.000 s, at a"
+        LogError, match=r"test.bag: time jumps back by 109.000 s, from 9.000 s to -100.000 s, at a"
     ):
         make("topics: {/p: {}}", restarted())
 
@@ -182,6 +183,22 @@ def test_or_the_log_ends_there_if_asked(batch: int) -> None:
     made = make("topics: {/p: {}}", restarted(), batch=batch, on_time_jump="split")
     assert seconds(made.trace.times_ns) == list(range(100, 110))
     assert "the log is taken to end there" in made.remarks[0]
+
+
+@pytest.mark.parametrize("batch", [1, 7, 1000])
+def test_stamps_may_be_as_late_as_is_said(batch: int) -> None:
+    feed = Feed()
+    # a detector whose stamps are three seconds old when they are logged, beside one that is quick
+    for tick in range(40):
+        feed.add("/quick", tick * 100 * MS, pose_stamped(tick, 0, time_ns=tick * 100 * MS))
+        feed.add("/slow", tick * 100 * MS + 1, pose_stamped(tick, 5, time_ns=max(0, tick - 30) * 100 * MS))
+    text = "clock: header\ntopics: {/quick: {}, /slow: {max_age: forever}}"
+    with pytest.raises(LogError, match=r"time jumps back by \d\.\d{3} s, from \d\.\d{3} s to .*--late 5s"):
+        make(text, feed, batch=batch)
+    for late_ns in (5 * SECOND, LATEST_NS):
+        made = make(text, feed, batch=batch, late_ns=late_ns)
+        assert seconds(made.trace.times_ns) == [tick / 10 for tick in range(40)]
+        assert made.centre(5, "slow") == (35.0, 5.0)
 
 
 def test_a_clock_that_jumps_forward_does_not_make_billions_of_samples() -> None:

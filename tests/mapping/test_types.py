@@ -13,7 +13,7 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from mapping.feeding import SECOND, Feed, Made, header, make, pose, pose_stamped, ros, tf, transform
-from spatial_replay import Footprint, TrackedObject
+from spatial_replay import Footprint, TrackedObject, UsageError
 
 QUARTER = (0.0, 0.0, sin(pi / 4), cos(pi / 4))
 
@@ -323,3 +323,34 @@ def test_a_name_that_appears_twice_makes_the_object_unknown() -> None:
     made = one(content, "objects: 'list[*]', name: 'o{id}', position: [x, y]")
     assert (made.states("o1"), made.states("o2")) == ("?", "+")
     assert "object 'o1' is there twice in one message" in made.faults[0]
+
+
+def test_fixes_of_a_satellite_receiver_become_metres_from_the_origin() -> None:
+    def fixed(latitude: float, longitude: float, status: int = 0) -> Any:
+        own = ros("sensor_msgs/NavSatStatus", status=status)
+        return ros("sensor_msgs/NavSatFix", latitude=latitude, longitude=longitude, status=own)
+
+    feed = Feed()
+    for second, place in enumerate([(52.0, 13.0), (52.001, 13.0), (52.0, 13.001), (0.0, 0.0, -1)], 1):
+        feed.add("/fix", second * SECOND, fixed(*place))
+    made = make("origin: [52.0, 13.0]\ntopics: {/fix: {shape: {disc: 0.5}}}", feed)
+    assert made.states("fix") == "+++?"
+    # metres to a thousandth of a degree at 52 degrees north, by the ellipsoid of WGS 84
+    for sample, expected in enumerate([(0, 0), (0, 111.267), (68.678, 0)]):
+        assert made.centre(sample, "fix") == pytest.approx(expected, abs=2e-3)
+    with pytest.raises(UsageError, match=r"give the file an `origin: \[latitude, longitude\]`"):
+        make("topics: {/fix: {}}", feed)
+
+
+def test_joints_are_read_by_their_names_whatever_their_order() -> None:
+    feed = Feed()
+    for second, names in enumerate([("elbow", "wrist"), ("wrist", "elbow"), ("wrist",)], 1):
+        position = [{"elbow": 0.5, "wrist": 1.5}[name] for name in names]
+        joints = ros("sensor_msgs/JointState", position=position)
+        joints.name = list(names)
+        feed.add("/joints", second * SECOND, joints)
+    made = make('topics: {/joints: {signals: {elbow: "position[name=elbow]"}}}', feed)
+    assert made.trace.signals["elbow"].tolist() == pytest.approx([0.5, 0.5, np.nan], nan_ok=True)
+    assert made.faults == ()
+    with pytest.raises(UsageError, match="name has no 'elbo'; did you mean 'elbow'"):
+        make('topics: {/joints: {signals: {elbow: "position[name=elbo]"}}}', feed)

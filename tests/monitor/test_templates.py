@@ -79,7 +79,7 @@ def test_an_unknown_parameter_is_refused(trace):
         judged("a ovlp b", trace, each={"ego": "all"})
 
 
-@pytest.mark.parametrize("choice", ["", "everyone", "class:", "person"])
+@pytest.mark.parametrize("choice", ["", "class:"])
 def test_an_invalid_choice_of_objects_is_refused(trace, choice):
-    with pytest.raises(UsageError, match=r"chooses no objects; write ego=all or ego=class:NAME"):
+    with pytest.raises(UsageError, match=r"chooses no objects; write ego=all, ego=class:NAME or ego=OBJECT"):
         judged(ALONE, trace, each={"ego": choice})

@@ -314,6 +314,51 @@ def test_samples_older_than_a_second_survive_a_kill(tmp_path: Path, is_cold: boo
     assert safe <= found
 
 
+_BUSY = """
+import time
+from spatial_replay import Footprint, Recorder, Sample, parse_specification
+crowd = {f"p{k}": Footprint.box(2 * k, 0, 2 * k + 1, 1) for k in range(24)}
+spec = parse_specification("G (forall x, y in all: x dist y >= 0.5)")
+with Recorder("run.mcap", specifications=spec) as recorder:
+    while True:
+        now_ns = time.monotonic_ns()
+        recorder.write(Sample(now_ns, crowd))
+        print(now_ns, flush=True)
+        time.sleep(0.001)
+"""
+
+
+def test_a_kill_costs_no_second_even_where_the_evaluation_cannot_keep_up(tmp_path: Path) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", _BUSY],
+        cwd=tmp_path,
+        # as slow as a machine that is very busy
+        env={**os.environ, "SPATIAL_REPLAY_KERNELS": "interpreted"},
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        written = [int(process.stdout.readline())]
+        while written[-1] - written[0] < 3 * 10**9:
+            written.append(int(process.stdout.readline()))
+        process.kill()
+        written += [int(line) for line in process.communicate(timeout=300)[0].splitlines()]
+    path = tmp_path / "run.mcap"
+    read = read_trace(path, allow_damage=True).times_ns.tolist()
+    assert read == written[: len(read)]
+    assert written[-1] - read[-1] < 10**9
+
+
+def test_the_disk_has_each_chunk_if_asked(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Recorder(path, durability="disk") as recorder:
+        for index in range(30):
+            recorder.write(sample(index))
+    assert read_trace(path) == run(30)
+    with pytest.raises(UsageError, match="durability is 'paper'; give 'process' or 'disk'"):
+        Recorder(path, durability="paper")  # type: ignore[arg-type]
+
+
 def test_metadata_is_text(tmp_path: Path) -> None:
     with Recorder(tmp_path / "run.mcap", specifications=[SPEC, parse_specification("F cube ovlp cube")]):
         pass

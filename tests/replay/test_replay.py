@@ -14,9 +14,11 @@ from mcap.writer import CompressionType, Writer
 
 from replay.runs import PAST, SPECIFICATION, STEP_NS, PiecewiseSource, content_of, record, run, sample
 from spatial_replay import (
+    Footprint,
     LogError,
     OutputError,
     Replayed,
+    Sample,
     SpecificationError,
     Trace,
     UsageError,
@@ -25,7 +27,14 @@ from spatial_replay import (
 )
 from spatial_replay.logs import Block
 from spatial_replay.recording import record_source
-from spatial_replay.replay import ReplayOptions, Window, load_files, run_replay
+from spatial_replay.replay import (
+    ReplayOptions,
+    Window,
+    document_from_replay,
+    explain_results,
+    load_files,
+    run_replay,
+)
 from spatial_replay.sources import open_source
 
 SPEC = parse_specification(SPECIFICATION, filename="blocks.spatial")
@@ -184,17 +193,21 @@ def test_a_template_is_evaluated_for_each_chosen_object() -> None:
     assert [r.object for r in dishes.results] == ["cup 物"]
 
 
+class Counted(PiecewiseSource):
+    """A source that counts how often it is read."""
+
+    passes = 0
+
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        object.__setattr__(self, "passes", self.passes + 1)
+        return super().iter_blocks(start_ns, end_ns)
+
+
 def test_the_objects_of_templates_take_one_pass() -> None:
-    passes = []
-
-    class Counted(PiecewiseSource):
-        def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
-            passes.append((start_ns, end_ns))
-            return super().iter_blocks(start_ns, end_ns)
-
     spec = parse_specification("spec near(a) = G (a dist cube <= 9)\nspec far(b) = F (b dist cube >= 1)")
-    run_replay(Counted(run(), 4), [spec], ReplayOptions(each={"a": "class:dish", "b": "class:block"}))
-    assert len(passes) == 2
+    source = Counted(run(), 4)
+    run_replay(source, [spec], ReplayOptions(each={"a": "class:dish", "b": "class:block"}))
+    assert source.passes == 2
 
 
 @pytest.mark.parametrize(
@@ -202,13 +215,40 @@ def test_the_objects_of_templates_take_one_pass() -> None:
     [
         ({}, "near.ego. is a template"),
         ({"egg": "all"}, "no template has a parameter 'egg'"),
-        ({"ego": "dish"}, "ego='dish' chooses no objects"),
+        ({"ego": "class:"}, "ego='class:' chooses no objects"),
     ],
 )
 def test_invalid_choices_of_objects_are_reported(each: dict[str, str], said: str) -> None:
     spec = parse_specification("spec near(ego) = G (ego dist cube <= 9)")
     with pytest.raises(UsageError, match=said):
         run_replay(PiecewiseSource(run(), 4), [spec], ReplayOptions(each=each))
+
+
+def test_explaining_many_results_of_a_template_reads_the_log_no_further_time() -> None:
+    spec = parse_specification("spec near(ego) = G (ego dist p0 <= 2)")
+    crowd = Trace.from_samples(
+        Sample(i * 10**8, {f"p{k}": Footprint.box(k + 0.1 * i, 0, k + 0.1 * i + 0.5, 1) for k in range(40)})
+        for i in range(800)
+    )
+    assert crowd.nbytes > 2**22
+    source = Counted(crowd, 350)
+    replayed = run_replay(
+        source, [spec], ReplayOptions(each={"ego": "all"}), keep_series=True, keep_leaves=True
+    )
+    passes = source.passes
+    assert len(explain_results(replayed)) == 40
+    document_from_replay(replayed)
+    assert source.passes == passes == 2
+
+
+def test_a_template_is_evaluated_for_one_object_by_its_name() -> None:
+    spec = parse_specification("spec near(ego) = G (ego dist cube <= 9)")
+    replayed = run_replay(PiecewiseSource(run(), 4), [spec], ReplayOptions(each={"ego": "cup 物"}))
+    assert [result.object for result in replayed.results] == ["cup 物"]
+    missing = run_replay(PiecewiseSource(run(), 4), [spec], ReplayOptions(each={"ego": "cupe"}))
+    assert (missing.results, [part.reason for part in missing.vacuous]) == ((), ["no instances"])
+    assert "never has the object 'cupe'" in missing.missing[0].message
+    assert "did you mean 'cube'" in str(missing.missing[0])
 
 
 def test_a_class_that_the_log_never_has_gives_a_warning_and_no_result() -> None:

@@ -7,14 +7,14 @@ import json
 import socket
 import struct
 from collections.abc import Awaitable, Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from websockets.asyncio.client import connect
-from websockets.exceptions import WebSocketException
-from websockets.typing import Subprotocol
+from websockets.exceptions import InvalidStatus, WebSocketException
+from websockets.typing import Origin, Subprotocol
 
 import spatial_replay as sr
 from replay.runs import STEP_NS, PiecewiseSource, content_of, record, run
@@ -497,6 +497,72 @@ def test_a_log_that_can_no_longer_be_read_is_reported(tmp_path: Path) -> None:
             assert await own.constants() == {"far": 0.5, "soon": "10s"}
 
         watch(server, looking)
+
+
+async def _status(address: str, origin: str | None) -> int:
+    """The answer to a viewer from somewhere: 101 if it may come in."""
+    try:
+        async with connect(address, subprotocols=[PROTOCOL], origin=Origin(origin) if origin else None):
+            return 101
+    except InvalidStatus as error:
+        return error.response.status_code
+
+
+def test_only_viewers_and_pages_of_this_machine_may_connect() -> None:
+    own = LoadedLog(PiecewiseSource(run(COUNT), 7), [specification()]).evaluate()
+    may = [None, "https://app.foxglove.dev", "http://localhost:8080", "http://127.0.0.1:3000", "http://[::1]"]
+    may += ["https://viewer.example.org", "file://"]
+    may_not = [
+        "https://evil.example",
+        "https://app.foxglove.dev.evil.example",
+        "null",
+        "http://localhost.evil",
+    ]
+    may_not += ["http://app.foxglove.dev", "https://viewer.example.org:444", "ftp://localhost"]
+    with open_server(own, port=0, origins=["https://viewer.example.org/"]) as server:
+
+        async def trying() -> None:
+            assert {each: await _status(server.address, each) for each in may} == dict.fromkeys(may, 101)
+            found = {each: await _status(server.address, each) for each in may_not}
+            assert found == dict.fromkeys(may_not, 403)
+
+        asyncio.run(trying())
+    with (
+        pytest.raises(UsageError, match="'evil' is not the origin of a page"),
+        open_server(own, origins=["evil"]),
+    ):
+        pass
+
+
+def test_beyond_this_machine_a_token_is_needed() -> None:
+    own = LoadedLog(PiecewiseSource(run(COUNT), 7), [specification()]).evaluate()
+    with open_server(own, port=0, host="0.0.0.0") as server:
+        address = server.address.replace("0.0.0.0", "127.0.0.1")
+        bare = address.partition("/?")[0]
+
+        async def trying() -> None:
+            assert await _status(address, "https://app.foxglove.dev") == 101
+            assert await _status(address, "https://evil.example") == 403
+            assert [await _status(f"{bare}{each}", None) for each in ("", "/?token=", "/?token=no")] == [
+                401
+            ] * 3
+            async with viewer(address) as looking:
+                assert looking.info["name"] == "spatial-replay: run"
+
+        asyncio.run(trying())
+
+
+def test_what_is_no_request_of_a_viewer_is_refused_or_dropped(server: Serving) -> None:
+    port = int(server.address.rpartition(":")[2])
+    for sent, answered in ((b"GET / HTTP/1.1\r\nHost: a\r\n\r\n", b"426"), (b"x" * 10**5, b"")):
+        with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as connection, suppress(OSError):
+            connection.sendall(sent)
+            assert answered in connection.recv(1000)
+
+    async def looking(own: Viewer) -> None:
+        assert own.info["name"] == "spatial-replay: run"
+
+    watch(server, looking)
 
 
 @pytest.mark.parametrize("host", ["8.8.8.8", "no.such.host.invalid", "a..b", "::2", ""])

@@ -50,17 +50,15 @@ class PackedChunk:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Batch:
-    """Messages as records: heads (M,), payloads, declarations before some of them, (M,) sizes of all that."""
+    """Messages as records: heads (M,), payloads, and (M,) sizes of both."""
 
     heads: np.ndarray[tuple[int], np.dtype[np.void]]
     payloads: list[bytes]
-    declared: Mapping[int, bytes]
-    before: Integers
     sizes: Integers
 
     @classmethod
-    def of(cls, messages: Messages, numbers: Integers, declared: Mapping[int, bytes]) -> Batch:
-        """Return messages as records, with channel numbers (M,) and declarations before some."""
+    def of(cls, messages: Messages, numbers: Integers) -> Batch:
+        """Return messages as records, with channel numbers (M,)."""
         payloads = list(messages.payloads)
         sizes = np.fromiter(map(len, payloads), np.int64, len(payloads))
         heads = np.zeros(len(payloads), _MESSAGE)
@@ -70,10 +68,7 @@ class Batch:
         heads["sequence"] = messages.sequence
         heads["log_time"] = messages.log_time_ns
         heads["publish_time"] = messages.publish_time_ns
-        before = np.zeros(len(payloads), np.int64)
-        for index, declaration in declared.items():
-            before[index] = len(declaration)
-        return cls(heads, payloads, declared, before, sizes + _MESSAGE.itemsize + before)
+        return cls(heads, payloads, sizes + _MESSAGE.itemsize)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,29 +79,39 @@ class MessageRange:
     begin: int
     stop: int
 
+    @property
+    def heads(self) -> np.ndarray[tuple[int], np.dtype[np.void]]:
+        return self.batch.heads[self.begin : self.stop]
+
+    @property
+    def channels(self) -> list[int]:
+        """The numbers of the channels with messages in it."""
+        numbers: list[int] = np.unique(self.heads["channel"]).tolist()
+        return numbers
+
+    @property
+    def start_ns(self) -> int:
+        """Log time of its first message."""
+        return int(self.heads["log_time"][0])
+
     def parts(self) -> list[bytes]:
-        """Return heads and payloads in turn, with declarations before the heads that they precede."""
-        batch, begin, stop = self.batch, self.begin, self.stop
-        heads = batch.heads[begin:stop].tobytes()
+        """Return heads and payloads in turn."""
+        heads = self.heads.tobytes()
         width = _MESSAGE.itemsize
-        parts = [b""] * (2 * (stop - begin))
+        parts = [b""] * (2 * (self.stop - self.begin))
         parts[::2] = [heads[place : place + width] for place in range(0, len(heads), width)]
-        parts[1::2] = batch.payloads[begin:stop]
-        for index, declaration in batch.declared.items():
-            if begin <= index < stop:
-                parts[2 * (index - begin)] = declaration + parts[2 * (index - begin)]
+        parts[1::2] = self.batch.payloads[self.begin : self.stop]
         return parts
 
 
-def pack(ranges: list[MessageRange], compressor: zstandard.ZstdCompressor) -> PackedChunk:
-    """Pack messages into a compressed chunk with its index."""
-    content = b"".join([part for each in ranges for part in each.parts()])
-    heads = np.concatenate([each.batch.heads[each.begin : each.stop] for each in ranges])
+def pack(ranges: list[MessageRange], declaring: bytes, compressor: zstandard.ZstdCompressor) -> PackedChunk:
+    """Pack messages into a compressed chunk with its index, after the declarations that it begins with."""
+    heads = np.concatenate([each.heads for each in ranges])
     sizes = np.concatenate([each.batch.sizes[each.begin : each.stop] for each in ranges])
-    before = np.concatenate([each.batch.before[each.begin : each.stop] for each in ranges])
+    content = declaring + b"".join([part for each in ranges for part in each.parts()])
     entries = np.zeros(len(heads), _INDEX_ENTRY)
     entries["log_time"] = heads["log_time"]
-    entries["offset"] = np.cumsum(sizes) - sizes + before
+    entries["offset"] = len(declaring) + np.cumsum(sizes) - sizes
     index, offsets, counts = bytearray(), dict[int, int](), dict[int, int]()
     for channel in np.unique(heads["channel"]).tolist():
         listed = entries[heads["channel"] == channel].tobytes()

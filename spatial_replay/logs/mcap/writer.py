@@ -2,13 +2,15 @@
 
 The bounds of chunks depend on topics, bytes and log time alone, so that equal messages make equal files.
 Messages of /spatial/* have chunks of their own: who wants them need not read the camera images between them.
+Schemas and channels are declared again and again: the first chunk of a log that was never closed may be
+broken, and the others can be read without it.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +24,13 @@ from mcap import records
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.chunks import encoded
-from spatial_replay.logs.mcap.packing import Batch, McapSummary, MessageRange, PackedChunk, pack
+from spatial_replay.logs.mcap.packing import (
+    Batch,
+    McapSummary,
+    MessageRange,
+    PackedChunk,
+    pack,
+)
 from spatial_replay.logs.messages import Channel, Messages, Schema, messages_of, select
 from spatial_replay.logs.output_file import output_error
 from spatial_replay.logs.topics import LIBRARY, MAGIC, OWN_PREFIX
@@ -31,6 +39,9 @@ CHUNK_BYTES = 128 * 2**10
 """A chunk is closed when it holds this much, uncompressed."""
 CHUNK_NS = 10**9
 """A chunk is closed before a message this much later than its first one."""
+REPEAT_NS = 5 * 10**9
+"""A channel is declared again in the second chunk with its messages, and in one this much after the last that
+declares it. In every chunk, schemas would add 15 % to an annotated log; so they add up to 5 %."""
 COMPRESSION_LEVEL = 1
 """Coordinates hardly shrink further at higher levels, which take several times as long."""
 WAITING_CHUNKS = 1024
@@ -41,17 +52,26 @@ WAITING_BYTES = 256 * 2**20
 
 @dataclass(slots=True)
 class _Lane:
-    """The open chunk of some topics, and the schemas that were declared in chunks of these topics.
+    """The open chunk of some topics."""
 
-    Chunks of two lanes may be written in another order than their messages came, and a schema has to come
-    before its channels: so each lane declares the schemas that it uses.
-    """
-
-    schemas: set[Schema] = field(default_factory=set)
     open: list[MessageRange] = field(default_factory=list)
     open_bytes: int = 0
     began_ns: int = 0
     began_s: float = 0.0
+
+
+@dataclass(slots=True)
+class _Declaration:
+    """A channel and its schema as records, and in how many chunks, and when last, they were declared."""
+
+    schema: bytes
+    channel: bytes
+    count: int = 0
+    last_ns: int = 0
+
+    def is_due(self, time_ns: int) -> bool:
+        """Return whether a chunk that begins at a time declares it."""
+        return self.count < 2 or time_ns >= self.last_ns + REPEAT_NS
 
 
 class LogWriter:
@@ -85,6 +105,7 @@ class LogWriter:
         self._summary = McapSummary()
         self._channels: dict[Channel, int] = {}
         self._schemas: dict[Schema, int] = {}
+        self._declarations: dict[int, _Declaration] = {}
         self._lanes = (_Lane(), _Lane())
         self._worker = ThreadPoolExecutor(1, "chunk-compression")
         self._compressor = zstandard.ZstdCompressor(level=COMPRESSION_LEVEL)
@@ -110,10 +131,10 @@ class LogWriter:
         self.write_messages(messages_of(channel, np.array([log_time_ns], np.int64), (payload,), sequence))
 
     def write_messages(self, messages: Messages) -> None:
-        """Add messages in the order given; a channel is declared before its first one."""
+        """Add messages in the order given."""
         if not len(messages):
             return
-        numbers, lanes, declared = self._numbers(messages)
+        numbers, lanes = self._numbers(messages)
         closings: list[tuple[int, int, list[MessageRange], int]] = []
         for number, lane in enumerate(self._lanes):
             places = np.flatnonzero(lanes == number)
@@ -121,10 +142,7 @@ class LogWriter:
                 closings += self._overtaken(lane, messages.log_time_ns)
                 continue
             own = messages if len(places) == len(messages) else select(messages, places)
-            before = {
-                int(np.searchsorted(places, at)): each for at, each in declared.items() if lanes[at] == number
-            }
-            batch = Batch.of(own, numbers[places], before)
+            batch = Batch.of(own, numbers[places])
             closings += self._divide(lane, batch, places, messages.log_time_ns)
         # in the order of the messages at which they close, however these were divided among calls
         for _, _, ranges, size in sorted(closings, key=lambda closing: closing[:2]):
@@ -171,44 +189,39 @@ class LogWriter:
         finally:
             self._worker.shutdown(cancel_futures=True)
 
-    def _numbers(self, messages: Messages) -> tuple[Integers, Integers, dict[int, bytes]]:
-        """Return (M,) channel numbers, (M,) lanes, and declarations by the message that they precede."""
+    def _numbers(self, messages: Messages) -> tuple[Integers, Integers]:
+        """Return (M,) channel numbers and (M,) lanes; channels that are new are numbered as they come."""
         known, first = np.unique(messages.channel, return_index=True)
         number = np.zeros(int(known.max()) + 1, np.int64)
         lane = np.zeros(len(number), np.int64)
-        declared: dict[int, bytes] = {}
-        for index in sorted(first.tolist()):
-            local = int(messages.channel[index])
+        for local in known[np.argsort(first)].tolist():
             channel = messages.channels[local]
             lane[local] = not channel.topic.startswith(OWN_PREFIX)
             if channel not in self._channels:
-                declared[index] = self._declare(channel, self._lanes[int(lane[local])])
+                self._declare(channel)
             number[local] = self._channels[channel]
-        return number[messages.channel], lane[messages.channel], declared
+        return number[messages.channel], lane[messages.channel]
 
-    def _declare(self, channel: Channel, lane: _Lane) -> bytes:
-        declaration = b""
-        schema = channel.schema
-        if schema is not None and schema not in lane.schemas:
-            lane.schemas.add(schema)
+    def _declare(self, channel: Channel) -> None:
+        """Number a channel and its schema, and prepare the records that chunks declare them with."""
+        schema, described = channel.schema, b""
+        if schema is not None:
             is_new = schema not in self._schemas
             number = self._schemas.setdefault(schema, len(self._schemas) + 1)
-            described = records.Schema(
-                id=number, data=schema.data, encoding=schema.encoding, name=schema.name
-            )
+            record = records.Schema(id=number, data=schema.data, encoding=schema.encoding, name=schema.name)
             if is_new:
-                self._summary.schemas.append(described)
-            declaration += encoded(described)
+                self._summary.schemas.append(record)
+            described = encoded(record)
         self._channels[channel] = len(self._channels) + 1
-        record = records.Channel(
+        declared = records.Channel(
             id=self._channels[channel],
             topic=channel.topic,
             message_encoding=channel.encoding,
             metadata=dict(channel.metadata),
             schema_id=0 if schema is None else self._schemas[schema],
         )
-        self._summary.channels.append(record)
-        return declaration + encoded(record)
+        self._summary.channels.append(declared)
+        self._declarations[declared.id] = _Declaration(described, encoded(declared))
 
     def _divide(
         self, lane: _Lane, batch: Batch, places: Integers, times_ns: Integers
@@ -266,9 +279,19 @@ class LogWriter:
 
     def _pack(self, ranges: list[MessageRange], size: int) -> None:
         """Compress a chunk on the other thread, and write those that are ready."""
-        self._packing.append(self._worker.submit(pack, ranges, self._compressor))
+        declaring = self._declaring(ranges)
+        self._packing.append(self._worker.submit(pack, ranges, declaring, self._compressor))
         self._packing_bytes.append(size)
         self._write_packed(WAITING_CHUNKS)
+
+    def _declaring(self, ranges: Sequence[MessageRange]) -> bytes:
+        """Return the declarations that a chunk begins with; each schema is in it once."""
+        start_ns = ranges[0].start_ns
+        numbers = sorted(set().union(*(each.channels for each in ranges)))
+        due = [each for number in numbers if (each := self._declarations[number]).is_due(start_ns)]
+        for each in due:
+            each.count, each.last_ns = each.count + 1, start_ns
+        return b"".join([*dict.fromkeys(each.schema for each in due), *(each.channel for each in due)])
 
     def _write_packed(self, waiting: int) -> None:
         """Write chunks in their order until no more than `waiting` are left, and those that are ready."""

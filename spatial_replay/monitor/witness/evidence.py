@@ -127,13 +127,17 @@ class Evidence:
         """Iterate over the samples in blocks, each with the earlier ones that it may look back at."""
         past: Trace | None = None
         for trace in self._traces():
+            if len(trace) and trace.times_ns[0] >= self.instance.end_ns:
+                # an object of a template is there for a part of the log only
+                return
             skip = 0
             if past is not None and self._reach != (0, 0):
                 recent = tail(past, *self._reach)
                 skip = len(recent)
                 trace = Trace.concatenate([recent, trace])
             past = trace if len(trace) else past
-            yield TraceScene(trace, self._regions, skip)
+            if len(trace) and trace.times_ns[-1] >= self.instance.start_ns:
+                yield TraceScene(trace, self._regions, skip)
 
 
 def _object_names(base: Term) -> tuple[str, ...]:

@@ -1,0 +1,271 @@
+"""Recognise objects and signals in messages of unknown types, by the names and values of their fields."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+from spatial_replay.mapping.field_paths import (
+    FieldError,
+    FieldPath,
+    field_names,
+    get_field,
+    is_list,
+    iter_elements,
+    walk,
+)
+
+_DEEPEST = 4
+"""Levels of nested fields to search."""
+_POSITIONS = ("position", "center", "centre", "translation", "location", "point")
+_TURNS = ("orientation", "rotation", "quaternion")
+_YAWS = ("yaw", "theta", "heading", "angle")
+_SIZES = ("dimension", "dimensions", "size", "scale", "extent", "shape", "bbox")
+_OUTLINES = ("corners", "polygon", "points", "vertices", "outline", "footprint", "contour")
+_NAMES = ("name", "id", "track_id", "object_id", "tracking_id", "child_frame_id", "uuid", "label")
+_NO_IDENTITIES = frozenset({"frame", "class", "type", "category", "parent", "sensor", "status", "seq"})
+"""Fields such as `class_id` and `frame_id` are the same for several objects."""
+_CLASSES = ("class", "class_name", "classification", "category", "label", "object_type", "type")
+_LISTS = re.compile("object|detection|track|tag|agent|obstacle|pose|vehicle|pedestrian|marker")
+_NOT_PLACES = frozenset(
+    {
+        *("velocity", "velocities", "vel", "speed", "acceleration", "accel", "twist", "linear", "angular"),
+        *("force", "torque", "wrench", "covariance", "header", "stamp", "timestamp", "origin"),
+        *("mount", "mounting", "sensor", "camera", "extrinsic", "extrinsics", "calibration"),
+    }
+)
+"""Words in the names of fields whose points are no places of objects, such as sensors' mounts."""
+_VECTORS = re.compile(r"twist|vector3|accel|wrench|imu|cmd_vel|velocity", re.IGNORECASE)
+"""Topics and types whose x and y are no place."""
+_TIMES = frozenset({"time", "stamp", "timestamp", "sec", "secs", "nsec", "nsecs", "nanosec", "nanos", "seq"})
+"""Words in the names of numbers that say when, and not what."""
+_FIELD = re.compile(r"[A-Za-z_][\w-]*", re.ASCII)
+_KEY = re.compile(r"[^\[\]{}|=\s]{1,100}", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class Guess:
+    """Fields of a message that look like those of an object; texts are field paths.
+
+    Attributes:
+        objects: of the list of objects, or None for a single one.
+        position: of a point, or of x and y.
+        size: of length, width and maybe height; or of a radius.
+        names: candidates for what distinguishes objects, the likeliest first.
+        others: of further lists whose elements look like objects.
+    """
+
+    objects: str | None = None
+    position: str | tuple[str, ...] | None = None
+    orientation: str | None = None
+    yaw: str | None = None
+    polygon: str | None = None
+    size: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+    class_name: str | None = None
+    others: tuple[str, ...] = ()
+
+    @property
+    def score(self) -> int:
+        """How many fields of an object there are; a place counts most."""
+        parts = (self.polygon, self.size, self.names, self.orientation or self.yaw, self.class_name)
+        return 10 * (self.polygon is not None or self.position is not None) + sum(map(bool, parts))
+
+
+def guess_objects(topic: str, kind: str, messages: Sequence[object]) -> Guess | None:
+    """Find an object, or a list of them, in the messages of a topic; None if nothing looks like one.
+
+    Args:
+        kind: the type of the messages.
+    """
+    if _VECTORS.search(kind) or _VECTORS.search(topic.rsplit("/", 1)[-1]):
+        return None
+    guesses = [guess for each in messages if (guess := _guess(each)) is not None]
+    if not guesses:
+        return None
+    best = max(guesses, key=lambda guess: guess.score)
+    return replace(best, names=tuple(name for name in best.names if _distinguishes(name, best, messages)))
+
+
+def numbers_in(message: object) -> tuple[str, ...]:
+    """Return the paths of the numbers and truth values in a message, but for times and the header.
+
+    Of lists only those beside a list `name` are found, such as `position[name=elbow]`.
+    """
+    paths: list[str] = []
+    for path, value in _iter_fields(message, is_skipped=_is_time):
+        if isinstance(value, int | float):
+            paths.append(path)
+        elif is_list(value) and len(value) and isinstance(value[0], int | float):
+            prefix, _, last = path.rpartition(".")
+            keys = [
+                names
+                for name, names in _iter_fields(message, is_skipped=_is_time)
+                if name == (f"{prefix}.name" if prefix else "name") and is_list(names)
+            ]
+            if keys and len(keys[0]) == len(value):
+                usable = [key for key in keys[0] if isinstance(key, str) and _KEY.fullmatch(key)]
+                paths += [f"{prefix + '.' if prefix else ''}{last}[name={key}]" for key in usable]
+    return tuple(paths)
+
+
+def frame_of(message: object) -> str | None:
+    """Return the frame of a message's coordinates, if the message names it."""
+    for path, value in _iter_fields(message, is_skipped=lambda name: False):
+        if path.split(".")[-1] == "frame_id" and isinstance(value, str) and value:
+            return value.removeprefix("/")
+    return None
+
+
+def _guess(message: object) -> Guess | None:
+    itself = _object_in(message)
+    lists = sorted(
+        ((guess, path) for path, guess in _iter_lists(message)),
+        key=lambda each: (-_list_rank(each[1]), -each[0].score),
+    )
+    if lists and (itself is None or itself.polygon is None):
+        best, path = lists[0]
+        return replace(best, objects=path, others=tuple(other for _, other in lists[1:]))
+    return itself
+
+
+def _distinguishes(name: str, guess: Guess, messages: Sequence[object]) -> bool:
+    """Return whether no two objects of a message share the value of a field."""
+    if guess.objects is None:
+        return True
+    for message in messages:
+        try:
+            values = [
+                walk(FieldPath.of(name), each) for each in iter_elements(FieldPath.of(guess.objects), message)
+            ]
+        except FieldError:
+            return False
+        if len(set(map(str, values))) < len(values):
+            return False
+    return True
+
+
+def _iter_lists(message: object) -> Iterator[tuple[str, Guess]]:
+    for path, value in _iter_fields(message):
+        if is_list(value) and len(value) and field_names(value[0]):
+            guess = _object_in(value[0])
+            # the corners of an outline are points, not objects
+            if guess is not None and not (path.split(".")[-1] in _OUTLINES and guess.score <= 10):
+                yield f"{path}[*]", guess
+
+
+def _object_in(value: object) -> Guess | None:
+    """Find the fields of one object in a message or an element of a list."""
+    fields = dict(_iter_fields(value))
+    polygon = next((path for path in _named(fields, _OUTLINES) if _is_outline(fields[path])), None)
+    position = _position_in(fields)
+    if polygon is None and position is None:
+        return None
+    yaw = _first(fields, _YAWS, _is_number) if polygon is None else None
+    turn = next((path for path in _named(fields, _TURNS) if _has(fields[path], "xyzw")), None)
+    return Guess(
+        position=position if polygon is None else None,
+        orientation=turn if polygon is None else None,
+        yaw=None if turn else yaw,
+        polygon=polygon,
+        size=_size_in(fields) if polygon is None else (),
+        names=_names_in(fields),
+        class_name=_first(fields, _CLASSES, lambda each: isinstance(each, str)),
+    )
+
+
+def _position_in(fields: dict[str, object]) -> str | tuple[str, ...] | None:
+    for path in _named(fields, _POSITIONS):
+        if _has(fields[path], "xy"):
+            return path
+    if _is_number(fields.get("x")) and _is_number(fields.get("y")) and not _is_number(fields.get("w")):
+        return ("x", "y")
+    return None
+
+
+def _size_in(fields: dict[str, object]) -> tuple[str, ...]:
+    for path in _named(fields, _SIZES):
+        for names in (("length", "width", "height"), ("x", "y", "z"), ("size_x", "size_y", "size_z")):
+            known = field_names(fields[path])
+            if all(name in known and _is_number(get_field(fields[path], name)) for name in names[:2]):
+                return tuple(f"{path}.{name}" for name in names if name in known)
+    for names in (("length", "width", "height"), ("size_x", "size_y", "size_z")):
+        if all(_is_number(fields.get(name)) for name in names[:2]):
+            return tuple(name for name in names if name in fields)
+    return ("radius",) if _is_number(fields.get("radius")) else ()
+
+
+def _names_in(fields: dict[str, object]) -> tuple[str, ...]:
+    """Return the paths of what may distinguish objects: a name or an id, then such as `fiducial_id`."""
+    others = [
+        path
+        for path in fields
+        if (words := _words(path.split(".")[-1]))[-1] in ("id", "uuid") and not _NO_IDENTITIES & {*words}
+    ]
+    names: list[str] = []
+    for path in dict.fromkeys([*_named(fields, _NAMES), *sorted(others, key=lambda path: path.count("."))]):
+        value = fields[path]
+        if isinstance(value, str | int) and not isinstance(value, bool) and value != "":
+            names.append(path)
+        elif "value" in field_names(value):
+            names.append(f"{path}.value")
+    return tuple(names)
+
+
+def _words(name: str) -> list[str]:
+    """Return the words in the name of a field: `trackId` and `track_id` → track, id."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower().split("_")
+
+
+def _named(fields: dict[str, object], names: tuple[str, ...]) -> list[str]:
+    """Return the paths that end in one of some names, by depth, then in the order of the names."""
+    ends = {path: "_".join(_words(path.split(".")[-1])) for path in fields}
+    paths = [path for path in fields if ends[path] in names]
+    return sorted(paths, key=lambda path: (path.count("."), names.index(ends[path])))
+
+
+def _first(fields: dict[str, object], names: tuple[str, ...], fits: Callable[[object], bool]) -> str | None:
+    return next((path for path in _named(fields, names) if fits(fields[path])), None)
+
+
+def _is_no_place(name: str) -> bool:
+    return not _NOT_PLACES.isdisjoint(_words(name))
+
+
+def _is_time(name: str) -> bool:
+    return name == "header" or not _TIMES.isdisjoint(_words(name))
+
+
+def _iter_fields(
+    value: object, path: str = "", depth: int = 0, *, is_skipped: Callable[[str], bool] = _is_no_place
+) -> Iterator[tuple[str, object]]:
+    """Iterate over the fields of a message and its parts, with their paths; lists are not entered."""
+    for name in field_names(value) if depth < _DEEPEST else ():
+        if not is_skipped(name) and _FIELD.fullmatch(name):
+            inner = get_field(value, name)
+            full = f"{path}.{name}" if path else name
+            yield full, inner
+            yield from _iter_fields(inner, full, depth + 1, is_skipped=is_skipped)
+
+
+def _list_rank(path: str) -> int:
+    """Return how well the name of a list suits objects that move."""
+    last = path.removesuffix("[*]").split(".")[-1].lower()
+    return 2 * ("moving" in last or "dynamic" in last) + bool(_LISTS.search(last))
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _has(value: object, names: str) -> bool:
+    """Return whether a message has numbers as fields with these names of one letter."""
+    known = field_names(value)
+    return all(name in known and _is_number(get_field(value, name)) for name in names)
+
+
+def _is_outline(value: object) -> bool:
+    if not is_list(value):
+        return "points" in field_names(value) and _is_outline(get_field(value, "points"))
+    return len(value) >= 3 and _has(value[0], "xy")
