@@ -17,8 +17,7 @@ from typing import Any, Final, TypeAlias, TypeVar, cast
 
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import is_address
-from spatial_replay.mapping.checked_yaml import checked_document, read_yaml_text
-from spatial_replay.mapping.yaml_document import Document, Place
+from spatial_replay.mapping.yaml_document import Document, Place, checked_document, read_yaml_text
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.trace.time_points import time_point_from_text

@@ -6,11 +6,10 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from spatial_replay.bags.columns import Message
+from spatial_replay.bags.columns import DISORDER_NS, Message
 from spatial_replay.logs.objects.decode import decode_objects
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.topics import OBJECTS
-from spatial_replay.mapping.reading_plan import DISORDER_NS
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import ABSENT, Trace
 

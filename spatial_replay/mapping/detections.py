@@ -241,8 +241,8 @@ def _local_metres(fixes: Floats, origin: tuple[float, float]) -> Floats:
     )
     offsets = earth_fixed(fixes) - earth_fixed(np.array([origin]))
     metres: Floats = offsets @ np.stack([east, north], axis=1)
-    is_fixed: Booleans = (np.abs(fixes[:, :2]) <= (90.0, 360.0)).all(axis=1) & ~(fixes[:, 2:] < 0).any(axis=1)
-    metres[~is_fixed] = np.nan
+    is_off = np.any(np.abs(fixes[:, :2]) > (90.0, 360.0), axis=1) | np.any(fixes[:, 2:] < 0, axis=1)
+    metres[np.flatnonzero(is_off)] = np.nan
     return metres
 
 

@@ -19,7 +19,6 @@ from typing import Any, cast
 
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import log_file
-from spatial_replay.mapping.checked_yaml import checked_document, read_yaml_text
 from spatial_replay.mapping.field_paths import FieldPath, NameTemplate
 from spatial_replay.mapping.model import (
     NO_TOPIC,
@@ -36,7 +35,7 @@ from spatial_replay.mapping.model import (
     age_ns,
     duration_ns,
 )
-from spatial_replay.mapping.yaml_document import Document, Place
+from spatial_replay.mapping.yaml_document import Document, Place, checked_document, read_yaml_text
 from spatial_replay.text import nearest_hint
 from spatial_replay.trace.axes import Axes
 
