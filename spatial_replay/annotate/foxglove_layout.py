@@ -14,7 +14,7 @@ import numpy as np
 
 from spatial_replay.annotate.curves import curved_nodes
 from spatial_replay.annotate.scene_entities import FRAMES
-from spatial_replay.annotate.specification import ReportedTree, unit_of
+from spatial_replay.annotate.specification import ReportedTree, unit_of, unit_words
 from spatial_replay.annotate.standing import named_parts, part_title
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.logs.messages import Attachment
@@ -68,8 +68,6 @@ _LONGEST_LABEL: Final = 24
 
 _INDICATOR_PIXELS: Final = 18
 _ZERO: Final = "#8c8c8c"
-
-_UNIT_WORDS: Final = MappingProxyType({"": "footprint units", "1": "no unit", "mixed": "mixed units"})
 
 STANDING_COLOURS: Final[Mapping[int, tuple[str, str]]] = MappingProxyType(
     {
@@ -274,7 +272,7 @@ def _plots(name: str, title: str, curves: Sequence[_Curve]) -> list[Panel]:
     panels = []
     for index, unit in enumerate(list(dict.fromkeys(curve.unit for curve in curves))[:_MOST_PLOTS]):
         own = [curve for curve in curves if curve.unit == unit][:_MOST_CURVES]
-        words = _UNIT_WORDS.get(unit, unit)
+        words = unit_words(unit)
         paths = [
             {
                 # viewers draw samples as dots of this colour darkened, which cover a dense curve

@@ -137,6 +137,12 @@ def unit_of(formula: Formula, signal_units: Mapping[str, str]) -> str:
     return units.pop() if units else FOOTPRINT_UNITS
 
 
+def unit_words(unit: str) -> str:
+    """Return a unit that `unit_of` gives as it is written at an axis."""
+    words = {FOOTPRINT_UNITS: "footprint units", DIMENSIONLESS: "no unit", MIXED: "mixed units"}
+    return words.get(unit, unit)
+
+
 def _add_nodes(
     result: SpecificationResult, formula: Formula, relations: frozenset[str], signal_units: Mapping[str, str]
 ) -> None:

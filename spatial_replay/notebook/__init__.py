@@ -25,6 +25,7 @@ _VIEWS: Mapping[str, str] = MappingProxyType(
         "spatial_replay.planning.maps": "planning_view",
         "spatial_replay.planning.read": "planning_view",
         "spatial_replay.spec.formula": "specification_view",
+        "spatial_replay.trace.trace": "trace_view",
         "spatial_replay.tuning.tuned": "tuning_view",
     }
 )

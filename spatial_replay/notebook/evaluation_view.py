@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from spatial_replay.annotate.specification import unit_of, unit_words
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.evaluate import Evaluation
@@ -190,7 +191,7 @@ def draw_result(result: SpecResult, ax: Axes | None = None) -> Axes:
     _name_curves(ax, curves, has_band)
     ax.set_title(_title(result), loc="left", fontsize=10)
     ax.set_xlabel("time from the first sample in s")
-    ax.set_ylabel("robustness")
+    ax.set_ylabel(plain(f"robustness [{unit_words(unit_of(result.formula, {}))}]"))
     ax.spines[["top", "right"]].set_visible(False)
     return ax
 

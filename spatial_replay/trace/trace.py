@@ -13,6 +13,7 @@ from spatial_replay.errors import TraceError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.lazy import Displayed
 from spatial_replay.text import times_apart
 from spatial_replay.trace.measurement_cache import MeasurementCache
 from spatial_replay.trace.sample import Sample
@@ -22,7 +23,7 @@ ABSENT = -1
 
 
 @dataclass(frozen=True, eq=False)
-class Trace:
+class Trace(Displayed):
     """T samples with strictly increasing times.
 
     Objects are stored as observations: rows of flat arrays, one for each time an object was reported.

@@ -51,11 +51,13 @@ def test_samples_are_read_back_as_they_were_written(tmp_path: Path) -> None:
     assert content.topics() == {
         "/spatial/automaton",
         "/spatial/events",
+        "/spatial/frame",
         "/spatial/log",
         "/spatial/objects",
         "/spatial/robustness",
         "/spatial/scene",
         "/spatial/specification",
+        "/spatial/standing",
     }
     assert ("recorded/blocks.spatial", SPECIFICATION.encode()) in content.attachments
     assert content.metadata[0][0] == "spatial_replay"

@@ -1,0 +1,33 @@
+"""Traces in notebooks."""
+
+from __future__ import annotations
+
+import pytest
+
+import spatial_replay as sr
+from pages import shown
+
+SAMPLES = [
+    sr.Sample(
+        index * 10**8,
+        {"mover": sr.Footprint.box(index, 0, index + 1, 1), "post": sr.Footprint.disc(3, 4, 0.5)},
+    )
+    for index in range(5)
+]
+
+
+@pytest.mark.usefixtures("figures")
+def test_a_trace_is_drawn_with_start_end_trails_and_regions() -> None:
+    specification = sr.parse_specification("region goal = box(4, 0, 6, 2)\nspec s = F mover enclosedin goal")
+    ax = sr.Trace.from_samples(SAMPLES).plot(specification=specification)
+    assert {text.get_text() for text in ax.texts} == {"mover", "post", "goal"}
+    trail = ax.lines[0].get_xydata()
+    assert trail[[0, -1]].tolist() == [[0.5, 0.5], [4.5, 0.5]]
+    assert "footprint units" in ax.get_xlabel()
+    assert ax.get_title("left") == "5 samples over 0.400 s"
+
+
+def test_a_page_says_in_how_many_samples_an_object_is() -> None:
+    text = shown(sr.Trace.from_samples(SAMPLES[:3]))
+    assert "3 samples over 0.200 s" in text
+    assert "mover3" in text
