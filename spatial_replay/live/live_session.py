@@ -31,7 +31,7 @@ from spatial_replay.mapping.live_assembler import rehearse
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
 from spatial_replay.monitor.monitor import Ending, Monitor
 from spatial_replay.recording.changes import VerdictChanges
-from spatial_replay.recording.recorder import SampleWriter
+from spatial_replay.recording.recorder import Recorder, SampleWriter
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import counted
 from spatial_replay.trace.sample import Sample
@@ -255,6 +255,7 @@ class LiveSession:
                         f"the connection to {self._address} is lost: {reason}; everything is unknown until"
                         " it is back"
                     )
+                    self._report_event("connection lost")
                     async for update in self._evaluated(self._lose(list(self._planned)), at_s):
                         yield update
         async for update in self._evaluated(self._add(messages), arrived_s):
@@ -295,8 +296,14 @@ class LiveSession:
             return Trace.from_samples(())
         self._silent |= {*silent}
         listed = ", ".join(silent)
+        self._report_event(f"silence on {listed}")
         self._notes.append(f"no message on {listed} for {self._dead_man_s:g} s: what it reports is unknown")
         return self._lose(silent)
+
+    def _report_event(self, what: str) -> None:
+        for recorder in self._recorders:
+            if isinstance(recorder, Recorder):
+                recorder.report_event(what)
 
     # -------------------------------------------------------------------------------- planning
 

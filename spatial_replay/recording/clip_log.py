@@ -244,6 +244,11 @@ class ClipLog:
         return not self._fired.empty() or (self._open is not None and bool(self._open.waiting))
 
     @property
+    def waits_for_events(self) -> bool:
+        """Whether any event fires."""
+        return any(text.strip() == "event" for text, _ in self._conditions)
+
+    @property
     def held_bytes(self) -> int:
         """What the ring takes in memory."""
         return self._bytes

@@ -341,6 +341,12 @@ class Recorder(SampleWriter):
         self._clips.fire(reason)
         self._ring()
 
+    def report_event(self, what: str) -> None:
+        """Fire the trigger if it waits for events: of the connection or of a sensor, as for a change of a
+        verdict."""
+        if self._clips is not None and self._clips.waits_for_events:
+            self.trigger(what)
+
     @property
     def is_triggered(self) -> bool:
         """Whether it writes what its trigger chooses, not everything."""

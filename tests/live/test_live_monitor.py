@@ -300,13 +300,18 @@ def test_what_a_silent_topic_reported_is_unknown(tmp_path: Path) -> None:
     mapped, spec = files(tmp_path, MAPPING, SPEC)
     with robot() as own:
         driving = drive(own, range(20))
-        found = asyncio.run(updates_of(own.address, spec, mapped, 21, dead_man_s=0.5))
+        clips, event = tmp_path / "clips", Trigger("event", before_s=1, after_s=0)
+        found = asyncio.run(
+            updates_of(own.address, spec, mapped, 21, dead_man_s=0.5, clips=clips, trigger=event)
+        )
         driving.join()
     last = found[-1]
     assert set(last.sample.unknown) == {"robot", "vase"}
     assert any("no message on" in note for note in last.notes)
     assert last.node("clear").lower == float("-inf")
     assert last.sample.time_ns == found[-2].sample.time_ns + 1
+    # it is an event, which a trigger may wait for
+    assert any("silence" in each.name for each in clips.iterdir())
 
 
 @pytest.mark.parametrize("protocol", ["foxglove.sdk.v1", "foxglove.websocket.v1"])
