@@ -6,6 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
@@ -85,12 +86,18 @@ def export_table(
     rows, first_ns = 0, 0
     with replacing(output, inputs) as stream:
         write = writer(stream, [TIME, SECONDS, *titles.values()], list(automata.values()))
-        for table in _iter_tables(source, titles, automata, QUANTITIES.index(quantity), faults):
-            write(table)
-            first_ns = first_ns if rows else int(table.times_ns[0])
-            rows += len(table.times_ns)
-            advance(len(table.times_ns))
-        write(None)
+        try:
+            for table in _iter_tables(source, titles, automata, QUANTITIES.index(quantity), faults):
+                write(table)
+                first_ns = first_ns if rows else int(table.times_ns[0])
+                rows += len(table.times_ns)
+                advance(len(table.times_ns))
+            write(None)
+        except BaseException:
+            # a writer that is left open would go on writing when it is collected, to a closed file
+            with suppress(Exception):
+                write(None)
+            raise
     return rows, len(titles), counted_from(faults, first_ns)
 
 
@@ -283,7 +290,10 @@ def _parquet_writer(stream: Any, titles: Sequence[str], automata: Sequence[str])
 
     def write(table: TableRows | None) -> None:
         if table is None:
-            writer.close()
+            try:
+                writer.close()
+            finally:
+                writer.is_open = False
             return
         columns = [
             pa.array(table.times_ns),

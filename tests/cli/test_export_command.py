@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import sys
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,8 @@ from cli.program import run_program
 from replay.runs import SPECIFICATION, PiecewiseSource, record, run
 from spatial_replay import parse_specification
 from spatial_replay.cli import run as run_in_process
-from spatial_replay.replay import run_replay
+from spatial_replay.replay import export_table, run_replay
+from spatial_replay.sources import open_source
 
 
 @pytest.fixture
@@ -71,3 +74,20 @@ def test_the_readable_part_of_a_damaged_log_is_exported_with_code_3(
     assert run_in_process(["export", "broken.mcap", "-o", "run.csv"]) == 3
     assert "broken.mcap" in capsys.readouterr().err
     assert len((folder / "run.csv").read_text().splitlines()) == 13
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_an_export_that_is_interrupted_at_its_end_leaves_nothing_and_says_nothing(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, ending: str
+) -> None:
+    complaints: list[object] = []
+    monkeypatch.setattr(sys, "unraisablehook", complaints.append)
+    before = sorted(folder.iterdir())
+
+    def interrupt(rows: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        export_table(open_source("annotated.mcap"), folder / f"run.{ending}", advance=interrupt)
+    gc.collect()
+    assert (sorted(folder.iterdir()), complaints) == (before, [])
