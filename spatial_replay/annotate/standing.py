@@ -208,12 +208,16 @@ def part_title(name: str, tree: ReportedTree) -> str:
     return f"{name} in {tree.title}"
 
 
+_POWERS: Final = np.array([float(f"1e{digits}") for digits in range(20)])
+_POWERS.flags.writeable = False
+
+
 def rounded(numbers: Floats) -> Floats:
     """Return numbers with four digits, so that viewers print them short; very large and small ones stay."""
     size = np.abs(numbers)
     is_usual = (size >= 1e-15) & (size < 1e15)
     digits = 3.0 - np.floor(np.log10(np.where(is_usual, size, 1.0)))
-    power = 10.0 ** np.abs(digits)
+    power = _POWERS[np.abs(digits).astype(np.int64)]
     usual = np.where(is_usual, numbers, 0.0)
     # quotients and products of whole numbers, so that the result is the number nearest to those digits
     shown = np.where(digits < 0.0, np.round(usual / power) * power, np.round(usual * power) / power)
