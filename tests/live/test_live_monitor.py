@@ -261,7 +261,8 @@ def test_a_viewer_sees_the_run_and_a_service_fires_the_trigger(tmp_path: Path) -
         def watch() -> None:
             try:
                 asyncio.run(look())
-                until(lambda: any(clips.iterdir()))
+                # a trigger that fires while a clip is open would make that one longer
+                until(lambda: any(each.read_bytes().endswith(b"\x89MCAP0\r\n") for each in clips.iterdir()))
                 os.kill(os.getpid(), signal.SIGUSR1)
                 until(lambda: len(list(clips.iterdir())) > 1)
             finally:
