@@ -51,6 +51,11 @@ def _notebook() -> Any:
     return import_module("spatial_replay.notebook")
 
 
+def data_frame(value: object) -> Any:
+    """Return results as a pandas DataFrame; see `spatial_replay.notebook.data_frame`."""
+    return import_module("spatial_replay.notebook.data_frame").data_frame(value)
+
+
 def drawn_as_svg(value: Displayed) -> str | None:
     """Return a value as SVG, or None if it cannot be drawn here."""
     drawing: str | None = _notebook().svg(value)

@@ -131,10 +131,12 @@ class DrawnEntity(NamedTuple):
     Attributes:
         rings: its outlines, (n, 2) each.
         colour: red, green and blue, 0 to 255.
+        class_name: of an object that has one.
     """
 
     rings: tuple[Floats, ...]
     colour: tuple[int, int, int]
+    class_name: str | None = None
 
 
 class DrawnViolation(NamedTuple):
@@ -184,6 +186,7 @@ class SceneFrames:
         times_ns: (S,) int64.
         objects, regions: (S, objects) and (S, regions), the worst robustness of their requirements.
         object_colours, region_colours: the same with a last axis of red, green and blue, 0 to 1.
+        scale: the robustness at which colours are full.
     """
 
     times_ns: Integers
@@ -191,6 +194,8 @@ class SceneFrames:
     regions: Floats
     object_colours: Floats
     region_colours: Floats
+    scale: float
+    _presence: Presence
     _content: _SceneContent
     _regions: tuple[Region, ...]
 
@@ -204,7 +209,10 @@ class SceneFrames:
         for column, name in enumerate(content.names):
             if content.forms[index, column] >= _FIRST_FORM:
                 rings = content.rings.rings_of(int(content.observations[index, column]))
-                entities[OBJECT + name] = DrawnEntity(rings, _bytes(self.object_colours[index, column]))
+                colour = _bytes(self.object_colours[index, column])
+                code = int(self._presence.class_code[index, column])
+                class_name = self._presence.classes[code] if code >= 0 else None
+                entities[OBJECT + name] = DrawnEntity(rings, colour, class_name)
         found, violation = content.violations, None
         if found.is_shown[index]:
             robustness = float(found.robustness[index])
@@ -290,7 +298,7 @@ class SceneEncoder:
             place=state.place,
             templates=MappingProxyType(dict(list(templates.items())[-_MOST_TEMPLATES:])),
         )
-        frames = SceneFrames(times_ns, objects, regions, *shades, content, self._drawn)
+        frames = SceneFrames(times_ns, objects, regions, *shades, scale, presence, content, self._drawn)
         return SceneMessages(times_ns, payloads, after, frames)
 
     def scaled(self, state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState, Floats, int]:

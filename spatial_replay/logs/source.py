@@ -178,6 +178,11 @@ def axes_of(source: Source) -> Axes:
     return axes if isinstance(axes, Axes) else OUR_AXES
 
 
+def signal_units_of(source: Source) -> Mapping[str, str]:
+    """Return the units that a source declares for its signals, by their names."""
+    return dict(getattr(source, "signal_units", {}))
+
+
 def reading_options(source: Source) -> dict[str, object]:
     """Return the options of a source that are not the defaults, for a log's metadata."""
     concave = getattr(source, "concave", "decompose")

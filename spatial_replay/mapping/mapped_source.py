@@ -67,6 +67,12 @@ class MappedSource:
         return self.mapping.axes
 
     @property
+    def signal_units(self) -> Mapping[str, str]:
+        """The units that the mapping declares, by signal."""
+        signals = [signal for topic in self.mapping.topics for signal in topic.signals]
+        return {signal.name: signal.unit for signal in signals if signal.unit}
+
+    @property
     def options(self) -> Mapping[str, object]:
         """The options of reading, for the metadata of a copy."""
         mapping = {"mapping": self.mapping.name, "mapping_sha256": self.mapping.sha256}

@@ -6,9 +6,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from reprlib import repr as shortened
+from typing import Any
 
 from spatial_replay.errors import SpecificationError, UsageError
-from spatial_replay.lazy import Displayed
+from spatial_replay.lazy import Displayed, data_frame
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.result import NodeResult, SpecResult, no_such_node
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
@@ -93,6 +94,14 @@ class Evaluation(Displayed):
             return fitting[0]
         known = ", ".join(r.name if r.object is None else f"{r.name} for {r.object}" for r in self.results)
         raise UsageError(f"{len(fitting)} results fit name={name!r}, object={object!r}; there are {known}")
+
+    def to_pandas(self) -> Any:
+        """Return the results as a pandas DataFrame: a row for each, with its verdict, numbers and times.
+
+        Raises:
+            UsageError: pandas is not installed.
+        """
+        return data_frame(self)
 
     def node(self, name: str, object: str | None = None) -> NodeResult:
         """Return the root node of a named spec, wherever it occurs.

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
-from spatial_replay.lazy import Displayed
+from spatial_replay.lazy import Displayed, data_frame
 from spatial_replay.monitor.causes import Cause, Conjunct, LeastPart, conjuncts_of, find_causes, find_least
 from spatial_replay.monitor.offline import evaluate_offline, full_signal, window_signal
 from spatial_replay.monitor.semantics import Semantics, require_ltlf
@@ -18,7 +19,7 @@ from spatial_replay.monitor.sentences import cause_sentences, sentences_of, verd
 from spatial_replay.monitor.stream import NEVER, InstanceStream, SeriesBlock
 from spatial_replay.monitor.vacuity import Vacuous, find_vacuous
 from spatial_replay.monitor.verdict import Verdict, final_verdict
-from spatial_replay.monitor.witness.evidence import Evidence
+from spatial_replay.monitor.witness.evidence import Evidence, Gap
 from spatial_replay.monitor.witness.path import End, deciding_path
 from spatial_replay.monitor.witness.witness import Witness, find_witness, time_of_least
 from spatial_replay.spec.diagnostics import nearest_hint
@@ -234,6 +235,21 @@ class SpecResult(Displayed):
             return ()
         named = {**self.evidence.instance.named, self.name: self.spec}
         return find_causes(self._conjuncts(node), self.values, self.final, self.settled_ns, witness, named)
+
+    def to_pandas(self) -> Any:
+        """Return the numbers of each sample as a pandas DataFrame, indexed by `time_ns`.
+
+        Its columns are `seconds` since the first sample evaluated, and for each node `NAME value`, `NAME now`,
+        `NAME lower` and `NAME upper`, where NAME is the spec's name, else the node's id and text.
+
+        Raises:
+            UsageError: pandas is not installed, or the numbers of each sample were not kept.
+        """
+        return data_frame(self)
+
+    def gaps(self) -> tuple[Gap, ...]:
+        """Return when each object and signal that the formula names is missing, for those that ever are."""
+        return self.evidence.gaps(self.formula)
 
     @property
     def least(self) -> LeastPart | None:

@@ -45,8 +45,13 @@ def sentences_of(
         sentences = [Sentence(f"{title} is pending: {numbers} so far, and later samples decide.")]
     else:
         sentences = [Sentence(f"{title} is {witness.verdict}{_ENDED if has_ended else ''}: {numbers}.")]
+    is_decided = not (witness.deciding is None or witness.deciding.unknown) and not is_open
+    is_decided = is_decided and witness.verdict is not Verdict.UNKNOWN
     if witness.missed is not None and not is_open:
-        sentences.append(Sentence(missed_text(witness.missed, first_ns), "."))
+        # how well a condition held is not how badly its response failed
+        is_measured = witness.missed.is_condition and is_decided
+        measured = f": {_what_was_measured(witness.deciding)}" if is_measured and witness.deciding else ""
+        sentences.append(Sentence(missed_text(witness.missed, first_ns), f"{measured}."))
     if witness.deciding is None:
         sentences.append(_dead_end(witness.path[-1], first_ns))
     elif witness.deciding.unknown:
@@ -57,7 +62,8 @@ def sentences_of(
     else:
         what = "What counts so far" if is_open else "What decides"
         how = _how_it_decides(witness, witness.deciding, first_ns, is_open=is_open)
-        sentences.append(Sentence(f"{what} is `{witness.deciding.text}`, which ", how))
+        if witness.missed is None or not witness.missed.is_condition or is_open:
+            sentences.append(Sentence(f"{what} is `{witness.deciding.text}`, which ", how))
         sentences.append(Sentence(_flip(witness, witness.deciding, witness.threshold, is_open=is_open)))
     if witness.open_end is not None:
         sentences.append(_open_end(*witness.open_end, first_ns))
@@ -199,10 +205,19 @@ def _end(deciding: DecidingAtom) -> float:
 
 def _in_time(witness: Witness) -> str:
     """Name the temporal operator that chose the sample."""
-    for step in reversed(witness.path[:-1]):
+    for place, step in reversed(list(enumerate(witness.path[:-1]))):
         if step.operator in ("F", "G", "U", "R", "W", "X", "WX", "O", "H", "S", "Y"):
-            return f" (within `{step.name or shortened_formula(step.text)}`)"
+            return f" (within `{_called(witness, place)}`)"
     return ""
+
+
+def _called(witness: Witness, place: int) -> str:
+    """Return what a step of a path is called: its name, its text, or the name around a text that is long."""
+    step = witness.path[place]
+    names = [each.name for each in witness.path[: place + 1] if each.name]
+    if step.name or shortened_formula(step.text) == step.text or not names:
+        return step.name or shortened_formula(step.text)
+    return names[-1]
 
 
 def _in_time_of_all(witness: Witness, deciding: DecidingAtom, so_far: str) -> str:
@@ -210,10 +225,10 @@ def _in_time_of_all(witness: Witness, deciding: DecidingAtom, so_far: str) -> st
     passed: set[str] = set()
     # one sample may settle a G that fails or an F that holds, and later ones be worse or better
     unsure = {End.HIGH: "G", End.LOW: "F"}.get(deciding.end) if witness.is_settled else None
-    for step in reversed(witness.path[:-1]):
+    for place, step in reversed(list(enumerate(witness.path[:-1]))):
         if step.operator == unsure:
             break
-        where = f"{so_far}within `{step.name or shortened_formula(step.text)}`"
+        where = f"{so_far}within `{_called(witness, place)}`"
         if step.operator in ("F", "O") and passed <= {"or", "spec"}:
             return f" (its greatest {where})"
         if step.operator in ("G", "H") and passed <= {"and", "spec"}:

@@ -79,7 +79,7 @@ def find_vacuous(evidence: Evidence, leaves: Floats, times_ns: Integers) -> tupl
     scopes = _scopes(instance.formula, times_ns)
     found = [
         *_empty_windows(nodes, scopes, times_ns),
-        *_idle_implications(nodes, scopes, done, instance.formula),
+        *_idle_implications(nodes, scopes, done, evidence),
         *_idle_bodies(nodes, scopes, evidence),
         *_empty_groups(nodes, scopes, evidence),
     ]
@@ -182,21 +182,21 @@ def _empty_windows(
 
 
 def _idle_implications(
-    nodes: Sequence[Formula], scopes: Sequence[_Samples], done: OfflineNodes, formula: Formula
+    nodes: Sequence[Formula], scopes: Sequence[_Samples], done: OfflineNodes, evidence: Evidence
 ) -> Iterator[_Idle]:
     antecedents: dict[int, int] = {}
-    for identifier, parent, _ in iter_nodes(formula):
+    for identifier, parent, _ in iter_nodes(evidence.instance.formula):
         if parent is not None:
             antecedents.setdefault(parent, identifier)
     for identifier, (node, scope) in enumerate(zip(nodes, scopes, strict=True)):
         if isinstance(node, Boolean) and node.operator == "->" and scope.any():
             high = done.ends(antecedents[identifier])[1]
             if not (high[scope] >= 0.0).any():
-                yield _untested(identifier, node)
+                yield _untested(identifier, node, evidence)
 
 
-def _untested(identifier: int, implication: Boolean) -> _Idle:
-    antecedent = format_formula(implication.operands[0])
+def _untested(identifier: int, implication: Boolean, evidence: Evidence) -> _Idle:
+    antecedent = format_formula(evidence.bound(implication.operands[0]))
     what = f"was never tested: `{antecedent}` never held."
     return _Idle(identifier, "antecedent never held", (what,))
 
@@ -213,7 +213,7 @@ def _idle_bodies(nodes: Sequence[Formula], scopes: Sequence[_Samples], evidence:
         high = columns[low_and_high(len(columns), wide=True)[1]]
         for (implication, _), ends in zip(inner, high, strict=True):
             if not (ends[scope] >= 0.0).any():
-                yield _untested(identifier, implication)
+                yield _untested(identifier, implication, evidence)
 
 
 def _implications(node: Quantified) -> Iterator[tuple[Boolean, Formula]]:

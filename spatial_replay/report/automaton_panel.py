@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from spatial_replay.automata.automaton import Automaton
+from spatial_replay.automata.dot_hoa import abbreviated, meanings
 from spatial_replay.automata.drawing import draw_automaton
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
@@ -51,7 +52,8 @@ class StatePathCollector:
 
 def automaton_value(automaton: Automaton, path: StatePath) -> Mapping[str, Any]:
     """Return an automaton as the page draws it: states with their places, transitions with their guards."""
-    drawing = draw_automaton(automaton, {state for states in path.sets for state in states})
+    visited = {state for states in path.sets for state in states}
+    drawing, short = draw_automaton(automaton, visited), abbreviated(automaton)
     return {
         "summary": drawing.summary,
         "left_out": drawing.left_out,
@@ -66,5 +68,10 @@ def automaton_value(automaton: Automaton, path: StatePath) -> Mapping[str, Any]:
             }
             for state in drawing.states
         ],
-        "moves": [move._asdict() for move in drawing.moves],
+        # the same words on arrows, and the same legend, as in a drawing by Graphviz
+        "moves": [
+            {**move._asdict(), "label": brief.guard}
+            for move, brief in zip(drawing.moves, draw_automaton(short, visited).moves, strict=True)
+        ],
+        "legend": meanings(short),
     }

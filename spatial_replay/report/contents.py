@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
@@ -17,11 +18,13 @@ from spatial_replay.report.decision_panel import ReportedDecisions
 from spatial_replay.report.event_panel import ReportedEvent
 from spatial_replay.report.scene_panel import ReportedScene
 from spatial_replay.report.tree_panel import final_text
-from spatial_replay.spec.formula import NamedSpec, Specification
+from spatial_replay.spec.formula import Formula, NamedSpec, Specification
 from spatial_replay.spec.units import Unit
 from spatial_replay.text import Sentence
 from spatial_replay.trace.axes import Axes
 
+MANY: Final = 6
+"""More results are counted, sorted and can be filtered; only the explanation of the first is unfolded."""
 MOST_DRAWN: Final = 24
 """Results with an explanation, a tree and curves, at most: the worst. All have their verdicts."""
 
@@ -33,11 +36,13 @@ class Pointer(NamedTuple):
         ends: (2, 2), from where to where it points.
         text: the atom's.
         number: its robustness, in the unit of the log where `scale` divides it.
+        is_condition: whether it is in the condition of an implication, whose response is what was missed.
     """
 
     ends: Floats
     text: str
     number: float
+    is_condition: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +54,7 @@ class ReportedResult:
 
         sentences: the explanation of its verdict; none if the page does not explain it.
         decided_ns: the sample that decided it; None without an explanation.
+        decided_node: the id of the node that decided it, an atom where there is one; None without an explanation.
         pointer: the two points between which the atom that decided it stands; None if it has none.
         named: the specs of its file, by name.
         units: those of the numbers that its robustness is the least of.
@@ -61,6 +67,7 @@ class ReportedResult:
     relations: frozenset[str]
     sentences: tuple[Sentence, ...]
     decided_ns: int | None
+    decided_node: int | None
     pointer: Pointer | None
     named: Mapping[str, NamedSpec]
     units: tuple[Unit, ...]
@@ -87,6 +94,11 @@ class ReportedResult:
         """The root's robustness, or between which numbers it lies."""
         return final_text(self.result.robustness, self.result.lower, self.result.upper)
 
+    @property
+    def formula(self) -> Formula:
+        """Its formula, with the object that it is about in place of a template's parameter."""
+        return self.result.evidence.bound(self.result.formula)
+
 
 @dataclass(frozen=True, eq=False)
 class RunReport:
@@ -98,7 +110,9 @@ class RunReport:
         axes: those of the source, as opposed to those of the samples.
         faults, remarks: what was lost while reading, and other notes of the reader.
         vacuous: templates that no object fits.
+        observed_ns: of a run with unknown results, from when on all that they are about is observed; else None.
         unreadable: how many observations have no finite numbers.
+        signal_units: those that are declared, by the signals' names.
     """
 
     log: str
@@ -110,11 +124,13 @@ class RunReport:
     faults: tuple[str, ...]
     remarks: tuple[str, ...]
     unreadable: int
+    signal_units: Mapping[str, str]
     semantics: Semantics
     certificate: Mapping[str, str]
     files: tuple[Specification, ...]
     results: tuple[ReportedResult, ...]
     vacuous: tuple[Vacuous, ...]
+    observed_ns: int | None
     scene: ReportedScene
     events: tuple[ReportedEvent, ...]
     decisions: ReportedDecisions
@@ -130,16 +146,26 @@ class RunReport:
 
     @property
     def drawn_numbers(self) -> list[int]:
-        """The places of those results: the worst if there are too many."""
-        return worst_results([each.result.verdict for each in self.results])
+        """The places of those results."""
+        return worst_results([each.result for each in self.results])
 
 
-def worst_results(verdicts: Sequence[Verdict]) -> list[int]:
-    """Return which results are explained and drawn, in order: `MOST_DRAWN` at most."""
-    return sorted(worst_first(verdicts)[:MOST_DRAWN])
+def worst_results(results: Sequence[SpecResult]) -> list[int]:
+    """Return which results are explained and drawn, in the order of `worst_first`: `MOST_DRAWN` at most."""
+    return worst_first(results)[:MOST_DRAWN]
 
 
-def worst_first(verdicts: Sequence[Verdict]) -> list[int]:
-    """Return the places of results: those violated, those unknown, the others, each kind in order."""
+def worst_first(results: Sequence[SpecResult]) -> list[int]:
+    """Return the places of results: those violated, those unknown, the others.
+
+    A few of one verdict stay in the order of the files; more are sorted, the least robustness first.
+    """
     severity = {Verdict.VIOLATED: 0, Verdict.UNKNOWN: 1}
-    return sorted(range(len(verdicts)), key=lambda number: severity.get(verdicts[number], 2))
+    are_many = len(results) > MANY
+
+    def key(number: int) -> tuple[int, float]:
+        result = results[number]
+        least = result.upper if math.isnan(result.robustness) else result.robustness
+        return severity.get(result.verdict, 2), least if are_many and not math.isnan(least) else 0.0
+
+    return sorted(range(len(results)), key=key)

@@ -19,7 +19,7 @@ from spatial_replay.report.compact import Packing, sentence_parts, singles
 from spatial_replay.report.contents import MOST_DRAWN, ReportedResult, RunReport
 from spatial_replay.report.decision_panel import decisions_value
 from spatial_replay.report.event_panel import MOST_EVENTS, event_values
-from spatial_replay.report.scene_panel import scene_value
+from spatial_replay.report.scene_panel import ReportedScene, scene_value
 from spatial_replay.report.tree_panel import (
     MOST_NODES,
     named_nodes,
@@ -132,9 +132,10 @@ def page_data(report: RunReport) -> PageData:
         np.concatenate([report.scene.times_ns, *(each.result.times_ns for each in drawn)]).astype(np.int64)
     )
     curves = [_curves(each) for each in drawn if len(each.result.times_ns)]
-    faults_ns = [each.fault_ns for each in drawn if each.fault_ns is not None]
-    room = _room(drawn, len(times_ns)) - len(faults_ns)
-    kept = np.union1d(times_ns[choose_samples(times_ns, curves, room)], np.array(faults_ns, np.int64))
+    room = _room(drawn, len(times_ns))
+    shown_ns = _shown_times(report, times_ns, room // 2)
+    kept = np.union1d(times_ns[choose_samples(times_ns, curves, room - len(shown_ns))], shown_ns)
+    scene = report.scene.at(kept)
     decisions = decisions_value(report.decisions, report.first_ns, packing)
     facts = {
         "settles": report.semantics == "ltlf",
@@ -147,8 +148,8 @@ def page_data(report: RunReport) -> PageData:
             # without those of the signs
             "curves": CURVES[2:],
         },
-        "results": [_result_value(each, kept, report.first_ns, packing) for each in drawn],
-        "scene": scene_value(report.scene, report.first_ns, _places(report), packing),
+        "results": [_result_value(each, kept, report, scene, packing) for each in drawn],
+        "scene": scene_value(scene, report.first_ns, _places(report), packing),
         "events": event_values(report.events, report.first_ns),
         "decisions": decisions["decisions"],
     }
@@ -175,7 +176,24 @@ def _curves(each: ReportedResult) -> NodeSeries:
     return NodeSeries(each.result.times_ns, each.result.series[list(named_nodes(each.result.formula))])
 
 
-def _result_value(each: ReportedResult, kept: Integers, first_ns: int, packing: Packing) -> Mapping[str, Any]:
+def _shown_times(report: RunReport, times_ns: Integers, most: int) -> Integers:
+    """Return samples that the page has whatever else it leaves out: `most` at most, but what decided.
+
+    Those are the samples that decided a verdict, those of events and, as far as there is room, at equal
+    distances those of the scene: at one cursor, the page shows one sample.
+    """
+    decided_ns = [each.decided_ns for each in report.drawn if each.decided_ns is not None]
+    events_ns = sorted({each.start_ns for each in report.events[:MOST_EVENTS]})[: most // 2]
+    shown_ns = np.array([*decided_ns, *events_ns], np.int64)
+    room = max(most - len(shown_ns), 2)
+    scene_ns = report.scene.times_ns[:: max(1, -(-len(report.scene.times_ns) // room))]
+    return np.intersect1d(np.concatenate([shown_ns, scene_ns]), times_ns)
+
+
+def _result_value(
+    each: ReportedResult, kept: Integers, report: RunReport, scene: ReportedScene, packing: Packing
+) -> Mapping[str, Any]:
+    first_ns = report.first_ns
     samples = np.flatnonzero(np.isin(each.result.times_ns, kept))
     here = each.result.times_ns[samples]
     series = series_of(each.result.series, each.result.formula, samples)
@@ -188,8 +206,11 @@ def _result_value(each: ReportedResult, kept: Integers, first_ns: int, packing: 
         "fault": None if each.fault_ns is None else (each.fault_ns - first_ns) / 1e9,
         "first": int(np.searchsorted(kept, here[0])) if len(here) else 0,
         "samples": len(here),
-        "nodes": tree_value(each.result.formula, each.result.values, each.result.final, each.relations),
-        "requirements": requirement_values(each.result, samples, packing),
+        "decided": _place_of(each),
+        "nodes": tree_value(
+            each.formula, each.result.values, each.result.final, each.relations, report.signal_units
+        ),
+        "requirements": requirement_values(each.result, samples, scene.entities_of, packing),
         "series": packing.add(singles(series), "f4"),
         "automaton": None,
         "no_automaton": sentence_parts(each.no_automaton),
@@ -204,6 +225,12 @@ def _result_value(each: ReportedResult, kept: Integers, first_ns: int, packing: 
     return value
 
 
+def _place_of(each: ReportedResult) -> int | None:
+    """Return the place on the page of the node that decided a result."""
+    shown = shown_nodes(each.result.formula)
+    return shown.index(each.decided_node) if each.decided_node in shown else None
+
+
 def _pointer_value(each: ReportedResult, first_ns: int) -> Mapping[str, Any] | None:
     """Return the arrow at what decided a result that is not satisfied, and when it is shown."""
     if each.pointer is None or each.fault_ns is None:
@@ -214,6 +241,7 @@ def _pointer_value(each: ReportedResult, first_ns: int) -> Mapping[str, Any] | N
         "text": each.pointer.text,
         "label": f"{each.pointer.number:.3g}",
         "number": json_number(each.pointer.number),
+        "is_condition": each.pointer.is_condition,
     }
 
 

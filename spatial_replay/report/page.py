@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
@@ -20,7 +21,7 @@ from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.notebook.figures import Html, element
 from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
 from spatial_replay.report.compact import json_text, sentence_parts
-from spatial_replay.report.contents import ReportedResult, RunReport, worst_first
+from spatial_replay.report.contents import MANY, ReportedResult, RunReport, worst_first
 from spatial_replay.report.data import page_data
 from spatial_replay.report.tree_panel import final_text
 from spatial_replay.spec.units import is_mixed
@@ -28,8 +29,6 @@ from spatial_replay.text import Instant, Sentence, counted, printable
 
 _CALENDAR_NS: Final = 500_000_000 * 10**9
 """Times from here on count from 1970; smaller ones are of clocks that start at power-on."""
-_MANY: Final = 6
-"""With more results, only the first explanation is unfolded, else all of the worst verdict."""
 _WITHOUT_SCRIPTS: Final = "Without scripts this page shows verdicts and explanations alone."
 
 
@@ -39,7 +38,8 @@ def header(report: RunReport, omissions: Sequence[str]) -> Html:
     Args:
         omissions: what the page leaves out to limit its size.
     """
-    title = element("div", element("h1", text(report.log)), chip(report.verdict), **{"class": "title"})
+    counts = element("span", _counts(report), **{"class": "quiet"}) if len(report.results) > 1 else Html("")
+    title = element("div", element("h1", text(report.log)), chip(report.verdict), counts, **{"class": "title"})
     return element(
         "header",
         element("a", "Skip to the run", **{"class": "skip", "href": "#main"}),
@@ -107,6 +107,12 @@ def _notices(report: RunReport, omissions: Sequence[str]) -> Iterator[Html]:
         yield _notice("note", what, report.remarks)
     elif report.remarks:
         yield _notice("note", "The log says of its samples:", report.remarks)
+    if report.observed_ns is not None:
+        since = Instant(report.observed_ns, report.first_ns)
+        # whole milliseconds, not past the sample
+        start = (report.observed_ns - report.first_ns) // 10**6 / 1e3
+        what = f"Everything that the unknown results are about is observed from {since} on: "
+        yield _notice("note", what + f"--from {start:.3f}s evaluates from there.", ())
     if report.semantics != "ltlf" and report.results:
         yield _notice("note", "Explanations are given under the semantics ltlf alone.", ())
     if omissions:
@@ -130,20 +136,29 @@ def _verdicts(report: RunReport) -> Iterator[Html]:
     for part in report.vacuous:
         yield element("p", *sentence_html(part.message, report.first_ns))
     places = {id(result): place for place, result in enumerate(report.drawn)}
-    are_many = len(report.results) > _MANY
-    worst = worst_first([each.result.verdict for each in report.results])
+    are_many = len(report.results) > MANY
+    if are_many:
+        yield element("p", text(_counts(report)), id="counts", **{"class": "counts"})
+    worst = worst_first([each.result for each in report.results])
     for number, each in enumerate(report.results[place] for place in worst):
         # which result the page shows when something in the verdict is chosen
         drawn = {"data-result": str(places[id(each)])} if id(each) in places else {}
         is_reported = each.result.verdict == report.verdict or bool(each.result.vacuous)
         is_unfolded = is_reported and not (are_many and number)
         unfolded = {"open": ""} if each.sentences and is_unfolded else {}
-        attributes = {"class": "verdict", **drawn, **unfolded}
+        attributes = {"class": "verdict", "data-verdict": str(each.result.verdict), **drawn, **unfolded}
         content = [element("p", *sentence_html(sentence, report.first_ns)) for sentence in each.sentences]
         content += [_specs(each, report.first_ns)] if each.sentences else []
         yield element(
             "details" if content else "div", _summary(each, report.first_ns), *content, **attributes
         )
+
+
+def _counts(report: RunReport) -> str:
+    """Return how many results have each verdict, the worst first: "26 violated, 2 satisfied"."""
+    counts = Counter(each.result.verdict for each in report.results)
+    order = (Verdict.VIOLATED, Verdict.UNKNOWN, Verdict.SATISFIED)
+    return ", ".join(f"{counts[verdict]:,} {verdict}" for verdict in order if counts[verdict])
 
 
 def _summary(each: ReportedResult, first_ns: int) -> Html:

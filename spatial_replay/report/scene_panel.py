@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from spatial_replay.annotate.scene_entities import REGION
+from spatial_replay.annotate.requirements import ClassMembers, Requirement
+from spatial_replay.annotate.scene_entities import OBJECT, REGION
 from spatial_replay.annotate.scene_update import DrawnEntity, DrawnViolation, SceneFrame, SceneFrames
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.report.compact import Packing
+from spatial_replay.spec.formula import ANY_CLASS
 
 MOST_FRAMES: Final = 3_000
 """Frames of a page, at most."""
@@ -30,11 +32,41 @@ class ReportedScene:
     Attributes:
         times_ns: (F,) int64.
         stride: every how many messages there is a frame.
+        scale: the robustness at which colours are full.
     """
 
     times_ns: Integers
     frames: tuple[SceneFrame, ...]
     stride: int
+    scale: float = 1.0
+
+    def at(self, times_ns: Integers) -> ReportedScene:
+        """Return the scene with its frames at some times only."""
+        is_kept = np.isin(self.times_ns, times_ns).tolist()
+        frames = tuple(frame for frame, kept in zip(self.frames, is_kept, strict=True) if kept)
+        return replace(self, times_ns=self.times_ns[is_kept], frames=frames)
+
+    def entities_of(self, requirement: Requirement) -> list[int]:
+        """Return the places on the page of the entities that a requirement is about."""
+        names = {REGION + name for name in requirement.regions} | {OBJECT + name for name in requirement.objects}
+        return [
+            place
+            for place, (identifier, classes) in enumerate(self._classes.items())
+            if identifier in names or any(_is_member(identifier, classes, each) for each in requirement.groups)
+        ]
+
+    @cached_property
+    def _classes(self) -> Mapping[str, frozenset[str]]:
+        """The classes that each entity ever has, casefolded, in the order of drawing."""
+        return {
+            identifier: frozenset((each.class_name or "").casefold() for each in shown.values())
+            for identifier, shown in sorted(_entities(self.frames).items(), key=_drawing_order)
+        }
+
+
+def _is_member(identifier: str, classes: frozenset[str], group: ClassMembers) -> bool:
+    kind, name = identifier.startswith(OBJECT), identifier.removeprefix(OBJECT)
+    return kind and name not in group.excluded and (group.class_name == ANY_CLASS or group.class_name in classes)
 
 
 class SceneCollector:
@@ -44,9 +76,11 @@ class SceneCollector:
         self._frames: list[tuple[int, SceneFrame]] = []
         self._count, self._stride, self._corners = 0, 1, 0
         self._last_ns: int | None = None
+        self._scale = 1.0
 
     def add(self, frames: SceneFrames) -> None:
         """Take in what the next messages show."""
+        self._scale = frames.scale
         for index, time_ns in enumerate(frames.times_ns.tolist()):
             self.add_frame(time_ns, partial(frames.frame, index))
 
@@ -75,7 +109,7 @@ class SceneCollector:
     def scene(self) -> ReportedScene:
         """The frames so far."""
         times_ns = np.array([time_ns for time_ns, _ in self._frames], np.int64)
-        return ReportedScene(times_ns, tuple(frame for _, frame in self._frames), self._stride)
+        return ReportedScene(times_ns, tuple(frame for _, frame in self._frames), self._stride, self._scale)
 
 
 class _Box(NamedTuple):
@@ -104,6 +138,7 @@ def scene_value(
     return {
         "times": packing.add((scene.times_ns - first_ns) / 1e9, "f8"),
         "stride": scene.stride,
+        "scale": scene.scale,
         "low": box.low.tolist(),
         "high": (box.low + box.size).tolist(),
         "entities": [

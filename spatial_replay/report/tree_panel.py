@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 
-from spatial_replay.annotate.requirements import requirements_of
+from spatial_replay.annotate.requirements import Requirement, requirements_of
 from spatial_replay.annotate.specification import unit_of
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.result import SpecResult
-from spatial_replay.monitor.sentences import divisor_of, number_text
+from spatial_replay.monitor.sentences import divisor_of
 from spatial_replay.monitor.verdict import final_verdict
 from spatial_replay.report.compact import Packing
 from spatial_replay.spec.format import format_formula
@@ -49,13 +49,19 @@ def initial_nodes(formula: Formula) -> frozenset[int]:
 
 
 def tree_value(
-    formula: Formula, robustness: Floats, final: Floats, relations: frozenset[str]
+    formula: Formula,
+    robustness: Floats,
+    final: Floats,
+    relations: frozenset[str],
+    signal_units: Mapping[str, str],
 ) -> list[Mapping[str, Any]]:
     """Return the shown nodes, each with its text and its final verdict.
 
     Args:
+        formula: with the object that it is about in place of a template's parameter.
         robustness: (N,), each node's value on the whole log.
         final: (N, 2), lower and upper end of each node for the finished log.
+        signal_units: those that are declared.
     """
     shown, initial = shown_nodes(formula), initial_nodes(formula)
     place = {identifier: index for index, identifier in enumerate(shown)}
@@ -66,7 +72,7 @@ def tree_value(
             "name": node.name or "",
             "head": _cut(_head(node, relations)),
             "text": _cut(format_formula(node, relations=relations)),
-            "unit": unit_of(node, {}),
+            "unit": unit_of(node, signal_units),
             "divisor": divisor_of(node),
             "initial": identifier in initial,
             "verdict": str(final_verdict(*final[identifier].tolist())),
@@ -77,10 +83,16 @@ def tree_value(
     ]
 
 
-def requirement_values(result: SpecResult, samples: Integers, packing: Packing) -> list[Mapping[str, Any]]:
+def requirement_values(
+    result: SpecResult,
+    samples: Integers,
+    entities_of: Callable[[Requirement], Sequence[int]],
+    packing: Packing,
+) -> list[Mapping[str, Any]]:
     """Return the requirements of a formula (see `annotate.requirements`) whose nodes are shown.
 
     Args:
+        entities_of: which entities of the page's scene a requirement is about.
         samples: (S,) indices of those that the page has.
     """
     place = {identifier: index for index, identifier in enumerate(shown_nodes(result.formula))}
@@ -88,6 +100,8 @@ def requirement_values(result: SpecResult, samples: Integers, packing: Packing) 
     return [
         {
             "node": place[requirement.node],
+            "sign": requirement.sign,
+            "entities": entities_of(requirement),
             "standing": packing.add(requirement.standing(result.series, samples), "u1"),
         }
         for requirement in requirements_of(result.formula, result.object, settles=settles)
@@ -99,9 +113,14 @@ def final_text(robustness: float, lower: float, upper: float) -> str:
     """Return a node's final robustness, or the ends of its interval."""
     if math.isnan(robustness) or not (lower == upper == robustness):
         if math.isnan(lower):
-            return "" if math.isnan(robustness) else number_text(robustness)
-        return f"{number_text(lower)} … {number_text(upper)}"
-    return number_text(robustness)
+            return "" if math.isnan(robustness) else short_number(robustness)
+        return f"{short_number(lower)} … {short_number(upper)}"
+    return short_number(robustness)
+
+
+def short_number(number: float) -> str:
+    """Return a number with four digits, as the page shows them."""
+    return f"{number:.4g}"
 
 
 def named_nodes(formula: Formula) -> tuple[int, ...]:

@@ -17,8 +17,9 @@ from spatial_replay.logs import topics as log_topics
 from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.output_file import refuse_inputs, replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
-from spatial_replay.logs.source import Source, axes_of
+from spatial_replay.logs.source import Source, axes_of, signal_units_of
 from spatial_replay.monitor.sentences import divisor_of
+from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions
@@ -128,11 +129,13 @@ def _report(source: Source, replay: Replay, replayed: Replayed, collector: Colle
         faults=replayed.faults,
         remarks=replayed.remarks,
         unreadable=replayed.unreadable,
+        signal_units=signal_units_of(source),
         semantics=replayed.semantics,
         certificate=replayed.certificate,
         files=tuple(replay.files),
         results=tuple(_results(replay, replayed, collector)),
         vacuous=replayed.vacuous,
+        observed_ns=_observed_ns(replayed),
         scene=collector.scene.scene,
         events=tuple(collector.events),
         decisions=collector.decisions.decisions,
@@ -151,6 +154,7 @@ def _results(replay: Replay, replayed: Replayed, collector: Collector) -> Iterat
             relations=RELATION_NAMES | replay.files[tree.file].relations,
             sentences=result.sentences(replayed.first_ns) if is_explained else (),
             decided_ns=None if witness is None else witness.time_ns,
+            decided_node=None if witness is None else witness.path[-1].node,
             pointer=None if witness is None else _pointer(witness),
             named={spec.name: spec for spec in replay.files[tree.file].specs},
             units=units_of(result.formula),
@@ -167,7 +171,8 @@ def _pointer(witness: Witness) -> Pointer | None:
         if measured.contact is not None:
             ends = np.array([measured.contact.first, measured.contact.second])
             number = witness.deciding.value * divisor_of(witness.deciding.atom)
-            return Pointer(ends, witness.deciding.text, number)
+            is_condition = witness.missed is not None and witness.missed.is_condition
+            return Pointer(ends, witness.deciding.text, number, is_condition)
     return None
 
 
@@ -175,4 +180,17 @@ def _explained(replayed: Replayed) -> frozenset[int]:
     """Return which results are explained: under the paper's semantics, none can be."""
     if replayed.semantics != "ltlf":
         return frozenset()
-    return frozenset(worst_results([result.verdict for result in replayed.results]))
+    return frozenset(worst_results(replayed.results))
+
+
+def _observed_ns(replayed: Replayed) -> int | None:
+    """Return from when on all is observed that results are about which are unknown; None if it never is."""
+    latest = replayed.start_ns
+    for result in replayed.results:
+        if result.verdict is not Verdict.UNKNOWN:
+            continue
+        for gap in result.gaps():
+            if gap.next_ns is None:
+                return None
+            latest = max(latest, gap.next_ns)
+    return latest if latest > replayed.start_ns else None

@@ -47,7 +47,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     write_report(source, files, folder / "damaged.html")
     crowd = [
         sr.Sample(
-            t * 10**8, {f"p{k}": sr.Footprint.disc(3 * k + t * (k % 2), k, 1) for k in range(t // 4, 6)}
+            t * 10**8, {f"p{k}": sr.Footprint.disc(3 * k + t * (k % 2), k, 1) for k in range(t // 4, 8)}
         )
         for t in range(20)
     ]
@@ -303,7 +303,7 @@ def test_the_scene_changes_with_the_cursor(open_page: Open) -> None:
 def test_the_scene_says_what_is_violated_now(open_page: Open) -> None:
     caption = open_page("violated", at="#t=1").locator(".caption")
     expect(caption).to_have_text(
-        "nothing is violated now; plate enclosedin mat of table_set is still to come, and 4 more"
+        "nothing is violated now; plate enclosedin mat of table_set is still to come, and 2 more"
     )
     caption = open_page("violated", at="#t=9.9").locator(".caption")
     expect(caption).to_have_text("nothing is violated now; table_set was before")
@@ -318,12 +318,13 @@ def test_the_keys_step_through_the_kept_samples_of_a_thinned_run(open_page: Open
 
 def test_a_violation_without_an_arrow_is_reported_too(open_page: Open) -> None:
     for time, words in (
-        (0.5, "nothing is violated now"),
-        (1.2, "no violation is known now; a dist b >= 1 of apart is unknown"),
+        (0.5, "power: nothing is violated now"),
         (2, "battery >= 0.5 of power fails by 0.1 now; no arrow can show it"),
     ):
         caption = open_page("unseen", at=f"#t={time}").locator(".caption")
         expect(caption).to_have_text(words)
+    caption = open_page("unseen", at="#t=1.2&r=1").locator(".caption")
+    expect(caption).to_have_text("no violation is known now; a dist b >= 1 of apart is unknown")
     caption = open_page("reached", at="#t=9").locator(".caption")
     expect(caption).to_have_text("no more requirements on the objects: they are grey")
 
@@ -366,7 +367,7 @@ def test_each_object_of_a_template_can_be_looked_into(open_page: Open) -> None:
     page = open_page("template")
     # the first that is violated is looked into at once
     expect(page.locator(".tree .mark").first).to_have_class("mark is-violated")
-    expect(page.locator("button.lane-name")).to_have_count(6)
+    expect(page.locator("button.lane-name")).to_have_count(8)
     page.locator(".lane-name", has_text="calm(p0)").click()
     # it left long before the run ended, and stands as it did then
     page.keyboard.press("End")
@@ -374,6 +375,56 @@ def test_each_object_of_a_template_can_be_looked_into(open_page: Open) -> None:
     expect(page.locator(".tree .row .number").nth(1)).to_have_text("")
     page.keyboard.press("Home")
     expect(page.locator(".tree .row .number").nth(1)).not_to_have_text("")
+
+
+def test_text_arrow_tree_and_curve_tell_one_story_when_the_page_opens(open_page: Open) -> None:
+    page = open_page("violated")
+    atom, number = "spoon dist plate <= 0.08", f"{MINUS}0.1552"
+    expect(page.locator(".verdict.chosen")).to_contain_text(f"{atom}, which fails by 0.155214")
+    expect(page.locator(".caption")).to_contain_text(f"{atom} of table_set fails by 0.1552")
+    decides = page.locator(".tree .row.decides").last
+    expect(decides).to_be_in_viewport()
+    expect(decides).to_contain_text(atom)
+    expect(decides.locator(".number").nth(1)).to_have_text(number)
+    expect(page.locator(".legend-entry", has_text=atom).locator(".number")).to_have_text(number)
+
+
+def test_many_results_are_counted_sorted_and_filtered(open_page: Open) -> None:
+    page = open_page("template")
+    expect(page.locator("#counts")).to_contain_text(re.compile(r"\d violated, \d satisfied"))
+    verdicts = page.locator(".verdict").evaluate_all("all => all.map((each) => each.dataset.verdict)")
+    assert verdicts == sorted(verdicts, reverse=True)
+    page.get_by_role("combobox", name="Verdict").select_option("satisfied")
+    expect(page.locator(".verdict:visible")).to_have_count(verdicts.count("satisfied"))
+    page.get_by_role("searchbox", name="Name").fill("p0")
+    expect(page.locator(".verdict:visible")).to_have_count(1)
+    # the lane of the chosen result stays
+    expect(page.locator("button.lane-name")).to_have_count(2)
+    expect(page.get_by_role("status")).to_have_text("1 of 8 listed")
+
+
+def test_the_scene_is_coloured_for_the_chosen_result(open_page: Open) -> None:
+    page = open_page("violated", at="#t=9.9")
+    picture = "document.querySelector('.stage').toDataURL()"
+    before = page.evaluate(picture)
+    page.locator(".lane-name", has_text="parallel").click()
+    assert page.evaluate(picture) != before
+    expect(page.locator(".caption")).to_contain_text("parallel")
+
+
+def test_numbers_of_a_thinned_run_are_those_of_the_time_that_is_named(open_page: Open) -> None:
+    page = open_page("thinned")
+    numbers = two_discs(12_000)
+    for wanted in (17.003, 40.444, 99.991):
+        page.evaluate("at => { location.hash = `#t=${at}`; }", wanted)
+        expect(readout(page)).not_to_have_text("0.000 s / 119.990 s")
+        seconds = float(readout(page).inner_text().split(" ")[0])
+        assert seconds <= wanted
+        sample = round(seconds * 100)
+        assert sample == pytest.approx(seconds * 100)
+        x = numbers.footprints.vertices[2 * sample, 0]
+        shown = page.locator(".tree .row.leaf", has_text="a dist b >= 0.001").locator(".number").nth(1)
+        assert float(shown.inner_text().replace(MINUS, "-")) == pytest.approx(1 - x - 0.001, abs=6e-4)
 
 
 def test_a_damaged_log_is_announced(open_page: Open) -> None:

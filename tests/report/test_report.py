@@ -65,7 +65,7 @@ def planned(tmp_path_factory: pytest.TempPathFactory) -> Page:
 
 def test_verdicts_and_explanations_can_be_read_without_scripts(violated: Page) -> None:
     said = violated.within("section#verdicts")
-    assert "violatedtable_setrobustness -0.155214" in said
+    assert "violatedtable_setrobustness -0.1552," in said
     assert "which fails by 0.155214 at 4.000 s" in said
     assert "with 0.235215 or more in place of 0.08" in said
 
@@ -201,8 +201,34 @@ def test_instances_of_a_template_have_their_own_results(tmp_path: Path) -> None:
     page = report_of_samples(
         tmp_path / "run.html", moving(6), "spec calm(ego) = G (ego dist b >= 0)", each={"ego": "all"}
     )
-    assert [result["title"] for result in page.facts["results"]] == ["calm(a)", "calm(b)"]
+    assert [result["title"] for result in page.facts["results"]] == ["calm(b)", "calm(a)"]
+    assert [result["verdict"] for result in page.facts["results"]] == ["violated", "satisfied"]
+    assert page.facts["results"][0]["nodes"][-1]["text"] == "b dist b >= 0"
     assert "calm(a)" in page.within("section#verdicts")
+
+
+def test_an_unknown_run_says_from_when_on_everything_is_observed(tmp_path: Path) -> None:
+    disc = sr.Footprint.disc
+    samples = [
+        sr.Sample(t * 10**9, {"a": disc(0, 0, 1)} | ({"b": disc(5, 0, 1)} if t >= 3 else {})) for t in range(6)
+    ]
+    page = report_of_samples(tmp_path / "run.html", samples, "spec apart = G (a dist b >= 1)")
+    assert "is observed from 3.000 s on: --from 3.000s evaluates from there." in page.within("header#")
+    seen = report_of_samples(tmp_path / "seen.html", samples, "spec apart = G (a dist b >= 1)", start=3 * 10**9)
+    assert "is observed from" not in seen.text
+
+
+def test_arrows_of_the_automaton_have_the_words_of_its_drawing(planned: Page) -> None:
+    automaton = planned.facts["results"][0]["automaton"]
+    assert "p1: red above blue" in automaton["legend"]
+    assert {"not p2"} < {move["label"] for move in automaton["moves"]}
+
+
+def test_a_unit_that_is_declared_is_shown(tmp_path: Path) -> None:
+    source = MemorySource(Trace.from_samples([sr.Sample(t, signals={"speed": 1.0}) for t in range(3)]))
+    declared = replace_units(source, {"speed": "m/s"})
+    write_report(declared, [sr.parse_specification("spec slow = G (speed <= 2)")], tmp_path / "run.html")
+    assert page_of(tmp_path / "run.html").facts["results"][0]["nodes"][0]["unit"] == "m/s"
 
 
 def test_a_damaged_log_is_said_to_be_so_first(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.spec.formula import Atom, Earlier, Formula, Group, Outline, Signal, Term, TrackedName
-from spatial_replay.spec.walks import base_of, iter_expressions, substitute
+from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, substitute
 from spatial_replay.trace.trace import Trace, window_of
 
 
@@ -95,10 +95,13 @@ class Evidence:
         begin, end = window_of(times_ns, self.instance.start_ns, self.instance.end_ns)
         return times_ns[begin:end]
 
-    def gaps(self, atom: Atom) -> tuple[Gap, ...]:
-        """Return when each object and signal that an atom names is missing, for those that ever are."""
-        signals = [each.name for each in iter_expressions(atom.expression) if isinstance(each, Signal)]
-        objects = dict.fromkeys(name for term in atom.terms for name in _object_names(base_of(term)))
+    def gaps(self, formula: Formula) -> tuple[Gap, ...]:
+        """Return when each object and signal that a formula names is missing, for those that ever are."""
+        atoms = [each for each in iter_formulas(formula) if isinstance(each, Atom)]
+        expressions = [each for atom in atoms for each in iter_expressions(atom.expression)]
+        signals = [each.name for each in expressions if isinstance(each, Signal)]
+        terms = [term for atom in atoms for term in atom.terms]
+        objects = dict.fromkeys(name for term in terms for name in _object_names(base_of(term)))
         kinds = [(f"signal {name!r}", name, True) for name in dict.fromkeys(signals)]
         kinds += [(name, name, False) for name in objects]
         parts: list[NDArray[np.bool_]] = []

@@ -1,6 +1,6 @@
 // The automaton of the chosen result: its states, the current one highlighted, and the transitions from there.
 
-const COLUMN = 96, ROW = 60, RADIUS = 17;
+const COLUMN = 128, ROW = 64, RADIUS = 17;
 // how far a move swings out at most, twice
 const HIGHEST = 84;
 
@@ -14,7 +14,7 @@ function makeAutomaton(clock) {
     const result = clock.run.results[clock.result];
     const automaton = result?.automaton;
     drawn = automaton ? drawAutomaton(automaton) : null;
-    drawing.replaceChildren(...(drawn ? [drawn.made] : whyNone(result)));
+    drawing.replaceChildren(...(drawn ? [drawn.made, legendOf(automaton)] : whyNone(result)));
     words.replaceChildren();
   });
   clock.on("time", () => {
@@ -29,6 +29,10 @@ function makeAutomaton(clock) {
     if (states.length) keepInView(drawing, drawn.states.get(states[0]));
     words.replaceChildren(...describe(result.automaton, states));
   });
+}
+
+function legendOf({legend}) {
+  return element("p", {class: "legend-words"}, ...legend.flatMap((each) => [element("code", {}, each), " "]));
 }
 
 function whyNone(result) {
@@ -55,7 +59,7 @@ function drawAutomaton(automaton) {
     "aria-label": `Automaton with ${automaton.summary}`, class: wide < 6 * COLUMN ? "small" : null,
   }, svg("defs", {}, tip("tip"), tip("tip-ahead")),
   svg("path", {class: "move", d: `M${x - 46} ${y} H${x - RADIUS - 5}`, "marker-end": "url(#tip)"}),
-  ...moves.map((move) => move.made), ...states.values());
+  ...moves.map((move) => move.made), ...states.values(), ...moves.map((move) => labelOf(move, places)));
   return {made, moves, states, set: null};
 }
 
@@ -64,19 +68,38 @@ function tip(id) {
     markerHeight: 9, orient: "auto"}, svg("path", {class: "tip", d: "M0 0 L8 4 L0 8 Z"}));
 }
 
+const LONGEST_LABEL = 18;
+
+// The guard of a move, with short names for long propositions, at the middle of its curve.
+function labelOf({source, target, label, guard}, places) {
+  if (!label) return null;
+  const [x, y] = middleOf(places.get(source), places.get(target));
+  const text = label.length > LONGEST_LABEL ? `${label.slice(0, LONGEST_LABEL - 1)}…` : label;
+  return svg("text", {class: "guard", x, y, "text-anchor": "middle", dy: "-0.3em"}, text, svg("title", {}, guard));
+}
+
+function middleOf([x0, y0], [x1, y1]) {
+  const [cx, cy] = controlOf([x0, y0], [x1, y1]);
+  return [(x0 + 2 * cx + x1) / 4, (y0 + 2 * cy + y1) / 4];
+}
+
 // From rim to rim; moves over several columns, back, or within a column go around what stands between.
 function curve([x0, y0], [x1, y1]) {
-  const dx = x1 - x0, dy = y1 - y0, length = Math.hypot(dx, dy);
-  const spans = Math.round(dx / COLUMN);
-  const share = spans === 1 ? 0.06 : spans > 1 && dy !== 0 ? 0.12 : 0.28;
-  const bend = Math.min(share * length, HIGHEST);
-  const [nx, ny] = [dy / length, -dx / length];
-  const [cx, cy] = [(x0 + x1) / 2 + bend * nx, (y0 + y1) / 2 + bend * ny];
+  const [cx, cy] = controlOf([x0, y0], [x1, y1]);
   const rim = (x, y, gap) => {
     const away = Math.hypot(cx - x, cy - y);
     return `${(x + gap * (cx - x) / away).toFixed(1)} ${(y + gap * (cy - y) / away).toFixed(1)}`;
   };
   return `M${rim(x0, y0, RADIUS)} Q${cx.toFixed(1)} ${cy.toFixed(1)} ${rim(x1, y1, RADIUS + 3)}`;
+}
+
+function controlOf([x0, y0], [x1, y1]) {
+  const dx = x1 - x0, dy = y1 - y0, length = Math.hypot(dx, dy);
+  const spans = Math.round(dx / COLUMN);
+  const share = spans === 1 ? 0.06 : spans > 1 && dy !== 0 ? 0.12 : 0.28;
+  const bend = Math.min(share * length, HIGHEST);
+  const [nx, ny] = [dy / length, -dx / length];
+  return [(x0 + x1) / 2 + bend * nx, (y0 + y1) / 2 + bend * ny];
 }
 
 function drawState(state, [x, y]) {

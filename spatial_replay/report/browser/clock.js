@@ -12,10 +12,12 @@ class Clock {
     this.time = this.opening;
     this.speed = 1;
     this.isPlaying = false;
-    this.listeners = {time: [], view: [], result: [], play: []};
+    // which results are listed: of a verdict, and with some letters in their titles
+    this.filter = {verdict: "", words: ""};
+    this.listeners = {time: [], view: [], result: [], play: [], filter: []};
   }
 
-  // Calls back now, and on every change of "time", "view", "result" or "play".
+  // Calls back now, and on every change of "time", "view", "result", "play" or "filter".
   on(what, callback) {
     this.listeners[what].push(callback);
     callback(this);
@@ -27,6 +29,16 @@ class Clock {
 
   get sample() {
     return indexAt(this.times, this.time);
+  }
+
+  // The time that texts name: that of the numbers, where the page leaves samples out.
+  get shownTime() {
+    return this.run.is_thinned && this.times.length ? this.times[this.sample] : this.time;
+  }
+
+  isListed({title, verdict}) {
+    const {verdict: wanted, words} = this.filter;
+    return (!wanted || verdict === wanted) && title.toLowerCase().includes(words.toLowerCase());
   }
 
   // The time at which the chosen result is first shown: where it went wrong, or the end.
@@ -185,8 +197,8 @@ function makeTransport(clock, events) {
   clock.on("time", () => {
     const share = clock.end > clock.start ? (clock.time - clock.start) / (clock.end - clock.start) : 0;
     slider.value = share * STEPS;
-    slider.setAttribute("aria-valuetext", secondsText(clock.time));
-    now.textContent = `${secondsText(clock.time)} / ${secondsText(clock.end)}`;
+    slider.setAttribute("aria-valuetext", secondsText(clock.shownTime));
+    now.textContent = `${secondsText(clock.shownTime)} / ${secondsText(clock.end)}`;
   });
   clock.on("play", () => {
     play.className = `button ${clock.isPlaying ? "pause" : "play"}`;

@@ -64,26 +64,39 @@ function curvesOf(run, result, quantity) {
   const named = result.nodes.filter(
     (node) => node.parent === null || (node.name && (quantity === NOW || node.initial)));
   const {curves: colours} = run.palette;
-  return named.slice(0, colours.length + 1).map((node, index) => ({
+  const found = named.slice(0, colours.length + 1).map((node, index) => ({
     node,
     numbers: node.series[quantity],
     name: node.parent === null ? result.title : node.name,
     colour: index === 0 ? null : colours[index - 1],
     reading: element("span", {class: "number"}),
   }));
+  const decided = result.nodes[result.decided];
+  if (decided && !named.includes(decided)) {
+    // an atom counts at each sample: its curve is that of the samples themselves
+    found.push({node: decided, numbers: decided.series[NOW], name: shortened(decided.text, 40),
+      colour: colour("ink"), isDashed: true, reading: element("span", {class: "number"})});
+  }
+  return found;
+}
+
+function shortened(text, longest) {
+  return text.length > longest ? `${text.slice(0, longest - 1)}…` : text;
 }
 
 function legendEntry(curve, shown, build) {
   const key = curve.node.id;
   const swatch = element("span", {class: `swatch ${curve.colour ? "" : "root"}`});
-  if (curve.colour) swatch.style.background = curve.colour;
+  if (curve.isDashed) swatch.classList.add("dashed");
+  else if (curve.colour) swatch.style.background = curve.colour;
   return element("button", {
     type: "button", class: "legend-entry", "aria-pressed": String(!shown.hidden.has(key)),
     onclick: () => {
       if (!shown.hidden.delete(key)) shown.hidden.add(key);
       build();
     },
-  }, swatch, element("span", {}, curve.name), curve.reading);
+  }, swatch, element("span", {}, curve.isDashed ? element("code", {}, curve.name) : curve.name,
+    curve.isDashed ? " now, which decided" : null), curve.reading);
 }
 
 function columns(result, curves) {
@@ -111,7 +124,7 @@ function options(clock, result, curves, shown, width) {
     ],
     series: [{}, ...curves.map((curve) => ({
       label: curve.name, show: !shown.hidden.has(curve.node.id), points: {show: result.samples === 1, size: 8},
-      width: curve.colour ? 1.5 : 2.5, stroke: curve.colour ?? ((chart) => signGradient(chart)),
+      width: curve.colour ? 1.5 : 2.5, dash: curve.isDashed ? [6, 4] : undefined, stroke: curve.colour ?? ((chart) => signGradient(chart)),
     }))],
     hooks: {
       drawClear: [(chart) => {

@@ -5,6 +5,7 @@ function makePage(run) {
   const clock = new Clock(run);
   makeTransport(clock, run.events);
   linkVerdicts(clock);
+  makeVerdicts(clock);
   makeScene(clock);
   makeTree(clock);
   makeLanes(clock);

@@ -21,21 +21,29 @@ function makeScene(clock, name = "scene") {
   place.append(made, element("div", {class: "scene-foot"}, caption, element("span", {class: "choice"},
     layerBox("names", "labels", layers, redraw), layerBox("trails", "trails", layers, redraw),
     hasMaps ? layerBox("map", "map", layers, redraw) : null)),
-  key([{ground: "positive", words: "its requirements hold now"},
+  key([{ground: "positive", words: clock.run.results.length > 1
+    ? "its requirements in the chosen result hold now" : "its requirements hold now"},
     {ground: "negative", words: "one is violated, whatever comes"},
     {ground: "neutral", words: "no requirement, still to come, or unknown"}]));
   let before = null;
   const show = () => {
     const frame = indexAt(scene.times, clock.time);
-    const now = [frame, clock.sample, decisionAt(clock.run, clock.time), pointerAt(clock)];
+    const now = [frame, clock.sample, decisionAt(clock.run, clock.time), pointerAt(clock), clock.result];
     if (now.every((each, index) => each === before?.[index])) return;
     before = now;
     redraw();
-    caption.replaceChildren(...captionOf(clock, scene, frame));
+    caption.replaceChildren(...captionOf(clock, scene, frame), ...drawnAt(clock, scene, frame));
   };
   clock.on("time", show);
   clock.on("result", show);
   window.addEventListener("themechange", redraw);
+}
+
+// A page of a long run may have fewer frames of its scene than samples.
+function drawnAt(clock, scene, frame) {
+  const time = scene.times[frame];
+  if (scene.stride < 2 && !clock.run.is_thinned || Math.abs(time - clock.times[clock.sample]) < 1e-9) return [];
+  return [` (drawn as it was at ${secondsText(time)})`];
 }
 
 function layerBox(label, name, layers, redraw) {
@@ -68,6 +76,8 @@ function readScene(run) {
     low: [least(0), least(1)],
     high: [greatest(0), greatest(1)],
     violations,
+    stride: scene.stride,
+    scale: scene.scale,
     isViolated: numbers(scene.is_violated),
     entities: scene.entities.map((entity) => readEntity(entity, numbers, coordinates)),
   };
@@ -105,17 +115,48 @@ function drawScene(context, clock, scene, layers, width, height) {
   if (layers.map && map) drawMap(context, clock.run, map, at);
   if (layers.trails) drawTrails(context, scene, frame, at);
   const labels = [];
-  for (const entity of scene.entities) drawEntity(context, entity, frame, at, labels);
+  const colourAt = coloursOf(clock, scene, frame);
+  scene.entities.forEach((entity, place) => drawEntity(context, entity, frame, at, labels, colourAt(entity, place)));
   if (decision) drawPlan(context, clock, decision, at);
   if (layers.labels) drawLabels(context, labels, width);
-  const violation = pointerAt(clock) ?? scene.violations.get(frame);
+  const violation = pointerAt(clock) ?? violationAt(clock, scene, frame);
   if (violation) drawViolation(context, violation, at, width);
 }
 
-function drawEntity(context, entity, frame, at, labels) {
+// The arrow of the scene, if it is of the chosen result.
+function violationAt({run, result}, scene, frame) {
+  const violation = scene.violations.get(frame);
+  return violation && (run.results.length < 2 || violation.result === result) ? violation : undefined;
+}
+
+// The colours of entities in a frame: by the requirements of the chosen result, where there are several.
+function coloursOf({run, result: chosen}, scene, frame) {
+  const stored = (entity) => entity.colours.subarray(3 * entity.shown[frame], 3 * entity.shown[frame] + 3);
+  const result = run.results[chosen];
+  if (run.results.length < 2 || !result) return stored;
+  const place = placeIn(result, indexAt(run.times, scene.times[frame]));
+  const least = new Map();
+  for (const {node, sign, standing, entities} of place === null || place >= result.samples ? [] : result.requirements) {
+    if (standing[place] !== HOLDING && standing[place] !== VIOLATED) continue;
+    const number = sign * result.nodes[node].series[NOW][place];
+    for (const entity of entities) least.set(entity, Math.min(number, least.get(entity) ?? Infinity));
+  }
+  return (entity, index) => mixed(run.palette, least.get(index), scene.scale);
+}
+
+// The colour of a robustness, as annotate/scene_update.py mixes it.
+function mixed(palette, number, scale) {
+  const parts = (name) => [1, 3, 5].map((start) => parseInt(palette[name].slice(start, start + 2), 16));
+  const grey = parts("neutral");
+  if (number === undefined) return grey;
+  const hue = parts(number >= 0 ? "positive" : "negative");
+  const share = 0.4 + 0.6 * Math.min(Math.abs(number) / scale, 1);
+  return grey.map((part, index) => Math.round(part + share * (hue[index] - part)));
+}
+
+function drawEntity(context, entity, frame, at, labels, [red, green, blue]) {
   const form = entity.form[frame];
   if (form === ABSENT) return;
-  const [red, green, blue] = entity.colours.subarray(3 * entity.shown[frame], 3 * entity.shown[frame] + 3);
   const isRegion = entity.kind === "region";
   let place = entity.starts[frame];
   const box = [Infinity, Infinity, -Infinity, -Infinity];
@@ -175,7 +216,7 @@ function outlined(context, text, x, y, fill) {
   context.fillText(text, x, y);
 }
 
-function drawViolation(context, {ends, label}, at, width) {
+function drawViolation(context, {ends, label, text: atom}, at, width) {
   const [x0, y0, x1, y1] = [at.x(ends[0]), at.y(ends[1]), at.x(ends[2]), at.y(ends[3])];
   const length = Math.hypot(x1 - x0, y1 - y0), angle = Math.atan2(y1 - y0, x1 - x0);
   const head = Math.min(11, length / 2);
@@ -193,7 +234,8 @@ function drawViolation(context, {ends, label}, at, width) {
   context.closePath();
   context.fill();
   context.font = `600 ${FONT}`;
-  const text = label.replace("-", "−"), half = context.measureText(text).width / 2 + 4;
+  const number = label.replace("-", "−"), text = atom ? `${shortened(atom, 48)}: ${number}` : number;
+  const half = context.measureText(text).width / 2 + 4;
   const x = Math.min(Math.max((x0 + x1) / 2, half), width - half);
   outlined(context, text, x, Math.max((y0 + y1) / 2 - 12, 10), colour("negative-text"));
 }
@@ -274,20 +316,32 @@ function pointerAt({run, result, sample}) {
 }
 
 function captionOf(clock, scene, frame) {
+  const words = wordsOf(clock, scene, frame);
+  const {results} = clock.run;
+  return results.length > 1 && !words.join("").includes(results[clock.result].title)
+    ? [`${results[clock.result].title}: `, ...words] : words;
+}
+
+function wordsOf(clock, scene, frame) {
   const {run} = clock;
   const pointer = pointerAt(clock);
   if (pointer) {
+    if (pointer.is_condition) {
+      return ["the arrow: ", element("code", {}, pointer.text),
+        ` of ${run.results[clock.result].title} held here, and what had to follow did not`];
+    }
     const how = pointer.number < 0 ? "fails" : "must not hold, and does";
     return ["the arrow, what decided the verdict: ", element("code", {}, pointer.text),
       ` of ${run.results[clock.result].title} ${how} by ${numberText(Math.abs(pointer.number))}`];
   }
-  const violation = scene.violations.get(frame);
+  const violation = violationAt(clock, scene, frame);
   if (violation) return ["the arrow: ", ...violationWords(run, scene.times[frame], violation)];
-  const open = requirementsAt(run, clock.sample);
+  const chosen = run.results.slice(clock.result, clock.result + 1);
+  const open = requirementsAt(chosen, clock.sample);
   const inState = (state) => open.filter(({standing}) => standing === state);
   const violated = inState(VIOLATED);
   if (violated.length) return [...failureWords(violated[0]), others(violated), "; no arrow can show it"];
-  if (scene.isViolated[frame]) {
+  if (scene.isViolated[frame] && run.results.length < 2) {
     return ["something is violated now that no arrow can show"];
   }
   const unknown = inState(UNKNOWN);
@@ -300,20 +354,20 @@ function captionOf(clock, scene, frame) {
       others(pending)];
   }
   if (open.length) return [`nothing is violated now${lostBefore(clock)}`];
-  const more = run.results.some((result) => result.requirements.length) ? "more " : "";
+  const more = chosen.some((result) => result.requirements.length) ? "more " : "";
   return [`no ${more}requirements on the objects: they are grey${lostBefore(clock)}`];
 }
 
-// Which results are violated by what was before.
-function lostBefore({run, sample}) {
-  const lost = run.results.filter(
+// Whether the chosen result is violated by what was before.
+function lostBefore({run, sample, result: chosen}) {
+  const lost = run.results.slice(chosen, chosen + 1).filter(
     (result) => statusOf(run, result, result.nodes[0], placeIn(result, sample)) === "violated");
   return lost.length ? `; ${lost[0].title} was before${others(lost)}` : "";
 }
 
 // What the arrow points at; of a requirement that the page leaves out, only the number.
 function violationWords(run, time, {result: which, node: index, label, robustness}) {
-  if (which < 0) return [`what is violated there, by ${label.replace("-", "")}`];
+  if (which < 0) return [`${label.replace("-", "−")}, which is violated there`];
   const result = run.results[which], node = result.nodes[index];
   const sample = indexAt(run.times, time), place = placeIn(result, sample);
   if (Math.abs(run.times[sample] - time) < 1e-9 && place !== null && place < result.samples) {
@@ -339,11 +393,11 @@ function others({length}) {
 }
 
 // How a requirement stands in a sample; see annotate/requirements.py.
-const FULFILLED = 0, VIOLATED = 2, PENDING = 3, UNKNOWN = 4;
+const FULFILLED = 0, HOLDING = 1, VIOLATED = 2, PENDING = 3, UNKNOWN = 4;
 
-// The requirements of all results at a sample that count there.
-function requirementsAt(run, sample) {
-  return run.results.flatMap((result) => {
+// The requirements of results at a sample that count there.
+function requirementsAt(results, sample) {
+  return results.flatMap((result) => {
     const place = placeIn(result, sample);
     if (place === null || place >= result.samples) return [];
     return result.requirements

@@ -12,14 +12,20 @@ function makeLanes(clock) {
   const over = element("div", {class: "over"}, cursor);
   body("timeline").append(place, laneKey());
   let lanes = [];
-  clock.on("result", () => {
-    lanes = clock.run.results.flatMap((result, number) => lanesOf(clock, result, number));
+  const build = () => {
+    lanes = clock.run.results.flatMap((result, number) =>
+      number === clock.result || clock.isListed(result) ? lanesOf(clock, result, number) : []);
     const chosen = clock.run.results[clock.result];
     if (chosen?.automaton) lanes.push(stateLane(clock, chosen));
     if (clock.run.decisions.length) lanes.push(decisionLane(clock));
     place.replaceChildren(...lanes.map((lane) => lane.made), over);
-    for (const lane of lanes) lane.redraw();
-  });
+    for (const lane of lanes) {
+      lane.redraw();
+      lane.update();
+    }
+  };
+  clock.on("result", build);
+  clock.on("filter", build);
   clock.on("view", () => lanes.forEach((lane) => lane.redraw()));
   const moveCursor = () => {
     const share = shareOf(clock, clock.time);

@@ -18,15 +18,28 @@ function makeTree(clock) {
       return;
     }
     list.replaceChildren(branch(result.nodes[0], rows));
+    lightPath(list, rows, result);
   });
   clock.on("time", () => {
     const result = clock.run.results[clock.result];
     if (!result) return;
     const sample = placeIn(result, clock.sample);
     const isLast = sample !== null && sample >= result.samples - 1;
-    title.textContent = `${result.title} at ${secondsText(clock.time)}${isLast ? ", the last sample" : ""}`;
+    title.textContent = `${result.title} at ${secondsText(clock.shownTime)}${isLast ? ", the last sample" : ""}`;
     for (const row of rows) showRow(row, clock.run, result, sample, isLast);
   });
+}
+
+// Marks the way to the node that decided the verdict, and scrolls to it.
+function lightPath(list, rows, {nodes, decided}) {
+  for (let place = decided; place !== null; place = nodes[place].parent) {
+    rows.find((row) => row.node.index === place)?.parts[0].parentElement.classList.add("decides");
+  }
+  const last = rows.find((row) => row.node.index === decided)?.parts[0];
+  if (!last) return;
+  const box = last.getBoundingClientRect(), frame = list.getBoundingClientRect();
+  if (box.bottom > frame.bottom) list.scrollTop += box.bottom - frame.bottom + frame.height / 3;
+  else if (box.top < frame.top) list.scrollTop += box.top - frame.top - frame.height / 3;
 }
 
 function branch(node, rows, hasIntervals = false) {

@@ -68,6 +68,46 @@ function linkVerdicts(clock) {
   }
 }
 
+// Lists of many results: what to list, and which result the panels show.
+function makeVerdicts(clock) {
+  const verdicts = [...document.querySelectorAll(".verdict")];
+  for (const verdict of verdicts) {
+    if (verdict.dataset.result === undefined) continue;
+    // what is unfolded is looked at
+    verdict.querySelector("summary")?.addEventListener("click", () => {
+      const number = Number(verdict.dataset.result);
+      if (verdict.open || number === clock.result) return;
+      clock.pause();
+      clock.choose(number);
+      clock.seek(clock.opening);
+    });
+  }
+  clock.on("result", () => {
+    for (const verdict of verdicts) {
+      verdict.classList.toggle("chosen", verdict.dataset.result === String(clock.result) && verdicts.length > 1);
+    }
+  });
+  const counts = document.getElementById("counts");
+  if (!counts) return;
+  const kinds = [...new Set(verdicts.map((verdict) => verdict.dataset.verdict))];
+  const kind = element("select", {"aria-label": "Verdict", onchange: () => filter()},
+    element("option", {value: ""}, "all"), ...kinds.map((each) => element("option", {value: each}, each)));
+  const words = element("input", {type: "search", "aria-label": "Name", placeholder: "name", oninput: () => filter()});
+  const left = element("span", {class: "quiet", role: "status"});
+  const filter = () => {
+    clock.filter = {verdict: kind.value, words: words.value};
+    let listed = 0;
+    for (const verdict of verdicts) {
+      const title = verdict.querySelector(".name").textContent;
+      verdict.hidden = !clock.isListed({title, verdict: verdict.dataset.verdict});
+      listed += !verdict.hidden;
+    }
+    left.textContent = listed < verdicts.length ? `${listed} of ${verdicts.length} listed` : "";
+    clock.emit("filter");
+  };
+  counts.append(element("span", {class: "filter"}, kind, words, left));
+}
+
 function makeEvents(clock) {
   const place = body("events");
   const {events} = clock.run;
