@@ -239,8 +239,8 @@ class SpecResult(Displayed):
     def to_pandas(self) -> Any:
         """Return the numbers of each sample as a pandas DataFrame, indexed by `time_ns`.
 
-        Its columns are `seconds` since the first sample evaluated, and for each node `NAME value`, `NAME now`,
-        `NAME lower` and `NAME upper`, where NAME is the spec's name, else the node's id and text.
+        Its columns are `seconds` since the first sample evaluated, and for each node `NAME value`,
+        `NAME now`, `NAME lower` and `NAME upper`, where NAME is the spec's name, else the node's id and text.
 
         Raises:
             UsageError: pandas is not installed, or the numbers of each sample were not kept.

@@ -40,7 +40,9 @@ def _of_result(result: SpecResult) -> Any:
     """Return a row for each sample, and four columns for each node."""
     pandas = _pandas()
     if not result.has_series:
-        raise UsageError(f"the numbers of each sample of {result.title!r} were not kept; evaluate() keeps them")
+        raise UsageError(
+            f"the numbers of each sample of {result.title!r} were not kept; evaluate() keeps them"
+        )
     columns = {"seconds": (result.times_ns - result.times_ns[:1]) / 1e9}
     names = [node.name or f"{node.id}: {node.text}" for node in result.nodes]
     for name, node in zip(names, result.nodes, strict=True):

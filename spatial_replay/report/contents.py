@@ -54,7 +54,7 @@ class ReportedResult:
 
         sentences: the explanation of its verdict; none if the page does not explain it.
         decided_ns: the sample that decided it; None without an explanation.
-        decided_node: the id of the node that decided it, an atom where there is one; None without an explanation.
+        decided_node: the id of the node that decided it; None without an explanation.
         pointer: the two points between which the atom that decided it stands; None if it has none.
         named: the specs of its file, by name.
         units: those of the numbers that its robustness is the least of.
@@ -110,7 +110,7 @@ class RunReport:
         axes: those of the source, as opposed to those of the samples.
         faults, remarks: what was lost while reading, and other notes of the reader.
         vacuous: templates that no object fits.
-        observed_ns: of a run with unknown results, from when on all that they are about is observed; else None.
+        observed_ns: from when on all is observed that unknown results are about; or None.
         unreadable: how many observations have no finite numbers.
         signal_units: those that are declared, by the signals' names.
     """

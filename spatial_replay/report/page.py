@@ -39,7 +39,9 @@ def header(report: RunReport, omissions: Sequence[str]) -> Html:
         omissions: what the page leaves out to limit its size.
     """
     counts = element("span", _counts(report), **{"class": "quiet"}) if len(report.results) > 1 else Html("")
-    title = element("div", element("h1", text(report.log)), chip(report.verdict), counts, **{"class": "title"})
+    title = element(
+        "div", element("h1", text(report.log)), chip(report.verdict), counts, **{"class": "title"}
+    )
     return element(
         "header",
         element("a", "Skip to the run", **{"class": "skip", "href": "#main"}),

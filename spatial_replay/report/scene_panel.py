@@ -48,11 +48,14 @@ class ReportedScene:
 
     def entities_of(self, requirement: Requirement) -> list[int]:
         """Return the places on the page of the entities that a requirement is about."""
-        names = {REGION + name for name in requirement.regions} | {OBJECT + name for name in requirement.objects}
+        names = {REGION + name for name in requirement.regions} | {
+            OBJECT + name for name in requirement.objects
+        }
         return [
             place
             for place, (identifier, classes) in enumerate(self._classes.items())
-            if identifier in names or any(_is_member(identifier, classes, each) for each in requirement.groups)
+            if identifier in names
+            or any(_is_member(identifier, classes, each) for each in requirement.groups)
         ]
 
     @cached_property
@@ -66,7 +69,9 @@ class ReportedScene:
 
 def _is_member(identifier: str, classes: frozenset[str], group: ClassMembers) -> bool:
     kind, name = identifier.startswith(OBJECT), identifier.removeprefix(OBJECT)
-    return kind and name not in group.excluded and (group.class_name == ANY_CLASS or group.class_name in classes)
+    return (
+        kind and name not in group.excluded and (group.class_name == ANY_CLASS or group.class_name in classes)
+    )
 
 
 class SceneCollector:

@@ -17,6 +17,7 @@ from spatial_replay.monitor.verdict import final_verdict
 from spatial_replay.report.compact import Packing
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Boolean, Formula, Temporal, iter_nodes, operands_of, operator_of
+from spatial_replay.text import json_number
 
 MOST_NODES: Final = 400
 """Nodes of a tree that a page shows, at most."""
@@ -97,10 +98,14 @@ def requirement_values(
     """
     place = {identifier: index for index, identifier in enumerate(shown_nodes(result.formula))}
     settles = result.semantics == "ltlf"
+    # of the finished log
+    ends = np.full((len(result.final), 4, 1), np.nan)
+    ends[:, 2:, 0] = result.final
     return [
         {
             "node": place[requirement.node],
             "sign": requirement.sign,
+            "outcome": json_number(float(requirement.outcome(ends, np.zeros(1, np.int64))[0])),
             "entities": entities_of(requirement),
             "standing": packing.add(requirement.standing(result.series, samples), "u1"),
         }

@@ -377,8 +377,8 @@ def test_each_object_of_a_template_can_be_looked_into(open_page: Open) -> None:
     expect(page.locator(".tree .row .number").nth(1)).not_to_have_text("")
 
 
-def test_text_arrow_tree_and_curve_tell_one_story_when_the_page_opens(open_page: Open) -> None:
-    page = open_page("violated")
+def test_text_arrow_tree_and_curve_are_of_one_atom_when_the_page_opens(open_page: Open) -> None:
+    page = open_page("violated", height=1400)
     atom, number = "spoon dist plate <= 0.08", f"{MINUS}0.1552"
     expect(page.locator(".verdict.chosen")).to_contain_text(f"{atom}, which fails by 0.155214")
     expect(page.locator(".caption")).to_contain_text(f"{atom} of table_set fails by 0.1552")
@@ -400,7 +400,7 @@ def test_many_results_are_counted_sorted_and_filtered(open_page: Open) -> None:
     expect(page.locator(".verdict:visible")).to_have_count(1)
     # the lane of the chosen result stays
     expect(page.locator("button.lane-name")).to_have_count(2)
-    expect(page.get_by_role("status")).to_have_text("1 of 8 listed")
+    expect(page.locator("#counts [role=status]")).to_have_text("1 of 8 listed")
 
 
 def test_the_scene_is_coloured_for_the_chosen_result(open_page: Open) -> None:

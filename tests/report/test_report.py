@@ -210,11 +210,14 @@ def test_instances_of_a_template_have_their_own_results(tmp_path: Path) -> None:
 def test_an_unknown_run_says_from_when_on_everything_is_observed(tmp_path: Path) -> None:
     disc = sr.Footprint.disc
     samples = [
-        sr.Sample(t * 10**9, {"a": disc(0, 0, 1)} | ({"b": disc(5, 0, 1)} if t >= 3 else {})) for t in range(6)
+        sr.Sample(t * 10**9, {"a": disc(0, 0, 1)} | ({"b": disc(5, 0, 1)} if t >= 3 else {}))
+        for t in range(6)
     ]
     page = report_of_samples(tmp_path / "run.html", samples, "spec apart = G (a dist b >= 1)")
     assert "is observed from 3.000 s on: --from 3.000s evaluates from there." in page.within("header#")
-    seen = report_of_samples(tmp_path / "seen.html", samples, "spec apart = G (a dist b >= 1)", start=3 * 10**9)
+    seen = report_of_samples(
+        tmp_path / "seen.html", samples, "spec apart = G (a dist b >= 1)", window=Window(start_ns=3 * 10**9)
+    )
     assert "is observed from" not in seen.text
 
 
@@ -224,10 +227,13 @@ def test_arrows_of_the_automaton_have_the_words_of_its_drawing(planned: Page) ->
     assert {"not p2"} < {move["label"] for move in automaton["moves"]}
 
 
-def test_a_unit_that_is_declared_is_shown(tmp_path: Path) -> None:
-    source = MemorySource(Trace.from_samples([sr.Sample(t, signals={"speed": 1.0}) for t in range(3)]))
-    declared = replace_units(source, {"speed": "m/s"})
-    write_report(declared, [sr.parse_specification("spec slow = G (speed <= 2)")], tmp_path / "run.html")
+def test_a_unit_that_is_declared_is_shown(tmp_path: Path, data_folder: Path) -> None:
+    (tmp_path / "turtles.yaml").write_text(
+        "topics:\n"
+        "  /turtle1/pose: {shape: {disc: 0.5}, signals: {speed: {field: linear_velocity, unit: m/s}}}\n"
+    )
+    source = open_source(data_folder / "bags/two_turtles.bag", mapping=tmp_path / "turtles.yaml")
+    write_report(source, [sr.parse_specification("spec slow = G (speed <= 9)")], tmp_path / "run.html")
     assert page_of(tmp_path / "run.html").facts["results"][0]["nodes"][0]["unit"] == "m/s"
 
 

@@ -136,9 +136,11 @@ function coloursOf({run, result: chosen}, scene, frame) {
   if (run.results.length < 2 || !result) return stored;
   const place = placeIn(result, indexAt(run.times, scene.times[frame]));
   const least = new Map();
-  for (const {node, sign, standing, entities} of place === null || place >= result.samples ? [] : result.requirements) {
-    if (standing[place] !== HOLDING && standing[place] !== VIOLATED) continue;
-    const number = sign * result.nodes[node].series[NOW][place];
+  const isEnd = frame === scene.times.length - 1 && place === result.samples - 1;
+  for (const {node, sign, outcome, standing, entities} of place === null || place >= result.samples ? [] : result.requirements) {
+    if (isEnd ? outcome === null : standing[place] !== HOLDING && standing[place] !== VIOLATED) continue;
+    // at the end, what it came to; JSON has infinite numbers as texts
+    const number = isEnd ? Number(String(outcome).replace("inf", "Infinity")) : sign * result.nodes[node].series[NOW][place];
     for (const entity of entities) least.set(entity, Math.min(number, least.get(entity) ?? Infinity));
   }
   return (entity, index) => mixed(run.palette, least.get(index), scene.scale);
