@@ -31,9 +31,11 @@ class Rings(NamedTuple):
 
     def rings_of(self, footprint: int) -> tuple[Floats, ...]:
         """Return the rings (n, 2) of one of the footprints."""
-        points = self.points[self.start[footprint] : self.start[footprint + 1]]
-        ends = np.cumsum(self.forms[self.form[footprint]].rings)[:-1]
-        return tuple(np.split(points, ends))
+        end, rings = int(self.start[footprint]), []
+        for length in self.forms[self.form[footprint]].rings:
+            begin, end = end, end + length
+            rings.append(self.points[begin:end])
+        return tuple(rings)
 
 
 class Form(NamedTuple):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,6 +17,9 @@ PATIENCE_S = 1.0
 COMPILING = "compiling, once on this machine"
 """Label of a bar while kernels are compiled."""
 
+_NOTEBOOK = "JPY_PARENT_PID"
+"""What kernels of notebooks set for the programs that their cells run."""
+
 Advance = Callable[[int], None]
 
 
@@ -24,12 +28,13 @@ def progress(label: str, total: int | None = None) -> Iterator[Advance]:
     """Show the progress of some work: `with progress("reading", len(items)) as advance: ... advance(1)`.
 
     The bar appears on standard error, if that is a terminal, once the work has taken a second. It is removed
-    at the end of the work. While kernels are compiled, its label says so.
+    at the end of the work. While kernels are compiled, its label says so. A cell of a notebook shows none,
+    though it runs `!spatial-replay …` on a terminal.
 
     Args:
         total: number of steps; None if it is not known.
     """
-    if not sys.stderr.isatty():
+    if not sys.stderr.isatty() or _NOTEBOOK in os.environ:
         yield lambda steps: None
         return
     # imports the compiler, which all work that is worth a bar needs anyway

@@ -333,7 +333,7 @@ def document(
         element("title", text(title)),
         f"<style>{style}</style></head><body>",
         *parts,
-        '<div id="transport" class="transport" role="group" aria-label="Time"></div>',
+        '<div id="transport" class="transport" role="region" aria-label="Time"></div>',
         *(f'<script type="{json_kind}" id="{name}">{each}</script>' for name, each in facts.items()),
         *(f'<script type="{packed_kind}" id="{name}">{each}</script>' for name, each in numbers.items()),
         f"<script>{library}</script>",

@@ -180,6 +180,11 @@ def test_a_slow_first_step_already_shows_the_bar(tmp_path: Path) -> None:
     assert "samples" in standard_error_on_terminal((sys.executable, "-c", work), tmp_path, {})
 
 
+def test_long_work_shows_nothing_in_a_cell_of_a_notebook(tmp_path: Path) -> None:
+    work = (sys.executable, "-c", _WORK.format(pause=0.4))
+    assert standard_error_on_terminal(work, tmp_path, {"JPY_PARENT_PID": "1"}) == ""
+
+
 def test_long_work_shows_nothing_in_a_pipe(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", _WORK.format(pause=0.4)], cwd=tmp_path, capture_output=True, check=False
