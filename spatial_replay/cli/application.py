@@ -153,8 +153,11 @@ def run(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ExitCode.BROKEN_PIPE
     except (Exception, KeyboardInterrupt) as error:
-        report_error(error)
-        return exit_code_from_error(error)
+        # click takes the end of whatever file for an interruption
+        is_end = isinstance(error, click.Abort) and isinstance(error.__cause__, EOFError)
+        reported = error.__cause__ or error if is_end else error
+        report_error(reported)
+        return exit_code_from_error(reported)
     return int(code or 0)
 
 
