@@ -75,7 +75,36 @@ _windows_within = st.builds(
 )
 """A bounded operator below another: what looks through windows has rules of its own."""
 
-formulas_of_leaves = st.one_of(_nested(1), _nested(2), _nested(3), _nested(4), _windows_within)
+_literals = st.one_of(_leaves, _leaves.map(lambda leaf: Boolean("not", (leaf,))))
+
+
+def responses(windows):
+    """An unbounded operator over conditions and windows, as requirements are usually written."""
+    conditioned = st.builds(Boolean, st.sampled_from(["and", "or", "->"]), st.tuples(_literals, windows))
+    bodies = st.one_of(
+        windows,
+        conditioned,
+        st.builds(Boolean, st.sampled_from(["and", "or"]), st.tuples(conditioned, windows)),
+        st.builds(Boolean, st.sampled_from(["and", "or"]), st.tuples(conditioned, _literals)),
+    )
+    return st.one_of(
+        st.builds(Temporal, st.sampled_from(["F", "G"]), st.tuples(bodies)),
+        st.builds(Temporal, st.sampled_from(["U", "R", "W"]), st.tuples(_literals, bodies)),
+    )
+
+
+def windows_of(operands, bounds):
+    """One operator that looks ahead over the given formulas."""
+    single, pairs = st.tuples(operands), st.tuples(operands, operands)
+    return st.one_of(
+        st.builds(Temporal, st.sampled_from(["F", "G"]), single, bounds),
+        st.builds(Temporal, st.sampled_from(["U", "R"]), pairs, bounds),
+        st.builds(Temporal, st.sampled_from(["X", "WX"]), single),
+    )
+
+
+_responses = responses(windows_of(_literals, st.one_of(sample_bounds(), time_bounds())))
+formulas_of_leaves = st.one_of(_responses, _nested(1), _nested(2), _nested(3), _nested(4), _windows_within)
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,12 @@ from laws.strategies_monitor import (
     formulas_of_leaves,
     leaf_runs,
     recordings,
+    responses,
     specifications,
+    time_bounds,
     tracked_objects,
     widened,
+    windows_of,
 )
 from spatial_replay import Monitor, Verdict, evaluate
 from spatial_replay.monitor.instances import find_instances
@@ -33,7 +36,7 @@ from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.monitor.stream import EvaluationStream
 from spatial_replay.monitor.verdict import final_verdict, online_verdict
-from spatial_replay.spec.formula import Boolean, Temporal, Truth
+from spatial_replay.spec.formula import Boolean, Bound, Temporal, Truth
 from spatial_replay.trace.sample import FOREVER
 
 VALUE, NOW, LOWER, UPPER = range(4)
@@ -197,6 +200,29 @@ def test_a_monitor_equals_an_evaluation_sample_by_sample(data, specification, re
 
 
 # ------------------------------------------------------------------------------------------- equivalences
+
+
+@settings(max_examples=60)
+@given(data=st.data(), shape=responses(st.sampled_from(LEAVES)), run=leaf_runs(max_size=30))
+def test_windows_at_a_constant_cost_equal_windows_run_backwards(data, shape, run):
+    wide = st.integers(0, 9).flatmap(
+        lambda low: st.builds(Bound, st.just(low), st.integers(low, 20), st.just("samples"))
+    )
+    ahead = data.draw(windows_of(st.sampled_from(LEAVES), st.one_of(wide, time_bounds())))
+    # always true, but only the general way looks through a window below a window
+    always = Temporal("G", (Truth(True),), Bound(0, 0, "samples"))
+    slow = replace(ahead, operands=tuple(both(operand, always) for operand in ahead.operands))
+    leaf = data.draw(st.sampled_from(LEAVES))
+    assert_same(*(root_of(with_window(shape, leaf, window), run) for window in (ahead, slow)))
+
+
+def with_window(formula, leaf, window):
+    """A formula with a window in place of a leaf."""
+    if formula == leaf:
+        return window
+    operands = tuple(with_window(each, leaf, window) for each in getattr(formula, "operands", ()))
+    return replace(formula, operands=operands) if operands else formula
+
 
 small = st.one_of(st.sampled_from(LEAVES), formulas_of_leaves)
 

@@ -1,4 +1,4 @@
-"""Temporal operators alone, over a finished signal: the robustness at each sample to the end."""
+"""Temporal operators alone: over a finished signal, and sample by sample with windows below others."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 
 import spatial_replay as sr
+from spatial_replay.compiled import compile_ahead
 from spatial_replay.monitor.offline import full_signal
 from spatial_replay.monitor.online.program import compile_formula
+from spatial_replay.monitor.online.step import OnlineRun
 
 MILLION = 1_000_000
 WIDTHS = (10, 1000, 100_000)
@@ -54,6 +56,59 @@ def _times(operator: str, bounds: list[str], values: Any, times_ns: Any) -> dict
             full_signal(formula, order, leaves, times_ns)
             if turn > 0:
                 times[bound].append(time.perf_counter() - start)
+    return times
+
+
+ONLINE = 400_000
+RESPONSES = {
+    "G (a -> F[0,w] b)": "G (p >= 0 -> F{bound} q >= 0)",
+    "G (a -> G[0,w] b)": "G (p >= 0 -> G{bound} q >= 0)",
+    "G (a -> c U[0,w] b)": "G (p >= 0 -> q >= 1 U{bound} q >= 0)",
+    "G (a -> F[0,5] G[0,w] b)": "G (p >= 0 -> F[0,5] G{bound} q >= 0)",
+}
+GENERAL = "G (a -> F[0,5] G[0,w] b)"
+"""Run backwards over its windows at each sample."""
+
+
+def bench_online_windows(bench: Any) -> None:
+    """Bounded operators below an unbounded one, every prefix, beside `G (a -> b)`; processor time."""
+    compile_ahead()
+    source = np.random.default_rng(0).normal(size=(1, 2, ONLINE))
+    for name, text in RESPONSES.items():
+        is_general = name == GENERAL
+        widths = (10, 100) if is_general else (10, 100, 1000, 10_000, 100_000)
+        in_samples = {f"{width}": text.format(bound=f"[0,{width}]") for width in widths}
+        in_seconds = {f"{width / 100:g} s": text.format(bound=f"[0s,{width / 100}s]") for width in widths}
+        plain = {"": "G (p >= 0 -> q >= 0)"}
+        times = _online_times(
+            plain | in_samples | in_seconds, source[:, :, :10_000] if is_general else source
+        )
+        for width, own in times.items():
+            label = f"{name}, {width}" if width else "G (a -> b)"
+            bench.quantile(label, own, 0.5, limit_s=None if is_general else 2e-6)
+        if is_general:
+            continue
+        fastest = {width: min(own) for width, own in times.items()}
+        for unit, group in (("samples", in_samples), ("seconds", in_seconds)):
+            flat = [fastest[width] for width in group]
+            bench.ratio(f"{name}, {unit}: slowest to quickest", max(flat) / min(flat), WIDER_LIMIT)
+        bench.ratio(f"{name}: to G (a -> b)", max(fastest.values()) / fastest[""], 6.0)
+
+
+def _online_times(texts: dict[str, str], leaves: Any) -> dict[str, list[float]]:
+    """Processor time for each sample by each formula in turn, so that other work falls on all alike."""
+    programs = {
+        name: compile_formula(sr.parse_specification(text).specs[0].formula) for name, text in texts.items()
+    }
+    times_ns = np.arange(leaves.shape[2], dtype=np.int64) * 10_000_000
+    times: dict[str, list[float]] = {name: [] for name in texts}
+    for turn in range(6):
+        for name, program in programs.items():
+            run = OnlineRun(program)
+            start = time.process_time()
+            run.extend(leaves, times_ns)
+            if turn > 0:
+                times[name].append((time.process_time() - start) / len(times_ns))
     return times
 
 

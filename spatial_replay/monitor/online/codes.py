@@ -26,6 +26,13 @@ NOT, AND, OR = 2, 3, 4
 ONCE, HISTORICALLY, SINCE = 7, 8, 9
 WINDOW_MAX, WINDOW_MIN = 10, 11  # of a, over [low, high] back
 DELAY = 12  # a, low back; high times infinity where there is none
+# of conditions a at past positions and the extrema of b over the windows [low, high] ahead of them (see
+# `clauses`): over positions whose window has begun, and over those whose window has closed
+BEGUN_MIN, BEGUN_MAX = 13, 14  # min of max(a, max of b); max of min(a, min of b)
+CLOSED_MIN_OF_MAX, CLOSED_MIN_OF_MIN, CLOSED_MAX_OF_MAX, CLOSED_MAX_OF_MIN = 17, 18, 19, 20
+BEGUN = (BEGUN_MIN, BEGUN_MAX)
+CLOSED = (CLOSED_MIN_OF_MAX, CLOSED_MIN_OF_MIN, CLOSED_MAX_OF_MAX, CLOSED_MAX_OF_MIN)
+RINGS = (WINDOW_MAX, WINDOW_MIN, *BEGUN, *CLOSED)  # keep positions in a ring
 AHEAD = 16  # added to a code from ONCE on: its mirror image in time (see `finished`)
 
 # columns of parts' nodes
@@ -49,8 +56,12 @@ BINARY_NODES = (
 
 # columns of parts: nodes, numbers of variables and tables, where its tables and its cells start
 PART_FIRST, PART_END, PART_VARIABLES, PART_TABLES, PART_TABLE_START, PART_CELL_START = range(6)
-PART_IS_FLAT, PART_IS_REMEMBERING, PART_END_CORNER = 6, 7, 8  # the corner that ends a run
-PART_WIDTH = 9
+PART_KIND, PART_IS_REMEMBERING, PART_END_CORNER = 6, 7, 8  # the corner that ends a run
+# of clauses: signals, whether they join by minimum, and the part beside them, -1 for none
+PART_ENDING, PART_LOWER, PART_UPPER, PART_IS_MINIMUM, PART_BESIDE = 9, 10, 11, 12, 13
+PART_WIDTH = 14
+# kinds of parts
+TABLE, WINDOWED, CLAUSES = 0, 1, 2  # see `tables`, `windows`, `clauses`
 
 # columns of reports: the index is of the signal or part, the rule is for now
 REPORT_CODE, REPORT_INDEX, REPORT_RULE, REPORT_FIRST, REPORT_END = range(5)

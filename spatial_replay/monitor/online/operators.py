@@ -33,8 +33,6 @@ Row = tuple[int, ...]
 NOTHING = -1
 """Stands where a row has no operand, no upper end, no variable, no table or no window."""
 
-_WINDOWS = (codes.WINDOW_MAX, codes.WINDOW_MIN)
-
 
 def looks_ahead(formula: Formula) -> bool:
     """Return whether a formula contains a future operator."""
@@ -74,22 +72,20 @@ class SignalTable:
 
     @property
     def windows(self) -> int:
-        """How many rows keep a sliding window."""
-        return sum(row[0] in _WINDOWS for row in self._rows)
+        """How many rows keep a ring of positions."""
+        return sum(row[0] in codes.RINGS for row in self._rows)
 
     @property
     def keeps_history(self) -> bool:
         """Whether any row looks at more than the newest sample."""
-        return any(row[0] in _WINDOWS or row[0] == codes.DELAY for row in self._rows)
+        return any(row[0] in codes.RINGS or row[0] == codes.DELAY for row in self._rows)
 
     def array(self) -> Integers:
-        """Return the table (S, SIGNAL_WIDTH), with its sliding windows numbered."""
-        window = 0
-        rows = []
-        for row in self._rows:
-            is_window = row[0] in _WINDOWS
-            rows.append((*row, window if is_window else NOTHING))
-            window += is_window
+        """Return the table (S, SIGNAL_WIDTH), with its rings numbered: first those with numbers beside."""
+        rings = [row for row in self._rows if row[0] in codes.RINGS]
+        rings.sort(key=lambda row: row[0] not in codes.BEGUN)
+        numbers = {row: number for number, row in enumerate(rings)}
+        rows = [(*row, numbers.get(row, NOTHING)) for row in self._rows]
         return array_of_rows(rows, codes.SIGNAL_WIDTH)
 
     def add(self, formula: Formula) -> int:
@@ -103,15 +99,16 @@ class SignalTable:
     def _added_row(self, formula: Formula, operands: list[int]) -> int:
         match formula:
             case Truth():
-                return self._row(codes.CONSTANT, low=1 if formula.value else -1)
+                return self.row(codes.CONSTANT, low=1 if formula.value else -1)
             case Atom() | Quantified():
-                return self._row(codes.LEAF, self._leaf_number(formula))
+                return self.row(codes.LEAF, self._leaf_number(formula))
             case Boolean():
                 return self._boolean(formula.operator, operands)
             case Temporal():
                 return self._temporal(formula.operator, operands, formula.bound)
 
-    def _row(self, code: int, a: int = 0, b: int = 0, unit: int = 0, low: int = 0, high: int = 0) -> int:
+    def row(self, code: int, a: int = 0, b: int = 0, unit: int = 0, low: int = 0, high: int = 0) -> int:
+        """Return the place of a row, which is added unless there is one like it."""
         return self._rows.setdefault((code, a, b, unit, low, high), len(self._rows))
 
     def _leaf_number(self, formula: Atom | Quantified) -> int:
@@ -128,9 +125,9 @@ class SignalTable:
     def _boolean(self, operator: str, operands: list[int]) -> int:
         first, *rest = operands
         if operator == "not":
-            return self._row(codes.NOT, first)
+            return self.row(codes.NOT, first)
         for operand in rest:
-            first = self._row(codes.AND if operator == "and" else codes.OR, first, operand)
+            first = self.row(codes.AND if operator == "and" else codes.OR, first, operand)
         return first
 
     def _temporal(self, operator: str, operands: list[int], bound: Bound | None, ahead: int = 0) -> int:
@@ -138,33 +135,33 @@ class SignalTable:
         unit, low, high = window_of(bound)
         match operator:
             case "Y":
-                return self._delay(operands[0], codes.SAMPLES, 1, ahead)
+                return self.delay(operands[0], codes.SAMPLES, 1, ahead)
             case "S":
                 left, right = operands
-                return self._since(left, right, unit, low, high, ahead)
+                return self.since(left, right, unit, low, high, ahead)
         is_weak = operator == "H"
         if high is not None:
             code = codes.WINDOW_MIN if is_weak else codes.WINDOW_MAX
-            return self._row(code + ahead, operands[0], 0, unit, low, high)
-        running = self._row((codes.HISTORICALLY if is_weak else codes.ONCE) + ahead, operands[0])
-        return running if low == 0 else self._delay(running, unit, low, ahead, is_weak=is_weak)
+            return self.row(code + ahead, operands[0], 0, unit, low, high)
+        running = self.row((codes.HISTORICALLY if is_weak else codes.ONCE) + ahead, operands[0])
+        return running if low == 0 else self.delay(running, unit, low, ahead, is_weak=is_weak)
 
-    def _since(self, left: int, right: int, unit: int, low: int, high: int | None, ahead: int) -> int:
+    def since(self, left: int, right: int, unit: int, low: int, high: int | None, ahead: int = 0) -> int:
         """Write phi S[a,b] psi as O[a,b] psi and phi S[a,inf] psi, the latter as phi on the last a and
         phi S psi before: since min distributes over max, both are exact for robustness too."""
-        result = self._row(codes.SINCE + ahead, left, right)
+        result = self.row(codes.SINCE + ahead, left, right)
         if low > 0:
-            before = self._delay(result, unit, low, ahead)
-            since = self._row(codes.WINDOW_MIN + ahead, left, 0, unit, 0, low - 1)
-            result = self._row(codes.AND, since, before)
+            before = self.delay(result, unit, low, ahead)
+            since = self.row(codes.WINDOW_MIN + ahead, left, 0, unit, 0, low - 1)
+            result = self.row(codes.AND, since, before)
         if high is not None:
-            within = self._row(codes.WINDOW_MAX + ahead, right, 0, unit, low, high)
-            result = self._row(codes.AND, within, result)
+            within = self.row(codes.WINDOW_MAX + ahead, right, 0, unit, low, high)
+            result = self.row(codes.AND, within, result)
         return result
 
-    def _delay(self, operand: int, unit: int, distance: int, ahead: int, *, is_weak: bool = False) -> int:
+    def delay(self, operand: int, unit: int, distance: int, ahead: int = 0, *, is_weak: bool = False) -> int:
         """Add an operand delayed by a distance; before the first sample +inf if weak, -inf if strong."""
-        return self._row(codes.DELAY + ahead, operand, 0, unit, distance, 1 if is_weak else -1)
+        return self.row(codes.DELAY + ahead, operand, 0, unit, distance, 1 if is_weak else -1)
 
 
 MAX_VARIABLES = 12
@@ -194,7 +191,7 @@ def part_of(signals: SignalTable, node: Temporal) -> WindowedPart:
     return part
 
 
-class WindowedPart:
+class PartRows:
     """The rows of one part, operands first; equal subformulas share one.
 
     Attributes:
@@ -202,23 +199,16 @@ class WindowedPart:
         tables: 1, and one for each past operator that carries a table of its own.
     """
 
-    def __init__(self, signals: SignalTable, root: Temporal, *, anchored: bool) -> None:
-        """Build the part of a node that looks ahead.
-
-        Args:
-            signals: receives the subformulas that do not look ahead.
-            anchored: whether the root is a bounded operator that is only ever asked for at the first
-                sample, so that its window is a fixed stretch of the run and needs no history.
-        """
+    def __init__(self) -> None:
+        """Begin without rows."""
         self.variables = 0
         self.tables = 1
-        self._signals = signals
         self._rows: dict[Row, int] = {}
-        self._added: dict[tuple[int, bool], int] = {}
-        if anchored:
-            self._anchored(root, True)
-        else:
-            self._add(root, True)
+
+    @property
+    def fields(self) -> tuple[Row, ...]:
+        """Rows up to the column for the window's end, and whether they are a variable."""
+        return tuple(self._rows)
 
     def rows(self) -> tuple[Row, ...]:
         """Return rows with the numbers of their variable and table, and whether they depend on either."""
@@ -257,7 +247,7 @@ class WindowedPart:
         weak = [row[3] for row in self._rows if row[-1]]
         return sum(1 << variable for variable, is_weak in enumerate(weak) if is_weak)
 
-    def _row(
+    def row(
         self,
         code: int,
         a: int = 0,
@@ -268,12 +258,33 @@ class WindowedPart:
         high: int = 0,
         variable: bool = False,
     ) -> int:
+        """Return the place of a row, which is added unless there is one like it."""
         key = (code, a, b, weak, unit, low, high, int(variable))
         if key not in self._rows:
             self._rows[key] = len(self._rows)
             self.variables += variable
             self.tables += code in _RECURRENT_PAST
         return self._rows[key]
+
+
+class WindowedPart(PartRows):
+    """The rows of a node that looks ahead, in negation normal form."""
+
+    def __init__(self, signals: SignalTable, root: Temporal, *, anchored: bool) -> None:
+        """Build the part of a node that looks ahead.
+
+        Args:
+            signals: receives the subformulas that do not look ahead.
+            anchored: whether the root is a bounded operator that is only ever asked for at the first
+                sample, so that its window is a fixed stretch of the run and needs no history.
+        """
+        super().__init__()
+        self._signals = signals
+        self._added: dict[tuple[int, bool], int] = {}
+        if anchored:
+            self._anchored(root, True)
+        else:
+            self._add(root, True)
 
     def _add(self, formula: Formula, positive: bool) -> int:
         """Return the row of a formula, or of its negation, in negation normal form.
@@ -296,10 +307,10 @@ class WindowedPart:
                 return reduce(partial(self._join, is_both=is_both), operands)
             build = self._future if formula.operator in FUTURE_OPERATORS else self._past
             return build(formula.operator, operands, formula.bound, positive)
-        return self._row(codes.LITERAL, self._signals.add(formula), 0 if positive else 1)
+        return self.row(codes.LITERAL, self._signals.add(formula), 0 if positive else 1)
 
     def _join(self, first: int, second: int, *, is_both: bool) -> int:
-        return self._row(codes.PART_AND if is_both else codes.PART_OR, first, second)
+        return self.row(codes.PART_AND if is_both else codes.PART_OR, first, second)
 
     def _future(self, operator: str, operands: list[int], bound: Bound | None, positive: bool) -> int:
         left, right, bound = _as_until(operator, operands, bound)
@@ -313,34 +324,34 @@ class WindowedPart:
         """Add until or release over a window, by the identity that `SignalTable` uses for since."""
         weak = int(not is_until)
         own, other = _by_kind(codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN, is_until)
-        within = None if high is None else self._row(own, right, 0, weak, unit, low, high)
+        within = None if high is None else self.row(own, right, 0, weak, unit, low, high)
         if within is not None and left == NOTHING:
             return within
         code = codes.UNTIL if is_until else codes.RELEASE
-        running = self._row(code, left, right, weak, variable=high is None)
+        running = self.row(code, left, right, weak, variable=high is None)
         if low > 0 or high is not None:
-            running = self._row(codes.SHIFT, running, 0, weak, unit, low, NOTHING if high is None else high)
+            running = self.row(codes.SHIFT, running, 0, weak, unit, low, NOTHING if high is None else high)
         if low > 0 and left != NOTHING:
-            before = self._row(other, left, 0, 1 - weak, unit, 0, low - 1)
+            before = self.row(other, left, 0, 1 - weak, unit, 0, low - 1)
             running = self._join(before, running, is_both=is_until)
         return running if within is None else self._join(within, running, is_both=is_until)
 
     def _past(self, operator: str, operands: list[int], bound: Bound | None, positive: bool) -> int:
         unit, low, high = window_of(bound)
         if operator == "Y":
-            return self._row(codes.PAST_DELAY, operands[0], 0, int(not positive), codes.SAMPLES, 1)
+            return self.row(codes.PAST_DELAY, operands[0], 0, int(not positive), codes.SAMPLES, 1)
         left, right = (NOTHING, operands[0]) if operator in ("O", "H") else operands
         is_since = (operator in ("O", "S")) == positive
         weak = int(not is_since)
         own, other = _by_kind(codes.PAST_WINDOW_MAX, codes.PAST_WINDOW_MIN, is_since)
-        within = None if high is None else self._row(own, right, 0, weak, unit, low, high)
+        within = None if high is None else self.row(own, right, 0, weak, unit, low, high)
         if within is not None and left == NOTHING:
             return within
-        result = self._row(codes.PAST_SINCE if is_since else codes.PAST_TRIGGER, left, right, weak)
+        result = self.row(codes.PAST_SINCE if is_since else codes.PAST_TRIGGER, left, right, weak)
         if low > 0:
-            result = self._row(codes.PAST_DELAY, result, 0, weak, unit, low)
+            result = self.row(codes.PAST_DELAY, result, 0, weak, unit, low)
             if left != NOTHING:
-                before = self._row(other, left, 0, 1 - weak, unit, 0, low - 1)
+                before = self.row(other, left, 0, 1 - weak, unit, 0, low - 1)
                 result = self._join(before, result, is_both=is_since)
         return result if within is None else self._join(within, result, is_both=is_since)
 
@@ -353,7 +364,7 @@ class WindowedPart:
             is_until = (formula.operator != "G") == positive
             code = codes.ANCHORED_UNTIL if is_until else codes.ANCHORED_RELEASE
             end = NOTHING if high is None else high
-            return self._row(code, left, right, int(not is_until), unit, low, end, variable=True)
+            return self.row(code, left, right, int(not is_until), unit, low, end, variable=True)
         if isinstance(formula, Boolean) and formula.operator == "not":
             return self._anchored(formula.operands[0], not positive)
         windows = [self._anchored(each, positive) for each in operands_of(formula)]

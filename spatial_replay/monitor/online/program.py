@@ -5,7 +5,7 @@ A formula becomes three tables, each with operands first:
 - *signals*: every subformula without a future operator. Its robustness at a sample is final with that
   sample, so it is computed forwards, with a little state for past operators.
 - *parts*: one for each node that is a temporal operator and looks ahead, in negation normal form over
-  signals, so that its robustness is monotone in all its operands.
+  signals, so that its robustness is monotone in all its operands; or as clauses, which are signals.
 - *reports*: the tree as the user wrote it; Boolean nodes combine the numbers of their operands.
 
 `OnlineRun` runs samples through them.
@@ -19,7 +19,10 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.clauses import Clauses, clauses_of
 from spatial_replay.monitor.online.operators import (
+    NOTHING,
+    PartRows,
     Row,
     SignalTable,
     WindowedPart,
@@ -41,7 +44,7 @@ class Program:
         parts: (P, PART_WIDTH).
         reports: (N, REPORT_WIDTH), in the order of node ids.
         operands: ids of the nodes below each node of the tree, node after node.
-        windows: how many signals keep a sliding window.
+        windows: how many signals keep a ring of positions.
         table_size: how many numbers the parts' tables hold for one channel.
         cells: how many rows of bookkeeping the parts need.
         keeps_history: whether any window, delay or part looks at more than the newest sample.
@@ -77,7 +80,9 @@ def compile_formula(formula: Formula) -> Program:
             reports.append((codes.REPORT_OF_BOOLEAN[node.operator], 0, 0, *ends))
         elif isinstance(node, Temporal):
             part = part_of(signals, node)
-            reports.append((codes.REPORT_PART, parts.add(part), _now_rule(node, part), *ends))
+            clauses = clauses_of(signals, part)
+            number = parts.add(part) if clauses is None else parts.add_clauses(clauses)
+            reports.append((codes.REPORT_PART, number, _now_rule(node, part), *ends))
     return Program(
         leaves=tuple(signals.leaves),
         signals=signals.array(),
@@ -101,9 +106,20 @@ class _Parts:
         self.table_size = 0
         self.cells = 0
         self.keeps_history = False
-        self._built: dict[tuple[Row, ...], int] = {}
+        self._built: dict[tuple[Row, ...] | Row, int] = {}
 
-    def add(self, part: WindowedPart) -> int:
+    def add_clauses(self, clauses: Clauses) -> int:
+        """Add a part that is made of signals, after the part beside it, and return its number."""
+        beside = NOTHING if clauses.beside is None else self.add(clauses.beside)
+        own = (clauses.ending, clauses.lower, clauses.upper, int(clauses.is_minimum), beside)
+        if own not in self._built:
+            self._built[own] = len(self.part_rows)
+            end = len(self.node_rows)
+            row = (end, end, 0, 0, self.table_size, self.cells, codes.CLAUSES, 0, 0, *own)
+            self.part_rows.append(row)
+        return self._built[own]
+
+    def add(self, part: PartRows) -> int:
         """Add a part and return its number."""
         rows = part.rows()
         if rows in self._built:
@@ -118,9 +134,10 @@ class _Parts:
                 part.tables,
                 self.table_size,
                 self.cells,
-                int(part.is_flat),
+                codes.TABLE if part.is_flat else codes.WINDOWED,
                 int(part.is_remembering),
                 part.end_corner,
+                *[NOTHING] * 5,
             )
         )
         self.node_rows.extend(rows)

@@ -11,7 +11,7 @@ import numpy as np
 
 from spatial_replay.compiled import inlined, piece
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.online.codes import CHANNELS, HISTORICALLY, ONCE, SAMPLES
+from spatial_replay.monitor.online.codes import BEGUN, CHANNELS, HISTORICALLY, ONCE, SAMPLES
 from spatial_replay.monitor.online.program import Program
 
 TILE = 256
@@ -31,9 +31,10 @@ class Memory(NamedTuple):
         stamps: (room,), their times in ns.
         running: (CHANNELS, S), every signal at the last sample.
         firsts: (CHANNELS, S), every signal at the first sample.
-        wedges: (W, CHANNELS, room), for each sliding window a ring of positions.
-        wedge_ends: (W, CHANNELS, 2), how many positions ever left and entered it.
-        wedge_next: (W,), the next position to enter.
+        wedges: (W, CHANNELS, room), for each signal with a ring its positions.
+        wedge_ends: (W, CHANNELS, 4), how many positions ever left and entered it, and the next ones to come.
+        wedge_next: (W,), the next position to enter a sliding window.
+        heights: (B, CHANNELS, 3, room), numbers beside the positions of the first rings.
         tables: (CHANNELS, ...), the parts' tables (see `tables`).
         cells: the parts' bookkeeping (see `windows`).
     """
@@ -45,6 +46,7 @@ class Memory(NamedTuple):
     wedges: Integers
     wedge_ends: Integers
     wedge_next: Integers
+    heights: Floats
     tables: Floats
     cells: Integers
 
@@ -92,8 +94,9 @@ def first_memory(program: Program, room: int) -> Memory:
         running=np.zeros((CHANNELS, signals)),
         firsts=np.zeros((CHANNELS, signals)),
         wedges=np.zeros((program.windows, CHANNELS, room), np.int64),
-        wedge_ends=np.zeros((program.windows, CHANNELS, 2), np.int64),
+        wedge_ends=np.zeros((program.windows, CHANNELS, 4), np.int64),
         wedge_next=np.zeros(program.windows, np.int64),
+        heights=np.zeros((int(np.isin(program.signals[:, 0], BEGUN).sum()), CHANNELS, 3, room)),
         tables=np.zeros((CHANNELS, program.table_size)),
         cells=cells,
     )
@@ -125,30 +128,40 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
 def widen(memory: Memory, before: int) -> None:
     """Copy into each new channel the state of the one of the `before` channels that it was equal to."""
     by_channel = (memory.running, memory.firsts, memory.tables, memory.history)
-    by_window = (memory.wedges.swapaxes(0, 1), memory.wedge_ends.swapaxes(0, 1))
+    rings = (memory.wedges, memory.wedge_ends, memory.heights)
+    by_window = (ring.swapaxes(0, 1) for ring in rings)
     for state in (*by_channel, *by_window):
         if before == 1:
             state[1] = state[0]
         state[2:] = state[:2]
 
 
-def forget(memory: Memory, moved: int, used: int) -> None:
-    """Drop the oldest `moved` of `used` recent samples."""
+def forget(memory: Memory, moved: int, used: int, channels: int) -> None:
+    """Drop the oldest `moved` of `used` recent samples, in the channels in use."""
     memory.stamps[: used - moved] = memory.stamps[moved:used].copy()
-    memory.history[:, :, : used - moved] = memory.history[:, :, moved:used].copy()
+    history = memory.history[:channels]
+    history[:, :, : used - moved] = history[:, :, moved:used].copy()
 
 
-def doubled(memory: Memory) -> Memory:
-    """Return the memory with twice the room for recent samples."""
+def doubled(memory: Memory, channels: int) -> Memory:
+    """Return the memory with twice the room for recent samples; only channels in use take up memory."""
     old = len(memory.stamps)
+    history = np.zeros((*memory.history.shape[:2], 2 * old))
+    history[:channels, :, :old] = memory.history[:channels]
     wedges = np.zeros((*memory.wedges.shape[:2], 2 * old), np.int64)
-    for window, channel in np.ndindex(memory.wedges.shape[:2]):
-        entries = np.arange(*memory.wedge_ends[window, channel])
+    heights = np.zeros((*memory.heights.shape[:3], 2 * old))
+    for window, channel in np.ndindex(len(wedges), channels):
+        entries = np.arange(*memory.wedge_ends[window, channel, :2])
         wedges[window, channel, entries % (2 * old)] = memory.wedges[window, channel, entries % old]
+        if window < len(heights):
+            heights[window, channel][:, entries % (2 * old)] = memory.heights[window, channel][
+                :, entries % old
+            ]
     return memory._replace(
         stamps=np.concatenate((memory.stamps, np.zeros(old, np.int64))),
-        history=np.concatenate((memory.history, np.zeros_like(memory.history)), axis=2),
+        history=history,
         wedges=wedges,
+        heights=heights,
     )
 
 

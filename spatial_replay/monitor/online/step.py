@@ -18,17 +18,15 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.online.program import Program
+from spatial_replay.monitor.online.signals import step_signals
 from spatial_replay.monitor.online.state import (
     NUMBERS,
     TILE,
     Memory,
     Scratch,
-    behind,
     doubled,
-    first_behind,
     first_memory,
     forget,
-    past_value,
     scratch_for,
     widen,
 )
@@ -157,110 +155,6 @@ def report(
         final[n, 0], final[n, 1] = numbers[n, 6, count - 1] + 0.0, numbers[n, 7, count - 1] + 0.0
 
 
-@piece
-def step_signals(
-    signals: Integers, leaves: Floats, t: int, count: int, position: int, offset: int, memory: Memory
-) -> None:
-    """Add all signals over the samples t … t + count - 1 of `leaves`, in every channel, to the history.
-
-    Args:
-        position: of the first of these samples in the run; it stands at position - offset in the history.
-    """  # fmt: skip
-    begin = position - offset
-    history, stamps, running, wedge_next = memory.history, memory.stamps, memory.running, memory.wedge_next
-    channels = leaves.shape[0]
-    for s in range(signals.shape[0]):
-        code, a, b = signals[s, 0], signals[s, 1], signals[s, 2]
-        for channel in range(channels):
-            mirror = channel ^ 1 if channels > 1 else channel
-            target = history[channel, s, begin : begin + count]
-            first = history[channel, a, begin : begin + count]
-            second = history[channel, b, begin : begin + count]
-            if code == codes.LEAF:
-                for k in range(count):
-                    target[k] = leaves[channel, a, t + k]
-            elif code == codes.CONSTANT:
-                for k in range(count):
-                    target[k] = signals[s, 4] * np.inf
-            elif code == codes.NOT:
-                for k in range(count):
-                    target[k] = -history[mirror, a, begin + k]
-            elif code == codes.AND:
-                for k in range(count):
-                    target[k] = min(first[k], second[k])
-            elif code == codes.OR:
-                for k in range(count):
-                    target[k] = max(first[k], second[k])
-            elif code in (codes.ONCE, codes.HISTORICALLY, codes.SINCE):
-                _run_past(code, first, second, target, running[channel, s], position == 0)
-            elif code == codes.DELAY:
-                for k in range(count):
-                    source = behind(stamps, offset, position + k, signals[s, 3], signals[s, 4])
-                    if source >= offset:
-                        target[k] = history[channel, a, source - offset]
-                    else:
-                        target[k] = signals[s, 5] * np.inf
-            else:
-                _slide(
-                    signals[s], history[channel, a], target, position, offset, count, stamps,
-                    memory.wedges[signals[s, 6], channel], memory.wedge_ends[signals[s, 6], channel],
-                    wedge_next[signals[s, 6]],
-                )  # fmt: skip
-            running[channel, s] = target[count - 1]
-            if position == 0:
-                memory.firsts[channel, s] = target[0]
-        if code in (codes.WINDOW_MAX, codes.WINDOW_MIN):
-            newest = behind(stamps, offset, position + count - 1, signals[s, 3], signals[s, 4])
-            wedge_next[signals[s, 6]] = max(wedge_next[signals[s, 6]], newest + 1)
-
-
-@piece
-def _run_past(code: int, first: Floats, second: Floats, target: Floats, before: float, starts: bool) -> None:
-    """Run an unbounded once, historically or since, from its value at the previous sample."""
-    value = before
-    if starts:
-        value = np.inf if code == codes.HISTORICALLY else -np.inf
-    for k in range(len(target)):
-        value = past_value(code, first[k], second[k], value)
-        target[k] = value
-
-
-@piece
-def _slide(
-    signal: Integers,
-    source: Floats,
-    target: Floats,
-    position: int,
-    offset: int,
-    count: int,
-    stamps: Integers,
-    wedge: Integers,
-    ends: Integers,
-    entering: int,
-) -> None:
-    """Compute an extremum over a sliding window, with a wedge of the positions that can still attain it.
-
-    The wedge is a ring; `ends` counts the positions that ever left and entered it.
-    """  # fmt: skip
-    sign = 1.0 if signal[0] == codes.WINDOW_MAX else -1.0
-    size = wedge.shape[0]
-    head, tail = ends[0], ends[1]
-    for k in range(count):
-        newest = behind(stamps, offset, position + k, signal[3], signal[4])
-        while entering <= newest:
-            value = sign * source[entering - offset]
-            while tail > head and sign * source[wedge[(tail - 1) % size] - offset] <= value:
-                tail -= 1
-            wedge[tail % size] = entering
-            tail += 1
-            entering += 1
-        oldest = first_behind(stamps, offset, position + k, signal[3], signal[5])
-        while tail > head and wedge[head % size] < oldest:
-            head += 1
-        target[k] = source[wedge[head % size] - offset] if tail > head else -sign * np.inf
-    ends[0], ends[1] = head, tail
-
-
 class Tables(NamedTuple):
     """A program's tables (see `Program`)."""
 
@@ -311,7 +205,7 @@ def step_with_windows(
     step_tables(tables.nodes, tables.parts, memory, scratch, channels, position, start_ns, begin, count)
     for p in range(len(tables.parts)):
         part = tables.parts[p]
-        if not part[codes.PART_IS_FLAT]:
+        if part[codes.PART_KIND] == codes.WINDOWED:
             step_windows(
                 tables.nodes, part, memory, scratch, channels, position, offset, count, scratch.parts[p]
             )
@@ -340,7 +234,8 @@ class OnlineRun:
         self._scratch = scratch_for(program, room, tile)
         self._final = np.zeros((len(program.reports), 2))
         self._tables = Tables.of(program)
-        self._take_in = step if program.parts[:, codes.PART_IS_FLAT].all() else step_with_windows
+        has_windows = (program.parts[:, codes.PART_KIND] == codes.WINDOWED).any()
+        self._take_in = step_with_windows if has_windows else step
         self._channels = 1
         self._position = 0
         self._offset = 0
@@ -400,9 +295,9 @@ class OnlineRun:
             last = self._position - 1
             keep = kept_from(signals, nodes, parts, self._memory, self._scratch, self._offset, last)
             if 2 * (keep - self._offset) >= room:
-                forget(self._memory, keep - self._offset, used)
+                forget(self._memory, keep - self._offset, used, self._channels)
                 self._offset = keep
             elif used == room:
-                self._memory = doubled(self._memory)
+                self._memory = doubled(self._memory, self._channels)
                 self._scratch = scratch_for(self._program, 2 * room, self._tile)
         return min(wanted, len(self._memory.stamps) - (self._position - self._offset))

@@ -213,11 +213,32 @@ def _step_simple(
 
 
 @piece
+def _read_clauses(
+    part: Integers, memory: Memory, scratch: Scratch, channels: int, begin: int, count: int, numbers: Floats
+) -> None:
+    """Fill a part's numbers from its signals, joined with the part beside it, which comes before it."""
+    nominal_high = 1 if channels > 1 else 0
+    wide_low = 2 if channels > 2 else 0
+    beside, is_minimum = part[codes.PART_BESIDE], part[codes.PART_IS_MINIMUM]
+    for number in (0, 1, 4, 5, 6, 7):
+        signal = part[codes.PART_ENDING]
+        if number in (4, 5):
+            signal = part[codes.PART_LOWER] if number == 4 else part[codes.PART_UPPER]
+        channel = (0 if number < 2 else wide_low) + (nominal_high if number % 2 else 0)
+        for k in range(count):
+            value = memory.history[channel, signal, begin + k]
+            if beside >= 0:
+                other = scratch.parts[beside, number, k]
+                value = min(value, other) if is_minimum else max(value, other)
+            numbers[number, k] = value
+
+
+@piece
 def step_tables(
     nodes: Integers, parts: Integers, memory: Memory, scratch: Scratch, channels: int, position: int,
     start_ns: int, begin: int, count: int,
 ) -> None:  # fmt: skip
-    """Substitute samples into the tables of the parts without windows below their root.
+    """Substitute samples into the tables of the parts without windows, and read those that are signals.
 
     Args:
         position: of the first of the `count` samples; they stand at `begin` in the history.
@@ -228,7 +249,9 @@ def step_tables(
     ends, lows, highs = scratch.series[0], scratch.series[1], scratch.series[2]
     for p in range(parts.shape[0]):
         part, numbers = parts[p], scratch.parts[p]
-        if not part[codes.PART_IS_FLAT]:
+        if part[codes.PART_KIND] == codes.CLAUSES:
+            _read_clauses(part, memory, scratch, channels, begin, count, numbers)
+        if part[codes.PART_KIND] != codes.TABLE:
             continue
         for channel in range(channels):
             table = memory.tables[

@@ -365,6 +365,13 @@ def _tables_of(part: Integers, channel: int, memory: Memory) -> Floats:
     return memory.tables[channel, start : start + (part[codes.PART_TABLES] << part[codes.PART_VARIABLES])]
 
 
+@inlined
+def _is_settled(part: Integers, memory: Memory) -> bool:
+    """Return whether no later sample matters: every window from the first sample on has closed."""
+    without_state = part[codes.PART_VARIABLES] == 0 and not part[codes.PART_IS_REMEMBERING]
+    return bool(without_state and memory.cells[part[codes.PART_CELL_START]] > 0)
+
+
 @piece
 def step_windows(
     nodes: Integers, part: Integers, memory: Memory, scratch: Scratch, channels: int, position: int,
@@ -380,6 +387,11 @@ def step_windows(
     nodes_of_part = part[codes.PART_END] - part[codes.PART_FIRST]
     for k in range(count):
         last = position + k
+        if _is_settled(part, memory):
+            for which in range(NUMBERS):
+                channel = (0 if which < 4 else wide_low) + (nominal_high if which % 2 else 0)
+                numbers[which, k] = _tables_of(part, channel, memory)[0]
+            continue
         base = min(memory.cells[part[codes.PART_CELL_START]], last)
         reach(nodes, part, memory, scratch, base, last, offset, last)
         scratch.high[:nodes_of_part] = last
@@ -414,11 +426,11 @@ def kept_from(
         code, unit = signals[s, codes.SIGNAL_CODE], signals[s, codes.SIGNAL_UNIT]
         if code == codes.DELAY:
             keep = min(keep, behind(memory.stamps, offset, last, unit, signals[s, codes.SIGNAL_LOW]))
-        elif code in (codes.WINDOW_MAX, codes.WINDOW_MIN):
+        elif code in codes.RINGS:
             keep = min(keep, first_behind(memory.stamps, offset, last, unit, signals[s, codes.SIGNAL_HIGH]))
     for p in range(parts.shape[0]):
         part = parts[p]
-        if not part[codes.PART_IS_FLAT]:
+        if part[codes.PART_KIND] == codes.WINDOWED and not _is_settled(part, memory):
             base = min(memory.cells[part[codes.PART_CELL_START]], last)
             reach(nodes, part, memory, scratch, base, last, offset, last)
             for d in range(part[codes.PART_END] - part[codes.PART_FIRST]):

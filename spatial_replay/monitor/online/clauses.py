@@ -1,0 +1,277 @@
+"""Clauses: a part whose windows stand right below its root, as signals, at a constant cost for each sample.
+
+Take `G` over a body in negation normal form. As a conjunction of disjunctions, the body splits, since minima
+may be taken in any order: G (x and y) is G x and G y. So consider one clause, `max(p, window of b)`, whose
+*condition* p is without future operators, and the least of its responses over all positions i up to now.
+
+- *A window of the same kind*, `p or G[l,h] b`: min over i of max(p_i, min over j of b_j) is min over j of
+  max(b_j, min over the i whose window holds j of p_i). The inner minimum is over a window behind j.
+- *A window of the other kind*, `p or F[l,h] b`: what closed windows hold is settled, and b_j counts for all
+  windows that have begun and are open, so those over which it is the greatest so far form a single segment.
+
+With a left operand, `a R (…)`, p counts as the greater of p and every a before, and before the next sample,
+where what is open begins, that is all. `F` and `U` are the same upside down. Two windows in a clause, or a
+window below another, are none of this: they stay with `windows`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import reduce
+
+from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.operators import NOTHING, PartRows, Row, SignalTable
+
+MAX_CLAUSES = 16
+"""How many clauses a body may have, each a few signals; they may grow as 2**operators."""
+MAX_TABLE = 5
+"""How many unbounded operators may stand beside windows."""
+
+Clause = frozenset[int]
+"""Rows of a part that are joined by `or` below a weak root, by `and` below a strong one."""
+
+
+@dataclass(frozen=True)
+class Clauses:
+    """A part as signals.
+
+    Attributes:
+        ending: its value if the run ends here.
+        lower, upper: its value with the worst and the best continuation.
+        is_minimum: whether clauses are joined by the minimum: whether the root is `G` or `R`.
+        beside: those clauses that have no window, which are joined with the others.
+    """
+
+    ending: int
+    lower: int
+    upper: int
+    is_minimum: bool
+    beside: PartRows | None
+
+
+def clauses_of(signals: SignalTable, part: PartRows) -> Clauses | None:
+    """Return a part as clauses, for which signals are added; None if it has to be run as it is."""
+    code, left, body, is_weak, *_, is_variable = part.fields[-1]
+    if not is_variable or code not in (codes.UNTIL, codes.RELEASE) or part.is_flat:
+        return None
+    if left != NOTHING and part.fields[left][0] != codes.LITERAL:
+        return None
+    clauses = _normal_form(part.fields, body, is_weak=bool(is_weak))
+    if clauses is None:
+        return None
+    builder = _Builder(signals, part.fields, left, is_weak=bool(is_weak))
+    for clause in clauses:
+        if not builder.add(clause):
+            return None
+    return builder.result()
+
+
+def _normal_form(rows: tuple[Row, ...], body: int, *, is_weak: bool) -> list[Clause] | None:
+    """Return a body's clauses, without those that another one implies; None if they are too many."""
+    forms: list[list[Clause] | None] = []
+    for row, (code, a, b, *_) in enumerate(rows[: body + 1]):  # operands come first
+        if code not in (codes.PART_AND, codes.PART_OR):
+            forms.append([frozenset((row,))])
+            continue
+        first, second = forms[a], forms[b]
+        if first is None or second is None:
+            forms.append(None)
+            continue
+        if (code == codes.PART_AND) == is_weak:
+            both = first + second
+        else:
+            both = [one | other for one in first for other in second]
+        distinct = list(dict.fromkeys(both))
+        needed = [each for each in distinct if not any(other < each for other in distinct)]
+        forms.append(needed if len(needed) <= MAX_CLAUSES else None)
+    return forms[body]
+
+
+class _Builder:
+    """Collects the signals of one part, clause by clause."""
+
+    def __init__(self, signals: SignalTable, rows: tuple[Row, ...], left: int, *, is_weak: bool) -> None:
+        self._signals = signals
+        self._rows = rows
+        self._left = left
+        self._is_weak = is_weak
+        self._both, self._either = (codes.AND, codes.OR) if is_weak else (codes.OR, codes.AND)
+        self._running, self._before = (
+            (codes.HISTORICALLY, codes.ONCE) if is_weak else (codes.ONCE, codes.HISTORICALLY)
+        )
+        self._window = codes.WINDOW_MIN if is_weak else codes.WINDOW_MAX
+        self._same, self._other = (
+            (codes.PART_WINDOW_MIN, codes.PART_WINDOW_MAX)
+            if is_weak
+            else (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN)
+        )
+        # by clause: settled whatever comes, if the run ends here, and as bad as it may come
+        self._settled: list[int] = []
+        self._ending: list[int] = []
+        self._open: list[int] = []
+        self._tabled: list[Clause] = []
+
+    def add(self, clause: Clause) -> bool:
+        """Add a clause; return whether there is a rule for it."""
+        rows = self._rows
+        literals = sorted(each for each in clause if rows[each][0] == codes.LITERAL)
+        others = sorted(clause.difference(literals), key=lambda each: rows[each][0])
+        condition = self._condition(literals)
+        if not others:
+            self._add_same(self._signals.row(self._running, condition))
+            return True
+        if len(others) == 1 and rows[others[0]][0] in (self._same, self._other):
+            return self._add_window(condition, rows[others[0]])
+        if all(self._unbounded(each) is not None for each in others):
+            self._tabled.append(clause)
+            return True
+        return self._add_release(condition, [rows[each] for each in others])
+
+    def result(self) -> Clauses | None:
+        """Return what was added; None if there was no window or if the table beside would be too large."""
+        beside = self._table() if self._tabled else None
+        if not self._ending or (beside is not None and beside.variables > MAX_TABLE):
+            return None
+        ending, settled = self._joined(self._ending), self._joined(self._settled)
+        if self._left == NOTHING:
+            last = self._nothing()
+        else:  # what is open may begin with the next sample
+            last = self._joined([*self._open, self._signals.row(self._before, self._literal(self._left))])
+        lower, upper = (last, settled) if self._is_weak else (settled, last)
+        return Clauses(ending, lower, upper, self._is_weak, beside)
+
+    def _add_window(self, condition: int, window: Row) -> bool:
+        code, operand, _, _, unit, low, high, *_ = window
+        if self._rows[operand][0] != codes.LITERAL:
+            return False
+        number = self._literal(operand)
+        if code == self._same:
+            behind = self._signals.row(self._window, condition, 0, unit, low, high)
+            self._add_joined(behind, number, condition, (unit, low, high))
+            return True
+        kind = codes.CLOSED_MIN_OF_MAX if self._is_weak else codes.CLOSED_MAX_OF_MIN
+        closed = self._signals.row(kind, condition, number, unit, low, high)
+        begun = codes.BEGUN_MIN if self._is_weak else codes.BEGUN_MAX
+        ending = [closed, self._signals.row(begun, condition, number, unit, low, high)]
+        if low > 0:
+            ending.append(self._signals.row(self._window, condition, 0, unit, 0, low - 1))
+        self._settled.append(closed)
+        self._ending.append(self._joined(ending))
+        self._open.append(self._ending[-1])
+        return True
+
+    def _add_joined(self, behind: int, number: int, condition: int, window: tuple[int, int, int]) -> None:
+        """Add a clause by what its conditions are, together, where its window holds each number."""
+        value = self._signals.row(self._running, self._signals.row(self._either, behind, number))
+        if self._left == NOTHING:
+            self._add_same(value)
+            return
+        unit, low, high = window
+        kind = codes.CLOSED_MIN_OF_MIN if self._is_weak else codes.CLOSED_MAX_OF_MAX
+        open_ = [self._signals.row(kind, condition, number, unit, low, high)]
+        if high > 0:
+            open_.append(self._signals.row(self._window, condition, 0, unit, 0, high - 1))
+        self._settled.append(value)
+        self._ending.append(value)
+        self._open.append(self._joined(open_))
+
+    def _add_same(self, value: int) -> None:
+        for each in (self._settled, self._ending, self._open):
+            each.append(value)
+
+    def _add_release(self, condition: int, others: list[Row]) -> bool:
+        """Add a clause with a release over a window (an until, below a strong root), as it is expanded.
+
+        At i that is min over j of max(b_j, greatest a from i to before j), so that all conditions together
+        are, at j, a trigger over the window behind.
+        """
+        windows = [row for row in others if row[0] == self._same]
+        shifts = [row for row in others if row[0] == codes.SHIFT]
+        if len(windows) != 1 or len(shifts) != 1 or self._left != NOTHING:
+            return False
+        _, operand, _, _, unit, low, high, *_ = windows[0]
+        release = self._rows[shifts[0][1]]
+        code, a, b = release[:3]
+        kind = codes.RELEASE if self._is_weak else codes.UNTIL
+        if (code, b, release[7]) != (kind, operand, 0) or shifts[0][4:7] != (unit, low, high):
+            return False
+        # as long as the window has not begun
+        expected = (self._other, a, 0, 1 - release[3], unit, 0, low - 1, 0)
+        if [row for row in others if row not in (windows[0], shifts[0])] != ([expected] if low > 0 else []):
+            return False
+        if {self._rows[each][0] for each in (a, b)} != {codes.LITERAL}:
+            return False
+        earlier = self._signals.delay(self._literal(a), codes.SAMPLES, 1)
+        if self._is_weak:
+            earlier, condition = (self._signals.row(codes.NOT, each) for each in (earlier, condition))
+        behind = self._signals.since(earlier, condition, unit, low, high)
+        if self._is_weak:
+            behind = self._signals.row(codes.NOT, behind)
+        self._add_joined(behind, self._literal(b), condition, (unit, low, high))
+        return True
+
+    def _condition(self, literals: list[int]) -> int:
+        found = [self._literal(each) for each in literals]
+        if self._left != NOTHING:
+            before = self._signals.row(self._before, self._literal(self._left))
+            # what stands before the first sample is the least that it can be
+            found.append(self._signals.delay(before, codes.SAMPLES, 1, is_weak=not self._is_weak))
+        return reduce(
+            lambda one, other: self._signals.row(self._either, one, other), found or [self._nothing()]
+        )
+
+    def _literal(self, row: int) -> int:
+        _, signal, is_negated = self._rows[row][:3]
+        return self._signals.row(codes.NOT, signal) if is_negated else signal
+
+    def _nothing(self) -> int:
+        return self._signals.row(codes.CONSTANT, low=-1 if self._is_weak else 1)
+
+    def _joined(self, values: list[int]) -> int:
+        return reduce(lambda one, other: self._signals.row(self._both, one, other), values)
+
+    def _unbounded(self, row: int) -> Row | None:
+        """Return an until or a release of literals without a window; None for anything else.
+
+        One with a window is expanded to the extremum over it, and the same operator without. Where the first
+        holds, it makes no difference how the second goes on behind the window.
+        """
+        code, a, _, _, _, low, *_ = self._rows[row]
+        if code == codes.SHIFT and low == 0:
+            code = self._rows[a][0]
+            kind = codes.UNTIL if self._is_weak else codes.RELEASE
+            if code != kind:
+                return None
+            row = a
+        elif code not in (codes.UNTIL, codes.RELEASE) or not self._rows[row][-1]:
+            return None
+        fields = self._rows[row]
+        operands = [each for each in fields[1:3] if each != NOTHING]
+        return fields if all(self._rows[each][0] == codes.LITERAL for each in operands) else None
+
+    def _table(self) -> PartRows:
+        """Return the clauses without a window as a part of their own, under the same root."""
+        part = PartRows()
+
+        def literal(row: int) -> int:
+            if row == NOTHING:
+                return NOTHING
+            _, signal, is_negated = self._rows[row][:3]
+            return part.row(codes.LITERAL, signal, is_negated)
+
+        def added(row: int) -> int:
+            operator = self._unbounded(row) if self._rows[row][0] != codes.LITERAL else None
+            if operator is None:
+                return literal(row)
+            code, a, b, weak, *_ = operator
+            return part.row(code, literal(a), literal(b), weak, variable=True)
+
+        both, either = (codes.PART_AND, codes.PART_OR) if self._is_weak else (codes.PART_OR, codes.PART_AND)
+        bodies = [
+            reduce(lambda one, other: part.row(either, one, other), map(added, sorted(clause)))
+            for clause in self._tabled
+        ]
+        body = reduce(lambda one, other: part.row(both, one, other), bodies)
+        root = codes.RELEASE if self._is_weak else codes.UNTIL
+        part.row(root, literal(self._left), body, int(self._is_weak), variable=True)
+        return part

@@ -1,0 +1,225 @@
+"""Signals: subformulas without future operators, and what clauses say of positions that are behind.
+
+The robustness of a subformula without a future operator is final with its sample. So it is computed
+forwards, once, with a little state for past operators; and so is what the clauses of a part are made of (see
+`clauses`): the least or the greatest response of the positions up to the sample.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spatial_replay.compiled import inlined, piece
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.state import Memory, behind, first_behind, is_closed, past_value
+
+
+@piece
+def step_signals(
+    signals: Integers, leaves: Floats, t: int, count: int, position: int, offset: int, memory: Memory
+) -> None:
+    """Add all signals over the samples t … t + count - 1 of `leaves`, in every channel, to the history.
+
+    Args:
+        position: of the first of these samples in the run; it stands at position - offset in the history.
+    """  # fmt: skip
+    begin = position - offset
+    history, stamps, running, wedge_next = memory.history, memory.stamps, memory.running, memory.wedge_next
+    channels = leaves.shape[0]
+    for s in range(signals.shape[0]):
+        code, a, b = signals[s, 0], signals[s, 1], signals[s, 2]
+        for channel in range(channels):
+            mirror = channel ^ 1 if channels > 1 else channel
+            target = history[channel, s, begin : begin + count]
+            first = history[channel, a, begin : begin + count]
+            second = history[channel, b, begin : begin + count]
+            if code == codes.LEAF:
+                for k in range(count):
+                    target[k] = leaves[channel, a, t + k]
+            elif code == codes.CONSTANT:
+                for k in range(count):
+                    target[k] = signals[s, 4] * np.inf
+            elif code == codes.NOT:
+                for k in range(count):
+                    target[k] = -history[mirror, a, begin + k]
+            elif code == codes.AND:
+                for k in range(count):
+                    target[k] = min(first[k], second[k])
+            elif code == codes.OR:
+                for k in range(count):
+                    target[k] = max(first[k], second[k])
+            elif code in (codes.ONCE, codes.HISTORICALLY, codes.SINCE):
+                _run_past(code, first, second, target, running[channel, s], position == 0)
+            elif code == codes.DELAY:
+                for k in range(count):
+                    source = behind(stamps, offset, position + k, signals[s, 3], signals[s, 4])
+                    if source >= offset:
+                        target[k] = history[channel, a, source - offset]
+                    else:
+                        target[k] = signals[s, 5] * np.inf
+            elif code in codes.BEGUN:
+                ring = signals[s, 6]
+                _gather_begun(
+                    signals[s], history[channel, a], history[channel, b], target, position, offset, count,
+                    stamps, memory.wedges[ring, channel], memory.heights[ring, channel],
+                    memory.wedge_ends[ring, channel],
+                )  # fmt: skip
+            elif code in codes.CLOSED:
+                ring = signals[s, 6]
+                _gather_closed(
+                    signals[s], history[channel, a], history[channel, b], target, position, offset, count,
+                    stamps, memory.wedges[ring, channel], memory.wedge_ends[ring, channel],
+                    running[channel, s],
+                )  # fmt: skip
+            else:
+                _slide(
+                    signals[s], history[channel, a], target, position, offset, count, stamps,
+                    memory.wedges[signals[s, 6], channel], memory.wedge_ends[signals[s, 6], channel],
+                    wedge_next[signals[s, 6]],
+                )  # fmt: skip
+            running[channel, s] = target[count - 1]
+            if position == 0:
+                memory.firsts[channel, s] = target[0]
+        if code in (codes.WINDOW_MAX, codes.WINDOW_MIN):
+            newest = behind(stamps, offset, position + count - 1, signals[s, 3], signals[s, 4])
+            wedge_next[signals[s, 6]] = max(wedge_next[signals[s, 6]], newest + 1)
+
+
+@piece
+def _run_past(code: int, first: Floats, second: Floats, target: Floats, before: float, starts: bool) -> None:
+    """Run an unbounded once, historically or since, from its value at the previous sample."""
+    value = before
+    if starts:
+        value = np.inf if code == codes.HISTORICALLY else -np.inf
+    for k in range(len(target)):
+        value = past_value(code, first[k], second[k], value)
+        target[k] = value
+
+
+@piece
+def _slide(
+    signal: Integers,
+    source: Floats,
+    target: Floats,
+    position: int,
+    offset: int,
+    count: int,
+    stamps: Integers,
+    wedge: Integers,
+    ends: Integers,
+    entering: int,
+) -> None:
+    """Compute an extremum over a sliding window, with a wedge of the positions that can still attain it.
+
+    The wedge is a ring; `ends` counts the positions that ever left and entered it.
+    """  # fmt: skip
+    sign = 1.0 if signal[0] == codes.WINDOW_MAX else -1.0
+    size = wedge.shape[0]
+    head, tail = ends[0], ends[1]
+    for k in range(count):
+        newest = behind(stamps, offset, position + k, signal[3], signal[4])
+        while entering <= newest:
+            value = sign * source[entering - offset]
+            while tail > head and sign * source[wedge[(tail - 1) % size] - offset] <= value:
+                tail -= 1
+            wedge[tail % size] = entering
+            tail += 1
+            entering += 1
+        oldest = first_behind(stamps, offset, position + k, signal[3], signal[5])
+        while tail > head and wedge[head % size] < oldest:
+            head += 1
+        target[k] = source[wedge[head % size] - offset] if tail > head else -sign * np.inf
+    ends[0], ends[1] = head, tail
+
+
+@inlined
+def _apart(stamps: Integers, offset: int, unit: int, position: int, later: int) -> int:
+    """Return how far a position is ahead of another, in the unit of a window."""
+    return later - position if unit == codes.SAMPLES else stamps[later - offset] - stamps[position - offset]
+
+
+@piece
+def _gather_closed(
+    signal: Integers, conditions: Floats, source: Floats, target: Floats, position: int, offset: int,
+    count: int, stamps: Integers, wedge: Integers, state: Integers, before: float,
+) -> None:  # fmt: skip
+    """Compute the extremum of the responses of all positions whose window ahead has closed.
+
+    The wedge is that of a sliding window, which moves on to the next position as soon as its window closes.
+    """  # fmt: skip
+    code, unit, near, far = signal[0], signal[3], signal[4], signal[5]
+    is_least = code in (codes.CLOSED_MIN_OF_MAX, codes.CLOSED_MIN_OF_MIN)
+    sign = 1.0 if code in (codes.CLOSED_MIN_OF_MAX, codes.CLOSED_MAX_OF_MAX) else -1.0
+    size = wedge.shape[0]
+    head, tail, asking, entering = state[0], state[1], state[2], state[3]
+    value = before
+    if position == 0:
+        value = np.inf if is_least else -np.inf
+    for k in range(count):
+        last = position + k
+        while asking <= last and is_closed(stamps, offset, last, asking, unit, far):
+            # what lies before `asking` may be forgotten already
+            while tail > head and (
+                wedge[head % size] < asking or _apart(stamps, offset, unit, asking, wedge[head % size]) < near
+            ):
+                head += 1
+            while entering <= last and _apart(stamps, offset, unit, asking, entering) <= far:
+                if _apart(stamps, offset, unit, asking, entering) >= near:
+                    number = sign * source[entering - offset]
+                    while tail > head and sign * source[wedge[(tail - 1) % size] - offset] <= number:
+                        tail -= 1
+                    wedge[tail % size] = entering
+                    tail += 1
+                entering += 1
+            found = source[wedge[head % size] - offset] if tail > head else -sign * np.inf
+            condition = conditions[asking - offset]
+            value = min(value, max(condition, found)) if is_least else max(value, min(condition, found))
+            asking += 1
+        target[k] = value
+    state[0], state[1], state[2], state[3] = head, tail, asking, entering
+
+
+@piece
+def _gather_begun(
+    signal: Integers, conditions: Floats, source: Floats, target: Floats, position: int, offset: int,
+    count: int, stamps: Integers, wedge: Integers, heights: Floats, state: Integers,
+) -> None:  # fmt: skip
+    """Compute the extremum of the responses of the positions whose window has begun and is still open.
+
+    Positions for which the same number of `source` counts so far lie side by side: they make one segment,
+    and a new number joins all those segments that it outdoes. So `wedge` holds the newest position of each
+    segment, and `heights` its number, the extremum of its conditions, and that of all responses up to it.
+    Positions that have closed may stay in a segment: what is found for them later never outdoes their
+    own response, which `_gather_closed` holds.
+    """  # fmt: skip
+    unit, near, far = signal[3], signal[4], signal[5]
+    is_least = signal[0] == codes.BEGUN_MIN
+    sign = 1.0 if is_least else -1.0
+    size = wedge.shape[0]
+    bottom, top, asking = state[0], state[1], state[2]
+    for k in range(count):
+        last = position + k
+        newest, condition = -1, sign * np.inf
+        while asking <= last and _apart(stamps, offset, unit, asking, last) >= near:
+            number = conditions[asking - offset]
+            condition = min(condition, number) if is_least else max(condition, number)
+            newest = asking
+            asking += 1
+        found = source[last - offset]
+        while top > bottom and sign * found >= sign * heights[0, (top - 1) % size]:
+            top -= 1
+            number = heights[1, top % size]
+            condition = min(condition, number) if is_least else max(condition, number)
+            newest = max(newest, wedge[top % size])
+        if newest >= 0:
+            below = heights[2, (top - 1) % size] if top > bottom else sign * np.inf
+            response = max(condition, found) if is_least else min(condition, found)
+            wedge[top % size] = newest
+            heights[0, top % size], heights[1, top % size] = found, condition
+            heights[2, top % size] = min(below, response) if is_least else max(below, response)
+            top += 1
+        while top > bottom and is_closed(stamps, offset, last, wedge[bottom % size], unit, far):
+            bottom += 1
+        target[k] = heights[2, (top - 1) % size] if top > bottom else sign * np.inf
+    state[0], state[1], state[2] = bottom, top, asking
