@@ -45,7 +45,7 @@ function drawAutomaton(automaton) {
   const places = new Map(automaton.states.map((state) => [state.number, place(state)]));
   const rows = automaton.states.map((state) => place(state)[1]);
   const columns = automaton.states.map((state) => place(state)[0]);
-  const low = Math.min(...rows) - 52, high = Math.max(...rows) + 44, wide = Math.max(...columns);
+  const low = Math.min(...rows) - 62, high = Math.max(...rows) + 44, wide = Math.max(...columns);
   const moves = automaton.moves.filter((move) => move.source !== move.target).map((move) => ({
     ...move,
     made: svg("path", {class: "move", d: curve(places.get(move.source), places.get(move.target)),
@@ -70,17 +70,21 @@ function tip(id) {
 
 const LONGEST_LABEL = 18;
 
-// The guard of a move, with short names for long propositions, at the middle of its curve.
+// The guard of a move, with short names for long propositions, beside its curve.
 function labelOf({source, target, label, guard}, places) {
   if (!label) return null;
-  const [x, y] = middleOf(places.get(source), places.get(target));
+  const [x, y] = placeOfGuard(places.get(source), places.get(target));
   const text = label.length > LONGEST_LABEL ? `${label.slice(0, LONGEST_LABEL - 1)}…` : label;
   return svg("text", {class: "guard", x, y, "text-anchor": "middle", dy: "-0.3em"}, text, svg("title", {}, guard));
 }
 
-function middleOf([x0, y0], [x1, y1]) {
+function placeOfGuard([x0, y0], [x1, y1]) {
   const [cx, cy] = controlOf([x0, y0], [x1, y1]);
-  return [(x0 + 2 * cx + x1) / 4, (y0 + 2 * cy + y1) / 4];
+  // labels of curves beside each other are not one above the other
+  const spans = Math.round((x1 - x0) / COLUMN);
+  const share = spans === 1 ? 0.5 : spans % 2 ? 0.5 : 0.4, rest = 1 - share;
+  const along = (from, by, to) => rest * rest * from + 2 * rest * share * by + share * share * to;
+  return [along(x0, cx, x1), along(y0, cy, y1)];
 }
 
 // From rim to rim; moves over several columns, back, or within a column go around what stands between.
@@ -134,7 +138,8 @@ function describe(automaton, states) {
     parts.push(element("p", {}, element("b", {}, `State ${number}`), `: ${state.about}.`));
     const moves = automaton.moves.filter((move) => move.source === number);
     parts.push(element("ul", {}, ...moves.map((move) => element("li", {},
-      move.target === number ? "stays if " : `to ${move.target} if `, element("code", {}, move.guard)))));
+      move.target === number ? "stays if " : `to ${move.target} if `,
+      element("code", {title: move.guard}, move.label ?? move.guard)))));
   }
   if (automaton.left_out) parts.push(element("p", {class: "quiet"}, `${automaton.left_out} states are not drawn.`));
   return states.length > 1
