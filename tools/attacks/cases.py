@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import random
-import resource
 import time
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
@@ -94,7 +93,9 @@ def run_case(attack: Attack, case: Case, *, is_timed: bool) -> Outcome:
 
 def memory_bytes() -> int:
     """Return the most memory that this process has held."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    # what `getrusage` returns is inherited from the process that started this one
+    status = Path("/proc/self/status").read_text()
+    return int(status.partition("VmHWM:")[2].split()[0]) * 1024
 
 
 def _timed(attack: Attack, case: Case) -> tuple[Outcome, float]:
