@@ -124,7 +124,7 @@ def test_a_recorder_and_a_replay_give_the_same_results(replay: tuple[Trace, Spec
 
 
 def by_topic(messages: Sequence[tuple[str, int, int, int, bytes]]) -> list[tuple[str, int, int, int, bytes]]:
-    """Messages topic by topic: a recorder writes a sample before it evaluates it, a replay what it read last."""
+    """Messages topic by topic: a recorder writes a sample before its verdicts, a replay after them."""
     return sorted(messages, key=lambda each: each[0])
 
 
