@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import math
 import time
 from collections.abc import AsyncIterator, Sequence
@@ -153,6 +154,8 @@ class LiveSession:
         client = Client(self._address, self._wants, inbox, self._record)
         listening = asyncio.create_task(client.run())
         listening.add_done_callback(lambda _: inbox.filled.set())
+        # all that is loaded by now stays: to look through it for garbage would keep samples waiting
+        gc.freeze()
         try:
             while not (self._stopped or self.failure):
                 await self._wait(inbox)

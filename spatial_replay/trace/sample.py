@@ -87,7 +87,8 @@ class Sample:
             _require_name(name, "an object")
             if name in objects:
                 raise TraceError(f"object {name!r} is both known and unknown; give it once")
-            if class_name is not None:
+            # a class may be empty, as that of a tracked object
+            if class_name not in (None, ""):
                 _require_name(class_name, "a class")
         object.__setattr__(self, "objects", MappingProxyType(objects))
         object.__setattr__(self, "unknown", MappingProxyType(dict(self.unknown)))
