@@ -36,6 +36,7 @@ spec reach = F (cup enclosedin goal)
 spec apart = G (cup dist jug >= 0 -> F[0, 2] cup leftof jug)
 spec timed = G[0s, 2s] (cup oriented[1] jug) and H[0, 2] (cup farfrom[0.1] jug[-1])
 spec open = G (forall x in things: x dist goal >= 0) and (load >= 1) U[0, 3] (cup touch[1] jug)
+spec nested = G (F[0, 2] G[0, 1] (cup ovlp jug))
 """
 _PAPER = "region goal = box(0, 0, 4, 4)\nspec reach = (F (cup enclosedin goal)) and G[0, 2] (cup ovlp jug)"
 
