@@ -171,15 +171,15 @@ class Monitor:
         self._live = LiveStream(specification, checked, start_ns or 0)
         self._violations = ViolationLog(specification, start_ns or 0) if checked == "ltlf" else None
         self._last_ns: int | None = None
-        self._robustness = [float("nan")] * len(self._specs)
+        self._numbers: list[Floats | None] = [None] * len(self._specs)
 
     def endings(self) -> tuple[Ending, ...]:
         """Return the result of each spec if the run ends here; unknown before the first sample."""
         return tuple(
-            Ending(spec, Verdict.UNKNOWN, robustness, float("-inf"), float("inf"))
+            Ending(spec, Verdict.UNKNOWN, _robustness(last), float("-inf"), float("inf"))
             if final is None
-            else Ending(spec, final_verdict(*final[0].tolist()), robustness, *final[0].tolist())
-            for spec, final, robustness in zip(self._specs, self._live.finals, self._robustness, strict=True)
+            else Ending(spec, final_verdict(*final[0].tolist()), _robustness(last), *final[0].tolist())
+            for spec, final, last in zip(self._specs, self._live.finals, self._numbers, strict=True)
         )
 
     def update(self, sample: Sample) -> Update:
@@ -197,8 +197,7 @@ class Monitor:
                 f"a sample at {at} follows one at {last}; give samples in the order of their times"
             )
         self._last_ns = sample.time_ns
-        numbers = list(map(_read_only, self._live.extend(sample)))
-        self._robustness = [float("nan") if each is None else float(each[0, 0]) for each in numbers]
+        self._numbers = numbers = list(map(_read_only, self._live.extend(sample)))
         specs = tuple(map(SpecUpdate, self._specs, numbers, self._names))
         if self._violations is None:
             return Update(sample.time_ns, specs, self._places)
@@ -214,6 +213,10 @@ def _places_of_names(names: tuple[tuple[str | None, ...], ...]) -> Mapping[str, 
             if name is not None:
                 places.setdefault(name, (index, identifier))
     return MappingProxyType(places)
+
+
+def _robustness(numbers: Floats | None) -> float:
+    return float("nan") if numbers is None else float(numbers[0, 0])
 
 
 def _read_only(numbers: Floats | None) -> Floats | None:
