@@ -79,7 +79,10 @@ _MEANT_SIGNS: Mapping[str, str] = MappingProxyType(
         ),
     }
 )
-_LENGTHS = frozenset({"m", "cm", "mm", "km", "um", "in", "ft", "px"})
+_LENGTHS: Mapping[str, float] = MappingProxyType(
+    {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
+)
+"""Units of length, in metres."""
 _TIMES: Mapping[str, float] = MappingProxyType({"us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "sec": 1.0})
 _OPPOSITE: Mapping[str, str] = MappingProxyType({"STAR": "/", "SLASH": "*", "PLUS": "-", "MINUS": "+"})
 """Signs of arithmetic, and what each is on the other side of a comparison."""
@@ -214,7 +217,10 @@ def meant_sign(sign: str) -> str:
 def unit_hint(number: str, unit: str) -> str:
     """Return how a number with a unit is written, or "" where the unit is none."""
     if unit in _LENGTHS:
-        return f"lengths have no unit, but that of the log's footprints: write {number}, converted to it"
+        metres = format(float(number) * _LENGTHS[unit], "g")
+        return f"lengths are in the unit of the log's footprints: write {metres} if those are metres"
+    if unit == "px":
+        return f"lengths are in the unit of the log's footprints: write {number} if those are pixels"
     if unit in _TIMES:
         return f"units of time are s and ms: write {format(float(number) * _TIMES[unit], 'g')}s"
     return f"write it without the blank: {number}{unit}" if unit in ("s", "ms") else ""
@@ -260,6 +266,8 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
         )
     if token.type in ("NAME", "IN"):
         return _meant_word(token, last, after, accepted)
+    if token.type in _OPPOSITE and before.type == "DIST" and "COMPARE" in accepted:
+        return f"a distance has no {token.value!r}", "it is compared as it is: put the number into its limit"
     if token.type in ("EQUAL", "COLON") and position == 1 and last.type == "NAME":
         written = "".join(each.value for each in tokens[position:] if each.type not in ("EQUAL", "COLON"))
         hint = f"equality is written ==; a number is defined by const {last.value} = {written or '1.0'}"
