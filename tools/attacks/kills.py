@@ -9,13 +9,14 @@ import random
 import signal
 import struct
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 import spatial_replay as sr
-from attacks.cases import Case, Outcome
+from attacks.cases import Case, Outcome, memory_bytes
 from spatial_replay.geometry.arrays import Integers
 
 MOST_LOST_S = 1.0
@@ -27,6 +28,7 @@ PATIENCE_S = 60.0
 AT_ONCE = 4
 """Recorders that are killed together: each is a load for the others."""
 _ROOM = 8 * 20_000
+_FORK = multiprocessing.get_context("fork")
 
 
 class Kills:
@@ -61,18 +63,22 @@ class Kills:
         return case
 
     def run(self, case: Case, folder: Path) -> Outcome:
-        fork = multiprocessing.get_context("fork")
-        busy = [fork.Process(target=_compute, daemon=True) for _ in range(case["busy"])]
+        busy = [_FORK.Process(target=_compute, daemon=True) for _ in range(case["busy"])]
         runs = [_Run(folder / str(number), each) for number, each in enumerate(case["recorders"])]
-        processes = [fork.Process(target=_record, args=(run,), daemon=True) for run in runs]
+        processes = [_FORK.Process(target=_record, args=(run,), daemon=True) for run in runs]
         for each in (*busy, *processes):
             each.start()
         try:
             begun_s = time.monotonic()
             while any(not run.count for run in runs) and time.monotonic() - begun_s < PATIENCE_S:
                 time.sleep(0.005)
-            time.sleep(case["seconds"])
-            for run, process in zip(runs, processes, strict=True):
+            time.sleep(max(0.0, case["seconds"] - 1.0))
+            before = [_queueing_ns(process.pid) for process in processes]
+            time.sleep(min(1.0, case["seconds"]))
+            for run, process, earlier in zip(runs, processes, before, strict=True):
+                later = _queueing_ns(process.pid)
+                run.queued_s = max((later[task] - earlier.get(task, 0)) / 1e9 for task in later)
+                run.memory_bytes = memory_bytes(process.pid)
                 run.killed_ns = time.monotonic_ns()
                 process.kill()
         finally:
@@ -80,13 +86,12 @@ class Kills:
                 with suppress(ProcessLookupError):
                     each.kill()
                 each.join()
-        # a process that is forked while a thread holds a lock may never begin, and is killed all the same
         begun = [run for run in runs if run.count]
         outcome = Outcome(counts={"kills": len(begun), "not begun": len(runs) - len(begun)})
-        for run in begun:
-            own = _outcome(run.folder, run.written(), run.killed_ns)
+        for own in _in_fork(lambda: [_outcome(run) for run in begun]):
             outcome.take_in(own)
             outcome.problems += own.problems
+        for run in runs:
             run.shared.close()
         return outcome
 
@@ -98,7 +103,8 @@ class _Run:
         folder.mkdir()
         self.folder, self.about = folder, about
         self.shared = mmap.mmap(-1, _COUNT.size + _ROOM)
-        self.killed_ns = 0
+        self.killed_ns = self.memory_bytes = 0
+        self.queued_s = 0.0
 
     @property
     def count(self) -> int:
@@ -113,9 +119,31 @@ class _Run:
         return np.frombuffer(bytes(self.shared[_COUNT.size : _COUNT.size * (1 + count)]), "<i8")
 
 
-def _outcome(folder: Path, written: Integers, killed_ns: int) -> Outcome:
+def _queueing_ns(process: int | None) -> dict[str, int]:
+    """Return how long each thread of a process has waited for a processor so far."""
+    tasks = Path(f"/proc/{process}/task")
+    return {task.name: int((task / "schedstat").read_text().split()[1]) for task in tasks.iterdir()}
+
+
+def _in_fork(work: Callable[[], list[Outcome]]) -> list[Outcome]:
+    """Return what a forked process finds: reading starts threads, and a process with threads cannot be
+    forked safely, as this one is for the recorders of the next case."""
+    ours, theirs = _FORK.Pipe(duplex=False)
+    process = _FORK.Process(target=lambda: theirs.send(work()), daemon=True)
+    process.start()
+    theirs.close()
+    try:
+        return ours.recv()
+    except EOFError:
+        return [Outcome(["the process that reads the logs has died"])]
+    finally:
+        process.join()
+
+
+def _outcome(run: _Run) -> Outcome:
     from spatial_replay.sources.recover import recover_log
 
+    folder, written, killed_ns = run.folder, run.written(), run.killed_ns
     path = folder / "run.mcap"
     outcome = Outcome(counts={"samples": len(written)})
     try:
@@ -128,10 +156,19 @@ def _outcome(folder: Path, written: Integers, killed_ns: int) -> Outcome:
             outcome.problems.append(f"nothing can be read: {error}")
     lost = np.setdiff1d(written, found)
     late_s = (killed_ns - int(lost[0])) / 1e9 if len(lost) else 0.0
-    outcome.worst = {"lost_s": late_s, "lost_samples": len(lost)}
+    held = max(run.memory_bytes, memory_bytes())
+    outcome.worst = {
+        "lost_s": late_s,
+        "lost_samples": len(lost),
+        "memory_mb": held / 1e6,
+        "queued_s": run.queued_s,
+    }
     if late_s > MOST_LOST_S:
         outcome.counts["over"] = 1
-        outcome.problems.append(f"{len(lost)} samples are lost, the first {late_s:.2f} s before the kill")
+        outcome.problems.append(
+            f"{len(lost)} samples are lost, the first {late_s:.2f} s before the kill; a thread of the"
+            f" recorder had waited {run.queued_s:.2f} s for a processor in the last second"
+        )
     if recovery is not None:
         recovered = sr.read_trace(folder / "recovered.mcap")
         if not np.array_equal(recovered.times_ns, found):
