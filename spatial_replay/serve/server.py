@@ -13,7 +13,7 @@ from concurrent.futures import Future
 from reprlib import repr as shortened
 from threading import Thread
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import foxglove
 from foxglove import Parameter, Service, ServiceRequest
@@ -26,7 +26,7 @@ from spatial_replay.serve.pace import PlaybackState, Status
 from spatial_replay.serve.player import CONSTANTS, Level, Note
 from spatial_replay.serve.relay import Relay
 from spatial_replay.serve.requests import Questions, Values
-from spatial_replay.serve.services import SERVICES, answer, asset
+from spatial_replay.serve.services import PLAYBACK_STATE, SERVICES, STEERING, answer, asset, steered
 from spatial_replay.serve.session import PLAYBACK, Session
 
 # viewers get their errors in replies; the SDK would print them on standard error, too
@@ -225,7 +225,7 @@ class LiveServer(PublishingServer):
             supported_encodings=["json"],
             capabilities=list(_CAPABILITIES),
             server_listener=_Listener(self._session, self),
-            services=[self._service(name) for name in SERVICES],
+            services=[*map(self._service, SERVICES), *map(self._steering, STEERING)],
             asset_handler=lambda uri: asset(self._session.wait_for_evaluation(), uri),
             context=self._context,
             playback_time_range=self._session.span_ns,
@@ -233,22 +233,20 @@ class LiveServer(PublishingServer):
 
     def _service(self, name: str) -> Service:
         described = SERVICES[name]
-        request, response = (
-            foxglove.MessageSchema(
-                encoding="json",
-                schema=foxglove.Schema(
-                    name=schema["title"], encoding="jsonschema", data=json.dumps(schema).encode()
-                ),
-            )
-            for schema in (described.request, described.response)
-        )
 
         def handle(request: ServiceRequest) -> bytes:
             return self._questions.ask(lambda evaluated: answer(name, evaluated, request.payload))
 
-        return Service(
-            name, schema=foxglove.ServiceSchema(name, request=request, response=response), handler=handle
-        )
+        return _json_service(name, described.request, described.response, handle)
+
+    def _steering(self, name: str) -> Service:
+        def handle(request: ServiceRequest) -> bytes:
+            self.send_state(self._session.steer(steered(name, request.payload)))
+            self.send_playback()
+            state = {key.partition(".")[2]: value for key, value in self._session.playback.items()}
+            return json.dumps(state).encode()
+
+        return _json_service(name, STEERING[name].request, PLAYBACK_STATE, handle)
 
 
 class RunServer(PublishingServer):
@@ -313,17 +311,30 @@ def _trigger_service(fire: Callable[[str], None]) -> Service:
         fire(reason[:_LONGEST_TEXT] if isinstance(reason, str) and reason else "service call")
         return b'{"fired": true}'
 
-    request, response = (
+    request = {"title": "TriggerRequest", "type": "object", "properties": {"reason": {"type": "string"}}}
+    response = {"title": "TriggerResponse", "type": "object", "properties": {"fired": {"type": "boolean"}}}
+    return _json_service("trigger", request, response, handle)
+
+
+def _json_service(
+    name: str,
+    request: Mapping[str, Any],
+    response: Mapping[str, Any],
+    handle: Callable[[ServiceRequest], bytes],
+) -> Service:
+    """Return a service whose request and response are JSON, by their schemas."""
+    asked, answered = (
         foxglove.MessageSchema(
             encoding="json",
             schema=foxglove.Schema(
-                name=name, encoding="jsonschema", data=json.dumps({"type": "object"}).encode()
+                name=schema["title"], encoding="jsonschema", data=json.dumps(schema).encode()
             ),
         )
-        for name in ("TriggerRequest", "TriggerResponse")
+        for schema in (request, response)
     )
-    schema = foxglove.ServiceSchema("trigger", request=request, response=response)
-    return Service("trigger", schema=schema, handler=handle)
+    return Service(
+        name, schema=foxglove.ServiceSchema(name, request=asked, response=answered), handler=handle
+    )
 
 
 class _Listener(protocol.ServerListener):

@@ -15,12 +15,13 @@ from spatial_replay.errors import UsageError
 from spatial_replay.logs.topics import LAYOUT
 from spatial_replay.replay.document import document_from_replay, explain_results
 from spatial_replay.replay.loaded_log import Evaluated
+from spatial_replay.serve.session import PLAYBACK
 
 _MOST_BYTES: Final = 1 << 16
 
 
 class Service(NamedTuple):
-    """A service.
+    """A service that computes something from what is shown.
 
     Attributes:
         request, response: JSON schemas.
@@ -30,6 +31,32 @@ class Service(NamedTuple):
     request: Mapping[str, Any]
     response: Mapping[str, Any]
     answer: Callable[[Evaluated, Mapping[str, Any]], Mapping[str, Any]]
+
+
+class Steering(NamedTuple):
+    """A service that steers the playback.
+
+    Attributes:
+        request: a JSON schema.
+        values: returns the parameters of the playback that a request sets (see `PLAYBACK`).
+    """
+
+    request: Mapping[str, Any]
+    values: Callable[[Mapping[str, Any]], Mapping[str, float | bool]]
+
+
+def steered(name: str, payload: bytes) -> Mapping[str, float | bool]:
+    """Return the parameters of the playback that a request sets.
+
+    Args:
+        name: one of `STEERING`.
+        payload: the request, a JSON object; may be empty for an object without members.
+
+    Raises:
+        UsageError: an invalid request.
+    """
+    service = STEERING[name]
+    return service.values(_request(name, payload, service.request))
 
 
 def answer(name: str, evaluated: Evaluated, payload: bytes) -> bytes:
@@ -84,12 +111,14 @@ def _write_constants(evaluated: Evaluated, request: Mapping[str, Any]) -> Mappin
 
 
 def _object(title: str, **properties: Mapping[str, Any]) -> Mapping[str, Any]:
+    # some viewers fail at an object that does not list its properties
     return {"title": title, "type": "object", "properties": properties, "additionalProperties": False}
 
 
 _CONSTANTS = {
     "description": "Numbers and, as texts, durations, by name; the others stay as they are shown.",
     "type": "object",
+    "properties": {},
     "additionalProperties": {"type": ["number", "string"]},
 }
 
@@ -97,7 +126,7 @@ SERVICES: Final[Mapping[str, Service]] = MappingProxyType(
     {
         "evaluate": Service(
             _object("spatial_replay.EvaluateRequest", constants=_CONSTANTS),
-            {"title": "spatial_replay.EvaluateResponse", "type": "object"},
+            {"title": "spatial_replay.EvaluateResponse", "type": "object", "properties": {}},
             _evaluate,
         ),
         "explain": Service(
@@ -109,7 +138,9 @@ SERVICES: Final[Mapping[str, Service]] = MappingProxyType(
             {
                 "title": "spatial_replay.ExplainResponse",
                 "type": "object",
-                "properties": {"explanations": {"type": "array", "items": {"type": "object"}}},
+                "properties": {
+                    "explanations": {"type": "array", "items": {"type": "object", "properties": {}}}
+                },
             },
             _explain,
         ),
@@ -125,6 +156,35 @@ SERVICES: Final[Mapping[str, Service]] = MappingProxyType(
     }
 )
 
+
+_TIME, _PLAY, _SPEED, _ = PLAYBACK
+_SECONDS = {"description": "Seconds after the first sample.", "type": "number", "minimum": 0}
+_TIMES = {"description": "Seconds of the log in a second.", "type": "number", "exclusiveMinimum": 0}
+
+STEERING: Final[Mapping[str, Steering]] = MappingProxyType(
+    {
+        "play": Steering(_object("spatial_replay.PlayRequest"), lambda _: {_PLAY: True}),
+        "pause": Steering(_object("spatial_replay.PauseRequest"), lambda _: {_PLAY: False}),
+        "seek": Steering(
+            {**_object("spatial_replay.SeekRequest", time=_SECONDS), "required": ["time"]},
+            lambda request: {_TIME: request["time"]},
+        ),
+        "speed": Steering(
+            {**_object("spatial_replay.SpeedRequest", speed=_TIMES), "required": ["speed"]},
+            lambda request: {_SPEED: request["speed"]},
+        ),
+    }
+)
+"""Services for viewers without controls of their own; each answers with the playback as it is then."""
+
+PLAYBACK_STATE: Final[Mapping[str, Any]] = _object(
+    "spatial_replay.PlaybackState",
+    time=_SECONDS,
+    play={"type": "boolean"},
+    speed=_TIMES,
+    loop={"type": "boolean"},
+)
+"""The JSON schema of their answer."""
 
 _PREFIX = "spatial-replay://"
 
