@@ -136,7 +136,8 @@ class AnnotatedEvaluation:
             return layout_attachment(
                 LayoutContents(self.trees, [False] * len(self.trees), None, topics, axes)
             )
-        return layout_attachment(self.contents(self._extent, topics, axes))
+        contents = self.contents(self._extent, topics, axes)
+        return layout_attachment(contents._replace(outcomes=self._annotator.outcomes))
 
     def automata_metadata(self) -> Mapping[str, str]:
         """Return the size of each spec's automaton, or the reason why it has none."""

@@ -21,7 +21,7 @@ from spatial_replay.annotate.robustness import encode_robustness
 from spatial_replay.annotate.scene_entities import encode_frame
 from spatial_replay.annotate.scene_update import SceneEncoder, SceneFrames, SceneState
 from spatial_replay.annotate.specification import ReportedTree, encode_specification
-from spatial_replay.annotate.standing import StandingEncoder
+from spatial_replay.annotate.standing import Outcome, StandingEncoder
 from spatial_replay.annotate.violations import EvaluatedResult, leaf_pairs, violated_since
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Channel, Messages, messages_of
@@ -107,6 +107,16 @@ class Annotator:
         """What a viewer shows after the messages so far."""
         return self._scene
 
+    @property
+    def outcomes(self) -> Sequence[Outcome]:
+        """What each result came to, once the log has ended."""
+        return self._standing.outcomes
+
+    @property
+    def _over(self) -> list[str]:
+        """What decided each result, as far as that has happened."""
+        return [each.over for each in self._reporters]
+
     def redraw(self) -> None:
         """Draw the whole scene with the next sample, for a viewer that shows nothing yet."""
         self._scene = SceneState()
@@ -128,9 +138,11 @@ class Annotator:
             messages.append(self._messages(_SPECIFICATION, trace.times_ns[:1], [self.specification()]))
         messages.append(self._robustness(blocks))
         messages.append(self._automaton_states(blocks))
+        changes = self._changes(blocks)
         if self._trees:
-            messages.append(self._messages(_STANDING, *self._standing.encode(trace.times_ns, blocks)))
-        messages += self._events(self._changes(blocks))
+            standing = self._standing.encode(trace.times_ns, blocks, self._over)
+            messages.append(self._messages(_STANDING, *standing))
+        messages += self._events(changes)
         messages.append(self._scene_messages(trace, blocks))
         self._remember(trace, blocks)
         return messages
@@ -181,7 +193,8 @@ class Annotator:
         ]
         last_ns = int(trace.times_ns[-1])
         numbers = self._messages(_ROBUSTNESS, np.full(len(robustness), time_ns), robustness)
-        standing = self._messages(_STANDING, np.array([time_ns]), [self._standing.end(last_ns, finals)])
+        ending = self._standing.end(last_ns, finals, self._over)
+        standing = self._messages(_STANDING, np.array([time_ns]), [ending])
         self._since_ns = [
             violated_since(own, block, since_ns)
             for own, block, since_ns in zip(self._requirements, ended, self._since_ns, strict=True)

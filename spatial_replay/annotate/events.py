@@ -43,7 +43,7 @@ from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.vacuity import Vacuous
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import Formula, Specification, iter_nodes, operator_of
+from spatial_replay.spec.formula import Specification, iter_nodes, operator_of
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.walks import substitute
 from spatial_replay.text import requirement_text, time_text
@@ -101,6 +101,8 @@ class EventReporter:
 
     Attributes:
         settled: what settled the violation of the root before the end of the log, once it has happened.
+        over: what decided the root's verdict, an atom or a missing response, once there is one; "" if that
+            is not known.
     """
 
     def __init__(
@@ -122,6 +124,7 @@ class EventReporter:
         self._carried: dict[tuple[int, int], LeafValue | None] = {}
         self._last_ns: int | None = None
         self.settled: SettledViolation | None = None
+        self.over = ""
 
     def extend(self, block: SeriesBlock) -> list[EncodedEvent]:
         """Take in the next samples; return the changes that they confirm, by node, then by time."""
@@ -196,8 +199,12 @@ class EventReporter:
             witness, because = self._settled(settled, time_ns)
             if change.node == 0 and verdict is Verdict.VIOLATED:
                 self.settled = SettledViolation(time_ns, settled)
+            self._remember(change.node, settled)
         else:
-            witness = because = self._words(self._deciding_leaf(change.node, after, block))
+            found = self._deciding_leaf(change.node, after, block)
+            witness = because = self._words(found)
+            if after.code in _VERDICTS:
+                self._remember(change.node, found)
         now = PeriodText(after, witness, change_sentence(reported.title, after, because), settled)
         past = None
         if before is not None:
@@ -212,9 +219,11 @@ class EventReporter:
         if self._history is not None and self._history.is_complete:
             decided = self._history.finished(reported.node, self._values, final)
             witness, because = self._settled(decided, last_ns)
+            self._remember(node, decided)
         elif verdict is not Verdict.UNKNOWN:
             found = self._leaf_finder.find_leaf(reported.node, final, low=low, wide=self._settles)
             witness = because = self._words(found)
+            self._remember(node, found)
         after = Period(_ENDED[verdict], last_ns, last_ns, lower if low else upper, OF_CURRENT)
         sentence = end_sentence(reported.title, verdict, (lower, upper), because)
         now = PeriodText(after, witness, sentence, decided)
@@ -265,6 +274,17 @@ class EventReporter:
         )
         return EncodedEvent(time_ns, *(each.SerializeToString(deterministic=True) for each in (event, log)))
 
+    def _remember(self, node: int, found: DecidingLeaf | LeafValue | None) -> None:
+        """Keep what decided the root's verdict, if it is one over all continuations."""
+        if self._reported[node].node or found is None or not self._settles:
+            return
+        missed = found.missed if isinstance(found, DecidingLeaf) else None
+        is_response = missed is not None and missed.is_condition
+        self.over = missed.response if missed and is_response else self._leaf_text(found.leaf)
+
+    def _leaf_text(self, leaf: int) -> str:
+        return format_formula(substitute(self._leaves[leaf], self._bindings), relations=self._relations)
+
     def _settled(self, found: DecidingLeaf | None, now_ns: int) -> tuple[str, str]:
         """Return what decided in words, and the same with how long ago; nothing for None."""
         if found is None:
@@ -279,9 +299,8 @@ class EventReporter:
         """Return a leaf and its number in words; "" for none."""
         if found is None:
             return ""
-        leaf: Formula = substitute(self._leaves[found.leaf], self._bindings)
-        amount = amount_text(abs(found.number), leaf)
-        return leaf_words(format_formula(leaf, relations=self._relations), found.number, amount, past=past)
+        amount = amount_text(abs(found.number), self._leaves[found.leaf])
+        return leaf_words(self._leaf_text(found.leaf), found.number, amount, past=past)
 
     def _facts(self, reported: ReportedNode) -> dict[str, str]:
         of = {} if self._tree.object is None else {"object": self._tree.object}

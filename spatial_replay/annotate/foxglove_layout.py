@@ -14,8 +14,8 @@ import numpy as np
 
 from spatial_replay.annotate.curves import curved_nodes
 from spatial_replay.annotate.scene_entities import FRAMES
-from spatial_replay.annotate.specification import ReportedTree, unit_of, unit_words
-from spatial_replay.annotate.standing import named_parts, part_title
+from spatial_replay.annotate.specification import MIXED, ReportedTree, unit_of, unit_words
+from spatial_replay.annotate.standing import Outcome, named_parts, part_title
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.schemas.Robustness_pb2 import (
@@ -49,6 +49,7 @@ from spatial_replay.palette import (
     lighter,
 )
 from spatial_replay.spec.formula import Formula
+from spatial_replay.text import shortened_formula
 from spatial_replay.trace.axes import OUR_AXES, Axes
 from spatial_replay.trace.trace import Trace
 
@@ -105,8 +106,15 @@ def scene_panel(camera: Mapping[str, Any], topics: Collection[str], axes: Axes =
     return _titled("3D!scene", "Scene" if axes == OUR_AXES else f"Scene, {axes}", config)
 
 
-def indicators(trees: Sequence[ReportedTree]) -> list[Panel]:
-    """Return a light for each result, in the colour of how it stands at the cursor."""
+def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[Outcome] = ()) -> list[Panel]:
+    """Return a light for each result, in the colour of how it stands at the cursor.
+
+    Args:
+        outcomes: of the finished log; titles say since when, by how much and over what results are violated.
+    """
+    titles = [tree.title for tree in trees]
+    for index, outcome in enumerate(outcomes):
+        titles[index] += _violation_text(outcome)
     rules = [
         {"operator": "=", "rawValue": str(number), "color": colour, "label": words}
         for number, (words, colour) in STANDING_COLOURS.items()
@@ -114,7 +122,7 @@ def indicators(trees: Sequence[ReportedTree]) -> list[Panel]:
     return [
         _titled(
             f"Indicator!result{index}",
-            tree.title,
+            titles[index],
             {
                 "path": _standing_path(tree.title, "standing"),
                 "style": "background",
@@ -209,6 +217,11 @@ def node_table() -> Panel:
     return _titled("Table!nodes", "Nodes of the worst result", {"topicPath": f"{STANDING}.nodes"})
 
 
+def violation_table() -> Panel:
+    """Return the table of violated results: since when, by how much and over what."""
+    return _titled("Table!violated", "Violated results", {"topicPath": f"{STANDING}.violated"})
+
+
 def event_list() -> Panel:
     """Return the list of events."""
     config = {"minLogLevel": 1, "searchTerms": [], "topicToRender": EVENT_LOG}
@@ -235,6 +248,14 @@ def constants() -> Panel:
 def summary() -> Panel:
     """Return what the whole log comes to, with the constants as they are set."""
     return _titled("RawMessages!summary", "The whole log", {"topicPath": f"{CURVES_TOPIC}.summary"})
+
+
+def _violation_text(outcome: Outcome) -> str:
+    if outcome.standing != VIOLATED:
+        return ""
+    unit = f" {outcome.unit}" if outcome.unit and outcome.unit != MIXED else ""
+    over = f": {shortened_formula(outcome.over)}" if outcome.over else ""
+    return f", violated since {outcome.since_s:.3f} s by {outcome.by:.4g}{unit}{over}"
 
 
 def _titled(identifier: str, title: str, config: Config) -> Panel:
@@ -362,6 +383,7 @@ class LayoutContents(NamedTuple):
         extent: where its footprints are; None if it has none.
         topics: all that have messages.
         axes: those of the source, which the title of the scene says where they are not ours.
+        outcomes: of each tree, what it came to; empty while that can change.
     """
 
     trees: Sequence[ReportedTree]
@@ -369,6 +391,7 @@ class LayoutContents(NamedTuple):
     extent: SceneBounds | None
     topics: Collection[str]
     axes: Axes = OUR_AXES
+    outcomes: Sequence[Outcome] = ()
 
 
 def layout_attachment(contents: LayoutContents) -> Attachment:
@@ -386,7 +409,7 @@ def viewer_layout(contents: LayoutContents) -> dict[str, Any]:
 
     If the log has a planner's decisions, its map lies under the scene, and the reasons are listed below it.
     """
-    return _layout(contents.trees, _scene_panels(contents), _evaluation_panels(contents))
+    return _layout(contents, _scene_panels(contents), _evaluation_panels(contents))
 
 
 def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
@@ -398,8 +421,9 @@ def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
         # the curves of the whole log include those played so far
         played = len(result_curves(contents.trees))
         panels[:played] = [(panel, 3.0) for panel in whole_curves(contents.trees)]
+        panels.insert(0, (violation_table(), 1.5))
         left.append((summary(), 0.7))
-    return _layout(contents.trees, left, panels)
+    return _layout(contents, left, panels)
 
 
 _Weighted = tuple[Panel, float]
@@ -418,6 +442,8 @@ def _evaluation_panels(contents: LayoutContents) -> list[_Weighted]:
     if not trees:
         return []
     panels = [(panel, 3.0) for panel in result_curves(trees)]
+    if any(outcome.standing == VIOLATED for outcome in contents.outcomes):
+        panels.insert(0, (violation_table(), 1.5))
     panels += [(panel, 2.0) for panel in part_curves(trees)]
     panels.append((state_strips(trees, contents.has_states), 3.0))
     if EVENT_LOG in contents.topics:
@@ -431,10 +457,10 @@ def _attachment(layout: dict[str, Any]) -> Attachment:
 
 
 def _layout(
-    trees: Sequence[ReportedTree], left: Sequence[_Weighted], right: Sequence[_Weighted]
+    contents: LayoutContents, left: Sequence[_Weighted], right: Sequence[_Weighted]
 ) -> dict[str, Any]:
     """Return a layout: the lights of the results at the top, and two columns below them."""
-    lights = indicators(trees)
+    lights = indicators(contents.trees, contents.outcomes)
     rows = [lights[begin : begin + _PER_ROW] for begin in range(0, len(lights), _PER_ROW)]
     tree = _split("column", [(panel.identifier, share) for panel, share in left])
     if right:

@@ -5,8 +5,9 @@ Viewers need no other topic of numbers: one message has every result, and of the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -49,18 +50,49 @@ def worst_results(codes: Codes, violated_ns: Integers) -> Integers:
 
     Args:
         codes: (R, S), numbers of `Standing`.
-        violated_ns: (R,), since when each is violated whatever comes, or `LATEST_NS`.
+        violated_ns: (R, S), since when each is violated, or `LATEST_NS`.
     """
     ranks = _RANKS[codes]
-    since_ns = np.where(codes == VIOLATED, violated_ns[:, None], LATEST_NS)
+    since_ns = np.where(codes == VIOLATED, violated_ns, LATEST_NS)
     order = np.where(ranks == ranks.min(axis=0), since_ns - 1, LATEST_NS)
     return np.asarray(order.argmin(axis=0), np.int64)
+
+
+class _Layout(NamedTuple):
+    """What messages with the same texts and lengths share: the worst result, the states of automata in words,
+    the violated results with what decided them, and whether it is about the finished log."""
+
+    worst: int
+    words: tuple[str, ...]
+    violated: tuple[tuple[int, str], ...]
+    final: bool
+
+
+class Outcome(NamedTuple):
+    """What a result came to over the finished log.
+
+    Attributes:
+        standing: satisfied, violated or unknown, a number of `Standing`.
+        since_s: of a violation, since when it is certain, in seconds after the first sample.
+        by: its robustness without its sign: the end of its interval that decides; NaN where it is unknown.
+        unit: of the robustness.
+        over: what decided it; "" if that is not known.
+    """
+
+    standing: int
+    since_s: float
+    by: float
+    unit: str
+    over: str
 
 
 class StandingEncoder:
     """Encodes how results stand, sample after sample.
 
     Its state is the last numbers of each result. Cutting the samples into blocks changes no message.
+
+    Attributes:
+        outcomes: of each result, once the log has ended.
     """
 
     def __init__(self, trees: Sequence[ReportedTree], runs: Sequence[AutomatonRun | None]) -> None:
@@ -74,57 +106,82 @@ class StandingEncoder:
         self._nodes = [[node for _, _, node in iter_nodes(tree.formula)] for tree in trees]
         self._last = [np.full((len(nodes), 4, 1), np.nan) for nodes in self._nodes]
         self._words = [""] * len(trees)
-        self._violated_ns = np.full(len(trees), LATEST_NS)
+        self._violated_ns = [LATEST_NS] * len(trees)
+        self._first_ns: int | None = None
         self._written_ns: int | None = None
-        self._templates: dict[tuple[int, tuple[str, ...], bool], WireTemplate] = {}
+        self._templates: dict[_Layout, WireTemplate] = {}
+        self.outcomes: tuple[Outcome, ...] = ()
 
-    def encode(self, times_ns: Integers, blocks: Sequence[SeriesBlock]) -> tuple[Integers, list[bytes]]:
+    def encode(
+        self, times_ns: Integers, blocks: Sequence[SeriesBlock], over: Sequence[str]
+    ) -> tuple[Integers, list[bytes]]:
         """Take in the next samples; return the times and contents of their messages.
 
         Args:
             times_ns: (T,), of all samples.
             blocks: of each tree; an object's result may have fewer samples.
+            over: of each tree, what decided it, if that has happened in these samples or before.
         """
         chosen = spaced(times_ns, self._written_ns)
         shown_ns = times_ns[chosen]
-        series, words = [], []
+        series, words, since = [], [], []
         for index, block in enumerate(blocks):
             at = np.searchsorted(block.times_ns, shown_ns, side="right")
             series.append(np.concatenate([self._last[index], block.series], axis=2)[:, :, at])
             words.append(self._described(index, block, at))
+            since.append(np.append(self._violated_ns[index], self._violated(index, block))[at])
         self.pass_over(blocks)
         if not len(chosen):
             return shown_ns, []
         self._written_ns = int(shown_ns[-1])
-        return shown_ns, self._messages(shown_ns, series, np.array(words, object).reshape(len(words), -1))
+        said = np.array(words, object).reshape(len(words), -1)
+        return shown_ns, self._messages(shown_ns, series, said, np.array(since), over)
 
     def pass_over(self, blocks: Sequence[SeriesBlock]) -> None:
         """Take in the next samples without a message."""
         for index, block in enumerate(blocks):
             if not len(block.times_ns):
                 continue
+            if self._first_ns is None:
+                self._first_ns = min(int(each.times_ns[0]) for each in blocks if len(each.times_ns))
+            self._violated_ns[index] = int(self._violated(index, block)[-1])
             self._last[index] = block.series[:, :, -1:].copy()
             run = self._runs[index]
             if run is not None:
                 self._words[index] = run.latest_words
-            certain = block.series[0, 3] < 0.0
-            if self._violated_ns[index] == LATEST_NS and certain.any():
-                self._violated_ns[index] = block.times_ns[certain.argmax()]
 
-    def end(self, time_ns: int, finals: Sequence[Floats]) -> bytes:
+    def _violated(self, index: int, block: SeriesBlock) -> Integers:
+        """Return (T,) since when a result is violated, at each sample of a block; `LATEST_NS` where not."""
+        is_violated = block.series[0, 3] < 0.0
+        begins = is_violated & ~np.append(self._violated_ns[index] < LATEST_NS, is_violated)[:-1]
+        begun = np.maximum.accumulate(np.where(begins, np.arange(len(begins)), -1))
+        since_ns = np.where(begun < 0, self._violated_ns[index], block.times_ns[begun])
+        return np.where(is_violated, since_ns, LATEST_NS)
+
+    def end(self, time_ns: int, finals: Sequence[Floats], over: Sequence[str]) -> bytes:
         """Return the message about the finished log.
 
         Args:
             time_ns: of the last sample.
             finals: for each tree, (N, 2), lower and upper end of each node's value over the finished log.
+            over: of each tree, what decided it.
         """
-        series = []
+        first_ns = time_ns if self._first_ns is None else self._first_ns
+        since_ns = [min(each, time_ns) for each in self._violated_ns]
+        outcomes, series = [], []
         for last, final in zip(self._last, finals, strict=True):
             ended = last.copy()
             ended[:, 2:, 0] = final
             series.append(ended)
-        words = np.array(self._words, object)[:, None]
-        [payload] = self._messages(np.array([time_ns], np.int64), series, words, final=True)
+        for tree, ended, violated_ns, said in zip(self._trees, series, since_ns, over, strict=True):
+            code = int(standing_codes(ended[:1], final=True)[0, 0])
+            low, high = ended[0, 2:, 0].tolist()
+            by = -high if code == VIOLATED else low if code == SATISFIED else math.nan
+            since_s = (violated_ns - first_ns) / 1e9
+            outcomes.append(Outcome(code, since_s, by, unit_of(tree.formula, {}), said))
+        self.outcomes = tuple(outcomes)
+        words, times_ns = np.array(self._words, object)[:, None], np.array([time_ns], np.int64)
+        [payload] = self._messages(times_ns, series, words, np.array(since_ns)[:, None], over, final=True)
         return payload
 
     def _described(self, index: int, block: SeriesBlock, at: Integers) -> list[str]:
@@ -137,24 +194,39 @@ class StandingEncoder:
         return [every[place] for place in at.tolist()]
 
     def _messages(
-        self, times_ns: Integers, series: Sequence[Floats], words: np.ndarray, *, final: bool = False
+        self,
+        times_ns: Integers,
+        series: Sequence[Floats],
+        words: np.ndarray,
+        since_ns: Integers,
+        over: Sequence[str],
+        *,
+        final: bool = False,
     ) -> list[bytes]:
         codes = [standing_codes(each, final=final) for each in series]
-        worst = worst_results(np.array([each[0] for each in codes]), self._violated_ns)
+        of_results = np.array([each[0] for each in codes])
+        worst = worst_results(of_results, since_ns)
+        # the first of those violated first
+        order = np.argsort(np.where(of_results == VIOLATED, since_ns, LATEST_NS), axis=0, kind="stable")
+        counts = (of_results == VIOLATED).sum(axis=0)
         marks, numbers = self._rows(series, codes)
         payloads = [b""] * len(times_ns)
-        groups: dict[tuple[int, tuple[str, ...]], list[int]] = {}
-        for sample, key in enumerate(zip(worst.tolist(), map(tuple, words.T.tolist()), strict=True)):
+        groups: dict[_Layout, list[int]] = {}
+        for sample, count in enumerate(counts.tolist()):
+            violated = tuple((each, over[each]) for each in order[:count, sample].tolist())
+            key = _Layout(int(worst[sample]), tuple(words[:, sample]), violated, final)
             groups.setdefault(key, []).append(sample)
-        for (which, said), members in groups.items():
-            rows = series[which][:_MOST_ROWS, :, members]
-            own = rounded(rows[:, [1, 0]]).reshape(-1, len(members))
-            filled = np.concatenate([numbers[:, members], own]).T
+        for layout, members in groups.items():
+            rows = series[layout.worst][:_MOST_ROWS, :, members]
+            own = [rounded(rows[:, [1, 0]]).reshape(-1, len(members))]
+            for each, _ in layout.violated:
+                seconds = (since_ns[each, members] - (self._first_ns or 0)) / 1e9
+                own.append(np.stack([np.round(seconds, 3), rounded(-series[each][0, 3, members])]))
+            filled = np.concatenate([numbers[:, members], *own]).T
             stamps = times_ns[members].astype(np.uint64)[:, None]
             bits = np.concatenate([stamps, np.ascontiguousarray(filled).view(np.uint64)], axis=1)
-            own_marks = codes[which][:_MOST_ROWS, members]
-            template = self._template(which, said, final)
-            encoded = template.fill(bits, np.concatenate([marks[:, members], own_marks]).T)
+            own_marks = codes[layout.worst][:_MOST_ROWS, members]
+            encoded = self._template(layout).fill(bits, np.concatenate([marks[:, members], own_marks]).T)
             for sample, payload in zip(members, payloads_of(encoded), strict=True):
                 payloads[sample] = payload
         return payloads
@@ -169,16 +241,16 @@ class StandingEncoder:
                 numbers.append(numbered[identifier, 0 if looks_ahead(node) else 1])
         return np.array(marks, np.uint8), np.array(numbers)
 
-    def _template(self, worst: int, words: tuple[str, ...], final: bool) -> WireTemplate:
-        key = worst, words, final
-        if key not in self._templates:
+    def _template(self, layout: _Layout) -> WireTemplate:
+        if layout not in self._templates:
             if len(self._templates) >= _MOST_TEMPLATES:
                 self._templates.clear()
-            self._templates[key] = WireTemplate.of(self._message(*key))
-        return self._templates[key]
+            self._templates[layout] = WireTemplate.of(self._message(layout))
+        return self._templates[layout]
 
-    def _message(self, worst: int, words: tuple[str, ...], final: bool) -> StandingUpdate:
+    def _message(self, layout: _Layout) -> StandingUpdate:
         """Return a message with a value in every field that differs between samples."""
+        worst, words, violated, final = layout
         message = StandingUpdate(time_ns=1, worst=self._trees[worst].title, final=final)
         for tree, said in zip(self._trees, words, strict=True):
             unit = unit_of(tree.formula, {})
@@ -191,6 +263,10 @@ class StandingEncoder:
             unit = unit_of(node, {})
             text = format_formula(node) if node.name is None else node.name
             message.nodes.add(text=text, now=1.0, value=1.0, unit=unit, standing=UNKNOWN)
+        for index, over in violated:
+            tree = self._trees[index]
+            unit = unit_of(tree.formula, {})
+            message.violated.add(name=tree.title, since=1.0, by=1.0, unit=unit, over=over)
         return message
 
 

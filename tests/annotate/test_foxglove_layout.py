@@ -149,8 +149,11 @@ def test_every_result_has_its_curve_its_light_and_its_strip_under_its_name(tmp_p
         name: f'/spatial/standing.results[:]{{name=="{name}"}}.robustness' for name in ("near", "apart")
     }
     lights = [panel for name, panel in panels.items() if name.startswith("Indicator!")]
-    assert [light["lichtblickPanelTitle"] for light in lights] == ["near", "apart"]
-    assert [light["foxglovePanelTitle"] for light in lights] == ["near", "apart"]
+    for key in ("lichtblickPanelTitle", "foxglovePanelTitle"):
+        first, second = (light[key] for light in lights)
+        assert first == "near, violated since 0.400 s by 2.099: a closeto[2] b"
+        assert second == "apart"
+    assert panels["Table!violated"]["topicPath"] == "/spatial/standing.violated"
     strips = panels["StateTransitions!verdicts"]["paths"]
     assert [strip["value"] for strip in strips[:2]] == [light["path"] for light in lights]
     rules = {rule["rawValue"]: rule["label"] for rule in lights[0]["rules"]}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+import math
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +108,21 @@ def test_every_message_says_how_all_results_stand_and_the_last_what_the_log_come
     assert states[1].endswith("satisfied if nothing more came")
     assert states[2].endswith("violated, whatever comes")
     assert found[0].results[0].automaton.endswith("still to come: a closeto[1] b")
+
+
+def test_messages_say_since_when_by_how_much_and_over_what_results_are_violated(tmp_path: Path) -> None:
+    log = annotated(tmp_path, TEXT, moving([5.0, 4.0, 1.5, 1.25, 3.0]))
+    found = [message for _, message in messages(log, StandingUpdate, "/spatial/standing")]
+    rows = [[(each.name, each.since, each.by, each.over) for each in message.violated] for message in found]
+    assert rows == [
+        [],
+        [],
+        [("apart", 0.2, 0.5, "a farfrom[1] b")],
+        [("apart", 0.2, 0.75, "a farfrom[1] b")],
+        [("apart", 0.2, 0.75, "a farfrom[1] b")],
+        # the log has ended before the window of the other one began
+        [("apart", 0.2, 0.75, "a farfrom[1] b"), ("late", 0.4, math.inf, "")],
+    ]
 
 
 def test_the_last_message_on_robustness_has_the_verdict_of_the_finished_log(tmp_path: Path) -> None:

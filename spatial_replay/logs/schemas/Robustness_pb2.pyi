@@ -162,6 +162,7 @@ class StandingUpdate(google.protobuf.message.Message):
     WORST_FIELD_NUMBER: builtins.int
     NODES_FIELD_NUMBER: builtins.int
     FINAL_FIELD_NUMBER: builtins.int
+    VIOLATED_FIELD_NUMBER: builtins.int
     time_ns: builtins.int
     """Time of the sample in nanoseconds; equal to the log time of the message, unless that is final."""
     worst: builtins.str
@@ -176,6 +177,10 @@ class StandingUpdate(google.protobuf.message.Message):
     def nodes(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___NodeStanding]:
         """The nodes of the worst result, in the order of their ids."""
 
+    @property
+    def violated(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___Violation]:
+        """The results that are violated for good, the one that was so first before the others."""
+
     def __init__(
         self,
         *,
@@ -184,12 +189,52 @@ class StandingUpdate(google.protobuf.message.Message):
         worst: builtins.str = ...,
         nodes: collections.abc.Iterable[global___NodeStanding] | None = ...,
         final: builtins.bool = ...,
+        violated: collections.abc.Iterable[global___Violation] | None = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "time_ns", b"time_ns"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "final", b"final", "nodes", b"nodes", "results", b"results", "time_ns", b"time_ns", "worst", b"worst"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "final", b"final", "nodes", b"nodes", "results", b"results", "time_ns", b"time_ns", "violated", b"violated", "worst", b"worst"]) -> None: ...
     def WhichOneof(self, oneof_group: typing.Literal["_time_ns", b"_time_ns"]) -> typing.Literal["time_ns"] | None: ...
 
 global___StandingUpdate = StandingUpdate
+
+@typing.final
+class Violation(google.protobuf.message.Message):
+    """A result that is violated for good, for tables: numbers are rounded to four digits."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    NAME_FIELD_NUMBER: builtins.int
+    SINCE_FIELD_NUMBER: builtins.int
+    BY_FIELD_NUMBER: builtins.int
+    UNIT_FIELD_NUMBER: builtins.int
+    OVER_FIELD_NUMBER: builtins.int
+    name: builtins.str
+    """As in `results`."""
+    since: builtins.float
+    """Since when that is certain: seconds after the first sample."""
+    by: builtins.float
+    """By how much: what the value over all samples falls short of 0 at least."""
+    unit: builtins.str
+    """Unit of `by`; empty for footprint units."""
+    over: builtins.str
+    """What decided it: the atom, or the response that was missing. Empty if that is not known."""
+    def __init__(
+        self,
+        *,
+        name: builtins.str = ...,
+        since: builtins.float | None = ...,
+        by: builtins.float | None = ...,
+        unit: builtins.str = ...,
+        over: builtins.str = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["_by", b"_by", "_since", b"_since", "by", b"by", "since", b"since"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_by", b"_by", "_since", b"_since", "by", b"by", "name", b"name", "over", b"over", "since", b"since", "unit", b"unit"]) -> None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_by", b"_by"]) -> typing.Literal["by"] | None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_since", b"_since"]) -> typing.Literal["since"] | None: ...
+
+global___Violation = Violation
 
 @typing.final
 class ResultStanding(google.protobuf.message.Message):
