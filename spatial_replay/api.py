@@ -83,6 +83,7 @@ def replay_log(
     output: PathName | None = None,
     layer: bool = False,
     keep: Sequence[str] | None = None,
+    arrow: str = "",
     **options: Unpack[Evaluating],
 ) -> Replayed:
     """Evaluate specifications over a log, and write the annotated log if a file is named.
@@ -94,6 +95,7 @@ def replay_log(
         layer: write the derived messages only, without the log's own.
         keep: which of the log's own messages the output holds: "all" (as without it), "mapped" for those of
             mapped topics, or patterns of topics such as "/camera/*"; several add up.
+        arrow: the title of the result whose violation the output's scene points at; "" for the first one.
         options: how to evaluate it (`constants`, `each`, `semantics`, `start_ns`, `end_ns`, `every`,
             `strict_names`; see `Evaluating`), and how to read it, as for `read_trace`.
 
@@ -114,7 +116,7 @@ def replay_log(
     return run_replay(
         source,
         _files(specifications, source, constants),
-        replace(how, keep=_kept(keep, output)),
+        replace(how, keep=_kept(keep, output), arrow=arrow),
         keep_series=True,
         keep_leaves=True,
         output=None if output is None else Path(output),

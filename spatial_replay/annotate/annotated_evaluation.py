@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from spatial_replay.annotate.specification import reported_trees
+from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.logs.messages import Attachment, Channel, Messages, merge
 from spatial_replay.logs.topics import AUTOMATON, DERIVED, SCENE
@@ -18,6 +19,7 @@ from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
 from spatial_replay.monitor.vacuity import Vacuous
 from spatial_replay.spec.formula import Specification
+from spatial_replay.text import nearest_hint
 from spatial_replay.trace.axes import OUR_AXES, Axes
 from spatial_replay.trace.trace import Trace
 
@@ -26,6 +28,9 @@ if TYPE_CHECKING:
     from spatial_replay.annotate.automaton_state import SpecAutomaton
     from spatial_replay.annotate.foxglove_layout import LayoutContents, SceneBounds
     from spatial_replay.annotate.scene_update import SceneFrames, SceneState
+
+_MOST_NAMED: Final = 10
+"""The most results that an error lists."""
 
 
 class AnnotatedEvaluation:
@@ -46,6 +51,7 @@ class AnnotatedEvaluation:
         compiled_before: Callable[[], Sequence[Attachment]] = list,
         known: Sequence[SpecAutomaton] = (),
         show: Callable[[SceneFrames], None] = lambda frames: None,
+        arrow: str = "",
     ) -> None:
         """Start before the first sample.
 
@@ -54,18 +60,27 @@ class AnnotatedEvaluation:
             compiled_before: returns the attachments of a log; automata among them are not compiled with MONA.
             known: automata of specs of these files, which are not compiled again.
             show: takes what the messages of the scene show.
+            arrow: the title of the result whose violation the scene points at; "" for the first one.
+
+        Raises:
+            UsageError: no result has that title.
         """
         self._files = files
         self._semantics = semantics
         self._compiled_before = compiled_before
         self._known = known
         self._show = show
+        self._arrow = arrow
 
         self._evaluations = [
             EvaluationStream(own, file.regions, semantics) for own, file in zip(instances, files, strict=True)
         ]
         self.streams = [stream for evaluation in self._evaluations for stream in evaluation.streams]
         self.trees = reported_trees(files, instances)
+        titles = [tree.title for tree in self.trees]
+        if arrow and arrow not in titles:
+            hint = nearest_hint(arrow, titles) or f"there are: {', '.join(titles[:_MOST_NAMED])}"
+            raise UsageError(f"there is no result {arrow!r} for the arrow to point at; {hint}")
         self._extent: SceneBounds | None = None
         self._has_samples = False
 
@@ -158,19 +173,20 @@ class AnnotatedEvaluation:
 
         return automata_of(self._files, self.trees, self._semantics, self._compiled_before(), self._known)
 
-    def annotator(self, scene: SceneState | None = None) -> Annotator:
+    def annotator(self, scene: SceneState | None = None, arrow: str = "") -> Annotator:
         """Return an annotator that starts before the first sample.
 
         Args:
             scene: what a viewer already shows, if it continues with these messages.
+            arrow: the title of the result whose violation the scene points at; "" for the first one.
         """
         from spatial_replay.annotate.annotator import Annotator
 
         instances = [stream.instance for stream in self.streams]
         return Annotator(
-            self._files, self.trees, instances, self.automata, self._semantics, scene, self._show
+            self._files, self.trees, instances, self.automata, self._semantics, scene, self._show, arrow
         )
 
     @cached_property
     def _annotator(self) -> Annotator:
-        return self.annotator()
+        return self.annotator(arrow=self._arrow)

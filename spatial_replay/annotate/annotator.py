@@ -65,6 +65,7 @@ class Annotator:
         semantics: Semantics,
         scene: SceneState | None = None,
         show: Callable[[SceneFrames], None] = lambda frames: None,
+        arrow: str = "",
     ) -> None:
         """Start before the first sample.
 
@@ -72,6 +73,8 @@ class Annotator:
             instances, automata: one for each of `trees`.
             scene: what a viewer already shows, if it continues with these messages.
             show: takes what the messages of the scene show.
+            arrow: the title of the result whose violation the scene points at; "" for the first one, and one
+                that there is not.
         """
         self._files = files
         self._trees = trees
@@ -81,8 +84,11 @@ class Annotator:
         self._since_ns = [np.full(len(own), LATEST_NS) for own in self._requirements]
         self._automata = [each.automaton for each in automata]
         self._names = [[node.name for _, _, node in iter_nodes(tree.formula)] for tree in trees]
+        chosen = [tree for tree in trees if tree.title == arrow] or trees
         self._leaf_pairs = [
             leaf_pairs(instance, requirements, files[tree.file].regions, files[tree.file].relations)
+            if tree in chosen
+            else None
             for tree, instance, requirements in zip(trees, instances, self._requirements, strict=True)
         ]
         self._reporters = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,6 +40,12 @@ if TYPE_CHECKING:
 @click.option("--layer", is_flag=True, help="Write the derived messages only, without the log's own.")
 @keep_option("With -o: messages of the log to copy")
 @click.option(
+    "--arrow",
+    metavar="RESULT",
+    default="",
+    help="With -o: the result whose violation the scene points at.  [default: the first violated one]",
+)
+@click.option(
     "--json",
     "json_file",
     metavar="FILE|-",
@@ -64,6 +71,7 @@ def replay(
     output: Path | None,
     layer: bool,
     keep: tuple[str, ...],
+    arrow: str,
     json_file: str | None,
     series: bool,
     signal: bool,
@@ -106,6 +114,8 @@ def replay(
         raise UsageError("--layer applies to the annotated log; add -o FILE")
     if keep and output is None:
         raise UsageError("--keep applies to the annotated log; add -o FILE")
+    if arrow and output is None:
+        raise UsageError("--arrow applies to the scene of the annotated log; add -o FILE")
     if keep and layer:
         raise UsageError("--layer copies no messages; remove --keep or --layer")
     window_ns = None if width is None else _width_ns(width)
@@ -124,7 +134,7 @@ def replay(
         replayed = run_replay(
             inputs.source,
             inputs.files,
-            inputs.options(semantics, keep or (() if output else (MAPPED,))),
+            replace(inputs.options(semantics, keep or (() if output else (MAPPED,))), arrow=arrow),
             keep_series=json_file is not None and (series or signal or window_ns is not None),
             keep_leaves=True,
             output=output,

@@ -174,6 +174,8 @@ def _recorded_options(source: Source, options: ReplayOptions, *, layer: bool) ->
     }
     if options.each:
         recorded["each"] = dict(sorted(options.each.items()))
+    if options.arrow:
+        recorded["arrow"] = options.arrow
     if layer:
         recorded["layer"] = True
     elif options.keep not in (None, KEEP_ALL):

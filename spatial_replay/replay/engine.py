@@ -111,7 +111,7 @@ class Replay:
 
         Raises:
             UsageError: a template without its objects, or objects for a parameter that no template has; an
-                operator that the semantics lacks.
+                operator that the semantics lacks; no result for the arrow.
         """
         self._source = source
         self._written_files = files
@@ -123,6 +123,7 @@ class Replay:
             options.semantics,
             source.attachments,
             show=show,
+            arrow=options.arrow,
         )
         self.trees = self._evaluation.trees
         self._keep_series, self._keep_leaves = keep_series, keep_leaves

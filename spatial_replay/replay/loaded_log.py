@@ -321,9 +321,9 @@ class Evaluated:
         topics = {each.topic for each in self.loaded.own.channels}
         return live_layout_attachment(self.evaluation.contents(SceneBounds.of(self.loaded.inside), topics))
 
-    def annotator(self, scene: SceneState | None = None) -> Annotator:
+    def annotator(self, scene: SceneState | None = None, arrow: str = "") -> Annotator:
         """Return the annotator of these samples, before the first; see `AnnotatedEvaluation`."""
-        return self.evaluation.annotator(scene)
+        return self.evaluation.annotator(scene, arrow)
 
     def part(self, begin: int, end: int) -> tuple[Trace, list[SeriesBlock]]:
         """Return samples `begin` to before `end` of those in the window, with their evaluation."""

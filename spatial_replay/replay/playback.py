@@ -29,6 +29,8 @@ class Playback:
     Attributes:
         evaluated: the evaluation; another one of the same log may replace it before a `seek`.
         start_ns, end_ns: from the first sample to the last sample or message of the log.
+        arrow: the title of the result whose violation the scene points at, from the next `seek` on; "" for
+            the first one.
         time_ns: the time up to which messages were taken, inclusive.
     """
 
@@ -39,6 +41,7 @@ class Playback:
         self.start_ns, self.end_ns = int(self._times_ns[0]), own.end_ns
         self.time_ns = self.start_ns
         self.evaluated = evaluated
+        self.arrow = ""
         self._start = scene_start(evaluated.loaded.inside, shown_regions(evaluated.edited.files))
         self._started = evaluated
         self._annotator = evaluated.annotator(self._start)
@@ -70,7 +73,7 @@ class Playback:
             regions = shown_regions(self.evaluated.edited.files)
             self._start, self._started = scene_start(self.evaluated.loaded.inside, regions), self.evaluated
         scene = replace(self._annotator.scene, written_ns=None, place=self._start.place)
-        self._annotator = self.evaluated.annotator(scene)
+        self._annotator = self.evaluated.annotator(scene, self.arrow)
         self._has_ended = False
         events = _last(merge(self._annotator.pass_over(*self.evaluated.part(0, shown))))
         derived = self._annotator.messages(*self.evaluated.part(shown, self._next))

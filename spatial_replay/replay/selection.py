@@ -58,6 +58,7 @@ class ReplayOptions:
             a template has no result for a class.
         keep: which messages of the log a copy keeps: "all", "mapped", patterns of topics; () for the samples
             only. None for all in a copy and, without one, those that need not be read for it.
+        arrow: the title of the result whose violation the scene points at; "" for the first one.
     """
 
     window: Window = Window()
@@ -65,6 +66,7 @@ class ReplayOptions:
     semantics: Semantics = "ltlf"
     strict_names: bool = False
     keep: tuple[str, ...] | None = None
+    arrow: str = ""
 
 
 DEFAULT_OPTIONS = ReplayOptions()

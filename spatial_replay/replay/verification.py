@@ -102,6 +102,7 @@ def verify_certificate(
         options.get("each", {}),
         _semantics(about),
         keep=keep,
+        arrow=str(options.get("arrow", "")),
     )
     replayed = run_replay(evaluated, _files(log), chosen, advance=advance)
     verified = Verified(dict(recorded), dict(replayed.certificate), replayed.faults)

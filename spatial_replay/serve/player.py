@@ -17,7 +17,8 @@ from spatial_replay.replay.loaded_log import EditedFiles, constant_values
 from spatial_replay.replay.playback import Playback
 from spatial_replay.serve.pace import PlaybackState
 from spatial_replay.serve.requests import PendingRequests, Values
-from spatial_replay.serve.session import Session
+from spatial_replay.serve.session import ARROW, Session
+from spatial_replay.text import nearest_hint
 
 
 class Level(Enum):
@@ -80,6 +81,9 @@ def thin(messages: Messages, most: int) -> Messages:
     return messages if kept.all() else select(messages, np.flatnonzero(kept))
 
 
+_MOST_NAMED: Final = 10
+"""The most results that a note lists."""
+
 CONSTANTS = "constants"
 LOG = "log"
 SPECIFICATION = "specification"
@@ -127,7 +131,8 @@ class Player:
         time_ns = self._playback.time_ns if requests.seek_ns is None else requests.seek_ns
         if requests.edited is not None:
             self._evaluate(requests.edited, time_ns)
-        if requests.edited is not None or requests.seek_ns is not None:
+        is_moved = requests.arrow is not None and self._point_at(requests.arrow)
+        if is_moved or requests.edited is not None or requests.seek_ns is not None:
             self._seek(time_ns)
         if requests.topics:
             self._resend(requests.topics)
@@ -147,6 +152,18 @@ class Player:
             self._viewers.send_values(constant_values(edited.constants))
         # viewers drop what they show of the log when the playback jumps, even to the same time
         self._viewers.send_state(self._session.state._replace(time_ns=time_ns, did_seek=True))
+
+    def _point_at(self, arrow: str) -> bool:
+        """Choose the result that the arrow is about; say whether there is such a one."""
+        titles = [tree.title for tree in self._playback.evaluated.evaluation.trees]
+        if arrow and arrow not in titles:
+            hint = nearest_hint(arrow, titles) or f"the results are: {', '.join(titles[:_MOST_NAMED])}"
+            self._viewers.send_note(Note(ARROW, Level.ERROR, f"there is no result {arrow!r}; {hint}"))
+            self._session.point_at(self._playback.arrow)
+            self._viewers.send_playback()
+            return False
+        self._playback.arrow = arrow
+        return True
 
     def _seek(self, time_ns: int) -> None:
         """Send what is shown at a time, and go on from there."""

@@ -31,6 +31,7 @@ class PendingRequests:
         is_controlled: whether to play, pause or change the speed.
         seek_ns: another time to go to.
         topics: topics that were subscribed to.
+        arrow: the title of the result to point at, if that is to change.
         stop: whether the session is to end.
     """
 
@@ -38,6 +39,7 @@ class PendingRequests:
     is_controlled: bool = False
     seek_ns: int | None = None
     topics: set[str] = field(default_factory=set)
+    arrow: str | None = None
     stop: bool = False
 
     def __bool__(self) -> bool:

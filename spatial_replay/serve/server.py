@@ -27,7 +27,7 @@ from spatial_replay.serve.player import CONSTANTS, Level, Note
 from spatial_replay.serve.relay import Relay
 from spatial_replay.serve.requests import Questions, Values
 from spatial_replay.serve.services import PLAYBACK_STATE, SERVICES, STEERING, answer, asset, steered
-from spatial_replay.serve.session import PLAYBACK, Session
+from spatial_replay.serve.session import ARROW, PLAYBACK, Session
 
 # viewers get their errors in replies; the SDK would print them on standard error, too
 logging.getLogger("foxglove").addHandler(logging.NullHandler())
@@ -215,7 +215,12 @@ class LiveServer(PublishingServer):
 
     def send_playback(self) -> None:
         """See `Viewers.send_playback`."""
-        self._server.publish_parameter_values(_parameters(self._session.playback))
+        self._server.publish_parameter_values(_parameters(self.steering))
+
+    @property
+    def steering(self) -> Mapping[str, float | str | bool]:
+        """The parameters that are no constants."""
+        return {**self._session.playback, ARROW: self._session.arrow}
 
     def _start(self) -> protocol.WebSocketServer:
         return foxglove.start_server(
@@ -350,24 +355,29 @@ class _Listener(protocol.ServerListener):
     def on_get_parameters(
         self, client: protocol.Client, param_names: list[str], request_id: str | None = None
     ) -> list[Parameter]:
-        chosen = _parameters({**self._session.playback, **self._session.values})
+        chosen = _parameters({**self._server.steering, **self._session.values})
         return [each for each in chosen if each.name in param_names] if param_names else chosen
 
     def on_set_parameters(
         self, client: protocol.Client, parameters: list[Parameter], request_id: str | None = None
     ) -> list[Parameter]:
         self._server.remove_note(CONSTANTS)
+        self._server.remove_note(ARROW)
         try:
             values = {each.name: _value(each) for each in parameters}
             playback = {name: value for name, value in values.items() if name in PLAYBACK}
-            constants = {name: value for name, value in values.items() if name not in PLAYBACK}
+            constants = {
+                name: value for name, value in values.items() if name not in PLAYBACK and name != ARROW
+            }
+            if ARROW in values:
+                self._session.point_at(values[ARROW])
             if constants:
                 self._session.set_constants(_without_flags(constants))
             if playback:
                 self._server.send_state(self._session.steer(playback))
         except SpatialReplayError as error:
             self._server.send_note(Note(CONSTANTS, Level.ERROR, str(error)))
-        return _parameters({**self._session.playback, **self._session.values})
+        return _parameters({**self._server.steering, **self._session.values})
 
     def on_playback_control_request(
         self, playback_control_request: protocol.PlaybackControlRequest

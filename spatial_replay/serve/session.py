@@ -17,6 +17,8 @@ PLAYBACK: Final = ("playback.time", "playback.play", "playback.speed", "playback
 """The parameters that steer the playback, for viewers without controls of their own: seconds after the first
 sample, whether it plays, seconds of the log in a second, whether it begins again at the end."""
 
+ARROW: Final = "scene.arrow"
+"""The parameter with the title of the result whose violation the arrow points at; "" for the first one."""
 
 _LONGEST_S: Final = 9e9
 
@@ -56,6 +58,7 @@ class Session:
         self._requested = Condition()
         self._is_over = False
         self._loops = False
+        self._arrow = ""
         self.failure: SpatialReplayError | None = None
 
     @property
@@ -91,6 +94,11 @@ class Session:
         seconds = round((state.time_ns - self._transport.start_ns) / 1e9, 3)
         is_playing = state.status is Status.PLAYING
         return dict(zip(PLAYBACK, (seconds, is_playing, state.speed, self._loops), strict=True))
+
+    @property
+    def arrow(self) -> str:
+        """The value of `ARROW`."""
+        return self._arrow
 
     # ------------------------------------------------------------------------ called for viewers
 
@@ -136,6 +144,18 @@ class Session:
             speed=float(values.get(speed, now[speed])),
             seek_ns=seek_ns,
         )
+
+    def point_at(self, arrow: float | str | bool) -> None:
+        """Let the arrow point at the violation of one result, by its title, or at the first one for "".
+
+        Raises:
+            UsageError: a value that is no text.
+        """
+        if not isinstance(arrow, str):
+            raise UsageError(f'{ARROW} cannot be {arrow!r}: give the title of a result, or "" for the first')
+        with self._requested:
+            self._pending.arrow = self._arrow = arrow
+            self._requested.notify()
 
     def set_constants(self, values: Values) -> None:
         """Give constants other values; all of them or, with an error, none.

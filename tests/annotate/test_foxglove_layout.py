@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,26 @@ def check_layout(log: Path) -> dict:
     for path in paths_of(layout["configById"]):
         assert values(log, path), path
     return layout
+
+
+def test_a_layout_reads_no_topic_of_more_than_60_messages_a_second(tmp_path):
+    step_ns, count = 2_000_000, 200
+    samples = [
+        sr.Sample(t * step_ns, {"a": sr.Footprint.box(t, 0, t + 1, 1), "b": sr.Footprint.disc(50, 2, 1)})
+        for t in range(count)
+    ]
+    output = tmp_path / "annotated.mcap"
+    files = [sr.parse_specification(TEXT)]
+    run_replay(MemorySource.from_samples(samples), files, output=output)
+    counts = Counter()
+    with output.open("rb") as stream:
+        counts.update(channel.topic for _, channel, _ in make_reader(stream).iter_messages())
+    seconds = (count - 1) * step_ns / 1e9
+    read = {split(path)[0] for path in paths_of(layout_of(output)["configById"])}
+    assert {"/spatial/scene", "/spatial/standing"} <= read
+    # the first sample, and how the log ends, are messages besides
+    assert all((counts[topic] - 2) / seconds <= 60 for topic in read)
+    assert counts["/spatial/robustness"] / seconds > 60
 
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"

@@ -12,12 +12,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from cli.interruptions import interrupted, write_many
 from cli.program import PROGRAM, run_program
 from replay.runs import SPECIFICATION, content_of, run, write_tracks
 from spatial_replay import Trace
 from spatial_replay.cli import run as run_in_process
+from spatial_replay.logs.topics import SCENE
 
 
 @pytest.fixture
@@ -330,3 +332,30 @@ def test_a_log_is_replayed_with_its_own_specification(folder: Path) -> None:
     assert run_in_process(["replay", "run.mcap", "--spec", "blocks.spatial", "-o", "named.mcap"]) == 4
     assert Path("own.mcap").read_bytes() == Path("named.mcap").read_bytes()
     assert content_of(Path("own.mcap")).of("/spatial/robustness")
+
+
+def test_the_arrow_of_an_annotated_log_points_at_the_result_that_is_chosen(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = 'spec near = G "cup 物" closeto[0] cube\nspec apart = G "cup 物" farfrom[99] cube'
+    (folder / "two.spatial").write_text(text, encoding="utf-8")
+    command = ["replay", "run.jsonl", "--spec", "two.spatial"]
+
+    def pointed_at(log: str) -> str:
+        drawn = [
+            SceneUpdate.FromString(each[-1]) for each in content_of(folder / log).messages if each[0] == SCENE
+        ]
+        [entity] = [entity for entity in drawn[1].entities if entity.id == "witness"]
+        return entity.texts[0].text.partition(":")[0]
+
+    assert run_in_process([*command, "-o", "first.mcap"]) == 1
+    assert run_in_process([*command, "-o", "chosen.mcap", "--arrow", "apart"]) == 1
+    assert pointed_at("first.mcap") == '"cup 物" closeto[0] cube'
+    assert pointed_at("chosen.mcap") == '"cup 物" farfrom[99] cube'
+    # the choice is part of the log, and its certificate is computed again with it
+    assert run_in_process(["verify", "chosen.mcap"]) == 0
+    capsys.readouterr()
+    assert run_in_process([*command, "-o", "other.mcap", "--arrow", "apat"]) == 2
+    assert "did you mean 'apart'?" in capsys.readouterr().err
+    assert run_in_process([*command, "--arrow", "apart"]) == 2
+    assert "add -o FILE" in capsys.readouterr().err

@@ -33,7 +33,7 @@ from serve.viewer import (
 )
 from spatial_replay import UsageError
 from spatial_replay.annotate.curves import MOST_POINTS
-from spatial_replay.logs import Channel, LogWriter, Schema, encode_objects
+from spatial_replay.logs import Channel, LogWriter, MemorySource, Schema, encode_objects
 from spatial_replay.logs.output_file import open_output
 from spatial_replay.logs.schemas.Curves_pb2 import Curves
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
@@ -250,6 +250,30 @@ def test_a_viewer_without_playback_control_steers_by_parameters(
             assert (await own.control(seek_ns=STEP_NS)).time_ns == STEP_NS
 
     asyncio.run(session())
+
+
+def test_a_viewer_chooses_the_result_that_the_arrow_is_about() -> None:
+    text = "spec near = G a closeto[1] b\nspec apart = G a farfrom[20] b"
+    places = {"a": sr.Footprint.box(0, 0, 1, 1), "b": sr.Footprint.box(5, 0, 6, 1)}
+    source = MemorySource.from_samples([sr.Sample(time_ns, places) for time_ns in (0, STEP_NS)], "run")
+
+    def arrow(message: Message) -> list[str]:
+        drawn = SceneUpdate.FromString(message.data).entities
+        return [each.text.strip() for entity in drawn if entity.id == "witness" for each in entity.texts]
+
+    async def looking(own: Viewer) -> None:
+        await own.subscribe([SCENE])
+        assert arrow(await own.message(SCENE)) == ["a closeto[1] b: -3"]
+        assert (await own.parameters())["scene.arrow"] == ""
+        await own.steer(**{"scene.arrow": "apart"})
+        assert arrow(await own.message(SCENE)) == ["a farfrom[20] b: -16"]
+        await own.steer(**{"scene.arrow": "apar"})
+        assert "did you mean 'apart'?" in await own.note("scene.arrow")
+        assert (await own.parameters())["scene.arrow"] == "apart"
+
+    loaded = LoadedLog(source, [sr.parse_specification(text)])
+    with open_server(loaded.evaluate(), port=0) as server:
+        watch(server, looking)
 
 
 def objects_of(schema: Any) -> Iterator[dict[str, Any]]:
