@@ -40,11 +40,12 @@ if TYPE_CHECKING:
     from spatial_replay.compare.alignment import Alignment, Knot, Parting
     from spatial_replay.compare.clips import Clip
     from spatial_replay.compare.decision_diff import DecisionDiff
+    from spatial_replay.compare.declarations import TextPlace
     from spatial_replay.compare.edit_cause import EditOutcome
     from spatial_replay.compare.movement import ObjectDiff
     from spatial_replay.compare.run_results import RunSpecDiff
     from spatial_replay.compare.runs import LogDiff
-    from spatial_replay.compare.spec_diff import FirstDifference, SpecDiff, TextPlace
+    from spatial_replay.compare.spec_diff import FirstDifference, SpecDiff
     from spatial_replay.compare.specifications import SpecificationDiff
     from spatial_replay.compare.trees import Edit
     from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
@@ -197,7 +198,8 @@ __getattr__, __dir__ = loaded_when_used(
         "compare.movement": ("ObjectDiff",),
         "compare.run_results": ("RunSpecDiff",),
         "compare.runs": ("LogDiff",),
-        "compare.spec_diff": ("FirstDifference", "SpecDiff", "TextPlace"),
+        "compare.declarations": ("TextPlace",),
+        "compare.spec_diff": ("FirstDifference", "SpecDiff"),
         "compare.specifications": ("SpecificationDiff",),
         "compare.trees": ("Edit",),
         "geometry.footprint": ("ConvexPart", "Footprint", "TrackedObject"),

@@ -49,7 +49,7 @@ class EditOutcome(NamedTuple):
 
 
 class EditOutcomes:
-    """What the old formula gives with some of the edits; atoms are those that were evaluated already."""
+    """What the old formula gives with some units of edits; atoms are those that were evaluated already."""
 
     def __init__(self, one: SpecResult, other: SpecResult, diff: TreeDiff) -> None:
         self._diff = diff
@@ -65,9 +65,9 @@ class EditOutcomes:
         self._known: dict[frozenset[int], EditOutcome] = {}
         self.count = 0
 
-    def __call__(self, edits: Sequence[int]) -> EditOutcome:
-        """Return the outcome of the old formula with only these edits made."""
-        chosen = frozenset(edits)
+    def __call__(self, units: Sequence[int]) -> EditOutcome:
+        """Return the outcome of the old formula with only these units of edits made."""
+        chosen = frozenset(units)
         if chosen not in self._known:
             self.count += 1
             self._known[chosen] = self._evaluated(self._diff.formula(chosen))
@@ -94,34 +94,34 @@ class EditOutcomes:
 def find_cause(
     diff: TreeDiff, outcome: Callable[[Sequence[int]], EditOutcome], old: EditOutcome, new: EditOutcome
 ) -> tuple[int, ...]:
-    """Return the edits that changed a verdict or, if that stayed, the numbers; deepest first.
+    """Return the units of edits that changed a verdict or, if that stayed, the numbers; deepest first.
 
     Making only these gives the new verdict (numbers), making all the others the old one, and none of them can
-    be left out. A single edit is looked for first, the deepest before others.
+    be left out. A single one is looked for first, the deepest before others.
 
     Args:
-        outcome: returns the outcome of the old formula with some of the edits.
+        outcome: returns the outcome of the old formula with some of the units.
     """
     if old.same_as(new):
         return ()
     verdict_only = old.verdict is not new.verdict
-    edits = sorted(diff.effective, key=lambda number: -diff.edits[number].depth)
+    units = sorted(diff.effective, key=lambda number: -max(edit.depth for edit in diff.units[number]))
     evaluated = 0
 
     def suffices(chosen: Sequence[int]) -> bool:
         nonlocal evaluated
         evaluated += 1
-        others = [number for number in edits if number not in chosen]
+        others = [number for number in units if number not in chosen]
         return (
             evaluated <= _MOST_EVALUATIONS
             and outcome(chosen).same_as(new, verdict_only=verdict_only)
             and outcome(others).same_as(old, verdict_only=verdict_only)
         )
 
-    for number in edits:
+    for number in units:
         if suffices((number,)):
             return (number,)
-    return tuple(minimised(edits, suffices))
+    return tuple(minimised(units, suffices))
 
 
 def minimised(parts: Sequence[int], holds: Callable[[Sequence[int]], bool]) -> list[int]:

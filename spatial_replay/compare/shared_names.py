@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -20,8 +20,9 @@ from spatial_replay.spec.formula import (
     RegionName,
     Term,
     Truth,
+    Variable,
 )
-from spatial_replay.spec.walks import map_leaves, map_terms
+from spatial_replay.spec.walks import iter_formulas, map_leaves, map_terms, substitute
 
 
 def unify_regions(
@@ -46,18 +47,45 @@ def unify_regions(
     return [_with_terms(formula, partial(_with_region, renamed=renamed)) for formula in formulas], joined
 
 
-def without_group_names(expression: Expression) -> Expression:
-    """Return an expression whose groups are known by their members alone."""
-    return map_leaves(expression, partial(_changed_leaf, change=without_group_name))
+@dataclass(frozen=True, slots=True)
+class SharedNames:
+    """Puts one name in place of all that stand for the same.
+
+    Attributes:
+        regions: for each region, the first one of its shape.
+    """
+
+    regions: Mapping[str, str]
+
+    @classmethod
+    def of(cls, regions: Mapping[str, Outline]) -> SharedNames:
+        """Find the regions of one shape."""
+        first: dict[Outline, str] = {}
+        return cls({name: first.setdefault(outline, name) for name, outline in regions.items()})
+
+    def expression(self, expression: Expression) -> Expression:
+        """Return an expression whose groups are known by their members, and regions by their shapes."""
+        return map_leaves(expression, partial(_changed_leaf, change=self.term))
+
+    def term(self, term: Any) -> Any:
+        """Return a term of the same kind."""
+        if isinstance(term, Group):
+            return replace(term, name="")
+        if isinstance(term, RegionName):
+            return RegionName(self.regions.get(term.name, term.name))
+        if not isinstance(term, (Earlier, Enlarged)):
+            return term
+        return replace(term, term=self.term(term.term))
 
 
-def without_group_name(term: Any) -> Any:
-    """Return a term whose group, if it has one, is known by its members alone."""
-    if isinstance(term, Group):
-        return replace(term, name="")
-    if not isinstance(term, (Earlier, Enlarged)):
-        return term
-    return replace(term, term=without_group_name(term.term))
+def without_variables(formula: Quantified) -> Formula:
+    """Return the body of a quantifier with variables that are known by their place alone."""
+    inner = sum(isinstance(each, Quantified) for each in iter_formulas(formula.body))
+    # no name of a text begins with a blank and a number
+    return substitute(
+        formula.body,
+        {name: Variable(f" {inner}.{index}") for index, name in enumerate(formula.variables)},
+    )
 
 
 def _with_terms(formula: Formula, change: Callable[[Term], Term]) -> Formula:

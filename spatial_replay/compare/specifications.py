@@ -6,33 +6,29 @@ new result, and the new formula without them has the old one.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from functools import cache
+from typing import Any
 
+from spatial_replay.compare.declarations import DeclarationChange, TextPlace, TextVersions
 from spatial_replay.compare.edit_cause import EditOutcome, EditOutcomes, find_cause
 from spatial_replay.compare.shared_names import unify_regions
-from spatial_replay.compare.spec_diff import SpecDiff, TextPlace
-from spatial_replay.compare.trees import Edit, TreeDiff, compare_trees
-from spatial_replay.errors import SpecificationError, UsageError
+from spatial_replay.compare.spec_diff import SpecDiff
+from spatial_replay.compare.trees import Edit, Origin, TreeDiff, changed_nodes, compare_trees
+from spatial_replay.errors import UsageError
 from spatial_replay.lazy import Displayed
 from spatial_replay.logs.source import Source
-from spatial_replay.monitor.evaluate import evaluate
+from spatial_replay.monitor.evaluate import Evaluation, evaluate
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, LogNames, ReplayOptions, Selection
 from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
-from spatial_replay.spec.format import format_duration
-from spatial_replay.spec.formula import NamedSpec, Span, Specification
-from spatial_replay.spec.load import parse_specification
+from spatial_replay.spec.formula import NamedSpec, Outline, Span, Specification
+from spatial_replay.spec.resolve import MAX_SIZE
 from spatial_replay.text import counted, counted_from
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
-
-_MOST_CONSTANTS: Final = 32
-"""Changed constants of a file that edits are traced back to."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,11 +77,13 @@ class SpecificationDiff(Displayed):
         """Yield the diff as text, as the command `diff` prints it."""
         yield f"{self.log}: {counted(self.samples, 'sample')}; {self.old.filename} → {self.new.filename}"
         same = 0
+        shown: set[DeclarationChange] = set()
         for each in self.specs:
             if not each.edits and not each.is_different:
                 same += 1
                 continue
-            first, *rest = each.sentences(self.first_ns)
+            first, *rest = each.sentences(self.first_ns, shown)
+            shown.update(edit.change for edit in each.edits if edit.change is not None)
             yield f"  {each.title}: {first}"
             yield from (f"    {sentence}" for sentence in rest)
         for names, where in ((self.removed, self.old), (self.added, self.new)):
@@ -132,28 +130,38 @@ def compare_specifications(
     """
     pairs, removed, added = _paired(old, new)
     formulas, regions = unify_regions([one.formula for one, _ in pairs], old.regions, new.regions)
-    olds = tuple(
-        replace(one, formula=formula, is_result=True)
-        for (one, _), formula in zip(pairs, formulas, strict=True)
-    )
-    news = tuple(replace(other, is_result=True) for _, other in pairs)
-    before, after = (
-        evaluate(
-            Specification(specs, file.profile, regions, filename=file.filename),
+    olds = [replace(one, formula=formula) for (one, _), formula in zip(pairs, formulas, strict=True)]
+    news = [other for _, other in pairs]
+
+    def evaluated(
+        specs: Sequence[NamedSpec], file: Specification, shapes: Mapping[str, Outline] = regions
+    ) -> Evaluation:
+        results = tuple(replace(spec, is_result=True) for spec in specs)
+        return evaluate(
+            Specification(results, file.profile, dict(shapes), filename=file.filename),
             trace,
             semantics=semantics,
             start_ns=start_ns,
             end_ns=min(end_ns, FOREVER),
             each=each,
         )
-        for specs, file in ((olds, old), (news, new))
-    )
+
+    before, after = evaluated(olds, old), evaluated(news, new)
+    versions = TextVersions(old, new)
     trees = {
-        id(other.formula): _traced_back(
-            compare_trees(one.formula, other.formula, other.name), one, other, old, new
+        id(other.formula): compare_trees(
+            one.formula, other.formula, other.name, regions, tuple(_origins(versions, *pair))
         )
-        for one, other in zip(olds, news, strict=True)
+        for one, other, pair in zip(olds, news, pairs, strict=True)
     }
+
+    @cache
+    def by_version(changes: frozenset[int], name: str, *, is_undone: bool) -> Evaluation | None:
+        """Evaluate a spec of the new text with declarations undone, or of the old one with some edited."""
+        file = versions.undone(changes) if is_undone else versions.applied(changes)
+        spec = _spec_named(file, name)
+        return None if file is None or spec is None else evaluated([spec], file, file.regions)
+
     return SpecificationDiff(
         log,
         len(before.results[0].times_ns) if before.results else 0,
@@ -161,7 +169,7 @@ def compare_specifications(
         old,
         new,
         tuple(
-            _spec_diff(one, other, trees[id(other.formula)], old, new)
+            _spec_diff(one, other, trees[id(other.formula)], versions, by_version)
             for one, other in zip(before.results, after.results, strict=True)
         ),
         removed,
@@ -222,10 +230,10 @@ def _paired(
     added = [spec for spec in new.results if spec.name not in olds]
     for other in tuple(added):
         for one in removed:
-            formulas, _ = unify_regions([one.formula], old.regions, new.regions)
+            (formula,), regions = unify_regions([one.formula], old.regions, new.regions)
             if (
                 one.parameter == other.parameter
-                and not compare_trees(formulas[0], other.formula, other.name).effective
+                and not compare_trees(formula, other.formula, other.name, regions).effective
             ):
                 pairs.append((one, other))
                 removed.remove(one)
@@ -246,76 +254,111 @@ def _paired(
     return pairs, tuple(spec.name for spec in removed), tuple(spec.name for spec in added)
 
 
-def _traced_back(
-    diff: TreeDiff, one: NamedSpec, other: NamedSpec, old: Specification, new: Specification
-) -> TreeDiff:
-    """Return a diff whose edits name the constant that they follow from, if one has another value."""
-    changed = [
-        name
-        for name, value in new.constants.items()
-        if name in old.constants
-        and (old.constants[name].value, old.constants[name].duration_ns) != (value.value, value.duration_ns)
-    ]
-    edits = list(diff.edits)
-    for name in changed[:_MOST_CONSTANTS]:
-        written = old.constants[name]
-        duration_ns = written.duration_ns
-        value = written.value if duration_ns is None else format_duration(duration_ns)
-        with suppress(SpecificationError, UsageError):
-            undone = parse_specification(new.source, profile=new.profile, constants={name: value})
-            formula = next(spec.formula for spec in undone.specs if spec.name == other.name)
-            before, _ = unify_regions([one.formula], old.regions, undone.regions)
-            rest = {_place_of(edit) for edit in compare_trees(before[0], formula, other.name).edits}
-            edits = [
-                replace(edit, subject=name)
-                if edit.kind in ("constant", "replaced")
-                and edit.subject is None
-                and _place_of(edit) not in rest
-                else edit
-                for edit in edits
-            ]
-    return replace(diff, edits=tuple(edits))
+def _origins(versions: TextVersions, one: NamedSpec, other: NamedSpec) -> Iterator[Origin]:
+    """Yield which nodes of a spec follow from each declaration, and which from the text of the specs."""
+    old, new = versions.old, versions.new
+    for number, change in enumerate(versions.changes):
+        applied, undone = versions.applied({number}), versions.undone({number})
+        yield Origin(
+            change,
+            _changed(old, one, applied, one.name) or frozenset(),
+            _changed(new, other, undone, other.name) or frozenset(),
+        )
+    if versions.changes:
+        every = range(len(versions.changes))
+        nodes = (
+            _changed(old, one, versions.undone(every), other.name),
+            _changed(new, other, versions.applied(every), one.name),
+        )
+        # where the two cannot be told apart, every node may follow from the text
+        all_nodes = frozenset(range(MAX_SIZE))
+        yield Origin(None, *(all_nodes if each is None else each for each in nodes))
 
 
-def _place_of(edit: Edit) -> tuple[object, ...]:
-    return edit.kind, edit.old_nodes, edit.new_nodes
+def _changed(
+    file: Specification, spec: NamedSpec, version: Specification | None, name: str
+) -> frozenset[int] | None:
+    """Return the nodes of a spec that another version of its text does not have; None without a version."""
+    other = _spec_named(version, name)
+    if version is None or other is None:
+        return None
+    (formula,), regions = unify_regions([other.formula], version.regions, file.regions)
+    return changed_nodes(formula, spec.formula, regions)
+
+
+def _spec_named(file: Specification | None, name: str) -> NamedSpec | None:
+    return None if file is None else next((spec for spec in file.specs if spec.name == name), None)
 
 
 def _spec_diff(
-    one: SpecResult, other: SpecResult, diff: TreeDiff, old: Specification, new: Specification
+    one: SpecResult,
+    other: SpecResult,
+    tree: TreeDiff,
+    versions: TextVersions,
+    by_version: Callable[..., Evaluation | None],
 ) -> SpecDiff:
-    outcomes = EditOutcomes(one, other, diff)
-    cause = find_cause(diff, outcomes, EditOutcome.of(one), EditOutcome.of(other))
+    outcomes = EditOutcomes(one, other, tree)
+    before, after = EditOutcome.of(one), EditOutcome.of(other)
+    units = find_cause(tree, outcomes, before, after)
+
+    def with_edit(edit: Edit, *, is_undone: bool) -> EditOutcome | None:
+        """Return the outcome with only an edit made, or all but that; None if there is no such text."""
+        changes: Sequence[int] = range(len(versions.changes))
+        if edit.change is not None:
+            changes = (versions.changes.index(edit.change),)
+        elif sum(each.change is None and each.kind != "renamed" for each in tree.edits) > 1:
+            return None
+        else:
+            # the only edit of the specs' text: the new one with all declarations undone has only this
+            is_undone = not is_undone
+        found = by_version(frozenset(changes), other.name if is_undone else one.name, is_undone=is_undone)
+        results = () if found is None else found.results
+        return next((EditOutcome.of(each) for each in results if each.object == one.object), None)
+
+    def suffices(edit: Edit) -> bool:
+        verdict_only = before.verdict is not after.verdict
+        found = (with_edit(edit, is_undone=False), after), (with_edit(edit, is_undone=True), before)
+        return all(
+            each is not None and each.same_as(wanted, verdict_only=verdict_only) for each, wanted in found
+        )
+
+    cause = [(edit, unit) for unit in units for edit in tree.units[unit]]
+    if len(units) == 1 and len(cause) > 1:
+        # edits that share a node: one of them may do
+        cause = next(([each] for each in cause if suffices(each[0])), cause)
+    alone = [
+        outcomes((unit,)) if len(tree.units[unit]) == 1 else with_edit(edit, is_undone=False)
+        for edit, unit in cause
+    ]
     return SpecDiff(
         other.name,
         one.name,
         one,
         other,
-        diff.edits,
-        tuple(diff.edits[number] for number in cause),
-        tuple(outcomes((number,)) for number in cause),
-        dict(_places(diff.edits, old, is_old=True)),
-        dict(_places(diff.edits, new, is_old=False)),
+        tree,
+        tuple(edit for edit, _ in cause),
+        tuple(alone),
+        dict(_places(tree.edits, versions, is_old=True)),
+        dict(_places(tree.edits, versions, is_old=False)),
     )
 
 
-_STATEMENT: Final = {"region": "region", "group": "group", "constant": "const", "replaced": "const"}
-
-
-def _places(edits: Sequence[Edit], file: Specification, *, is_old: bool) -> Iterator[tuple[Edit, TextPlace]]:
-    """Yield the line that each edit is in: of the definition that changed, or of the node."""
+def _places(
+    edits: Sequence[Edit], versions: TextVersions, *, is_old: bool
+) -> Iterator[tuple[Edit, TextPlace]]:
+    """Yield where each edit is in a text: the declaration that changed, or the line of the node."""
+    file = versions.old if is_old else versions.new
     lines = file.source.splitlines()
     for edit in edits:
-        line = None
-        if edit.subject is not None and edit.kind in _STATEMENT:
-            line = _defining_line(lines, _STATEMENT[edit.kind], edit.subject)
         span = edit.old_span if is_old else edit.new_span
-        if line is None and span is not None and span != Span(0, 0):
+        place = None
+        if edit.change is not None:
+            place = edit.change.old if is_old else edit.change.new
+        elif span is None:
+            # of what was added or removed: the line as it was without
+            place = versions.line_of_spec(edit.spec, is_old=is_old)
+        elif span != Span(0, 0):
             line = len(file.source[: span.start + 1].splitlines())
-        if line is not None and 0 < line <= len(lines):
-            yield edit, TextPlace(file.filename, line, lines[line - 1].strip())
-
-
-def _defining_line(lines: Sequence[str], statement: str, name: str) -> int | None:
-    pattern = re.compile(rf'\s*{statement}\s+"?{re.escape(name)}"?\s*=')
-    return next((number for number, line in enumerate(lines, 1) if pattern.match(line)), None)
+            place = TextPlace(file.filename, line, lines[line - 1].strip())
+        if place is not None:
+            yield edit, place

@@ -1,23 +1,27 @@
 """Two formulas compared node by node, by meaning: the edits that turn one into the other.
 
-Equal nodes are found wherever they moved to and whatever they are called. Any of the edits can be made
-without the others (`TreeDiff.formula`), which is how the one that matters is found.
+Equal nodes are found wherever they moved to and whatever they are called. What follows from one declaration,
+such as a constant, is one edit. Any unit of edits can be made without the others (`TreeDiff.formula`), which
+is how the one that matters is found.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, TypeAlias
+from itertools import chain
+from typing import Any, Literal, NamedTuple, TypeAlias
 
-from spatial_replay.compare.shared_names import without_group_name, without_group_names
+from spatial_replay.compare.declarations import DeclarationChange
+from spatial_replay.compare.shared_names import SharedNames, without_variables
 from spatial_replay.spec.format import format_bound, format_formula, format_term
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
     Formula,
     Group,
+    Outline,
     Quantified,
     RegionName,
     Span,
@@ -33,8 +37,8 @@ from spatial_replay.spec.walks import base_of, iter_terms
 EditKind: TypeAlias = Literal[
     "constant", "region", "group", "definition", "replaced", "added", "removed", "moved", "renamed"
 ]
-"""What was edited: a number of a node, a shape or group that it names, what its relation means (profile,
-scale), the node itself, one operand of a conjunction or disjunction, only its place, or only its name."""
+"""What was edited: a number, a shape or group that is named, what a macro or relation means (`def`, profile,
+`scale`), the node itself, one operand of a conjunction or disjunction, only its place or its name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +51,8 @@ class Edit:
         old_nodes, new_nodes: ids of the nodes in the two trees.
         old_span, new_span: the place of the first of them in the two texts.
         depth: of the deepest of them, from 0 at the root.
-        subject: the region or group that was edited, or the constant whose value alone explains the edit.
+        subject: the constant, region, group or macro whose declaration was edited, if it was one.
+        change: that declaration in both texts; None if the text of a spec was edited.
     """
 
     kind: EditKind
@@ -60,6 +65,7 @@ class Edit:
     new_span: Span | None
     depth: int
     subject: str | None = None
+    change: DeclarationChange | None = None
 
     @property
     def is_structural(self) -> bool:
@@ -78,8 +84,23 @@ class Edit:
             case "renamed":
                 return f"renamed {self.old} to {self.new}"
             case "region" | "group" | "definition":
-                return f"{self.kind}{about} changed in `{self.new}`"
+                return f"{self.kind}{about} changed in `{self.old if self.new is None else self.new}`"
+        if self.old is None or self.new is None:
+            return f"{self.kind}{about}: {f'adds `{self.new}`' if self.new else f'removes `{self.old}`'}"
         return f"{self.kind}{about}: `{self.old}` to `{self.new}`"
+
+
+class Origin(NamedTuple):
+    """The nodes of two trees that follow from one edit of their texts.
+
+    Attributes:
+        change: the declaration that was edited; None for the text of the specs themselves.
+        old, new: ids of the nodes.
+    """
+
+    change: DeclarationChange | None
+    old: frozenset[int]
+    new: frozenset[int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,31 +127,55 @@ _Merged: TypeAlias = "Formula | _Site | _Inner"
 
 @dataclass(frozen=True, eq=False)
 class TreeDiff:
-    """The edits between two formulas; none if they mean the same under the same names."""
+    """The edits between two formulas; none if they mean the same under the same names.
 
-    edits: tuple[Edit, ...]
+    Attributes:
+        units: edits that the tree can only show together: one, or declarations that share a node.
+    """
+
+    units: tuple[tuple[Edit, ...], ...]
     _merged: _Merged = field(repr=False)
 
     @property
-    def effective(self) -> tuple[int, ...]:
-        """The numbers of the edits that change what the formula means: all but new names."""
-        return tuple(number for number, edit in enumerate(self.edits) if edit.kind != "renamed")
+    def edits(self) -> tuple[Edit, ...]:
+        """All edits."""
+        return tuple(edit for unit in self.units for edit in unit)
 
-    def formula(self, edits: Collection[int]) -> Formula:
-        """Return the old formula with only these of the edits made, by number."""
-        built = _built(self._merged, frozenset(edits))
+    @property
+    def effective(self) -> tuple[int, ...]:
+        """The numbers of the units that change what the formula means: all but new names."""
+        return tuple(number for number, unit in enumerate(self.units) if unit[0].kind != "renamed")
+
+    def formula(self, units: Collection[int]) -> Formula:
+        """Return the old formula with only these of the units made, by number."""
+        built = _built(self._merged, frozenset(units))
         return Truth(True) if built is None else built
 
 
-def compare_trees(old: Formula, new: Formula, name: str) -> TreeDiff:
+def compare_trees(
+    old: Formula,
+    new: Formula,
+    name: str,
+    regions: Mapping[str, Outline],
+    origins: Sequence[Origin] = (),
+) -> TreeDiff:
     """Compare two formulas over the same regions (see `unify_regions`).
 
     Args:
         name: what the formulas are called.
+        origins: the edits of the two texts that nodes follow from; without them, each node has its own.
     """
-    comparison = _Comparison()
+    comparison = _Comparison(regions)
     merged = comparison.align(_Place(old, 0, name, 0), _Place(new, 0, name, 0))
-    return comparison.finished(merged)
+    return comparison.finished(merged, origins)
+
+
+def changed_nodes(old: Formula, new: Formula, regions: Mapping[str, Outline]) -> frozenset[int]:
+    """Return the ids of the nodes of a new formula that differ from an old one, and of those within them."""
+    comparison = _Comparison(regions)
+    comparison.align(_Place(old, 0, "", 0), _Place(new, 0, "", 0))
+    sites = [site for site in comparison.sites if site.kind != "renamed"]
+    return frozenset(number for site in sites for number in site.ids[1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +196,19 @@ class _Place:
             identifier += sum(1 for _ in iter_nodes(operand))
         return found
 
+    def members(self, operator: str, *, through_names: bool = False) -> list[_Place]:
+        """The operands of a conjunction or disjunction, and in place of those that are one, too, theirs.
+
+        Args:
+            through_names: look into specs, too.
+        """
+        found: list[_Place] = []
+        for place in self.operands:
+            inner = place.bare if through_names else place
+            is_more = operator_of(inner.node) == operator and (through_names or inner.node.name is None)
+            found += inner.members(operator, through_names=through_names) if is_more else [place]
+        return found
+
     @property
     def bare(self) -> _Place:
         """The node itself, or what it only repeats under another name."""
@@ -160,13 +218,46 @@ class _Place:
         return place
 
 
+class _Found(NamedTuple):
+    """A place where the trees differ, with what was edited there."""
+
+    kind: EditKind
+    old: _Place | None
+    new: _Place | None
+    subject: str | None
+
+    @property
+    def ids(self) -> tuple[range, range]:
+        """The ids of the nodes that differ; of those with another window or name, only their own."""
+        old, new = (_ids(place, self._is_alone) for place in (self.old, self.new))
+        return old, new
+
+    @property
+    def _is_alone(self) -> bool:
+        is_window = self.kind == "constant" and self.new is not None and isinstance(self.new.node, Temporal)
+        return self.kind == "renamed" or is_window
+
+    def follows_from(self, origin: Origin) -> bool:
+        """Say whether an edit of the texts changed it."""
+        return self.kind != "renamed" and not (
+            origin.old.isdisjoint(self.ids[0]) and origin.new.isdisjoint(self.ids[1])
+        )
+
+
+def _ids(place: _Place | None, is_alone: bool) -> range:
+    if place is None:
+        return range(0)
+    return range(place.id, place.id + (1 if is_alone else sum(1 for _ in iter_nodes(place.node))))
+
+
 class _Comparison:
     """Aligns two trees; numbers meanings, so that equal ones are found at once."""
 
-    def __init__(self) -> None:
+    def __init__(self, regions: Mapping[str, Outline]) -> None:
+        self._names = SharedNames.of(regions)
         self._numbers: dict[Hashable, int] = {}
         self._known: dict[int, tuple[Formula, int]] = {}
-        self._sites: list[tuple[EditKind, _Place | None, _Place | None, str | None]] = []
+        self.sites: list[_Found] = []
 
     def meaning(self, node: Formula) -> int:
         """Return a number that nodes of equal meaning share: names and the order of operands do not count."""
@@ -181,13 +272,17 @@ class _Comparison:
             case Truth():
                 key = node.value
             case Atom():
-                key = (node.relation, without_group_names(node.expression))
+                key = self._names.expression(node.expression)
             case Quantified():
-                group = without_group_name(node.group)
-                key = (node.quantifier, node.variables, group, self.meaning(node.body))
+                group = self._names.term(node.group)
+                key = (node.quantifier, len(node.variables), group, self.meaning(without_variables(node)))
             case Boolean(operator="spec"):
                 return self.meaning(node.operands[0])
-            case Boolean(operator="and" | "or" | "xor" | "<->"):
+            case Boolean(operator="and" | "or" as operator):
+                # brackets around some of the operands mean nothing
+                members = _Place(node, 0, "", 0).members(operator, through_names=True)
+                key = (operator, tuple(sorted(self.meaning(each.node) for each in members)))
+            case Boolean(operator="xor" | "<->"):
                 key = (node.operator, tuple(sorted(map(self.meaning, node.operands))))
             case Boolean():
                 key = (node.operator, tuple(map(self.meaning, node.operands)))
@@ -198,18 +293,18 @@ class _Comparison:
     def align(self, old: _Place, new: _Place) -> _Merged:
         """Compare two nodes that stand in for each other."""
         if old.node.name != new.node.name and None not in (old.node.name, new.node.name):
-            self._sites.append(("renamed", old, new, None))
+            self.sites.append(_Found("renamed", old, new, None))
         if self.meaning(old.node) == self.meaning(new.node):
             self._align_names(old, new)
             return new.node
         old, new = old.bare, new.bare
         match old.node, new.node:
             case Boolean(operator="and" | "or" as one), Boolean(operator=other) if one == other:
-                return self._matched(old.node, old.operands, new.node, new.operands)
-            case _, Boolean(operator="and" | "or") if self._is_among(old, new.operands):
-                return self._matched(new.node, [old], new.node, new.operands)
-            case Boolean(operator="and" | "or"), _ if self._is_among(new, old.operands):
-                return self._matched(old.node, old.operands, old.node, [new])
+                return self._matched(old.node, old.members(one), new.node, new.members(one))
+            case _, Boolean(operator="and" | "or" as one) if self._is_among(old, new.members(one)):
+                return self._matched(new.node, [old], new.node, new.members(one))
+            case Boolean(operator="and" | "or" as one), _ if self._is_among(new, old.members(one)):
+                return self._matched(old.node, old.members(one), old.node, [new])
             case Boolean(), Boolean() if old.node.operator == new.node.operator:
                 return _Inner(None, old.node, new.node, self._pairwise(old, new))
             case Temporal(), Temporal() if old.node.operator == new.node.operator:
@@ -220,32 +315,74 @@ class _Comparison:
         kind, subject = _kind_of(old.node, new.node)
         return self._site(kind, old, new, subject)
 
-    def finished(self, merged: _Merged) -> TreeDiff:
+    def finished(self, merged: _Merged, origins: Sequence[Origin]) -> TreeDiff:
         """Join the sites of one edit, wherever they occur, and return the edits."""
-        moved = {
-            self.meaning(place.node)
-            for kind, place, _, _ in self._sites
-            if kind == "removed" and place is not None
-        } & {
-            self.meaning(place.node)
-            for kind, _, place, _ in self._sites
-            if kind == "added" and place is not None
-        }
-        joined: dict[Hashable, list[int]] = {}
-        for number, (kind, old, new, _) in enumerate(self._sites):
-            meanings = [None if place is None else self.meaning(place.node) for place in (old, new)]
-            if kind in ("added", "removed") and (meanings[0] in moved or meanings[1] in moved):
-                joined.setdefault(("moved", meanings[0] or meanings[1]), []).append(number)
+        declared = [origin for origin in origins if origin.change is not None]
+        shared: list[tuple[set[int], list[int]]] = []
+        rest: list[int] = []
+        for number, site in enumerate(self.sites):
+            own = {index for index, origin in enumerate(declared) if site.follows_from(origin)}
+            if not own:
+                rest.append(number)
                 continue
-            spec = (new or old or _NOWHERE).spec
-            key = (kind, spec, *(_text(place, kind) for place in (old, new)), *meanings)
+            # declarations that share a node are edited together
+            joined = [each for each in shared if each[0] & own]
+            shared = [each for each in shared if not each[0] & own]
+            shared.append(
+                (own.union(*(each[0] for each in joined)), [*chain(*(each[1] for each in joined)), number])
+            )
+        units = [(min(sites), sites, sorted(own)) for own, sites in shared]
+        units += [(min(sites), sites, []) for sites in self._joined(rest)]
+        units.sort()
+        numbers = {site: unit for unit, (_, sites, _) in enumerate(units) for site in sites}
+        text = [origin for origin in origins if origin.change is None]
+        return TreeDiff(
+            tuple(
+                tuple(self._unit(sites, [declared[index] for index in own], text)) for _, sites, own in units
+            ),
+            _renumbered(merged, numbers),
+        )
+
+    def _joined(self, sites: Sequence[int]) -> Iterable[list[int]]:
+        """Join sites that follow from the text of the specs, by the places there."""
+        removed, added = (
+            {self.meaning(place.node) for site in sites for place in self._only(site, kind)}
+            for kind in ("removed", "added")
+        )
+        joined: dict[Hashable, list[int]] = {}
+        for number in sites:
+            kind, old, new, _ = self.sites[number]
+            meanings = [None if place is None else self.meaning(place.node) for place in (old, new)]
+            found = {each for each in meanings if each is not None}
+            spans = tuple(None if place is None else place.node.span for place in (old, new))
+            key: Hashable = ("place", kind == "renamed", *spans)
+            if kind in ("added", "removed") and found <= removed & added:
+                key = ("moved", *found)
+            elif Span(0, 0) in spans:
+                spec = (new or old or _NOWHERE).spec
+                key = (kind, spec, *(_text(place, kind) for place in (old, new)), *meanings)
             joined.setdefault(key, []).append(number)
-        numbers = {site: edit for edit, sites in enumerate(joined.values()) for site in sites}
-        edits = tuple(self._edit(sites) for sites in joined.values())
-        return TreeDiff(edits, _renumbered(merged, numbers))
+        return joined.values()
+
+    def _only(self, site: int, kind: EditKind) -> Iterator[_Place]:
+        """Yield the node of a site of a kind, added or removed."""
+        found = self.sites[site]
+        yield from (place for place in (found.old, found.new) if place is not None and found.kind == kind)
+
+    def _unit(
+        self, sites: Sequence[int], declared: Sequence[Origin], text: Sequence[Origin]
+    ) -> Iterator[Edit]:
+        """Yield the edits that sites follow from together: of each declaration, and of the specs' text."""
+        for origin in declared:
+            if origin.change is not None:
+                edit = self._edit([site for site in sites if self.sites[site].follows_from(origin)])
+                yield replace(edit, kind=origin.change.kind, subject=origin.change.name, change=origin.change)
+        own = [site for site in sites if any(self.sites[site].follows_from(origin) for origin in text)]
+        if own or not declared:
+            yield self._edit(own if declared else sites)
 
     def _edit(self, sites: Sequence[int]) -> Edit:
-        found = [self._sites[site] for site in sites]
+        found = [self.sites[site] for site in sites]
         olds = [old for _, old, _, _ in found if old is not None]
         news = [new for _, _, new, _ in found if new is not None]
         kinds = {kind for kind, *_ in found}
@@ -267,9 +404,9 @@ class _Comparison:
     def _site(
         self, kind: EditKind, old: _Place | None, new: _Place | None, subject: str | None = None
     ) -> _Site:
-        self._sites.append((kind, old, new, subject))
+        self.sites.append(_Found(kind, old, new, subject))
         return _Site(
-            len(self._sites) - 1, None if old is None else old.node, None if new is None else new.node
+            len(self.sites) - 1, None if old is None else old.node, None if new is None else new.node
         )
 
     def _align_names(self, old: _Place, new: _Place) -> None:
@@ -277,7 +414,7 @@ class _Comparison:
         for one, other in zip(old.operands, new.operands, strict=False):
             if self.meaning(one.node) == self.meaning(other.node):
                 if one.node.name != other.node.name and None not in (one.node.name, other.node.name):
-                    self._sites.append(("renamed", one, other, None))
+                    self.sites.append(_Found("renamed", one, other, None))
                 self._align_names(one, other)
 
     def _pairwise(self, old: _Place, new: _Place) -> tuple[_Merged, ...]:

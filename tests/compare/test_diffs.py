@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import spatial_replay as sr
 from compare.planned_runs import with_another_decision
@@ -136,3 +137,63 @@ def test_a_group_under_another_name_is_the_same_group() -> None:
     fewer = sr.parse_specification(text.replace("red, green", "red").replace("NAME", "reds"))
     edits = [edit for spec in sr.diff_specifications(trace, old, fewer).specs for edit in spec.edits]
     assert [(edit.kind, edit.subject) for edit in edits] == [("group", "reds")]
+
+
+TWICE = """\
+const near = 4  # how near
+region goal = box(0, 0, 9, 9)
+def beside(x, y) = x dist y <= near
+spec calm = G (beside(red, green) and beside(green, blue)) and F (red dist blue <= near)
+spec safe = G (forall x in all: x enclosedin goal) and F (red dist blue <= near)
+"""
+
+
+def three_blocks() -> sr.Trace:
+    boxes = {name: sr.Footprint.box(x, 0, x + 1, 1) for name, x in (("red", 0), ("green", 2), ("blue", 4))}
+    return sr.Trace.from_samples([sr.Sample(0, boxes)])
+
+
+def test_an_edited_declaration_is_one_edit_with_its_line_however_often_it_is_used() -> None:
+    old, new = (sr.parse_specification(TWICE.replace("near = 4", f"near = {near}")) for near in (4, 3.5))
+    diff = sr.diff_specifications(three_blocks(), old, new)
+    for spec in diff.specs:
+        ((edit, place),) = spec.new_places.items()
+        assert (edit.kind, edit.subject, place.line, place.text) == (
+            "constant",
+            "near",
+            1,
+            "const near = 3.5",
+        )
+        assert spec.old_places[edit].text == "const near = 4"
+    assert repr(diff).count("+ <text>:1: const near = 3.5") == 1
+
+
+def test_where_each_of_two_edits_flips_a_verdict_by_itself_that_is_said() -> None:
+    new = TWICE.replace("near = 4", "near = 0.5").replace("x dist y <= near", "x dist y <= near and x ovlp y")
+    diff = sr.diff_specifications(three_blocks(), *map(sr.parse_specification, (TWICE, new))).spec("calm")
+    assert [edit.subject for edit in diff.cause] == ["near", "beside"]
+    assert "each of these 2 edits is enough by itself; to get the old verdict back, undo both" in repr(
+        [*diff.sentences(0)]
+    )
+
+
+@pytest.mark.parametrize(
+    "edits",
+    [
+        {"goal": "target"},
+        {"F (red dist blue <= near)": "(F ((red dist blue <= near)))"},
+        {"beside(red, green) and beside(green, blue)": "(beside(green, blue)) and ((beside(red, green)))"},
+        {"# how near": "", "near = 4": "near = 4.0 in [0, 4]"},
+        {"x in all: x": "each in all: each", "beside(x, y)": "beside(y, x)", "x dist y": "y dist x"},
+        {"const near = 4  # how near\n": "", "region": "const near = 4\nregion"},
+        {"region goal": "const unused = 3\nregion goal"},
+    ],
+)
+def test_edits_without_another_meaning_are_no_difference(edits: dict[str, str]) -> None:
+    text = TWICE
+    for before, after in edits.items():
+        text = text.replace(before, after)
+    diff = sr.diff_specifications(three_blocks(), *map(sr.parse_specification, (TWICE, text)))
+    assert text != TWICE
+    assert diff.is_empty, diff
+    assert "edited" not in repr(diff)

@@ -15,7 +15,6 @@ from laws.strategies_monitor import HEADER, WORDS, Recording, recordings, specif
 from laws.strategies_spec import formula_texts
 from spatial_replay import NamedSpec, Specification
 from spatial_replay.compare.shared_names import unify_regions
-from spatial_replay.compare.trees import compare_trees
 from spatial_replay.spec.formula import Formula
 
 OTHER_HEADER = HEADER.replace("box(-2, -2, 3, 2)", "box(-1, -2, 3, 1)")
@@ -51,8 +50,8 @@ def test_the_cause_of_a_change_undone_undoes_it(pair, recording, semantics):
         return
     assert numbers_of(diff.old) == numbers_of(sr.evaluate(old, trace, semantics=semantics).result())
     assert numbers_of(diff.new) == numbers_of(sr.evaluate(new, trace, semantics=semantics).result())
-    (before,), regions = unify_regions([old.specs[0].formula], old.regions, new.regions)
-    tree = compare_trees(before, new.specs[0].formula, "s")
+    (_,), regions = unify_regions([old.specs[0].formula], old.regions, new.regions)
+    tree = diff.tree
 
     def outcome(formula: Formula) -> tuple[object, ...]:
         specification = Specification((NamedSpec("s", formula),), "paper", regions)
@@ -63,11 +62,63 @@ def test_the_cause_of_a_change_undone_undoes_it(pair, recording, semantics):
     assert outcome(tree.formula(everything)) == numbers_of(diff.new)
     assert bool(diff.cause) == (numbers_of(diff.old) != numbers_of(diff.new))
     if diff.cause:
-        cause = [number for number in everything if tree.edits[number] in diff.cause]
+        cause = [number for number in everything if set(tree.units[number]) & set(diff.cause)]
         compared = slice(0, 1) if diff.is_flipped else slice(None)
         others = [number for number in everything if number not in cause]
         assert outcome(tree.formula(cause))[compared] == numbers_of(diff.new)[compared]
         assert outcome(tree.formula(others))[compared] == numbers_of(diff.old)[compared]
+
+
+DECLARED = """\
+const near = {near}
+const far = near * {far}
+region zone = box(-2, -2, {zone}, 2)
+group many = {many}
+def beside(x, y) = x dist y {beside}
+spec calm = G ({low} <= a dist b <= far)
+spec s = calm and (F (beside(a, b) and b ovlp zone) or forall x in many: x enclosedin zone)
+"""
+WRITTEN = {
+    "near": ["1", "1.5", "3"],
+    "far": ["2", "4"],
+    "zone": ["1", "3"],
+    "many": ["a", "a, b", "b, c"],
+    "beside": ["<= near", "<= far and x leftof y", ">= near"],
+    "low": ["0", "0.5"],
+}
+STATEMENTS = {"constant": "const", "region": "region", "group": "group", "definition": "def"}
+
+
+@st.composite
+def edited_texts(draw) -> tuple[str, str]:
+    """A text, and the same after edits of some of its declarations and specs."""
+    old = {name: draw(st.sampled_from(values)) for name, values in WRITTEN.items()}
+    edited = draw(st.sets(st.sampled_from(sorted(WRITTEN)), min_size=1, max_size=3))
+    new = {name: draw(st.sampled_from(WRITTEN[name])) if name in edited else old[name] for name in old}
+    return DECLARED.format(**old), DECLARED.format(**new)
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.too_slow])
+@given(texts=edited_texts(), recording=recordings())
+def test_the_lines_that_a_diff_names_are_those_that_were_edited_and_undone_they_undo_it(texts, recording):
+    old, new = texts
+    trace = recording.trace()
+    (diff,) = sr.diff_specifications(trace, *map(sr.parse_specification, texts)).specs
+    lines = [set(text.splitlines()) for text in texts]
+    for edit in diff.edits:
+        pair = diff.old_places[edit].text, diff.new_places[edit].text
+        assert pair[0] in lines[0] - lines[1]
+        assert pair[1] in lines[1] - lines[0]
+        if edit.subject is not None:
+            assert pair[1].startswith(f"{STATEMENTS[edit.kind]} {edit.subject}")
+    assert len({diff.new_places[edit] for edit in diff.edits}) == len(diff.edits)
+    for edit in diff.cause:
+        old = old.replace(diff.old_places[edit].text, diff.new_places[edit].text)
+        new = new.replace(diff.new_places[edit].text, diff.old_places[edit].text)
+    for text, wanted in ((old, diff.new), (new, diff.old)):
+        outcome = numbers_of(sr.evaluate(sr.parse_specification(text), trace).result())
+        compared = slice(0, 1) if diff.is_flipped else slice(None)
+        assert outcome[compared] == numbers_of(wanted)[compared]
 
 
 @settings(max_examples=30)
