@@ -34,8 +34,13 @@ def read_only_integers(values: ArrayLike) -> Integers:
 def starts_from_counts(counts: Sequence[int] | Integers) -> Integers:
     """Return where each of n rows of the given lengths begins and the last one ends, (n + 1,)."""
     start = np.zeros(len(counts) + 1, np.int64)
-    np.cumsum(counts, out=start[1:])
+    np.add.accumulate(np.asarray(counts, np.int64), out=start[1:])
     return start
+
+
+def counts_from_starts(start: Integers) -> Integers:
+    """Return the lengths (n,) of rows that begin and end at the given places (n + 1,)."""
+    return np.asarray(start[1:] - start[:-1])
 
 
 def flat_index(first: Integers, counts: Integers) -> Integers:
@@ -46,5 +51,7 @@ def flat_index(first: Integers, counts: Integers) -> Integers:
 
 def count_in_rows(flags: Booleans, start: Integers) -> Integers:
     """Count the flags set in each row; rows may be empty."""
+    if not flags.any():
+        return np.zeros(len(start) - 1, np.int64)
     total = starts_from_counts(flags.astype(np.int64))
     return np.asarray(total[start[1:]] - total[start[:-1]])

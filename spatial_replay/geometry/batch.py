@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -11,12 +13,13 @@ from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.arrays import (
     Floats,
     Integers,
+    counts_from_starts,
     flat_index,
     read_only_floats,
     read_only_integers,
     starts_from_counts,
 )
-from spatial_replay.geometry.footprint import ConvexPart, Footprint
+from spatial_replay.geometry.footprint import Footprint, convex_parts
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,8 +63,20 @@ class FootprintBatch:
                 raise GeometryError(f"{name} is {actual}; {rows} rows of {parts} parts need {shape}")
         for name, last in (("part_start", parts), ("vertex_start", vertices)):
             start = getattr(self, name)
-            if start[0] != 0 or start[-1] != last or np.any(np.diff(start) < 0):
+            if start[0] != 0 or start[-1] != last or (start[1:] < start[:-1]).any():
                 raise GeometryError(f"{name} must rise from 0 to {last}; it is {start}")
+
+    @classmethod
+    def trusted(cls, **columns: Floats | Integers) -> FootprintBatch:
+        """Build rows of new, contiguous arrays that are known to fit together.
+
+        For a few rows, checking takes longer than making them.
+        """
+        batch = object.__new__(cls)
+        for name, array in columns.items():
+            array.flags.writeable = False
+            object.__setattr__(batch, name, array)
+        return batch
 
     def __len__(self) -> int:
         return len(self.part_start) - 1
@@ -91,9 +106,9 @@ class FootprintBatch:
     @classmethod
     def unknown(cls, count: int) -> FootprintBatch:
         """Build rows of which nothing is known: one point each, at NaN."""
-        return cls(
-            part_start=np.arange(count + 1),
-            vertex_start=np.arange(count + 1),
+        return cls.trusted(
+            part_start=np.arange(count + 1, dtype=np.int64),
+            vertex_start=np.arange(count + 1, dtype=np.int64),
             vertices=np.full((count, 2), np.nan),
             radius=np.zeros(count),
             bottom=np.full(count, np.nan),
@@ -103,10 +118,12 @@ class FootprintBatch:
     @classmethod
     def concatenate(cls, batches: Sequence[FootprintBatch]) -> FootprintBatch:
         """Join the rows of several batches, one after the other."""
+        if len(batches) == 1:
+            return batches[0]
         none = np.empty(0, np.int64)
-        part_counts = np.concatenate([none, *(np.diff(batch.part_start) for batch in batches)])
-        vertex_counts = np.concatenate([none, *(np.diff(batch.vertex_start) for batch in batches)])
-        return cls(
+        part_counts = np.concatenate([none, *(counts_from_starts(batch.part_start) for batch in batches)])
+        vertex_counts = np.concatenate([none, *(counts_from_starts(batch.vertex_start) for batch in batches)])
+        return cls.trusted(
             part_start=starts_from_counts(part_counts),
             vertex_start=starts_from_counts(vertex_counts),
             vertices=np.concatenate([np.empty((0, 2)), *(batch.vertices for batch in batches)]),
@@ -117,30 +134,48 @@ class FootprintBatch:
 
     def select(self, rows: Integers) -> FootprintBatch:
         """Return the given rows (K,), in the order given; a row may be repeated."""
-        part_counts = self.part_start[rows + 1] - self.part_start[rows]
-        parts = flat_index(self.part_start[rows], part_counts)
-        vertex_counts = self.vertex_start[parts + 1] - self.vertex_start[parts]
-        return FootprintBatch(
+        first_part = self.part_start[rows]
+        part_counts = self.part_start[rows + 1] - first_part
+        parts = flat_index(first_part, part_counts)
+        first_vertex = self.vertex_start[parts]
+        vertex_counts = self.vertex_start[parts + 1] - first_vertex
+        return FootprintBatch.trusted(
             part_start=starts_from_counts(part_counts),
             vertex_start=starts_from_counts(vertex_counts),
-            vertices=self.vertices[flat_index(self.vertex_start[parts], vertex_counts)],
+            vertices=self.vertices.take(flat_index(first_vertex, vertex_counts), axis=0),
             radius=self.radius[parts],
             bottom=self.bottom[rows],
             top=self.top[rows],
         )
 
+    def with_outlines(self, vertex_start: Integers, vertices: Floats) -> FootprintBatch:
+        """Return the same parts with other vertices, of as many parts: new arrays."""
+        return FootprintBatch.trusted(
+            part_start=self.part_start,
+            vertex_start=vertex_start,
+            vertices=vertices,
+            radius=self.radius,
+            bottom=self.bottom,
+            top=self.top,
+        )
+
     def footprint(self, row: int) -> Footprint:
-        """Return the footprint of one row.
+        """Return the footprint of one row; see `footprints`."""
+        (footprint,) = self.footprints([row])
+        return footprint
+
+    def footprints(self, rows: Sequence[int]) -> list[Footprint]:
+        """Return the footprints of some rows.
 
         Raises:
-            GeometryError: the row's coordinates are not those of convex parts.
+            GeometryError: coordinates that are not those of convex parts.
         """
-        parts = []
-        for part in range(self.part_start[row], self.part_start[row + 1]):
-            corners = self.vertices[self.vertex_start[part] : self.vertex_start[part + 1]]
-            parts.append(ConvexPart(corners, float(self.radius[part])))
-        return Footprint(tuple(parts))
+        is_all = len(rows) == len(self) and list(rows) == list(range(len(self)))
+        chosen = self if is_all else self.select(np.array(rows, np.int64))
+        parts = convex_parts(chosen.vertex_start, chosen.vertices, chosen.radius)
+        return [Footprint(tuple(parts[begin:end])) for begin, end in pairwise(chosen.part_start.tolist())]
 
     def height(self, row: int) -> tuple[float, float] | None:
         """Return the height interval (bottom, top) of one row, or None."""
-        return None if np.isnan(self.bottom[row]) else (float(self.bottom[row]), float(self.top[row]))
+        bottom = float(self.bottom[row])
+        return None if math.isnan(bottom) else (bottom, float(self.top[row]))

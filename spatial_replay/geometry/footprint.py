@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from spatial_replay.errors import GeometryError
-from spatial_replay.geometry.arrays import Floats, read_only_floats
+from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats
 from spatial_replay.geometry.outline import NOT_CONVEX, SOUND, convex_hull, convex_pieces, normalise_polygons
 from spatial_replay.text import is_encodable
 
@@ -61,6 +62,30 @@ class ConvexPart:
 
     def __hash__(self) -> int:
         return hash((self.radius, _ring(self.vertices)))
+
+
+def convex_parts(start: Integers, vertices: Floats, radius: Floats) -> list[ConvexPart]:
+    """Return P parts, checked and corrected all at once.
+
+    Args:
+        start: (P + 1,) where the vertices of each begin and end.
+        vertices: (V, 2), radius: (P,).
+
+    Raises:
+        GeometryError: as `ConvexPart`.
+    """
+    outlines = normalise_polygons(start, vertices)
+    if outlines.fault.any() or not (np.isfinite(radius) & (radius >= 0)).all():
+        each = zip(pairwise(start.tolist()), radius.tolist(), strict=True)
+        return [ConvexPart(vertices[begin:end], rounding) for (begin, end), rounding in each]
+    tidy = read_only_floats(outlines.vertices)
+    parts: list[ConvexPart] = []
+    for (begin, end), rounding in zip(pairwise(outlines.vertex_start.tolist()), radius.tolist(), strict=True):
+        part = object.__new__(ConvexPart)
+        object.__setattr__(part, "vertices", tidy[begin:end])
+        object.__setattr__(part, "radius", rounding)
+        parts.append(part)
+    return parts
 
 
 @dataclass(frozen=True, slots=True, eq=False)

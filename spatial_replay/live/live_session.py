@@ -272,9 +272,9 @@ class LiveSession:
         async for update in self._evaluated(self._fall_silent(now_s), now_s):
             yield update
 
-    def _add(self, messages: Sequence[Message]) -> Trace:
+    def _add(self, messages: Sequence[Message]) -> Trace | None:
         if self._assembler is None:
-            return Trace.from_samples(())
+            return None
         trace = self._assembler.add(messages, time.monotonic())
         self._notes += self._assembler.take_faults()
         if self._assembler.is_finished and self.failure is None:
@@ -284,19 +284,19 @@ class LiveSession:
             )
         return trace
 
-    def _lose(self, topics: Sequence[str]) -> Trace:
+    def _lose(self, topics: Sequence[str]) -> Trace | None:
         if self._assembler is None:
-            return Trace.from_samples(())
+            return None
         return self._assembler.lose(topics, time.monotonic())
 
-    def _fall_silent(self, now_s: float) -> Trace:
+    def _fall_silent(self, now_s: float) -> Trace | None:
         """Note topics that have been silent for too long; what they reported is unknown from now on."""
         if self._dead_man_s is None or self._assembler is None or not self._is_connected:
-            return Trace.from_samples(())
+            return None
         watched = [topic for topic in self._assembler.topics if topic not in self._silent]
         silent = [each for each in watched if now_s - self._last_s.get(each, now_s) >= self._dead_man_s]
         if not silent:
-            return Trace.from_samples(())
+            return None
         self._silent |= {*silent}
         listed = ", ".join(silent)
         self._report_event(f"silence on {listed}")
@@ -385,9 +385,9 @@ class LiveSession:
 
     # ------------------------------------------------------------------------------ evaluating
 
-    async def _evaluated(self, trace: Trace, arrived_s: float) -> AsyncIterator[LiveUpdate]:
+    async def _evaluated(self, trace: Trace | None, arrived_s: float) -> AsyncIterator[LiveUpdate]:
         """Evaluate samples, and yield what they give; late ones are dropped while newer ones wait."""
-        if not len(trace):
+        if trace is None or not len(trace):
             return
         turn_s = time.monotonic()
         last_ns = int(trace.times_ns[-1])
@@ -412,9 +412,9 @@ class LiveSession:
         changes = tuple(self._changes.after(updates))
         return LiveUpdate(sample, changes, self.take_notes(), self._delay_s, self._dropped, updates)
 
-    def _finish(self) -> Trace:
+    def _finish(self) -> Trace | None:
         if self._assembler is None:
-            return Trace.from_samples(())
+            return None
         trace = self._assembler.finish()
         self.remarks = self._assembler.take_remarks()
         return trace

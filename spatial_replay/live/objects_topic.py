@@ -54,14 +54,14 @@ class ObjectsAssembler:
     def lose(self, topics: Collection[str], now_s: float) -> Trace:
         """Return a sample right after the newest, in which every object is unknown."""
         if self._newest_ns < 0 or not self._classes:
-            return Trace.from_samples(())
+            return Trace.empty()
         self._newest_ns += 1
         unknown, self._classes = self._classes, {}
         return Trace.from_samples([Sample(self._newest_ns, unknown=unknown)])
 
     def finish(self) -> Trace:
         """Return the remaining samples: none."""
-        return Trace.from_samples(())
+        return Trace.empty()
 
     def take_faults(self) -> tuple[str, ...]:
         """Return what was lost since the last call."""

@@ -169,6 +169,11 @@ class Assembler:
         return self._newest_ns
 
     @property
+    def settled_ns(self) -> int:
+        """Up to when samples are final; -1 before the first."""
+        return self._settled_ns
+
+    @property
     def frames(self) -> FrameTree:
         """The transforms so far."""
         return self._tree
@@ -238,7 +243,10 @@ class Assembler:
         numbers = map(self._number_of_topic.get, arrived.topics, repeat(-1))
         number_of_message = np.fromiter(numbers, np.int64, len(arrived))
         stamped: list[_Stamped] = []
+        come = set(arrived.topics)
         for number, reader in enumerate(self._readers.values()):
+            if reader.name not in come:
+                continue
             places = np.flatnonzero(number_of_message == number)
             if len(places):
                 stamped.append(self._stamp(reader, places, arrived))
@@ -270,12 +278,20 @@ class Assembler:
         moving = [each for each in stamped if each.reader.advances_time]
         if not moving:
             return len(arrived)
-        places = np.concatenate([each.places for each in moving])
-        times_ns = np.concatenate([each.times_ns for each in moving])
-        order = np.argsort(places, kind="stable")
-        places, times_ns = places[order], times_ns[order]
-        if self._begin_ns is None and len(times_ns):
+        places, times_ns = moving[0].places, moving[0].times_ns
+        if len(moving) > 1:
+            places = np.concatenate([each.places for each in moving])
+            times_ns = np.concatenate([each.times_ns for each in moving])
+            order = np.argsort(places, kind="stable")
+            places, times_ns = places[order], times_ns[order]
+        if not len(times_ns):
+            return len(arrived)
+        if self._begin_ns is None:
             self._begin_ns = int(times_ns[0])
+        newest_ns = max(self._newest_ns, int(times_ns.max()))
+        if int(times_ns.min()) >= newest_ns - self._plan.late_ns:
+            self._newest_ns = newest_ns
+            return len(arrived)
         newest = np.maximum.accumulate(np.concatenate([[self._newest_ns], times_ns]))
         late = np.flatnonzero(times_ns < newest[:-1] - self._plan.late_ns)
         if not len(late):
@@ -322,7 +338,7 @@ class Assembler:
     def _settle(self, upto_ns: int) -> Trace:
         """Return the samples up to a time before which no further message is expected."""
         if upto_ns <= self._settled_ns:
-            return Trace.from_samples(())
+            return Trace.empty()
         start_ns, end_ns = self._window_ns
         # logs contain NaN and infinity; they make objects unknown, without warnings
         with np.errstate(all="ignore"):
@@ -391,7 +407,7 @@ class _SampleTimes:
             UsageError: the step is far too short for the rate of the messages.
         """
         if self._step_ns is None:
-            times = np.unique(times_ns)
+            times = times_ns if len(times_ns) == 1 else np.unique(times_ns)
             times = times[times > self._last_ns]
         else:
             times = self._multiples(times_ns, upto_ns, self._step_ns)

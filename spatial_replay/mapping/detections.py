@@ -17,7 +17,13 @@ from spatial_replay.mapping.binding import Binding
 from spatial_replay.mapping.field_paths import FieldPath, Style, field_names, style_of, tuple_getter
 from spatial_replay.mapping.footprints import BOX, DISC, POLYGON, SPHERE, Solid, Solids
 from spatial_replay.mapping.message_types import MessageLayout
-from spatial_replay.mapping.transforms import Transforms, matrices_from_quaternions, matrices_from_yaw, yaw_of
+from spatial_replay.mapping.transforms import (
+    Transforms,
+    matrices_from_quaternions,
+    matrices_from_yaw,
+    no_rotations,
+    yaw_of,
+)
 
 EVERY_OBJECT = -1
 """Instead of the code of a name: all objects of the topic."""
@@ -212,7 +218,7 @@ def _poses(layout: MessageLayout, binding: Binding, numbers: Floats) -> Poses:
     if binding.yaw is not None:
         yaw = numbers[:, binding.yaw] * layout.angle_scale
         return Poses(position, matrices_from_yaw(yaw), yaw)
-    return Poses(position, np.broadcast_to(np.eye(3), (count, 3, 3)), np.full(count, np.nan))
+    return Poses(position, no_rotations(count), np.full(count, np.nan))
 
 
 _EQUATOR_M, _ECCENTRICITY_SQUARED = 6_378_137.0, 6.694379990141316e-3
@@ -325,7 +331,7 @@ def _polygons(counts: Integers, points: Floats) -> Solids:
     """Return polygons with corners in the frame of their message, not in the object's own."""
     count = len(counts)
     owner, kind = np.arange(count), np.full(count, POLYGON, np.int8)
-    position, rotation = np.zeros((count, 3)), np.broadcast_to(np.eye(3), (count, 3, 3))
+    position, rotation = np.zeros((count, 3)), no_rotations(count)
     size = np.full((count, 3), np.nan)
     return Solids(owner, kind, position, rotation, size, starts_from_counts(counts), points)
 

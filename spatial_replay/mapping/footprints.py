@@ -13,7 +13,13 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.geometry.arrays import Floats, Integers, flat_index, starts_from_counts
+from spatial_replay.geometry.arrays import (
+    Floats,
+    Integers,
+    counts_from_starts,
+    flat_index,
+    starts_from_counts,
+)
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.outline import convex_hull
 from spatial_replay.mapping.field_paths import Style
@@ -50,7 +56,7 @@ class Solids:
         """Return the solids of one object, `count` times."""
         own = np.flatnonzero(self.owner == owner)
         pieces = np.tile(own, count)
-        sizes = np.diff(self.point_start)[pieces]
+        sizes = counts_from_starts(self.point_start)[pieces]
         return Solids(
             owner=np.repeat(np.arange(count, dtype=np.int64), len(own)),
             kind=self.kind[pieces],
@@ -71,12 +77,14 @@ def footprints_from_solids(solids: Solids, count: int) -> FootprintBatch:
     solids = _with_boxes(solids)
     kind, size = solids.kind, solids.size
     boxes, polygons, hulls = (np.flatnonzero(kind == each) for each in (BOX, POLYGON, HULL))
-    tilted = boxes[~is_upright(solids.rotation[boxes]) & ~np.isnan(size[boxes, 2])]
+    tilted = boxes[~np.isnan(size[boxes, 2])]
+    if len(tilted):
+        tilted = tilted[~is_upright(solids.rotation[tilted])]
     flat = np.setdiff1d(boxes, tilted, assume_unique=True) if len(tilted) else boxes
     rings = [_ring(solids, piece) for piece in hulls.tolist()]
     vertex_counts = _VERTICES[kind]
     vertex_counts[tilted] = 6
-    vertex_counts[polygons] = np.diff(solids.point_start)[polygons]
+    vertex_counts[polygons] = counts_from_starts(solids.point_start)[polygons]
     vertex_counts[hulls] = [len(ring) for ring in rings]
     start = starts_from_counts(vertex_counts)
     vertices = np.empty((int(start[-1]), 2))
@@ -91,8 +99,10 @@ def footprints_from_solids(solids: Solids, count: int) -> FootprintBatch:
     for piece, ring in zip(hulls.tolist(), rings, strict=True):
         vertices[start[piece] : start[piece] + len(ring)] = ring
     bottom, top = _heights(solids, size, count)
-    return FootprintBatch(
-        part_start=starts_from_counts(np.bincount(solids.owner, minlength=count).astype(np.int64)),
+    is_single = len(kind) == count and (solids.owner == np.arange(count)).all()
+    parts = np.ones(count, np.int64) if is_single else np.bincount(solids.owner, minlength=count)
+    return FootprintBatch.trusted(
+        part_start=starts_from_counts(parts),
         vertex_start=start,
         vertices=vertices,
         radius=np.where(_IS_ROUND[kind], size[:, 0] / 2, 0.0),
@@ -156,7 +166,7 @@ def _hexagons(solids: Solids, size: Floats, pieces: Integers) -> Floats:
 
 
 def _fill_polygons(vertices: Floats, start: Integers, solids: Solids, pieces: Integers) -> None:
-    counts = np.diff(solids.point_start)[pieces]
+    counts = counts_from_starts(solids.point_start)[pieces]
     points = solids.points[flat_index(solids.point_start[:-1][pieces], counts)]
     rotation, position = solids.rotation[pieces, :2, :], solids.position[pieces, :2]
     if (rotation != np.eye(3)[:2]).any() or position.any():

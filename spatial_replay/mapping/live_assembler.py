@@ -165,7 +165,8 @@ class LiveAssembler:
     def due_s(self) -> float | None:
         """Return when to `add` again, even without messages; None if nothing waits."""
         times = [each.until_s for each in self._held]
-        if self._silent and self._silent[-1][1] > self._patient_ns:
+        is_settled = self._assembler.settled_ns >= self._assembler.newest_ns
+        if self._silent and self._silent[-1][1] > self._patient_ns and not is_settled:
             times.append(self._silent[0][0])
         return min(times, default=None)
 
@@ -176,7 +177,7 @@ class LiveAssembler:
         """
         gone = set(topics) & set(self._latest_ns) - self._lost
         if not gone:
-            return Trace.from_samples(())
+            return Trace.empty()
         self._now_s = now_s
         self._lost |= gone
         self._held = [each for each in self._held if each.topic not in gone]

@@ -19,7 +19,7 @@ from spatial_replay.mapping.footprints import Solids, footprints_from_solids
 from spatial_replay.mapping.model import FOREVER_NS
 from spatial_replay.mapping.transforms import Transforms
 from spatial_replay.trace.axes import Axes
-from spatial_replay.trace.observations import Observations, trace_from_observations
+from spatial_replay.trace.observations import Observations, check_observations
 from spatial_replay.trace.trace import ABSENT
 
 LEFT = -1
@@ -71,7 +71,9 @@ class Events:
         Returns:
             distinct names (N,); rows (T, N), each a row, `ABSENT` or `STALE`; class codes (T, N).
         """
-        starts = np.flatnonzero(np.diff(self.name, prepend=-1))
+        starts = np.flatnonzero(np.append(True, self.name[1:] != self.name[:-1])[: len(self.name)])
+        if len(times_ns) == 1 and len(starts):
+            return self._state_at(int(times_ns[0]), max_age_ns, starts)
         ends = np.append(starts[1:], len(self.name))[: len(starts)]
         rows = np.full((len(times_ns), len(starts)), ABSENT, np.int64)
         classes = np.zeros((len(times_ns), len(starts)), np.int64)
@@ -85,6 +87,19 @@ class Events:
             rows[:, column] = np.where(is_absent, ABSENT, np.where(is_old, STALE, row))
             classes[:, column] = self.class_code[at]
         return self.name[starts], rows, classes
+
+    def _state_at(
+        self, time_ns: int, max_age_ns: int, starts: Integers
+    ) -> tuple[Integers, Integers, Integers]:
+        """Return the state at one time: all objects at once, as there are more of them than times."""
+        at = starts + np.add.reduceat(self.time_ns <= time_ns, starts, dtype=np.int64) - 1
+        has_appeared = at >= starts
+        at = np.maximum(at, starts)
+        row = self.row[at]
+        is_old = time_ns - self.time_ns[at] > max_age_ns
+        is_absent = ~has_appeared | (row == LEFT) | (time_ns >= self.expires_ns[at])
+        rows = np.where(is_absent, ABSENT, np.where(is_old, STALE, row))
+        return self.name[starts], rows[None], self.class_code[at][None]
 
 
 def events_from_messages(
@@ -182,6 +197,8 @@ class ObservationRows:
 
     @classmethod
     def concatenate(cls, several: Sequence[ObservationRows]) -> ObservationRows:
+        if len(several) == 1:
+            return several[0]
         return cls(
             FootprintBatch.concatenate([rows.shapes for rows in several]),
             np.concatenate([np.empty(0), *(rows.yaw for rows in several)]),
@@ -252,7 +269,7 @@ def _checked(
     """Check the observations, each as a sample of its own, so that an invalid one does not affect others."""
     count = len(detections.name)
     each = np.arange(count, dtype=np.int64)
-    trace, faults = trace_from_observations(
+    readable, checked, faults = check_observations(
         Observations(
             times_ns=each,
             sample=each,
@@ -270,20 +287,10 @@ def _checked(
     )
     for index, what in faults.items():
         report(index, what.removeprefix("object ''"))
-    checked = trace.rows[:, 0]
-    is_valid = np.zeros(count, np.bool_)
-    is_valid[trace.times_ns] = checked > ABSENT
-    # a trace numbers the rows of unknown objects downwards from -2
-    row = np.where(checked > ABSENT, checked, -2 - checked)
-    is_placed = np.zeros(count, np.bool_)
-    is_placed[trace.times_ns] = ~unknown[trace.times_ns]
-    placed = ObservationRows(
-        trace.footprints, trace.yaw, trace.uncertainty, trace.class_code, np.ones(len(trace), np.bool_)
-    )
-    if is_placed.all() and (row == each).all():
-        return replace(placed, is_valid=is_valid)
-    # blank rows are appended; an observation without a valid place gets the blank one of its index
-    number = np.arange(count, dtype=np.int64) + len(placed)
-    number[trace.times_ns] = np.where(unknown[trace.times_ns], number[trace.times_ns], row)
-    both = ObservationRows.concatenate([placed, ObservationRows.blank(detections.class_code)])
-    return replace(both.select(number), is_valid=is_valid & is_placed)
+    rows = ObservationRows(checked, yaw, uncertainty, detections.class_code, readable)
+    if not faults and not unknown.any():
+        return rows
+    lost = unknown.copy()
+    lost[list(faults)] = True
+    both = ObservationRows.concatenate([rows, ObservationRows.blank(detections.class_code)])
+    return replace(both.select(np.where(lost, count + each, each)), is_valid=readable & ~lost)

@@ -304,6 +304,9 @@ class PendingMessages:
         self._log_times_ns: list[Integers] = []
         self._contents: list[Any] = []
 
+    def __len__(self) -> int:
+        return len(self._contents)
+
     def add(
         self, times_ns: Integers, sequences: Integers, log_times_ns: Integers, contents: list[Any]
     ) -> None:

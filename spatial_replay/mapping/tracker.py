@@ -28,7 +28,11 @@ from spatial_replay.mapping.timeline import (
 from spatial_replay.mapping.topic_reader import ReportFault, TopicReader
 from spatial_replay.mapping.transforms import FrameTree, Transforms
 from spatial_replay.text import Instant, Sentence
-from spatial_replay.trace.trace import ABSENT, Trace
+from spatial_replay.trace.trace import ABSENT, Trace, renumbered
+
+_OLD_ADVANCES, _OLD_ROWS = 32, 256
+"""After so many stretches, or with so many observations, those that no sample needs any more are dropped: not
+after each, for a stretch may be a single message."""
 
 _MOST_NAMES = 8
 """Names listed in one remark."""
@@ -79,11 +83,15 @@ class Tracker:
         self._carried: dict[str, dict[int, list[_Carried]]] = {}
         self._signals: dict[tuple[str, int], tuple[Integers, Floats]] = {}
         self._topic_of_name: dict[int, str] = {}
+        self._advances = 0
 
     def advance(self, upto_ns: int) -> Integers:
         """Process the pending messages up to a time; return the times of those that may be sampled."""
+        self._advances += 1
         sampled = [np.empty(0, np.int64)]
         for name, reader in self._readers.items():
+            if not reader.pending:
+                continue
             times_ns, log_times_ns, contents = reader.pending.take(upto_ns)
             if reader.is_mapped:
                 columns = reader.read(log_times_ns, contents)
@@ -104,7 +112,7 @@ class Tracker:
     def trace(self, times_ns: Integers) -> Trace:
         """Return the samples at some times, up to the time of the last `advance`."""
         if not len(times_ns):
-            return Trace.from_samples(())
+            return Trace.empty()
         for topic, carried in self._carried.items():
             self._place_carried(topic, carried, times_ns)
         self._store_added()
@@ -116,7 +124,7 @@ class Tracker:
         stored, is_stale = self._rows, rows == STALE
         # unknown rows are numbered downwards from -2
         is_valid = np.append(stored.is_valid, False)[np.where(rows >= 0, rows, -1)]
-        numbered = np.where(rows == ABSENT, ABSENT, np.where(is_valid, rows, -2 - rows))
+        numbered = np.where((rows == ABSENT) | is_valid, rows, -2 - rows)
         if is_stale.any():
             # of stale objects only the class is known: one blank row for each class, after the others
             numbered = np.where(is_stale, -2 - (len(stored) + classes), numbered)
@@ -127,6 +135,8 @@ class Tracker:
         ordered = sorted(range(len(by_code)), key=lambda i: (by_code[i] is not None, by_code[i] or ""))
         rank = np.zeros(len(by_code), np.int64)
         rank[ordered] = np.arange(len(by_code))
+        used, numbered = renumbered(numbered)
+        stored = stored.select(used)
         return Trace(
             times_ns=times_ns,
             names=tuple(names[i] for i in order),
@@ -137,10 +147,13 @@ class Tracker:
             class_code=rank[stored.class_code] if len(rank) else stored.class_code,
             classes=tuple(by_code[i] for i in ordered),
             signals=self._signal_columns(times_ns),
-        ).take(np.arange(len(times_ns)))
+        )
 
     def forget(self, upto_ns: int) -> None:
         """Drop what no later sample needs: all but the last observation of each object and signal."""
+        if self._advances < _OLD_ADVANCES and len(self._rows) < _OLD_ROWS:
+            return
+        self._advances = 0
         used = [np.empty(0, np.int64)]
         for name, events in self._events.items():
             last = events.last()
@@ -204,7 +217,8 @@ class Tracker:
             # which of the two is right is not known, so the object is unknown
             number[again] = self._add(ObservationRows.blank(detections.class_code[again]))
         before = self._events[reader.name]
-        events = events_from_messages(detections, times_ns, number, alive=before, is_complete=is_complete)
+        alive = before.last()
+        events = events_from_messages(detections, times_ns, number, alive=alive, is_complete=is_complete)
         self._events[reader.name] = events.after(before)
 
     def _place_carried(
@@ -273,7 +287,7 @@ class Tracker:
         return np.arange(first, first + len(rows), dtype=np.int64)
 
     def _claim_names(self, topic: str, names: Integers) -> None:
-        for code in np.unique(names).tolist():
+        for code in set(names.tolist()):
             owner = self._topic_of_name.setdefault(code, topic)
             if owner != topic:
                 raise UsageError(

@@ -73,6 +73,13 @@ def matrices_from_yaw(yaw: Floats) -> Floats:
     return matrices
 
 
+def no_rotations(count: int) -> Floats:
+    """Return identity matrices (count, 3, 3)."""
+    matrices = np.zeros((count, 9))
+    matrices[:, ::4] = 1.0
+    return matrices.reshape(count, 3, 3)
+
+
 def yaw_of(matrices: Floats) -> Floats:
     """Return the angle (N,) of the projected x axis in radians; NaN if its projection is a point."""
     x, y = matrices[:, 0, 0], matrices[:, 1, 0]

@@ -13,6 +13,7 @@ from spatial_replay.geometry.arrays import (
     Floats,
     Integers,
     count_in_rows,
+    counts_from_starts,
     flat_index,
     starts_from_counts,
 )
@@ -67,10 +68,8 @@ def trace_from_observations(observed: Observations, *, concave: Concave) -> tupl
     """
     observed = _ordered(observed)
     faults = _duplicates(observed)
-    readable = _finite(observed) & ~observed.invalid
-    faults = _wrong_numbers(observed, readable) | faults
-    shapes, misshapen = _normalised(observed, readable, concave)
-    faults = misshapen | faults
+    readable, shapes, wrong = check_observations(observed, concave=concave)
+    faults = wrong | faults
     rows = np.full((len(observed.times_ns), len(observed.names)), ABSENT, np.int64)
     number = np.arange(len(observed.name), dtype=np.int64)
     rows[observed.sample, observed.name] = np.where(readable, number, -2 - number)
@@ -90,6 +89,21 @@ def trace_from_observations(observed: Observations, *, concave: Concave) -> tupl
         is_sound[list(faults)] = False
         trace = trace.take(np.flatnonzero(is_sound))
     return trace, faults
+
+
+def check_observations(
+    observed: Observations, *, concave: Concave
+) -> tuple[Booleans, FootprintBatch, dict[int, str]]:
+    """Check every observation on its own, and normalise its polygons.
+
+    Returns:
+        which observations (R,) have only finite numbers; the footprints; and the fault of each sample with
+        an observation that cannot be, by its index.
+    """
+    readable = _finite(observed) & ~observed.invalid
+    faults = _wrong_numbers(observed, readable)
+    shapes, misshapen = _normalised(observed, readable, concave)
+    return readable, shapes, misshapen | faults
 
 
 def _ordered(observed: Observations) -> Observations:
@@ -143,10 +157,10 @@ def _finite(observed: Observations) -> Booleans:
 def _wrong_numbers(observed: Observations, readable: Booleans) -> dict[int, str]:
     shapes = observed.shapes
     with np.errstate(invalid="ignore"):
-        empty_parts = count_in_rows(np.diff(shapes.vertex_start) == 0, shapes.part_start)
+        empty_parts = count_in_rows(counts_from_starts(shapes.vertex_start) == 0, shapes.part_start)
         negative_parts = count_in_rows(shapes.radius < 0, shapes.part_start)
         checks = (
-            (np.diff(shapes.part_start) == 0, "has no footprint; give it a polygon or parts"),
+            (counts_from_starts(shapes.part_start) == 0, "has no footprint; give it a polygon or parts"),
             (empty_parts > 0, "has a part without vertices; give each part at least one"),
             (negative_parts > 0, "has a part with a negative radius; give a radius of at least 0"),
             (observed.uncertainty < 0, "has a negative uncertainty; give a radius of at least 0"),
@@ -154,7 +168,7 @@ def _wrong_numbers(observed: Observations, readable: Booleans) -> dict[int, str]
         )
     faults: dict[int, str] = {}
     for wrong, what in checks:
-        for row in np.flatnonzero(wrong & readable).tolist():
+        for row in (wrong & readable).nonzero()[0].tolist():
             name = observed.names[observed.name[row]]
             faults.setdefault(int(observed.sample[row]), f"object {name!r} {what}")
     return faults
@@ -165,12 +179,14 @@ def _normalised(
 ) -> tuple[FootprintBatch, dict[int, str]]:
     """Return normalised polygons and the samples' faults; cut up those that are not convex."""
     shapes = observed.shapes
-    part_counts = np.diff(shapes.part_start)
+    part_counts = counts_from_starts(shapes.part_start)
     vertex_start, vertices, fault = normalise_polygons(shapes.vertex_start, shapes.vertices)
-    shapes = replace(shapes, vertex_start=vertex_start, vertices=vertices)
+    shapes = shapes.with_outlines(vertex_start, vertices)
+    if not fault.any():
+        return shapes, {}
     owner = np.repeat(np.arange(len(readable)), part_counts)
     # few are concave, so the slow decomposition runs one by one
-    odd = np.flatnonzero((fault != SOUND) & readable[owner] & (np.diff(vertex_start) > 0))
+    odd = np.flatnonzero((fault != SOUND) & readable[owner] & (counts_from_starts(vertex_start) > 0))
     pieces: dict[int, Footprint] = {}
     faults: dict[int, str] = {}
     for part in odd.tolist():

@@ -108,6 +108,12 @@ class Trace(Displayed):
         return int(np.count_nonzero(self.rows < ABSENT))
 
     @classmethod
+    def empty(cls) -> Trace:
+        """Return a trace without samples."""
+        none, numbers = np.empty(0, np.int64), np.empty(0)
+        return cls(none, (), none.reshape(0, 0), FootprintBatch.unknown(0), numbers, numbers, none, ())
+
+    @classmethod
     def from_samples(cls, samples: Iterable[Sample]) -> Trace:
         """Build the trace of the given samples, in their order.
 
@@ -156,7 +162,9 @@ class Trace(Displayed):
         unknown signals."""
         for index, time_ns in enumerate(self.times_ns.tolist()):
             rows = list(zip(self.names, self.rows[index].tolist(), strict=True))
-            objects = {name: self.observation(row) for name, row in rows if row >= 0}
+            known_rows = [row for _, row in rows if row >= 0]
+            footprints = iter(self.footprints.footprints(known_rows))
+            objects = {name: self._observation(row, next(footprints)) for name, row in rows if row >= 0}
             unknown = {
                 name: self.classes[int(self.class_code[-2 - row])] for name, row in rows if row < ABSENT
             }
@@ -166,11 +174,14 @@ class Trace(Displayed):
 
     def observation(self, row: int) -> TrackedObject:
         """Return the object that row `row` (at least 0) reports."""
+        return self._observation(row, self.footprints.footprint(row))
+
+    def _observation(self, row: int, footprint: Footprint) -> TrackedObject:
         yaw = float(self.yaw[row])
         return TrackedObject(
-            self.footprints.footprint(row),
+            footprint,
             class_name=self.classes[int(self.class_code[row])],
-            yaw=None if np.isnan(yaw) else yaw,
+            yaw=None if yaw != yaw else yaw,
             height=self.footprints.height(row),
             uncertainty=float(self.uncertainty[row]),
         )
@@ -183,11 +194,11 @@ class Trace(Displayed):
     def take(self, samples: Integers) -> Trace:
         """Return the samples with the given indices (K,), which must increase."""
         rows = self.rows[samples]
-        used, renumbered = _renumber(rows)
+        used, numbered = renumbered(rows)
         return replace(
             self,
             times_ns=self.times_ns[samples],
-            rows=renumbered,
+            rows=numbered,
             footprints=self.footprints.select(used),
             yaw=self.yaw[used],
             uncertainty=self.uncertainty[used],
@@ -311,16 +322,16 @@ def _same_samples(a: Trace, b: Trace) -> bool:
     return all(np.array_equal(one, other, equal_nan=one.dtype.kind == "f") for one, other in pairs)
 
 
-def _renumber(rows: Integers) -> tuple[Integers, Integers]:
+def renumbered(rows: Integers) -> tuple[Integers, Integers]:
     """Return the rows in use, by sample and name, and the row numbers that point at them."""
     present = rows != ABSENT
     marked = rows[present]
     unreadable = marked < ABSENT
     used = np.where(unreadable, -2 - marked, marked)
     number = np.arange(len(used), dtype=np.int64)
-    renumbered = np.full(rows.shape, ABSENT, np.int64)
-    renumbered[present] = np.where(unreadable, -2 - number, number)
-    return used, renumbered
+    result = np.full(rows.shape, ABSENT, np.int64)
+    result[present] = np.where(unreadable, -2 - number, number)
+    return used, result
 
 
 def _class_order(classes: Iterable[str | None]) -> tuple[str | None, ...]:
