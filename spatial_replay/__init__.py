@@ -64,9 +64,10 @@ if TYPE_CHECKING:
     from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Step
     from spatial_replay.planning.planner import Planner
     from spatial_replay.planning.settings import Settings
-    from spatial_replay.recording.clip_log import Trigger, TriggeredClip
+    from spatial_replay.recording.clip_log import TriggeredClip
     from spatial_replay.recording.message_channel import MessageChannel
     from spatial_replay.recording.recorder import Recorder
+    from spatial_replay.recording.trigger import Trigger
     from spatial_replay.replay.engine import Replayed
     from spatial_replay.replay.verification import Verified
     from spatial_replay.sources.open_log import read_trace
@@ -218,7 +219,8 @@ __getattr__, __dir__ = loaded_when_used(
         "planning.decisions": ("Candidate", "Consideration", "Guards", "Step"),
         "planning.planner": ("Planner",),
         "planning.settings": ("Settings",),
-        "recording.clip_log": ("Trigger", "TriggeredClip"),
+        "recording.clip_log": ("TriggeredClip",),
+        "recording.trigger": ("Trigger",),
         "recording.message_channel": ("MessageChannel",),
         "recording.recorder": ("Recorder",),
         "replay.engine": ("Replayed",),

@@ -96,6 +96,10 @@ class AnnotatedEvaluation:
         self._has_samples |= len(trace) > 0
         return self._annotator.messages(trace, blocks)
 
+    def occurrence(self, time_ns: int, what: str, sentence: str) -> Messages:
+        """Return the event of what happens to a run beside its samples."""
+        return merge(self._annotator.occurrence(time_ns, what, sentence))
+
     def redraw(self) -> None:
         """Draw the whole scene with the next sample, for a viewer that shows nothing yet."""
         self._annotator.redraw()

@@ -15,7 +15,7 @@ from spatial_replay.annotate.automaton_state import (
     AutomatonRun,
     SpecAutomaton,
 )
-from spatial_replay.annotate.events import EncodedEvent, EventReporter
+from spatial_replay.annotate.events import EncodedEvent, EventReporter, encoded_occurrence
 from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.robustness import encode_robustness
 from spatial_replay.annotate.scene_entities import encode_frame
@@ -152,6 +152,10 @@ class Annotator:
         messages.append(self._scene_messages(trace, blocks))
         self._remember(trace, blocks)
         return messages
+
+    def occurrence(self, time_ns: int, what: str, sentence: str) -> list[Messages]:
+        """Return the event of what happens to a run beside its samples."""
+        return self._events([encoded_occurrence(time_ns, what, sentence)])
 
     def pass_over(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
         """Take in the next samples and return only their events."""

@@ -93,6 +93,18 @@ class EncodedEvent(NamedTuple):
     log: bytes
 
 
+def encoded_occurrence(time_ns: int, what: str, sentence: str) -> EncodedEvent:
+    """Encode what happens to a run beside its samples, such as a connection that is lost."""
+    # what it makes unknown is reported with the samples
+    facts = {"occurrence": what, "verdict": str(Verdict.UNKNOWN), "message": sentence}
+    at = _stamp(time_ns)
+    event = Event(start_time=at, end_time=at)
+    for key, text in facts.items():
+        event.metadata.add(key=key, value=text)
+    log = Log(timestamp=at, level=Log.WARNING, message=sentence, name=what)
+    return EncodedEvent(time_ns, *(each.SerializeToString(deterministic=True) for each in (event, log)))
+
+
 class EventReporter:
     """Reports the changes of one result's root and of the named specs in it, up to the end of the log.
 

@@ -22,7 +22,8 @@ from spatial_replay.cli.options import (
     profile_option,
     specs_option,
 )
-from spatial_replay.cli.terminal import Coloured, Line, StatusLine, show, show_diagnostics, warn
+from spatial_replay.cli.terminal import Coloured, Line, StatusLine, show, show_diagnostics, show_file, warn
+from spatial_replay.cli.viewer_options import ServingArguments, serving_options
 from spatial_replay.errors import UsageError
 from spatial_replay.text import counted, escaped, time_text
 from spatial_replay.trace.time_points import duration_ns_from_text
@@ -33,8 +34,8 @@ if TYPE_CHECKING:
     from spatial_replay.mapping import LogMapping
     from spatial_replay.monitor.monitor import Ending
     from spatial_replay.recording import Recorder
-    from spatial_replay.recording.clip_log import Trigger
     from spatial_replay.recording.recorder import SampleWriter
+    from spatial_replay.recording.trigger import Trigger
     from spatial_replay.spec.formula import Specification
 
 _COLOURS: Final = {
@@ -143,21 +144,8 @@ def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int
     help="With --clips: memory for what waits for a trigger.",
 )
 @click.option("--serve", "serves", is_flag=True, help="Show what is monitored to viewers over WebSocket.")
-@click.option(
-    "--port",
-    metavar="P",
-    type=click.IntRange(0, 65535),
-    default=8766,
-    show_default=True,
-    help="With --serve: port to listen on; 0 for any free port.",
-)
-@click.option(
-    "--host",
-    metavar="HOST",
-    default="127.0.0.1",
-    show_default=True,
-    help="With --serve: address to listen on; anyone who can reach it can see the robot.",
-)
+@serving_options(8766, "With --serve: ")
+@click.option("--layout", is_flag=True, help="Print the layout to import in the viewer, and exit.")
 def monitor(
     address: str,
     specs: tuple[Path, ...],
@@ -176,8 +164,8 @@ def monitor(
     clips: Path | None,
     ring: int,
     serves: bool,
-    port: int,
-    host: str,
+    serving: ServingArguments,
+    layout: bool,
 ) -> ExitCode:
     """Monitor a running robot through foxglove_bridge, or another server of Foxglove's WebSocket protocol.
 
@@ -214,6 +202,9 @@ def monitor(
     files = load_spec_options(specs, profile, constants)
     show_diagnostics(warning for file in files for warning in file.warnings)
     mapping = None if mapping_file is None else load_mapping(mapping_file)
+    if layout:
+        show_file(_layout(files, mapping))
+        return ExitCode.SATISFIED
     trigger = None if clips is None else _trigger(triggers, before_s, after_s, ring)
     if output is not None:
         _refuse_inputs(output, specs, mapping_file)
@@ -222,7 +213,7 @@ def monitor(
         writers: list[SampleWriter] = [*recorders]
         fire = next((each.trigger for each in recorders if trigger and each.is_triggered), None)
         if serves:
-            writers.append(opened.enter_context(_viewing(files, mapping, host, port, fire)))
+            writers.append(opened.enter_context(_viewing(files, mapping, serving, fire)))
         session = LiveSession(
             address,
             files,
@@ -243,7 +234,7 @@ def monitor(
 
 
 def _trigger(when: tuple[str, ...], before_s: float, after_s: float, ring: int) -> Trigger:
-    from spatial_replay.recording.clip_log import Trigger
+    from spatial_replay.recording.trigger import Trigger
 
     with naming_option("--clips"):
         return Trigger(when or "violated", before_s, after_s, ring)
@@ -255,18 +246,27 @@ def _refuse_inputs(output: Path, specs: Sequence[Path], mapping_file: Path | Non
     refuse_inputs(output, [*specs, *([mapping_file] if mapping_file is not None else [])])
 
 
+def _layout(files: Sequence[Specification], mapping: LogMapping | None) -> str:
+    from spatial_replay.live.viewing import layout_of_run
+
+    return layout_of_run(files, mapping)
+
+
 @contextmanager
 def _viewing(
     files: Sequence[Specification],
     mapping: LogMapping | None,
-    host: str,
-    port: int,
+    serving: ServingArguments,
     fire: Callable[[str], None] | None,
 ) -> Iterator[Viewing]:
     from spatial_replay.live.viewing import open_viewing
 
-    with open_viewing(files, mapping, host=host, port=port, fire=fire) as viewing:
-        show(f"serving at {viewing.address}: in Foxglove or Lichtblick, Open connection, Foxglove WebSocket")
+    host, port, origins = serving.host, serving.port, serving.origins
+    with open_viewing(files, mapping, host=host, port=port, origins=origins, fire=fire) as viewing:
+        serving.warn_of_access("see this robot" + (" and fire the trigger" if fire is not None else ""))
+        show(f"serving at {viewing.address}")
+        show(f"  in Foxglove or Lichtblick: Open connection, Foxglove WebSocket, {viewing.address}")
+        show("  layout to import there: run the same command with --layout > live.json")
         yield viewing
 
 

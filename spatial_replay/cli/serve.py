@@ -16,7 +16,8 @@ from spatial_replay.cli.options import (
     warn_of_input,
 )
 from spatial_replay.cli.output import print_verdicts
-from spatial_replay.cli.terminal import show, show_file, warn
+from spatial_replay.cli.terminal import show, show_file
+from spatial_replay.cli.viewer_options import ServingArguments, serving_options
 from spatial_replay.cli.watching import files_to_watch, follow_saves, load_log, watch_option
 
 if TYPE_CHECKING:
@@ -29,28 +30,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @evaluation_options
-@click.option(
-    "--port",
-    metavar="P",
-    type=click.IntRange(0, 65535),
-    default=8765,
-    show_default=True,
-    help="Port to listen on; 0 for any free port.",
-)
-@click.option(
-    "--host",
-    metavar="ADDRESS",
-    default="127.0.0.1",
-    show_default=True,
-    help="Address to listen on; beyond this machine, viewers need the token in the printed address.",
-)
-@click.option(
-    "--allow-origin",
-    "origins",
-    metavar="ORIGIN",
-    multiple=True,
-    help="Web page that may connect, such as https://viewer.example.org; repeat for several.",
-)
+@serving_options(8765)
 @click.option("--play", is_flag=True, help="Start playing at once instead of waiting for a viewer.")
 @click.option("--layout", is_flag=True, help="Print the layout to import in the viewer, and exit.")
 @watch_option
@@ -58,9 +38,7 @@ if TYPE_CHECKING:
 @semantics_option
 def serve(
     request: EvaluationArguments,
-    port: int,
-    host: str,
-    origins: tuple[str, ...],
+    serving: ServingArguments,
     play: bool,
     layout: bool,
     watch: bool,
@@ -91,7 +69,7 @@ def serve(
         return None
     warn_of_input(evaluated.replayed)
     try:
-        return _serve(evaluated, files, host, port, play, origins)
+        return _serve(evaluated, files, serving, play)
     except KeyboardInterrupt:
         # the regular way to stop the server
         return ExitCode.INTERRUPTED
@@ -100,19 +78,16 @@ def serve(
 def _serve(
     evaluated: Evaluated,
     files: SpecificationFiles | None,
-    host: str,
-    port: int,
+    serving: ServingArguments,
     play: bool,
-    origins: tuple[str, ...],
 ) -> ExitCode | None:
     # imported here so that --help stays fast
     from spatial_replay.serve import open_server
-    from spatial_replay.serve.gate import is_loopback
 
+    host, port, origins = serving.host, serving.port, serving.origins
     with open_server(evaluated, host=host, port=port, play=play, origins=origins) as server:
         print_verdicts(evaluated.replayed, None)
-        if not is_loopback(host):
-            warn("who has this address, with its token, can read this log and change its constants")
+        serving.warn_of_access("read this log and change its constants")
         show(f"serving at {server.address}; stop with Ctrl-C")
         show(f"  in Foxglove or Lichtblick: Open connection, Foxglove WebSocket, {server.address}")
         show("  layout to import there: run the same command with --layout > live.json")

@@ -32,7 +32,8 @@ from spatial_replay.mapping.live_assembler import rehearse
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
 from spatial_replay.monitor.monitor import Ending, Monitor
 from spatial_replay.recording.changes import VerdictChanges
-from spatial_replay.recording.recorder import Recorder, SampleWriter
+from spatial_replay.recording.recorder import SampleWriter
+from spatial_replay.recording.recording import RunEvent
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import counted
 from spatial_replay.trace.sample import Sample
@@ -258,8 +259,8 @@ class LiveSession:
                         f"the connection to {self._address} is lost: {reason}; everything is unknown until"
                         " it is back"
                     )
-                    self._report_event("connection lost")
-                    async for update in self._evaluated(self._lose(list(self._planned)), at_s):
+                    trace = self._lose(list(self._planned), "connection lost")
+                    async for update in self._evaluated(trace, at_s):
                         yield update
         async for update in self._evaluated(self._add(messages), arrived_s):
             yield update
@@ -269,8 +270,14 @@ class LiveSession:
             self._early, early = Inbox(), self._early
             for item in early.take():
                 inbox.put(item)
-        async for update in self._evaluated(self._fall_silent(now_s), now_s):
-            yield update
+        if silent := self._silent_topics(now_s):
+            self._silent |= {*silent}
+            listed = ", ".join(silent)
+            self._notes.append(
+                f"no message on {listed} for {self._dead_man_s:g} s: what it reports is unknown"
+            )
+            async for update in self._evaluated(self._lose(silent, f"silence on {listed}"), now_s):
+                yield update
 
     def _add(self, messages: Sequence[Message]) -> Trace | None:
         if self._assembler is None:
@@ -284,29 +291,23 @@ class LiveSession:
             )
         return trace
 
-    def _lose(self, topics: Sequence[str]) -> Trace | None:
+    def _lose(self, topics: Sequence[str], what: str) -> Trace | None:
+        """Make unknown what some topics have reported; the newest note becomes an event that says so."""
         if self._assembler is None:
             return None
-        return self._assembler.lose(topics, time.monotonic())
+        trace = self._assembler.lose(topics, time.monotonic())
+        time_ns = int(trace.times_ns[-1]) if len(trace) else self._time_ns
+        if time_ns is not None:
+            for recorder in self._recorders:
+                recorder.report(RunEvent(time_ns, what, self._notes[-1]))
+        return trace
 
-    def _fall_silent(self, now_s: float) -> Trace | None:
-        """Note topics that have been silent for too long; what they reported is unknown from now on."""
+    def _silent_topics(self, now_s: float) -> list[str]:
+        """Return the topics that have been silent for too long since the last call."""
         if self._dead_man_s is None or self._assembler is None or not self._is_connected:
-            return None
+            return []
         watched = [topic for topic in self._assembler.topics if topic not in self._silent]
-        silent = [each for each in watched if now_s - self._last_s.get(each, now_s) >= self._dead_man_s]
-        if not silent:
-            return None
-        self._silent |= {*silent}
-        listed = ", ".join(silent)
-        self._report_event(f"silence on {listed}")
-        self._notes.append(f"no message on {listed} for {self._dead_man_s:g} s: what it reports is unknown")
-        return self._lose(silent)
-
-    def _report_event(self, what: str) -> None:
-        for recorder in self._recorders:
-            if isinstance(recorder, Recorder):
-                recorder.report_event(what)
+        return [each for each in watched if now_s - self._last_s.get(each, now_s) >= self._dead_man_s]
 
     # -------------------------------------------------------------------------------- planning
 

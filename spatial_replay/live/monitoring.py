@@ -11,8 +11,8 @@ from spatial_replay.errors import UsageError
 from spatial_replay.live.live_session import MAX_DELAY_S, LiveSession
 from spatial_replay.live.live_update import LiveUpdate
 from spatial_replay.mapping import LogMapping, load_mapping
-from spatial_replay.recording.clip_log import Trigger
 from spatial_replay.recording.recorder import Recorder
+from spatial_replay.recording.trigger import Trigger
 from spatial_replay.spec.formula import Specification
 
 _WAITING = 65_536

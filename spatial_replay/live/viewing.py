@@ -15,7 +15,7 @@ from spatial_replay.logs.topics import OBJECTS, SPECIFICATION, protobuf_channel
 from spatial_replay.mapping import LogMapping
 from spatial_replay.recording.recorder import SampleWriter
 from spatial_replay.recording.recorder_log import RunEnd, warm_up
-from spatial_replay.recording.recording import Recording, refuse_templates
+from spatial_replay.recording.recording import Recording, RunEvent, refuse_templates
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
@@ -52,15 +52,18 @@ class _ViewerLog:
             self.is_asked = False
             self._recording.redraw()
         self._recording.add(trace, messages)
-        for made in self._sink.messages:
-            self._server.publish(made)
         self._remember_specification()
-        self._sink.messages.clear()
+        self._publish()
         if len(trace):
             newest_ns = int(trace.times_ns[-1])
             self._server.send_time(newest_ns)
             if self._specification is not None and is_asked:
                 self._server.publish(_at(self._specification, newest_ns))
+
+    def report(self, event: RunEvent) -> None:
+        """Send what happens to the run beside its samples."""
+        self._recording.report(event)
+        self._publish()
 
     def flush(self) -> None:
         """Nothing waits."""
@@ -68,14 +71,18 @@ class _ViewerLog:
     def end(self, end: RunEnd) -> None:
         """Send the events at the end."""
         self._recording.end(interrupted=end.interrupted)
-        for made in self._sink.messages:
-            self._server.publish(made)
+        self._publish()
 
     def break_off(self, end: RunEnd) -> None:
         """Nothing follows."""
 
     def close(self) -> None:
         """Nothing is open."""
+
+    def _publish(self) -> None:
+        for made in self._sink.messages:
+            self._server.publish(made)
+        self._sink.messages.clear()
 
     def _remember_specification(self) -> None:
         for made in self._sink.messages if self._specification is None else ():
@@ -122,16 +129,19 @@ def open_viewing(
     *,
     host: str,
     port: int,
+    origins: Sequence[str] = (),
     fire: Callable[[str], None] | None = None,
 ) -> Iterator[Viewing]:
     """Serve a run to viewers while it goes on.
 
     Args:
         port: 0 for any that is free.
+        origins: of web pages that may connect, besides those of Foxglove and of this machine.
         fire: what the service `trigger` calls, with the reason that it is given.
 
     Raises:
-        UsageError: nothing can listen there, or the library for it is not installed.
+        UsageError: nothing can listen there, a text that is no origin, or the library for it is not
+            installed.
     """
     try:
         from spatial_replay.serve.server import RunServer
@@ -146,12 +156,26 @@ def open_viewing(
         if viewing is not None:
             viewing.ask()
 
-    server = RunServer(channels, host, port, ask, fire)
+    server = RunServer(channels, host, port, ask, fire, origins)
     try:
-        viewing = Viewing(files, {} if mapping is None else mapping.axes.metadata(), server)
+        viewing = Viewing(files, _axes(mapping), server)
         try:
             yield viewing
         finally:
             viewing.close()
     finally:
         server.stop()
+
+
+def layout_of_run(files: Sequence[Specification], mapping: LogMapping | None) -> str:
+    """Return the layout for viewers of a run, as JSON: its curves and states are drawn as they come.
+
+    Raises:
+        UsageError: a template, since its objects are not known yet.
+    """
+    recording = Recording(MemorySink(), files, _axes(mapping))
+    return recording.layout_ahead().data.decode()
+
+
+def _axes(mapping: LogMapping | None) -> Mapping[str, str]:
+    return {} if mapping is None else mapping.axes.metadata()

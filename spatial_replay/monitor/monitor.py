@@ -82,12 +82,14 @@ class Update:
         specs: one for each result spec, in the order of the text.
         places: for each name, its index in `specs` and its node.
         settled: what `violations` are found from.
+        satisfied: the specs that are satisfied whatever comes; why is found when asked for (`reason`).
     """
 
     time_ns: int
     specs: tuple[SpecUpdate, ...]
     places: Mapping[str, tuple[int, int]] = field(repr=False)
     settled: tuple[Settled, ...] = field(repr=False, default=())
+    satisfied: tuple[Settled, ...] = field(repr=False, default=())
 
     @cached_property
     def violations(self) -> tuple[Violation, ...]:
@@ -202,7 +204,8 @@ class Monitor:
         if self._violations is None:
             return Update(sample.time_ns, specs, self._places)
         self._violations.extend(sample, numbers)
-        return Update(sample.time_ns, specs, self._places, self._violations.settled)
+        known = self._violations
+        return Update(sample.time_ns, specs, self._places, known.settled, known.satisfied)
 
 
 def _places_of_names(names: tuple[tuple[str | None, ...], ...]) -> Mapping[str, tuple[int, int]]:

@@ -95,14 +95,22 @@ class Violation:
         missed = self.witness.missed
         if missed is not None and missed.is_condition:
             return missed_text(missed, self.first_ns)
-        when = Instant(self.witness.time_ns, self.first_ns)
-        number = self.atom.upper if self.atom.end is End.HIGH else self.atom.lower
-        size = amount_text(abs(number), self.atom.atom)
-        how = f"{'holds' if number >= 0.0 else 'fails'} by {size}"
+        number = _settling(self.atom)
         short = _short(
             self.atom, self.spec, abs(without_residue(number, self.atom.atom)) * divisor_of(self.atom.atom)
         )
-        return f"{short}: `{self.atom.text}` {how} at {when}"
+        return f"{short}: {_deciding_words(self.atom, self.witness, self.first_ns)}"
+
+
+def _settling(atom: DecidingAtom) -> float:
+    return atom.upper if atom.end is End.HIGH else atom.lower
+
+
+def _deciding_words(atom: DecidingAtom, witness: Witness, first_ns: int) -> str:
+    """Return an atom, its number, and when it decided."""
+    number = _settling(atom)
+    how = f"{'holds' if number >= 0.0 else 'fails'} by {amount_text(abs(number), atom.atom)}"
+    return f"`{atom.text}` {how} at {Instant(witness.time_ns, first_ns)}"
 
 
 def _short(atom: DecidingAtom, spec: str, amount: float) -> str:
@@ -123,13 +131,20 @@ def _short(atom: DecidingAtom, spec: str, amount: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Settled:
-    """A violation that a monitor has seen, with the samples to find its atom in."""
+    """A verdict that a monitor has seen, with the samples to find its atom in.
+
+    Attributes:
+        verdict: satisfied or violated, whatever comes.
+        number: the end of the interval that settles it: the lower one of what is satisfied.
+        samples: the newest; from `start` on they count, and they are all of them if `is_whole`.
+    """
 
     spec: NamedSpec
     program: Program
     specification: Specification
     conjunct: Conjunct
-    upper: float
+    verdict: Verdict
+    number: float
     samples: tuple[Sample, ...]
     start: int
     is_whole: bool
@@ -142,16 +157,26 @@ class Settled:
             self.conjunct.node,
             format_formula(self.conjunct.formula),
             self.samples[-1].time_ns,
-            self.upper,
-            self._witness(),
+            self.number,
+            self.witness,
             self.first_ns,
         )
 
-    def _witness(self) -> Witness | None:
+    @property
+    def reason(self) -> str:
+        """The atom that settled it and by how much, in words; "" if it was not found."""
+        found = self.witness
+        if found is None or found.deciding is None:
+            return ""
+        return _deciding_words(found.deciding, found, self.first_ns)
+
+    @cached_property
+    def witness(self) -> Witness | None:
         """Return the witness on the fewest of the newest samples that give the part its number."""
         for begin in self._begins():
             found = self._witness_from(begin)
-            if found.verdict is Verdict.VIOLATED and found.upper == self.upper:
+            number = found.upper if self.verdict is Verdict.VIOLATED else found.lower
+            if found.verdict is self.verdict and number == self.number:
                 return found
         return None
 
@@ -188,12 +213,19 @@ def rehearse(specification: Specification) -> None:
     for spec in specification.results:
         program = compile_formula(spec.formula)
         for conjunct in conjuncts_of(spec.formula, spec.name):
-            trial = Settled(spec, program, specification, conjunct, 0.0, (sample,), 0, True, 0)
-            _ = trial.violation.sentences
+            trial = Settled(
+                spec, program, specification, conjunct, Verdict.VIOLATED, 0.0, (sample,), 0, True, 0
+            )
+            _ = trial.violation.sentences, trial.reason
 
 
 class ViolationLog:
-    """The newest samples of one monitor, and the violations that they made certain."""
+    """The newest samples of one monitor, and what they made certain.
+
+    Attributes:
+        settled: the violations, of each part of a conjunction its own.
+        satisfied: the results that are satisfied.
+    """
 
     def __init__(self, specification: Specification, start_ns: int) -> None:
         """Start before the first sample."""
@@ -206,7 +238,9 @@ class ViolationLog:
             (index, spec, list(conjuncts_of(spec.formula, spec.name)))
             for index, spec in enumerate(specification.results)
         ]
+        self._unsatisfied = dict(enumerate(specification.results))
         self.settled: tuple[Settled, ...] = ()
+        self.satisfied: tuple[Settled, ...] = ()
 
     def extend(self, sample: Sample, numbers: Sequence[Floats | None]) -> None:
         """Take in a sample and the numbers (N, 4) of each result after it."""
@@ -217,26 +251,35 @@ class ViolationLog:
         samples.append(sample)
         for index, spec, conjuncts in self._open:
             after = numbers[index]
-            if after is not None and after[0, 3] < 0.0 and conjuncts:
+            if after is None:
+                continue
+            if after[0, 3] < 0.0 and conjuncts:
                 self._settle(spec, conjuncts, after)
+            elif after[0, 2] >= 0.0 and index in self._unsatisfied:
+                del self._unsatisfied[index]
+                whole = Conjunct(0, spec.name, spec.formula)
+                found = self._settled(spec, whole, Verdict.SATISFIED, float(after[0, 2]))
+                self.satisfied = (*self.satisfied, found)
 
     def _settle(self, spec: NamedSpec, conjuncts: list[Conjunct], numbers: Floats) -> None:
         for conjunct in tuple(conjuncts):
             upper = float(numbers[conjunct.node, 3])
-            if upper >= 0.0:
-                continue
-            conjuncts.remove(conjunct)
-            samples = tuple(self._samples)
-            start = next(k for k, each in enumerate(samples) if each.time_ns >= self._start_ns)
-            found = Settled(
-                spec,
-                compile_formula(spec.formula),
-                self._specification,
-                conjunct,
-                upper,
-                samples,
-                start,
-                not self._dropped,
-                self._first_ns or 0,
-            )
-            self.settled = (*self.settled, found)
+            if upper < 0.0:
+                conjuncts.remove(conjunct)
+                found = self._settled(spec, conjunct, Verdict.VIOLATED, upper)
+                self.settled = (*self.settled, found)
+
+    def _settled(self, spec: NamedSpec, conjunct: Conjunct, verdict: Verdict, number: float) -> Settled:
+        samples = tuple(self._samples)
+        return Settled(
+            spec,
+            compile_formula(spec.formula),
+            self._specification,
+            conjunct,
+            verdict,
+            number,
+            samples,
+            next(k for k, each in enumerate(samples) if each.time_ns >= self._start_ns),
+            not self._dropped,
+            self._first_ns or 0,
+        )

@@ -65,7 +65,8 @@ class VerdictChanges:
         name = spec.spec.name
         about = requirement_text(spec.spec.id, spec.spec.title)
         title = f"`{name}` ({about})" if about else f"`{name}`"
-        sentence = change_sentence(title, period, "")
+        reasons = [each.reason for each in update.satisfied if each.spec is spec.spec]
+        sentence = change_sentence(title, period, reasons[0] if period.code == SATISFIED and reasons else "")
         if period.code == VIOLATED:
             own = {node for node in spec.names if node is not None} | {name}
             reasons = [str(each) for each in update.violations if each.spec in own]

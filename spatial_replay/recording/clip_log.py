@@ -8,31 +8,29 @@ import queue
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from spatial_replay.errors import OutputError, UsageError
+from spatial_replay.errors import OutputError
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.logs.mcap.writer import LogWriter
 from spatial_replay.logs.messages import Channel, Messages
 from spatial_replay.logs.output_file import open_output
 from spatial_replay.logs.topics import TRIGGER
-from spatial_replay.monitor.monitor import Monitor, Update
+from spatial_replay.monitor.monitor import Monitor
 from spatial_replay.recording.changes import VerdictChanges
 from spatial_replay.recording.recorder_log import GATHER_S, RunEnd, warm_up
-from spatial_replay.recording.recording import Recording
-from spatial_replay.spec.formula import Specification, iter_nodes
-from spatial_replay.text import counted, nearest_hint
+from spatial_replay.recording.recording import Recording, RunEvent
+from spatial_replay.recording.trigger import EVENT, Trigger, condition_of
+from spatial_replay.spec.formula import Specification
+from spatial_replay.text import counted
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
-
-MOST_BYTES: Final = 256 * 2**20
-"""The most bytes that a ring holds by default."""
 
 _SLICE_BYTES: Final = 8 * 2**20
 """About the most bytes that are written to a clip before what has come is taken in."""
@@ -45,35 +43,8 @@ _MESSAGE_BYTES, _SAMPLE_BYTES, _OBJECT_BYTES, _VERTEX_BYTES = 320, 400, 600, 16
 """What a message takes in memory besides its payload; a sample, each object of it, each corner."""
 
 _MOST_STATIC: Final = 256
+_MOST_EVENTS: Final = 256
 _STATIC: Final = "tf_static"
-_VERDICTS: Final = ("violated", "satisfied")
-_BELOW: Final = re.compile(r"(?P<name>.+?)\s*<=?\s*(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)$")
-
-
-@dataclass(frozen=True, slots=True)
-class Trigger:
-    """When a recorder writes a clip, and how much of what it holds.
-
-    Attributes:
-        when: "violated" or "satisfied" for any spec, "NAME violated" for one; "NAME < 0.2" when its
-            robustness falls below a number; "event" for any change of a verdict, or of a sign that lasts;
-            "manual" for `Recorder.trigger` alone, which always fires. Several are given as a sequence.
-        before_s, after_s: how much time is kept, on the clock of the samples.
-        most_bytes: how much memory the ring takes; when that does not hold `before_s`, it is reported.
-    """
-
-    when: str | Sequence[str] = "violated"
-    before_s: float = 10.0
-    after_s: float = 5.0
-    most_bytes: int = MOST_BYTES
-
-    def __post_init__(self) -> None:
-        for name in ("before_s", "after_s"):
-            value = getattr(self, name)
-            if not (isinstance(value, (int, float)) and math.isfinite(value) and value >= 0):
-                raise UsageError(f"{name} is {value!r}; give seconds, 0 or more")
-        if self.most_bytes < 2**20:
-            raise UsageError(f"most_bytes is {self.most_bytes}; a ring takes 1 MB (1048576) or more")
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +83,15 @@ class _HeldSample(NamedTuple):
     size: int
 
 
-_Condition = Callable[[Sequence[Update], bool], str | None]
+class _HeldEvent(NamedTuple):
+    """What happened to the run, in the ring."""
+
+    time_ns: int
+    event: RunEvent
+    size: int = _MESSAGE_BYTES
+
+
+_Item: TypeAlias = _Held | _HeldSample | _HeldEvent
 
 
 class _Open:
@@ -122,7 +101,7 @@ class _Open:
         self, path: Path, files: Sequence[Specification], about: Mapping[str, str], fired: str, at_ns: int
     ) -> None:
         self.path, self.reasons, self.at_ns = path, [fired], at_ns
-        self.waiting: deque[_Held | _HeldSample] = deque()
+        self.waiting: deque[_Item] = deque()
         self.waiting_bytes = 0
         self.until_ns = at_ns
         self.first_ns: int | None = None
@@ -139,7 +118,7 @@ class _Open:
         self._last_ns: dict[int, int] = {}
         self._sample_ns = -1
 
-    def put(self, item: _Held | _HeldSample) -> None:
+    def put(self, item: _Item) -> None:
         self.waiting.append(item)
         self.waiting_bytes += item.size
         self.last_s = time.monotonic()
@@ -148,6 +127,7 @@ class _Open:
         """Write some of what waits."""
         samples: list[Sample] = []
         messages: list[_Held] = []
+        events: list[RunEvent] = []
         size = 0
         while self.waiting and size < most_bytes:
             item = self.waiting.popleft()
@@ -155,11 +135,13 @@ class _Open:
             self.first_ns = item.time_ns if self.first_ns is None else min(self.first_ns, item.time_ns)
             if isinstance(item, _Held):
                 messages.append(item)
+            elif isinstance(item, _HeldEvent):
+                events.append(item.event)
             elif item.time_ns > self._sample_ns:
                 samples.append(item.sample)
                 self._sample_ns = item.time_ns
         self.waiting_bytes -= size
-        if not (samples or messages):
+        if not (samples or messages or events):
             return
         beside = Messages()
         if messages:
@@ -168,6 +150,8 @@ class _Open:
             payloads = [each.payload for each in messages]
             beside = Messages(self.channels, channel, sequence, log_ns, publish_ns, payloads)
         self._recording.add(Trace.from_samples(samples), beside)
+        for event in events:
+            self._recording.report(event)
 
     def flush(self) -> None:
         self._writer.flush()
@@ -214,8 +198,8 @@ class ClipLog:
         """Compile everything, and make the folder."""
         self._folder, self._files, self._about = folder, files, dict(about or {})
         self._trigger = trigger
-        texts = [trigger.when] if isinstance(trigger.when, str) else list(trigger.when)
-        self._conditions = [(text, _condition(text, files)) for text in texts]
+        texts = trigger.texts
+        self._conditions = [(text, condition_of(text, files)) for text in texts]
         self._held_before = dict.fromkeys(texts, False)
         self._before_ns, self._after_ns = round(trigger.before_s * 1e9), round(trigger.after_s * 1e9)
         try:
@@ -228,6 +212,7 @@ class ClipLog:
         self._samples: deque[_HeldSample] = deque()
         self._messages: deque[_Held] = deque()
         self._static: deque[_Held] = deque(maxlen=_MOST_STATIC)
+        self._events: deque[_HeldEvent] = deque(maxlen=_MOST_EVENTS)
         self._channels: Mapping[int, Channel] = {}
         self._bytes = 0
         self._newest_ns = -1
@@ -242,11 +227,6 @@ class ClipLog:
     def is_busy(self) -> bool:
         """Whether a clip waits to be written, or a trigger was fired by hand."""
         return not self._fired.empty() or (self._open is not None and bool(self._open.waiting))
-
-    @property
-    def waits_for_events(self) -> bool:
-        """Whether any event fires."""
-        return any(text.strip() == "event" for text, _ in self._conditions)
 
     @property
     def held_bytes(self) -> int:
@@ -284,6 +264,15 @@ class ClipLog:
             if not self._open.waiting and self._is_past(self._open.until_ns):
                 self._finish(RunEnd(False, 0, 0))
 
+    def report(self, event: RunEvent) -> None:
+        """Take in what happens to the run; fire if any event does."""
+        held = _HeldEvent(event.time_ns, event)
+        self._events.append(held)
+        if self._open is not None and event.time_ns <= self._open.until_ns:
+            self._open.put(held)
+        if EVENT in self._trigger.texts:
+            self._begin(event.what, event.time_ns)
+
     def flush(self) -> None:
         """Hand what was written of a clip to the operating system; end one that nothing follows."""
         if self._open is None:
@@ -316,7 +305,7 @@ class ClipLog:
             reason = condition(updates, has_changed)
             if reason is not None and not self._held_before[text]:
                 self._begin(reason, sample.time_ns)
-            self._held_before[text] = reason is not None and text != "event"
+            self._held_before[text] = reason is not None and text != EVENT
 
     def _is_past(self, time_ns: int) -> bool:
         """Return whether neither samples nor messages up to a time are expected any more."""
@@ -382,9 +371,9 @@ class ClipLog:
             clip.put(item)
         clip.until_ns = max(clip.until_ns, at_ns + self._after_ns)
 
-    def _between(self, begin_ns: int, end_ns: int) -> list[_Held | _HeldSample]:
-        both: list[_Held | _HeldSample] = [*self._messages, *self._samples]
-        chosen = [each for each in both if begin_ns <= each.time_ns <= end_ns]
+    def _between(self, begin_ns: int, end_ns: int) -> list[_Item]:
+        every: list[_Item] = [*self._messages, *self._samples, *self._events]
+        chosen = [each for each in every if begin_ns <= each.time_ns <= end_ns]
         return sorted(chosen, key=lambda each: each.time_ns)
 
     def _evict(self) -> None:
@@ -435,75 +424,3 @@ def _sample_bytes(sample: Sample) -> int:
 
 def _megabytes(size: float) -> str:
     return f"{size / 2**20:,.0f} MB"
-
-
-def _condition(text: str, files: Sequence[Specification]) -> _Condition:
-    """Return a function of the updates with a sample that says why a trigger holds, or None.
-
-    Raises:
-        UsageError: it is none, or names no spec.
-    """
-    words = text.strip()
-    if words == "manual":
-        return lambda updates, has_changed: None
-    if words == "event":
-        return lambda updates, has_changed: "event" if has_changed else None
-    names = {
-        node.name
-        for file in files
-        for spec in file.results
-        for _, _, node in iter_nodes(spec.formula)
-        if node.name is not None
-    } | {spec.name for file in files for spec in file.results}
-    if not files:
-        raise UsageError(f"the trigger {text!r} waits for a spec, but there is none; give a specification")
-    if words in _VERDICTS:
-        return lambda updates, _: next(
-            (
-                f"{spec.spec.name} {words}"
-                for update in updates
-                for spec in update.specs
-                if str(spec.verdict) == words
-            ),
-            None,
-        )
-    name, _, verdict = words.rpartition(" ")
-    if verdict in _VERDICTS:
-        name = _known(name.strip(), names, text)
-        return lambda updates, _: f"{name} {verdict}" if _verdict(updates, name) == verdict else None
-    if (found := _BELOW.match(words)) is not None:
-        with suppress(ValueError):
-            number = float(found["number"])
-            name = _known(found["name"], names, text)
-            return lambda updates, _: f"{name} below {number:g}" if _value(updates, name) < number else None
-    raise UsageError(
-        f"the trigger {text!r} is not understood; write 'violated', 'NAME violated', 'NAME satisfied',"
-        " 'NAME < 0.2', 'event' or 'manual'"
-    )
-
-
-def _known(name: str, names: set[str], text: str) -> str:
-    if name not in names:
-        hint = nearest_hint(name, names) or f"the specs are {', '.join(sorted(names))}"
-        raise UsageError(f"the trigger {text!r} names no spec: {name!r}; {hint}")
-    return name
-
-
-def _verdict(updates: Sequence[Update], name: str) -> str:
-    for update in updates:
-        for spec in update.specs:
-            if spec.spec.name == name:
-                return str(spec.verdict)
-        if name in update.places and update.specs[update.places[name][0]].numbers is not None:
-            return str(update.node(name).verdict)
-    return ""
-
-
-def _value(updates: Sequence[Update], name: str) -> float:
-    for update in updates:
-        for spec in update.specs:
-            if spec.spec.name == name and spec.numbers is not None:
-                return float(spec.numbers[0, 0])
-        if name in update.places and update.specs[update.places[name][0]].numbers is not None:
-            return float(update.node(name).value)
-    return math.nan

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from functools import partial
 from itertools import takewhile
 from os import PathLike
 from pathlib import Path
@@ -16,12 +17,13 @@ from typing import Self
 from spatial_replay.errors import OutputError, SpatialReplayError, TraceError, UsageError
 from spatial_replay.logs.messages import Channel, Messages
 from spatial_replay.logs.output_file import Durability, refuse_inputs
-from spatial_replay.recording.clip_log import ClipLog, Trigger, TriggeredClip
+from spatial_replay.recording.clip_log import ClipLog, TriggeredClip
 from spatial_replay.recording.interruption import terminable, uninterrupted
 from spatial_replay.recording.message_channel import MessageChannel, MessageQueue
 from spatial_replay.recording.message_schema import SchemaLike, check_topic, message_channel
 from spatial_replay.recording.recorder_log import FileLog, RecorderLog, RunEnd
-from spatial_replay.recording.recording import refuse_templates
+from spatial_replay.recording.recording import RunEvent, refuse_templates
+from spatial_replay.recording.trigger import Trigger
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import times_apart
 from spatial_replay.trace.sample import Sample
@@ -59,6 +61,7 @@ class SampleWriter:
         self._waiting = waiting
         self._enough = max(1, min(waiting, _TOGETHER) // 2)
         self._blocks = block
+        self._events: queue.SimpleQueue[RunEvent] = queue.SimpleQueue()
         self._messages = MessageQueue(name, waiting, blocks=block, ring=self._ring)
         self._dropped = 0
         self._last_ns = -1
@@ -115,6 +118,11 @@ class SampleWriter:
         if self._queue.qsize() >= self._enough:
             self._ring()
 
+    def report(self, event: RunEvent) -> None:
+        """Hand over what happens to the run beside its samples, from the thread that writes these."""
+        self._events.put(event)
+        self._ring()
+
     def _is_behind(self) -> bool:
         """Return whether too many samples wait, or too much time of them could be lost."""
         if self._queue.qsize() + self._log.backlog >= self._waiting:
@@ -167,12 +175,19 @@ class SampleWriter:
             # those that are left came before the others
             taken = now if len(samples) < _TOGETHER else taken
             self._record(samples, self._messages.take())
+            self._report_events()
             if self._failure is None and time.monotonic() - flushed >= FLUSH_S:
                 self._try(self._log.flush)
                 flushed = time.monotonic()
                 self._unsafe_s = taken if self._queue.qsize() else None
         while len(messages := self._messages.take()):
             self._record([], messages)
+
+    def _report_events(self) -> None:
+        with suppress(queue.Empty):
+            while self._failure is None:
+                event = self._events.get_nowait()
+                self._try(partial(self._log.report, event))
 
     def _record(self, samples: Sequence[Sample], messages: Messages) -> None:
         """Encode and write samples and messages; after a failure, drop them."""
@@ -340,12 +355,6 @@ class Recorder(SampleWriter):
             raise UsageError(f"{self._name} is written as a whole; open a Recorder with a trigger")
         self._clips.fire(reason)
         self._ring()
-
-    def report_event(self, what: str) -> None:
-        """Fire the trigger if it waits for events: of the connection or of a sensor, as for a change of a
-        verdict."""
-        if self._clips is not None and self._clips.waits_for_events:
-            self.trigger(what)
 
     @property
     def is_triggered(self) -> bool:

@@ -21,7 +21,7 @@ from spatial_replay.geometry.measure import Operand
 from spatial_replay.logs.mcap.writer import LogWriter
 from spatial_replay.logs.messages import MemorySink, Messages
 from spatial_replay.logs.output_file import Durability, open_output
-from spatial_replay.recording.recording import Recording
+from spatial_replay.recording.recording import Recording, RunEvent
 from spatial_replay.spec import object_names, signal_names
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
@@ -63,6 +63,9 @@ class RecorderLog(Protocol):
 
     def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
         """Write the next samples, given in both forms, and messages."""
+
+    def report(self, event: RunEvent) -> None:
+        """Write what happens to the run beside its samples."""
 
     def flush(self) -> None:
         """Hand everything written so far to the operating system."""
@@ -117,6 +120,10 @@ class FileLog:
             self._unevaluated.append(trace)
         if self._unevaluated:
             self._evaluate_some()
+
+    def report(self, event: RunEvent) -> None:
+        """See `RecorderLog`."""
+        self._recording.report(event)
 
     @property
     def is_busy(self) -> bool:

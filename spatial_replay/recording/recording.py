@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 from spatial_replay import __version__
 from spatial_replay.annotate.annotated_evaluation import AnnotatedEvaluation
@@ -11,7 +12,7 @@ from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.certificate import EvaluationHashes, specifications_json
 from spatial_replay.annotate.specification import logged_specifications, specification_attachments
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.messages import Channel, Messages, Sink, merge, messages_of
+from spatial_replay.logs.messages import Attachment, Channel, Messages, Sink, merge, messages_of
 from spatial_replay.logs.objects.encode import encode_objects
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import (
@@ -31,6 +32,20 @@ from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
+
+
+class RunEvent(NamedTuple):
+    """What happens to a run beside its samples.
+
+    Attributes:
+        time_ns: on the clock of the samples.
+        what: in a few words: "connection lost".
+        sentence: with its consequence.
+    """
+
+    time_ns: int
+    what: str
+    sentence: str
 
 
 class Recording:
@@ -95,6 +110,13 @@ class Recording:
         """The channels of the messages that annotate a sample."""
         return self._evaluation.channels
 
+    def layout_ahead(self) -> Attachment:
+        """Return the layout for viewers before there are samples: all that may come has its place."""
+        # imported here since a log that is written has its layout at its end
+        from spatial_replay.annotate.foxglove_layout import layout_attachment
+
+        return layout_attachment(self._evaluation.contents(None, (), self._axes))
+
     def redraw(self) -> None:
         """Draw the whole scene with the next sample, for a viewer that shows nothing yet."""
         self._evaluation.redraw()
@@ -123,6 +145,13 @@ class Recording:
         stretches = self._evaluation.extend(trace)
         self._sink.write_messages(merge(self._evaluation.messages(trace, stretches)))
         self._hashes.add_results(stretches)
+
+    def report(self, event: RunEvent) -> None:
+        """Write what happens to the run beside its samples.
+
+        A replay, which knows nothing of it, has only what it makes unknown.
+        """
+        self._sink.write_messages(self._evaluation.occurrence(*event))
 
     def _own(self, trace: Trace, beside: Messages | None) -> Messages:
         """Return samples and messages beside them as they are written; count and hash them."""

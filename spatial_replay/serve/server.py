@@ -264,6 +264,7 @@ class RunServer(PublishingServer):
         port: int,
         subscribed: Callable[[], None],
         fire: Callable[[str], None] | None,
+        origins: Sequence[str] = (),
     ) -> None:
         """Listen; see `PublishingServer`.
 
@@ -272,7 +273,7 @@ class RunServer(PublishingServer):
             fire: what the service `trigger` calls with a reason; None for no service.
         """
         self._subscribed, self._fire = subscribed, fire
-        super().__init__("spatial-replay: live", channels, host, port)
+        super().__init__("spatial-replay: live", channels, host, port, origins)
 
     def publish(self, messages: Messages) -> None:
         """See `Viewers.publish`; channels that are new are offered first."""
