@@ -7,15 +7,22 @@ import struct
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import foxglove
+from foxglove_schemas_protobuf.Event_pb2 import Event
+from mcap.reader import make_reader
 from websockets.exceptions import WebSocketException
 from websockets.sync.server import ServerConnection, serve
 from websockets.typing import Subprotocol
 
+from spatial_replay.logs.topics import EVENTS
+
+PATIENCE_S = 90
 PLAYER = Path(__file__).with_name("player.py")
 MS = 10**6
 
@@ -151,3 +158,61 @@ def rude_server(*sent: str | bytes, protocol: str = "foxglove.websocket.v1") -> 
         finally:
             server.shutdown()
             thread.join(5)
+
+
+def files(folder: Path, mapping: str, spec: str) -> tuple[Path, Path]:
+    (folder / "map.yaml").write_text(mapping)
+    (folder / "safe.spatial").write_text(spec)
+    return folder / "map.yaml", folder / "safe.spatial"
+
+
+def until(is_over: Callable[[], bool]) -> None:
+    """Wait for something that another thread or process does."""
+    limit = time.monotonic() + PATIENCE_S
+    while not is_over():
+        assert time.monotonic() < limit
+        time.sleep(0.005)
+
+
+def messages_of(path: Path) -> list[tuple[str, int, bytes]]:
+    """The messages of a log, as the stock library reads them."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        return [
+            (channel.topic, message.log_time, message.data)
+            for _, channel, message in reader.iter_messages(log_time_order=True)
+        ]
+
+
+class Occurrence(NamedTuple):
+    """An event that no specification has."""
+
+    time_ns: int
+    what: str
+    sentence: str
+
+
+def occurrence(time_ns: int, data: bytes) -> Occurrence | None:
+    """Decode an event; None for a change of a result."""
+    facts = {each.key: each.value for each in Event.FromString(data).metadata}
+    return Occurrence(time_ns, facts["occurrence"], facts["message"]) if "occurrence" in facts else None
+
+
+def occurrences(path: Path) -> list[Occurrence]:
+    """What happened to a run, as its log says."""
+    events = [occurrence(time_ns, data) for topic, time_ns, data in messages_of(path) if topic == EVENTS]
+    return [each for each in events if each is not None]
+
+
+def drive(own: Robot, ticks: range, pause_s: float = 0.004) -> threading.Thread:
+    """Let a robot drive towards the vase, once it is listened to, from x = 1 by a centimetre each tick."""
+
+    def run_ticks() -> None:
+        until(own.is_heard)
+        for tick in ticks:
+            own.drive(tick, 1.0 - tick / 100)
+            time.sleep(pause_s)
+
+    driving = threading.Thread(target=run_ticks)
+    driving.start()
+    return driving

@@ -6,10 +6,8 @@ import asyncio
 import json
 import os
 import signal
-import socket
 import threading
 import time
-from collections.abc import Callable
 from contextlib import aclosing
 from pathlib import Path
 
@@ -18,16 +16,28 @@ import pytest
 from mcap.reader import make_reader
 
 import spatial_replay as sr
-from live.robots import MAPPING, SPEC, Player, Robot, frame, playing, pose, robot, rude_server
-from serve.viewer import viewer
+from live.robots import (
+    MAPPING,
+    PATIENCE_S,
+    SPEC,
+    Player,
+    drive,
+    files,
+    frame,
+    messages_of,
+    occurrences,
+    playing,
+    pose,
+    robot,
+    rude_server,
+)
 from spatial_replay import LogError, Sample, Trace, Trigger, UsageError
 from spatial_replay.bags import open_messages
 from spatial_replay.cli.application import run
 from spatial_replay.live import LiveSession, LiveUpdate, monitor
 from spatial_replay.live.client import LARGEST_FRAME
-from spatial_replay.logs.topics import EVENTS, OBJECTS, ROBUSTNESS, SCENE
+from spatial_replay.logs.topics import OBJECTS, ROBUSTNESS, SCENE
 
-PATIENCE_S = 90
 TURTLES = """
 topics:
   /turtle1/pose: {shape: {disc: 0.5}}
@@ -42,12 +52,6 @@ topics:
 APART = "spec apart = G (turtle1 dist turtle2 >= 0.5)\nspec near = F (turtle1 dist turtle2 <= 9)\n"
 
 
-def files(folder: Path, mapping: str, spec: str) -> tuple[Path, Path]:
-    (folder / "map.yaml").write_text(mapping)
-    (folder / "safe.spatial").write_text(spec)
-    return folder / "map.yaml", folder / "safe.spatial"
-
-
 async def updates_of(
     address: str, spec: Path, mapping: Path | None, count: int, **options: object
 ) -> list[LiveUpdate]:
@@ -60,14 +64,6 @@ async def updates_of(
                 if len(found) == count:
                     break
     return found
-
-
-def until(is_over: Callable[[], bool]) -> None:
-    """Wait for something that another thread or process does."""
-    limit = time.monotonic() + PATIENCE_S
-    while not is_over():
-        assert time.monotonic() < limit
-        time.sleep(0.005)
 
 
 @pytest.mark.parametrize(
@@ -101,16 +97,6 @@ def test_a_bag_that_a_server_plays_gives_the_samples_of_the_bag(
         for each in open_messages(bag).iter_messages(topics, None, int(expected.times_ns[-1]) + 1)
     ]
     assert set(wanted) <= set(messages_of(output))
-
-
-def messages_of(path: Path) -> list[tuple[str, int, bytes]]:
-    """The messages of a log, as the stock library reads them."""
-    with path.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True)
-        return [
-            (channel.topic, message.log_time, message.data)
-            for _, channel, message in reader.iter_messages(log_time_order=True)
-        ]
 
 
 def test_a_server_of_ours_needs_no_mapping(tmp_path: Path) -> None:
@@ -156,6 +142,11 @@ def test_what_a_lost_connection_hides_is_unknown_until_it_is_back(data_folder: P
         for player in players:
             player.kill()
     gap = found[lost()]
+    # the log says so, and a replay of it gives the same results
+    assert [(each.time_ns, each.what) for each in occurrences(output)] == [
+        (gap.sample.time_ns, "connection lost")
+    ]
+    assert run(["verify", str(output)]) == 0
     assert gap.sample.objects == {} and set(gap.sample.unknown) == {"turtle1", "turtle2"}
     assert gap.sample.time_ns == found[lost() - 1].sample.time_ns + 1
     assert any("is lost" in note and "unknown" in note for note in gap.notes)
@@ -198,20 +189,6 @@ def test_every_message_around_a_violation_is_in_its_clip(data_folder: Path, tmp_
     assert str(sr.evaluate(sr.load_specification(spec), sr.read_trace(clip)).verdict) == "violated"
 
 
-def drive(own: Robot, ticks: range, pause_s: float = 0.004) -> threading.Thread:
-    """Let a robot drive towards the vase, once it is listened to, from x = 1 by a centimetre each tick."""
-
-    def run_ticks() -> None:
-        until(own.is_heard)
-        for tick in ticks:
-            own.drive(tick, 1.0 - tick / 100)
-            time.sleep(pause_s)
-
-    driving = threading.Thread(target=run_ticks)
-    driving.start()
-    return driving
-
-
 def test_the_program_ends_at_the_violation_and_says_why(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -227,74 +204,7 @@ def test_the_program_ends_at_the_violation_and_says_why(
     assert "`clear` holds so far" in shown
     assert "vase" in shown.partition("violated")[2] and "too close to vase" in shown
     assert "clear  violated" in shown and "seen   satisfied" in shown
-
-
-def test_a_viewer_sees_the_run_and_a_service_fires_the_trigger(tmp_path: Path) -> None:
-    mapped, spec = files(tmp_path, MAPPING, SPEC)
-    clips = tmp_path / "clips"
-    port = free_port()
-    command = ["monitor", "", "--mapping", str(mapped), "--spec", str(spec), "--serve", "--port", str(port)]
-    command += ["--clips", str(clips), "--trigger", "manual", "--after", "0s", "--topics", "/*"]
-    command += ["--for", "60s"]
-    seen: set[str] = set()
-    moving, over = threading.Event(), threading.Event()
-
-    def drive_when_seen() -> None:
-        until(own.is_heard)
-        for tick in range(6000):
-            own.drive(tick, 0.1 if moving.is_set() else 1.0)
-            time.sleep(0.01)
-            if over.is_set():
-                return
-
-    async def look() -> None:
-        async with viewer(f"ws://127.0.0.1:{port}") as own:
-            await own.subscribe([SCENE, ROBUSTNESS, EVENTS, OBJECTS])
-            for topic in (OBJECTS, ROBUSTNESS, SCENE):
-                seen.add((await own.message(topic)).topic)
-            assert await own.call("trigger", {"reason": "looked odd"}) == {"fired": True}
-            moving.set()
-            await own.message(EVENTS, lambda each: b"`clear` is violated" in each.data)
-
-    with robot() as own:
-
-        def watch() -> None:
-            try:
-                asyncio.run(look())
-                # a trigger that fires while a clip is open would make that one longer
-                until(lambda: any(each.read_bytes().endswith(b"\x89MCAP0\r\n") for each in clips.iterdir()))
-                os.kill(os.getpid(), signal.SIGUSR1)
-                until(lambda: len(list(clips.iterdir())) > 1)
-            finally:
-                over.set()
-                os.kill(os.getpid(), signal.SIGINT)
-
-        command[1] = own.address
-        driving = threading.Thread(target=drive_when_seen)
-        driving.start()
-        watching = threading.Thread(target=watch)
-        waiting = threading.Thread(target=lambda: (until(lambda: listens(port)), watching.start()))
-        waiting.start()
-        assert run(command) == 1
-        watching.join()
-        driving.join()
-    assert seen == {OBJECTS, ROBUSTNESS, SCENE}
-    assert [each.name for each in sorted(clips.iterdir())][:2] == [
-        "0001-looked-odd.mcap",
-        "0002-SIGUSR1.mcap",
-    ]
-    assert all({"/robot", "/vase", OBJECTS} <= {m[0] for m in messages_of(each)} for each in clips.iterdir())
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def listens(port: int) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
+    assert "`seen` is satisfied, whatever comes: `robot dist vase <= 9` holds by 8.2 at 0.000 s." in shown
 
 
 def test_what_a_silent_topic_reported_is_unknown(tmp_path: Path) -> None:
@@ -312,7 +222,10 @@ def test_what_a_silent_topic_reported_is_unknown(tmp_path: Path) -> None:
     assert last.node("clear").lower == float("-inf")
     assert last.sample.time_ns == found[-2].sample.time_ns + 1
     # it is an event, which a trigger may wait for
-    assert any("silence" in each.name for each in clips.iterdir())
+    [clip] = [each for each in clips.iterdir() if "silence" in each.name]
+    [silence] = occurrences(clip)
+    assert (silence.time_ns, silence.what) == (last.sample.time_ns, "silence on /robot, /vase")
+    assert silence.sentence in last.notes
 
 
 @pytest.mark.parametrize("protocol", ["foxglove.sdk.v1", "foxglove.websocket.v1"])
