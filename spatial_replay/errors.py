@@ -16,9 +16,23 @@ Every message names the wrong value, its place and the remedy.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from os import PathLike, fspath
-from typing import Protocol, Self
+from os import PathLike, fspath, strerror
+from typing import Final, Protocol, Self
+
+_ERROR_NUMBER: Final = re.compile(r"\[Errno (\d+)\]")
+
+
+def system_reason(error: Exception) -> str:
+    """Return why the system refuses something, in its own words: "permission denied"."""
+    number = getattr(error, "errno", None)
+    if number is None and (listed := _ERROR_NUMBER.search(str(error))) is not None:
+        # several attempts to connect failed, each with its own error
+        number = int(listed[1])
+    # names that are not found have numbers below 0, of another list
+    words = strerror(number) if number is not None and number > 0 else getattr(error, "strerror", None)
+    return (words or str(error) or type(error).__name__).lower()
 
 
 class SpatialReplayError(Exception):
@@ -38,7 +52,7 @@ class MissingFileError(UsageError):
         if isinstance(error, FileNotFoundError | NotADirectoryError):
             reason = "no such file"
         else:
-            reason = (getattr(error, "strerror", None) or str(error) or "cannot be read").lower()
+            reason = system_reason(error)
         return cls(f"{fspath(path)}: {reason}; check the path")
 
 

@@ -7,10 +7,9 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import chain
 from typing import Final, NamedTuple, TypeAlias
 
-from spatial_replay.errors import LogError, RemoteError, UsageError
+from spatial_replay.errors import LogError, RemoteError, UsageError, system_reason
 from spatial_replay.live.protocol import (
     SUBPROTOCOLS,
     Advertised,
@@ -250,11 +249,7 @@ def _connecting_error(address: str, error: Exception) -> Exception:
         case TimeoutError():
             reason = f"no answer within {_OPEN_S:.0f} s"
         case OSError():
-            reason = (error.strerror or str(error)).lower()
-            for each in chain(getattr(error, "exceptions", ())):
-                reason = (each.strerror or str(each)).lower()
-            if "multiple exceptions" in reason or "connect call failed" in reason:
-                reason = "connection refused"
+            reason = system_reason(error)
         case _:
             reason = f"it does not answer as a WebSocket server ({error!s:.100})"
     return RemoteError(

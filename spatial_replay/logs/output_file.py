@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeAlias, get_args
 
-from spatial_replay.errors import OutputError, UsageError
+from spatial_replay.errors import OutputError, UsageError, system_reason
 
 _SCHEMES = ("s3:", "gs:", "az:", "http:", "https:")
 
@@ -158,8 +158,9 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
         # said below, or when it is opened
         pass
     except (OSError, ValueError) as error:
-        reason = (getattr(error, "strerror", None) or str(error)).lower()
-        raise UsageError(f"{output} cannot be written: {reason}; give the output another name") from None
+        raise UsageError(
+            f"{output} cannot be written: {system_reason(error)}; give the output another name"
+        ) from None
     if output.is_dir():
         raise UsageError(f"{output} is a folder; give the name of a file in it")
     if not output.parent.is_dir():

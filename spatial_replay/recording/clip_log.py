@@ -16,7 +16,7 @@ from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from spatial_replay.errors import OutputError
+from spatial_replay.errors import OutputError, system_reason
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.logs.mcap.writer import LogWriter
 from spatial_replay.logs.messages import Channel, Messages
@@ -205,7 +205,7 @@ class ClipLog:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OutputError(f"{folder}: {(error.strerror or str(error)).lower()}") from None
+            raise OutputError(f"{folder}: {system_reason(error)}") from None
         self._monitors = [Monitor(file) for file in files]
         self._changes = VerdictChanges(files)
         warm_up(files, ())

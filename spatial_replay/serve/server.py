@@ -5,7 +5,6 @@ from __future__ import annotations
 import ipaddress
 import json
 import logging
-import os
 import secrets
 import socket
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +18,7 @@ import foxglove
 from foxglove import Parameter, Service, ServiceRequest
 from foxglove import websocket as protocol
 
-from spatial_replay.errors import SpatialReplayError, UsageError
+from spatial_replay.errors import SpatialReplayError, UsageError, system_reason
 from spatial_replay.logs.messages import Channel, Messages, Schema
 from spatial_replay.serve.gate import Gate
 from spatial_replay.serve.pace import PlaybackState, Status
@@ -95,7 +94,7 @@ class PublishingServer:
             self._relay = Relay(host, port, (self._behind, self._server.port), self._gate)
         except (OSError, UnicodeError) as error:
             self._server.stop()
-            reason = _reason(error)
+            reason = "no such name" if isinstance(error, UnicodeError) else system_reason(error)
             raise UsageError(
                 f"cannot listen at {host}, port {port}: {reason}; choose another with --port, 0 for any"
                 if _is_own(host)
@@ -443,14 +442,6 @@ def _is_v6(host: str) -> bool:
         return ipaddress.ip_address(host).version == 6
     except ValueError:
         return False
-
-
-def _reason(error: OSError | UnicodeError) -> str:
-    """Return why nothing can listen at an address, in the words of the system."""
-    if isinstance(error, UnicodeError):
-        return "no such name"
-    is_of_name = isinstance(error, socket.gaierror) or error.errno is None
-    return str(error.strerror or error) if is_of_name else os.strerror(error.errno or 0)
 
 
 def _is_own(host: str) -> bool:

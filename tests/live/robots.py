@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import struct
 import subprocess
 import sys
@@ -20,6 +21,8 @@ from websockets.exceptions import WebSocketException
 from websockets.sync.server import ServerConnection, serve
 from websockets.typing import Subprotocol
 
+from spatial_replay.bags import open_messages
+from spatial_replay.bags.decoders import channel_of
 from spatial_replay.logs.topics import EVENTS
 
 PATIENCE_S = 90
@@ -135,8 +138,111 @@ def pose(number: int, tick: int, x: float = 0.0) -> bytes:
 
 
 @contextmanager
-def rude_server(*sent: str | bytes, protocol: str = "foxglove.websocket.v1") -> Iterator[str]:
-    """A server that sends what it is given once it is subscribed to, whatever it is."""
+def _served(serving: Callable[[ServerConnection], None], protocol: str) -> Iterator[str]:
+    with serve(serving, "127.0.0.1", 0, subprotocols=[Subprotocol(protocol)], max_size=None) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        try:
+            yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+        finally:
+            server.shutdown()
+            thread.join(5)
+
+
+@contextmanager
+def bridge(bag: Path, *topics: str, protocol: str, end: float, speed: float) -> Iterator[str]:
+    """A server that speaks as foxglove_bridge does, with the messages of a bag.
+
+    It announces each topic in a frame of its own, as ROS finds them. Between messages it sends what a monitor
+    has no use for: times, parameters, services, the graph of nodes, what it says about itself.
+    """
+    reader = open_messages(bag)
+    first_ns = reader.start_ns or 0
+    messages = list(reader.iter_messages(topics, None, first_ns + round(end * 1e9)))
+    declared = {topic.name: channel_of(topic) for topic in reader.topics()}
+    numbers = {topic: number for number, topic in enumerate(declared, 1)}
+    asides: list[str | bytes] = [
+        json.dumps({"op": "parameterValues", "parameters": [{"name": "/use_sim_time", "value": False}]}),
+        json.dumps(
+            {"op": "advertiseServices", "services": [{"id": 1, "name": "/reset", "type": "std_srvs/Empty"}]}
+        ),
+        json.dumps(
+            {
+                "op": "connectionGraphUpdate",
+                "publishedTopics": [{"name": topic, "publisherIds": ["/sim"]} for topic in topics],
+                "subscribedTopics": [],
+                "advertisedServices": [],
+                "removedTopics": [],
+                "removedServices": [],
+            }
+        ),
+        json.dumps({"op": "status", "level": 1, "message": "Send buffer limit reached", "id": "buffer"}),
+        json.dumps({"op": "removeStatus", "statusIds": ["buffer"]}),
+        struct.pack("<BQ", 2, first_ns),
+        struct.pack("<BIII", 3, 1, 1, 4) + b"cdr" + bytes(1),
+    ]
+
+    def serving(connection: ServerConnection) -> None:
+        with suppress(WebSocketException, OSError):
+            info = {
+                "op": "serverInfo",
+                "name": "foxglove_bridge",
+                "capabilities": [
+                    "clientPublish",
+                    "connectionGraph",
+                    "parametersSubscribe",
+                    "parameters",
+                    "services",
+                ],
+                "supportedEncodings": [declared[topics[0]].encoding],
+                "metadata": {"ROS_DISTRO": "humble"},
+                "sessionId": "1700000000",
+            }
+            connection.send(json.dumps(info))
+            subscribed: dict[str, int] = {}
+            for topic, channel in declared.items():
+                schema = channel.schema
+                assert schema is not None
+                described = {
+                    "id": numbers[topic],
+                    "topic": topic,
+                    "encoding": channel.encoding,
+                    "schemaName": schema.name,
+                    "schema": schema.data.decode(),
+                    "schemaEncoding": schema.encoding,
+                }
+                connection.send(json.dumps({"op": "advertise", "channels": [described]}))
+            while set(subscribed) != set(topics):
+                request = json.loads(connection.recv(30))
+                assert set(request) == {"op", "subscriptions"} and request["op"] == "subscribe"
+                for each in request["subscriptions"]:
+                    assert set(each) == {"id", "channelId"}
+                    subscribed |= {
+                        topic: each["id"] for topic in topics if numbers[topic] == each["channelId"]
+                    }
+            with suppress(TimeoutError):
+                connection.recv(0.6)
+            began = time.monotonic()
+            for place, message in enumerate(messages):
+                due_s = began + (message.log_time_ns - first_ns) / 1e9 / speed
+                time.sleep(max(0.0, due_s - time.monotonic()))
+                connection.send(asides[place % len(asides)])
+                connection.send(frame(subscribed[message.topic], message.log_time_ns, message.payload))
+            connection.recv(60)
+
+    with _served(serving, protocol) as address:
+        yield address
+
+
+@contextmanager
+def rude_server(
+    *sent: str | bytes, protocol: str = "foxglove.websocket.v1", breaks_off: bool = False
+) -> Iterator[str]:
+    """A server that sends what it is given once it is subscribed to, whatever it is.
+
+    Args:
+        breaks_off: go away in the middle of another message.
+    """
 
     def serving(connection: ServerConnection) -> None:
         with suppress(WebSocketException, OSError):
@@ -148,16 +254,14 @@ def rude_server(*sent: str | bytes, protocol: str = "foxglove.websocket.v1") -> 
                 connection.recv(0.6)
             for each in sent:
                 connection.send(each)
+            if breaks_off:
+                # a binary frame of 126 bytes, of which 10 come
+                connection.socket.sendall(bytes([0x82, 126, 0, 126]) + bytes(10))
+                connection.socket.shutdown(socket.SHUT_RDWR)
             connection.recv(60)
 
-    with serve(serving, "127.0.0.1", 0, subprotocols=[Subprotocol(protocol)], max_size=None) as server:
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
-        try:
-            yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
-        finally:
-            server.shutdown()
-            thread.join(5)
+    with _served(serving, protocol) as address:
+        yield address
 
 
 def files(folder: Path, mapping: str, spec: str) -> tuple[Path, Path]:

@@ -21,6 +21,7 @@ from live.robots import (
     PATIENCE_S,
     SPEC,
     Player,
+    bridge,
     drive,
     files,
     frame,
@@ -97,6 +98,30 @@ def test_a_bag_that_a_server_plays_gives_the_samples_of_the_bag(
         for each in open_messages(bag).iter_messages(topics, None, int(expected.times_ns[-1]) + 1)
     ]
     assert set(wanted) <= set(messages_of(output))
+
+
+@pytest.mark.parametrize("protocol", ["foxglove.sdk.v1", "foxglove.websocket.v1"])
+@pytest.mark.parametrize(
+    ("name", "mapping", "topics"),
+    [
+        ("two_turtles.bag", TURTLES, ("/turtle1/pose", "/turtle2/pose")),
+        ("two_turtles_mcap", FRAMES, ("/tf",)),
+    ],
+    ids=["ROS 1", "ROS 2"],
+)
+def test_a_bridge_of_ros_gives_the_samples_of_the_bag_that_the_robot_records(
+    data_folder: Path, tmp_path: Path, name: str, mapping: str, topics: tuple[str, ...], protocol: str
+) -> None:
+    bag = data_folder / "bags" / name
+    mapped, spec = files(tmp_path, mapping, APART)
+    whole = sr.read_trace(bag, mapping=mapped)
+    first_ns = open_messages(bag).start_ns or 0
+    expected = whole.slice(0, int((whole.times_ns < first_ns + 10**9).sum()))
+    with bridge(bag, *topics, protocol=protocol, end=1, speed=2) as address:
+        found = asyncio.run(updates_of(address, spec, mapped, len(expected)))
+    assert Trace.from_samples(update.sample for update in found) == expected
+    assert any("foxglove_bridge" in note for note in found[0].notes)
+    assert any("Send buffer limit reached" in note for each in found for note in each.notes)
 
 
 def test_a_server_of_ours_needs_no_mapping(tmp_path: Path) -> None:
@@ -247,6 +272,17 @@ def test_frames_that_break_the_protocol_are_left_out_and_said(tmp_path: Path, pr
     assert [each.time_ns for each in found] == [1, 30_000_001]
     notes = " ".join(note for each in found for note in each.notes)
     assert "is not JSON" in notes and "such frames are left out" in notes
+
+
+def test_a_server_that_goes_away_in_the_middle_of_a_message_leaves_a_whole_log(tmp_path: Path) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    output = tmp_path / "live.mcap"
+    with rude_server(pose(2, 0), pose(1, 0), breaks_off=True) as address:
+        found = asyncio.run(updates_of(address, spec, mapped, 2, output=output))
+    assert any("is lost: it broke off" in note for note in found[1].notes)
+    assert set(found[1].sample.unknown) == {"robot", "vase"}
+    assert len(sr.read_trace(output)) == 2
+    assert [each.what for each in occurrences(output)] == ["connection lost"]
 
 
 def test_a_huge_frame_ends_the_connection_and_not_the_run(tmp_path: Path) -> None:
