@@ -1,4 +1,4 @@
-"""`.db3` files of ROS 2 bags: opened without trust, and read up to the first damage.
+"""`.db3` files of ROS 2 bags: opened without trust, and read around what is damaged.
 
 A log is input from outside, so nothing in the database may compute, and whatever SQLite says about a
 damaged file becomes a fault of the log.
@@ -7,7 +7,9 @@ damaged file becomes a fault of the log.
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from bisect import bisect_left, bisect_right
+from collections import deque
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -29,6 +31,7 @@ from spatial_replay.bags.unpacking import copy_beginning, temporary_folder
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.messages import Channel, Schema
+from spatial_replay.text import Instant, Sentence
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
 _MOST_TOPICS = 100_000
@@ -37,8 +40,15 @@ _STEPS = 10_000
 _STEPS_A_BYTE = 20
 _MOST_ROWS, _BATCH_BYTES = 512, 2**21
 
+_MOST_PROBES = 10_000
+"""Parts of a damaged table that are tried; what is left then counts as lost."""
+
 Row = tuple[int, int, Any, Any]
 """Id, topic, time and content of a message; a damaged file may hold anything as the last two."""
+RowHead = tuple[int, int, int]
+"""Id, topic and time of a message."""
+_Span = tuple[int, int]
+"""The first and the last of some ids."""
 
 
 class SqliteBag(MessageReader):
@@ -111,15 +121,44 @@ class SqliteBag(MessageReader):
             f" WHERE topic_id IN ({', '.join('?' * len(wanted))}) AND timestamp BETWEEN ? AND ?"
             f" ORDER BY {'id' if as_recorded else 'timestamp, id'}"
         )
-        row_id = None
+        key = _by_id if as_recorded else _by_time
+        after = (-1, -1)
         with _opened(self._whole) as database:
             try:
                 for rows in _batches(database.execute(query, (*sorted(wanted), first, last - 1))):
                     yield self._columns(rows, wanted)
-                    row_id = rows[-1][0]
+                    after = key(rows[-1])
+                return
             except sqlite3.Error as error:
-                read = "no message could be read" if row_id is None else f"read up to row {row_id}"
-                self._faults.add(f"{self.name}: the database is damaged ({error}); {read}")
+                damage = str(error)
+        with _opened(self._whole) as database:
+            intact, lost = _intact_rows(database)
+            following = sorted(
+                (row for row in intact if row[1] in wanted and first <= row[2] < last and key(row) > after),
+                key=key,
+            )
+            for rows in _batches(_contents(database, following, lost)):
+                yield self._columns(rows, wanted)
+        self._report_lost(damage, intact, lost)
+
+    def _report_lost(self, damage: str, intact: Sequence[RowHead], lost: Collection[_Span]) -> None:
+        """Report what a damaged database has lost, with the times of the messages around it."""
+        damaged = f"{self.name}: the database is damaged ({damage})"
+        spans = _joined_spans(lost)
+        if not spans:
+            self._faults.add(f"{damaged}; every message could be read")
+        places = [row[0] for row in intact]
+        for begin, end in spans:
+            at, to = bisect_left(places, begin), bisect_right(places, end)
+            before = [Instant(row[2], 0) for row in intact[max(0, at - 1) : at]]
+            behind = [Instant(row[2], 0) for row in intact[to : to + 1]]
+            when: tuple[str | Instant, ...] = (" between ", *before, " and ", *behind)
+            if not (before and behind):
+                when = (" after ", *before) if before else (" before ", *behind) if behind else ()
+            rows = f"row {begin}" if begin == end else f"rows {begin} to {end}"
+            # where nothing is behind, how many there were is not known
+            rows = rows if behind or not before else f"rows from {begin} on"
+            self._faults.add(Sentence(f"{damaged}; messages", *when, f" are lost: {rows}"))
 
     def _columns(self, rows: Sequence[Row], wanted: Mapping[int, str]) -> MessageColumns:
         places, numbers, times, payloads = zip(*rows, strict=True)
@@ -223,7 +262,7 @@ def _read_tables(database: sqlite3.Connection, name: str) -> BagTables:
     return BagTables(topics, metadata, distribution)
 
 
-def _batches(cursor: sqlite3.Cursor) -> Iterator[list[Row]]:
+def _batches(cursor: Iterable[Row]) -> Iterator[list[Row]]:
     """Yield the rows of a query in lists of at most some megabytes; those before an error come before it."""
     rows: list[Row] = []
     held = 0
@@ -240,6 +279,83 @@ def _batches(cursor: sqlite3.Cursor) -> Iterator[list[Row]]:
         raise
     if rows:
         yield rows
+
+
+def _by_id(row: Row | RowHead) -> tuple[int, int]:
+    return row[0], 0
+
+
+def _by_time(row: Row | RowHead) -> tuple[int, int]:
+    return row[2], row[0]
+
+
+def _intact_rows(database: sqlite3.Connection) -> tuple[list[RowHead], set[_Span]]:
+    """Return the rows of a damaged database that can be found by their ids, in order, and the ids of others.
+
+    A part of the ids that cannot be read is halved until what is damaged is found.
+    """
+    query = "SELECT id, topic_id, timestamp FROM messages NOT INDEXED WHERE id BETWEEN ? AND ? ORDER BY id"
+    spans = deque([_all_ids(database)])
+    found: dict[int, RowHead] = {}
+    lost: set[_Span] = set()
+    for _ in range(_MOST_PROBES):
+        if not spans:
+            break
+        first, last = spans.popleft()
+        try:
+            for row in database.execute(query, (first, last)):
+                if all(type(each) is int for each in row):
+                    found[row[0]] = row
+                    first = max(first, row[0] + 1)
+        except sqlite3.Error as error:
+            if error.sqlite_errorcode == sqlite3.SQLITE_INTERRUPT:
+                spans.append((first, last))
+                break
+            middle = (first + last) // 2
+            halves = [(first, middle), (middle + 1, last)] if first < last else []
+            spans.extend(halves)
+            lost.update([] if halves else [(first, last)])
+    lost.update(spans)
+    return sorted(found.values()), lost
+
+
+def _all_ids(database: sqlite3.Connection) -> _Span:
+    """Return the ids that messages may have."""
+    try:
+        ((first, last),) = database.execute(
+            "SELECT (SELECT min(id) FROM messages NOT INDEXED), (SELECT max(id) FROM messages NOT INDEXED)"
+        )
+        if type(first) is type(last) is int:
+            return first, last
+    except sqlite3.Error:
+        pass
+    # recorders number messages from 1 on, and none takes fewer bytes than this
+    (pages,), (page,) = (
+        database.execute(f"PRAGMA {name}").fetchone() for name in ("page_count", "page_size")
+    )
+    return 0, int(pages * page) // 8
+
+
+def _contents(database: sqlite3.Connection, heads: Sequence[RowHead], lost: set[_Span]) -> Iterator[Row]:
+    """Yield rows with their contents; the ids of those that cannot be read go to `lost`."""
+    for row_id, *_ in heads:
+        try:
+            yield from database.execute(
+                "SELECT id, topic_id, timestamp, data FROM messages NOT INDEXED WHERE id = ?", (row_id,)
+            )
+        except sqlite3.Error:
+            lost.add((row_id, row_id))
+
+
+def _joined_spans(spans: Collection[_Span]) -> list[_Span]:
+    """Return spans of ids in order, those that follow each other as one."""
+    joined: list[_Span] = []
+    for first, last in sorted(spans):
+        if joined and first <= joined[-1][1] + 1:
+            joined[-1] = joined[-1][0], max(last, joined[-1][1])
+        else:
+            joined.append((first, last))
+    return joined
 
 
 def _records(database: sqlite3.Connection, table: str) -> list[dict[str, object]]:

@@ -93,9 +93,9 @@ class Recovery:
         samples = sum(gap.last - gap.first + 1 for gap in self.samples)
         messages = sum(self.missing.values())
         if messages and samples:
-            return f"{counted(messages, 'message')} are missing, {counted(samples, 'sample')} among them"
+            return f"{_missing(messages, 'message')}, {counted(samples, 'sample')} among them"
         if messages or samples:
-            return f"{counted(messages or samples, 'message' if messages else 'sample')} are missing"
+            return _missing(messages or samples, "message" if messages else "sample")
         return "how much is missing is not known"
 
     def metadata(self) -> dict[str, str]:
@@ -235,6 +235,10 @@ def _messages(columns: MessageColumns, channels: Mapping[int, Channel]) -> Messa
         columns.publish_time_ns,
         columns.payloads,
     )
+
+
+def _missing(count: int, noun: str) -> str:
+    return f"{counted(count, noun)} {'is' if count == 1 else 'are'} missing"
 
 
 def _spans(faults: Sequence[str]) -> tuple[tuple[int, int], ...]:

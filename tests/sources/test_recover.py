@@ -177,6 +177,27 @@ def test_a_bag_that_breaks_off_is_saved_up_to_there(tmp_path: Path) -> None:
     assert len(saved) > 60
 
 
+def test_what_a_damaged_page_of_a_database_takes_is_listed_by_time(tmp_path: Path) -> None:
+    folder = write_ros2(tmp_path / "drive", drive(600), storage="sqlite3")
+    whole = messages_of(folder)
+    path = next(folder.glob("*.db3"))
+    data = bytearray(path.read_bytes())
+    page = len(data) // 2 // 4096 * 4096
+    data[page : page + 4096] = bytes(4096)
+    path.write_bytes(data)
+    code, said = call("recover", folder, "-o", tmp_path / "saved.mcap")
+    assert code == 3
+    saved = messages_of(tmp_path / "saved.mcap")
+    lost = [each for each in whole if each not in saved]
+    assert 5 < len(lost) < 100
+    start_ns = whole[0].log_time_ns
+    record = metadata_of(tmp_path / "saved.mcap")["spatial_replay_recovery"]
+    ((first_ns, last_ns),) = json.loads(record["spans_ns"])
+    assert first_ns < lost[0].log_time_ns and lost[-1].log_time_ns < last_ns
+    assert last_ns - first_ns < 2 * (lost[-1].log_time_ns - lost[0].log_time_ns)
+    assert f"  time     {(first_ns - start_ns) / 1e9:.3f} s to {(last_ns - start_ns) / 1e9:.3f} s" in said
+
+
 def test_text_files_and_files_without_a_message_are_refused(tmp_path: Path) -> None:
     (tmp_path / "run.jsonl").write_text('{"time_ns": 0, "objects": []}\n')
     with pytest.raises(sr.UsageError, match="record tracks"):
