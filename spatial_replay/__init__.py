@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from spatial_replay.errors import (
+    ClusterError,
     GeometryError,
     LogError,
     MissingFileError,
@@ -89,6 +90,7 @@ __all__ = [
     "Candidate",
     "Cause",
     "Clip",
+    "ClusterError",
     "Consideration",
     "ConvexPart",
     "DecidingAtom",

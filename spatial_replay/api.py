@@ -346,7 +346,9 @@ def evaluate_logs(
         UsageError: a pattern without a log, options that do not work, pyarrow is not installed.
         SpecificationError: specifications with errors.
         OutputError: results cannot be written; those written so far stay.
+        ClusterError: the scheduler is lost; the results written so far stay.
     """
+    from spatial_replay.batch.prepare import prepare
     from spatial_replay.batch.run import run_batch, workers_of
     from spatial_replay.batch.suite import Conditions, Suite, load_suite
 
@@ -369,7 +371,7 @@ def evaluate_logs(
     else:
         files = [specifications] if isinstance(specifications, str | PathLike) else specifications
         suite = Suite.of_logs([fspath(log) for log in named], [sendable(file) for file in files], conditions)
-    return run_batch(suite, output, workers_of(jobs, dask), fail_on=frozenset(fail_on))
+    return run_batch(prepare(suite), output, workers_of(jobs, dask), fail_on=frozenset(fail_on))
 
 
 def read_results(folder: PathName) -> pa.Table:

@@ -9,7 +9,8 @@
     ├── TraceError              samples that do not form a trace
     ├── LogError                a log that is damaged or breaks its format
     │   └── RemoteError         an address that does not answer, or whose file changes
-    └── OutputError             an output could not be written
+    ├── OutputError             an output could not be written
+    └── ClusterError            a cluster of computers is lost
 
 Every message names the wrong value, its place and the remedy.
 """
@@ -111,3 +112,7 @@ class RemoteError(LogError):
 
 class OutputError(SpatialReplayError):
     """An output that could not be written: no space, no permission."""
+
+
+class ClusterError(SpatialReplayError):
+    """A cluster whose scheduler answers no more."""

@@ -39,23 +39,22 @@ class SuiteFile(pytest.File):
 
     def collect(self) -> Iterable[pytest.Item]:
         """Yield a test for each case, log and spec; faults of the suite end the collection."""
+        from spatial_replay.batch.prepare import prepare
         from spatial_replay.batch.rows import Task
-        from spatial_replay.batch.run import found_logs
-        from spatial_replay.batch.spec_files import checked_spec_files
         from spatial_replay.batch.suite import load_suite
         from spatial_replay.errors import SpatialReplayError
 
         try:
-            suite = load_suite(self.path)
-            cases = list(zip(suite.cases, checked_spec_files(suite), found_logs(suite), strict=True))
+            cases = prepare(load_suite(self.path))
         except SpatialReplayError as error:
             raise self.CollectError(str(error)) from None
-        for case, files, logs in cases:
-            for log in logs:
-                task = Task(log.path, tuple(file.text for file in files), case.conditions)
-                for number, file in enumerate(files):
+        for prepared in cases:
+            case = prepared.case
+            for log in prepared.logs:
+                task = Task(log.path, tuple(file.text for file in prepared.files), case.conditions)
+                for number, file in enumerate(prepared.files):
                     # several specification files may use one name
-                    stem = f"{file.name.removesuffix('.spatial')}." if len(files) > 1 else ""
+                    stem = f"{file.name.removesuffix('.spatial')}." if len(prepared.files) > 1 else ""
                     for spec in _result_names(task, number):
                         name = f"{case.name}[{log.name}-{stem}{spec}]"
                         yield ReplayItem.from_parent(

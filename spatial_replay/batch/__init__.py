@@ -1,6 +1,6 @@
 """Many logs: a suite of cases in, rows of results out.
 
-`suite` says what is evaluated, `spec_files` checks the specifications, `log_files` finds the logs, `rows`
+`suite` says what is evaluated, `prepare` checks it all, with `spec_files` and `log_files`; `rows`
 evaluates one log with all its specifications, `run` does so for all of them with the processes of `workers`,
 and `data_set` keeps what comes out. The other modules show it.
 

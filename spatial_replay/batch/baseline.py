@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
+from spatial_replay.batch.run_table import RANKS, result_name
 from spatial_replay.errors import UsageError
 
 if TYPE_CHECKING:
@@ -17,6 +19,8 @@ Key: TypeAlias = tuple[str, str, str, str, str | None]
 """Case, log, specification file, spec and object of a result."""
 Change: TypeAlias = Literal["worse", "verdict", "gone", "better"]
 
+BASELINE_VERDICT: Final = "baseline_verdict"
+BASELINE_ROBUSTNESS: Final = "baseline_robustness"
 _NUMBER: Final = re.compile(r"(?P<number>\d+(?:\.\d*)?|\.\d+)(?P<percent>%?)", re.ASCII)
 _KEY: Final = ("case", "log", "file", "spec", "object")
 _ORDER: Final = {"satisfied": 0, "unknown": 1, "violated": 2, None: 3}
@@ -83,29 +87,93 @@ class Difference:
         return self.change != "better"
 
     @property
+    def key(self) -> Key:
+        """Which result it is."""
+        return self.case, self.log, self.file, self.spec, self.object
+
+    @property
     def text(self) -> str:
         """What changed, with both numbers, in one line."""
-        name = self.spec if self.object is None else f"{self.spec}({self.object})"
-        was = f"{self.before or 'an error'} with robustness {_shown(self.before_robustness)} in the baseline"
-        if self.change == "gone":
-            return f"{self.log}: {name} is gone; it was {was}"
-        now = f"{self.now or 'an error'} with robustness {_shown(self.robustness)}"
-        return f"{self.log}: {name} is {now}; it was {was}"
+        return f"{self.log}: {result_name(self.spec, self.object)} is {self.failure} in the baseline"
+
+    @property
+    def failure(self) -> str:
+        """What changed, with both numbers, in a few words."""
+        now = "gone" if self.change == "gone" else _described(self.now, self.robustness)
+        return f"{now}; it was {_described(self.before, self.before_robustness)}"
 
 
 def compare(table: pa.Table, baseline: pa.Table, tolerance: Tolerance) -> list[Difference]:
-    """Return the differences of a run from a baseline, in the baseline's order; new results are none.
+    """Return the differences of a run from a baseline, the worst first; new results are none.
 
     Results are the same if case, log, specification file, spec and object are.
     """
-    return list(_differences(_by_key(table), _by_key(baseline), tolerance))
+    found = _differences(_by_key(table), _by_key(baseline), tolerance)
+    return sorted(found, key=lambda each: (RANKS[each.now], _least_first(each.robustness)))
+
+
+def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Difference]) -> pa.Table:
+    """Return the table of a run in which what is worse than the baseline fails, and what is gone has a row.
+
+    The columns `baseline_verdict` and `baseline_robustness` say what each result was.
+
+    Args:
+        differences: see `compare`.
+    """
+    import pyarrow as pa
+
+    before, keys = _by_key(baseline), _keys(table)
+    worse: dict[Key, list[str]] = defaultdict(list)
+    own, gone = set(keys), []
+    for each in differences:
+        if each.change == "gone":
+            gone.append(each)
+        elif each.fails:
+            # an error in place of all objects of a template
+            key = each.key if each.key in own else (*each.key[:-1], None)
+            worse[key].append(f"worse than the baseline: {each.failure}")
+    failures = [
+        "; ".join(filter(None, [failure, *worse.get(key, ())])) or None
+        for key, failure in zip(keys, table.column("failure").to_pylist(), strict=True)
+    ]
+    place = table.schema.get_field_index("failure")
+    table = table.set_column(place, table.schema.field(place), pa.array(failures, pa.string()))
+    was = [before.get(key, (None, None)) for key in keys]
+    for name, kind, values in (
+        (BASELINE_VERDICT, pa.string(), [verdict for verdict, _ in was]),
+        (BASELINE_ROBUSTNESS, pa.float64(), [number for _, number in was]),
+    ):
+        table = table.append_column(name, pa.array(values, kind))
+    rows = dict(zip(_keys(baseline), baseline.to_pylist(), strict=True)) if gone else {}
+    missing = [_gone_row(rows[each.key], each) for each in gone]
+    return pa.concat_tables([table, pa.Table.from_pylist(missing, table.schema)])
+
+
+def _gone_row(row: dict[str, Any], difference: Difference) -> dict[str, Any]:
+    """Return the row of a result that only the baseline has, given its row there."""
+    kept = ("key", *_KEY, "requirement", "title", "line", "expected")
+    nothing: dict[str, Any] = {
+        name: [] for name in ("explanation", "vacuous", "faults", "remarks", "missing")
+    }
+    nothing |= dict.fromkeys(("robustness", "lower", "upper"), math.nan)
+    return {
+        **nothing,
+        **{name: row.get(name) for name in kept},
+        "failure": f"{difference.failure} in the baseline",
+        "reason": "",
+        "seconds": 0.0,
+        BASELINE_VERDICT: difference.before,
+        BASELINE_ROBUSTNESS: difference.before_robustness,
+    }
+
+
+def _keys(table: pa.Table) -> list[Key]:
+    return list(zip(*(table.column(name).to_pylist() for name in _KEY), strict=True))
 
 
 def _by_key(table: pa.Table) -> dict[Key, tuple[str | None, float]]:
-    columns = [table.column(name).to_pylist() for name in _KEY]
     values = zip(table.column("verdict").to_pylist(), table.column("robustness").to_pylist(), strict=True)
-    keys = zip(*columns, strict=True)
-    return dict(zip(keys, values, strict=True))
+    return dict(zip(_keys(table), values, strict=True))
 
 
 def _differences(
@@ -133,5 +201,11 @@ def _differences(
             )
 
 
-def _shown(number: float) -> str:
-    return "not determined" if math.isnan(number) else f"{number:.6g}"
+def _least_first(number: float) -> float:
+    return math.inf if math.isnan(number) else number
+
+
+def _described(verdict: str | None, number: float) -> str:
+    if verdict is None:
+        return "an error"
+    return f"{verdict} with robustness {'not determined' if math.isnan(number) else f'{number:.6g}'}"

@@ -38,6 +38,8 @@ FORMAT: Final = 1
 """The version of the layout; rows of another version are never read."""
 LAST_RUN: Final = "last_run.parquet"
 IDENTITIES: Final = "identities.jsonl"
+SOURCE: Final = "source"
+"""The column of the file that was read: logs that hold the same share their rows."""
 _FORMAT_FILE: Final = "format.json"
 _ROWS: Final = "rows"
 _PARTITION: Final = "spec_hash="
@@ -76,6 +78,7 @@ def columns() -> pa.Schema:
             ("seconds", pa.float64()),
             ("error", text),
             ("error_kind", text),
+            (SOURCE, text),
         ]
     )
 
@@ -85,7 +88,7 @@ def run_columns() -> pa.Schema:
     pa = _pyarrow()
     text = pa.string()
     asked = [(name, text) for name in ("case", "log", "file", "expected", "failure")]
-    return pa.schema([*asked, *columns()])
+    return pa.schema([*asked, *(each for each in columns() if each.name != SOURCE)])
 
 
 def table_of(rows: Mapping[str, Sequence[ResultRow]]) -> pa.Table:
@@ -176,7 +179,7 @@ def _write_joined(files: ResultFiles, partition: str, tables: Mapping[str, pa.Ta
     """Write the rows of several keys as one file."""
     # named after what it holds, so that joining the same files twice gives one file
     digest = hashlib.sha256("".join(tables).encode()).hexdigest()[:32]
-    joined = _pyarrow().concat_tables(list(tables.values()))
+    joined = _pyarrow().concat_tables(tables.values(), promote_options="default")
     files.write(f"{partition}/{_JOINED}{digest}.parquet", _encoded(joined))
 
 
@@ -274,7 +277,8 @@ class ResultsFolder:
         tables += self._tables(
             [name for key, name in fresh.items() if key not in taken and (wanted is None or key in wanted)]
         )
-        return _pyarrow().concat_tables(tables) if tables else columns().empty_table()
+        # what was stored before a column was there lacks it
+        return _pyarrow().concat_tables([columns().empty_table(), *tables], promote_options="default")
 
     def join_files(self) -> None:
         """Join small files that runs have left into larger ones; call it while `locked`.

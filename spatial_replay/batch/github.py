@@ -7,8 +7,16 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
-from spatial_replay.batch.run_table import totals, worst_rows
+from spatial_replay.batch.run_table import (
+    damage_word,
+    result_name,
+    summary_text,
+    totals,
+    verdict_word,
+    worst_rows,
+)
 from spatial_replay.errors import OutputError
+from spatial_replay.logs.remote import is_address
 from spatial_replay.text import counted, printable
 
 if TYPE_CHECKING:
@@ -17,8 +25,6 @@ if TYPE_CHECKING:
 _ANNOTATIONS: Final = 10
 """GitHub shows no more of one kind for a step."""
 _WORST: Final = 10
-_ESCAPED: Final = {ord(sign): f"\\{sign}" for sign in "\\|["} | {ord("<"): "&lt;"}
-"""In a cell of a table: none ends another one, or becomes markup."""
 
 
 def is_github(environment: Mapping[str, str] = os.environ) -> bool:
@@ -41,6 +47,24 @@ def annotation(
     return f"::{severity} {properties}::{_data(message)}"
 
 
+def repository_path(file: str | Path, environment: Mapping[str, str] = os.environ) -> str:
+    """Return the path of a file as the tools of its repository know it: relative to the repository.
+
+    The repository is the folder of the job on GitHub, else the nearest folder above with a `.git`, else the
+    current one. A file elsewhere keeps its whole path, and an address stays.
+    """
+    if is_address(file):
+        return str(file)
+    path, here = Path(file).absolute(), Path.cwd()
+    job = environment.get("GITHUB_WORKSPACE")
+    above = next((each for each in (here, *here.parents) if (each / ".git").exists()), here)
+    for base in (Path(job) if job else above, above):
+        for own, root in ((Path(os.path.normpath(path)), base), (path.resolve(), base.resolve())):
+            if own.is_relative_to(root):
+                return own.relative_to(root).as_posix()
+    return path.as_posix()
+
+
 def worst_annotations(table: pa.Table, folder: Path = Path()) -> Iterator[str]:
     """Yield an annotation for each of the worst rows that fail, at the line of its spec.
 
@@ -51,8 +75,9 @@ def worst_annotations(table: pa.Table, folder: Path = Path()) -> Iterator[str]:
         if row["failure"] is None:
             return
         name = f"{row['requirement']} {row['spec']}" if row["requirement"] else row["spec"]
-        message = f"{row['log']}: {row['failure']}. {row['reason']}"
-        yield annotation("error", str(folder / row["file"]), row["line"], message, title=name)
+        message = f"{row['log']}: {row['failure']}. {row['reason']}".rstrip()
+        file = row["file"] if is_address(row["file"]) else folder / row["file"]
+        yield annotation("error", repository_path(file), row["line"], message, title=name)
 
 
 def write_summary(table: pa.Table, environment: Mapping[str, str] = os.environ) -> None:
@@ -75,8 +100,9 @@ def markdown(table: pa.Table) -> str:
     """Return the totals and the worst rows as Markdown."""
     lines = [
         "### spatial-replay\n",
-        "| case | spec | requirement | satisfied | violated | unknown | errors | least robustness |",
-        "|---|---|---|--:|--:|--:|--:|--:|",
+        f"{summary_text(table)}\n",
+        "| case | spec | requirement | satisfied | violated | unknown | errors | failed | least robustness |",
+        "|---|---|---|--:|--:|--:|--:|--:|--:|",
     ]
     for each in totals(table):
         names = [
@@ -84,7 +110,7 @@ def markdown(table: pa.Table) -> str:
             each.group["spec"] or each.group["file"],
             each.group["requirement"] or "",
         ]
-        numbers = [each.satisfied, each.violated, each.unknown, each.errors]
+        numbers = [each.satisfied, each.violated, each.unknown, each.errors, each.failures]
         least = "" if each.least is None else f"{each.least:.6g}"
         lines.append(_line([*names, *(f"{number:,}" for number in numbers), least]))
     failing = [row for row in worst_rows(table, _WORST) if row["failure"] is not None]
@@ -94,10 +120,13 @@ def markdown(table: pa.Table) -> str:
             "",
             f"{counted(count, 'result')} failed; the worst:",
             "",
-            "| log | spec | | |",
-            "|---|---|---|---|",
+            "| log | spec | verdict | failure | reason |",
+            "|---|---|---|---|---|",
         ]
-        lines += [_line([row["log"], row["spec"], row["failure"], row["reason"]]) for row in failing]
+        for row in failing:
+            names = [row["log"], result_name(row["spec"], row["object"])]
+            verdict = f"{verdict_word(row)}{damage_word(row)}"
+            lines.append(_line([*names, verdict, row["failure"], row["reason"]]))
     return "\n".join([*lines, "", ""])
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from xml.sax.saxutils import escape, quoteattr
 
+from spatial_replay.batch.run_table import damage_word, verdict_word
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.text import counted, printable
 
@@ -62,7 +63,7 @@ def _lines(
 ) -> Iterator[str]:
     suites: dict[tuple[str, ...], list[Values]] = {}
     wanted = ("case", "file", "spec", "requirement", "title", "log", "object", "failure", "error")
-    texts = ("explanation", "vacuous", "seconds", "error_kind", "verdict", "line")
+    texts = ("explanation", "vacuous", "seconds", "error_kind", "verdict", "line", "faults")
     for row in table.select([*wanted, *texts]).to_pylist():
         suites.setdefault((row["case"], row["file"], row["spec"]), []).append(row)
     failures, errors = _counts(row for rows in suites.values() for row in rows)
@@ -103,7 +104,7 @@ def _case(
     if row["failure"] is not None:
         # errors are about the test, failures about what it tests
         tag = "failure" if row["error"] is None else "error"
-        kind = row["error_kind"] or row["verdict"]
+        kind = row["error_kind"] or f"{verdict_word(row)}{damage_word(row)}"
         text = "\n".join([*row["explanation"], *row["vacuous"]]) or row["failure"]
         text = text if limit is None or len(text) <= limit else text[: limit - 1] + "…"
         message = printable(row["failure"], limit or 1_000)

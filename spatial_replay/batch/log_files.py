@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from spatial_replay.batch.suite import LogPattern
-from spatial_replay.batch.workers import ThisProcess, WorkerLost, Workers
+from spatial_replay.batch.workers import Progress, ThisProcess, WorkerLost, Workers
 from spatial_replay.errors import LogError, SpatialReplayError, UsageError
 from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.output_file import replacing
@@ -174,11 +174,12 @@ class Identities:
         except (OSError, ValueError):
             self._known.clear()
 
-    def of(self, paths: Sequence[str], workers: Workers) -> dict[str, str | None]:
+    def of(self, paths: Sequence[str], workers: Workers, progress: Progress) -> dict[str, str | None]:
         """Return the identity of each log; None if it cannot be read.
 
         Args:
             workers: they read the logs that are not known.
+            progress: shows how many have been read.
         """
         states = {path: None if is_address(path) else _state(path) for path in paths}
         unknown = [path for path, state in states.items() if state is None or state not in self._known]
@@ -186,8 +187,10 @@ class Identities:
         # few are read sooner than a process begins
         at_work = ThisProcess() if len(groups) == 1 else workers
         found: dict[str, str | None] = {}
-        for group, identities in at_work.results(identities_of, groups):
-            found |= dict.fromkeys(group) if isinstance(identities, WorkerLost) else identities
+        with progress("logs read", len(unknown)) as advance:
+            for group, identities in at_work.results(identities_of, groups) if groups else ():
+                found |= dict.fromkeys(group) if isinstance(identities, WorkerLost) else identities
+                advance(len(group))
         known = {path: found[path] if path in found else self._known[states[path] or ""] for path in paths}
         self._used = {
             state: identity

@@ -11,7 +11,17 @@ from urllib.parse import quote
 import numpy as np
 
 from spatial_replay import __version__
-from spatial_replay.batch.run_table import Total, Values, totals, worst_rows
+from spatial_replay.batch.baseline import BASELINE_ROBUSTNESS
+from spatial_replay.batch.run_table import (
+    Total,
+    Values,
+    damage_word,
+    result_name,
+    summary_text,
+    totals,
+    verdict_word,
+    worst_rows,
+)
 from spatial_replay.notebook.figures import Html, element
 from spatial_replay.report.compact import sentence_parts
 from spatial_replay.report.page import policy, text, theme
@@ -71,7 +81,7 @@ def _header(table: pa.Table, name: str) -> Html:
     failed = table.column("failure").null_count < len(table)
     chip = element("span", _headline(table), **{"class": f"chip is-{'violated' if failed else 'satisfied'}"})
     logs = len(set(zip(table.column("case").to_pylist(), table.column("log").to_pylist(), strict=True)))
-    about = " · ".join([counted(logs, "log"), counted(len(table), "result"), f"spatial-replay {__version__}"])
+    about = " · ".join([counted(logs, "log"), summary_text(table), f"spatial-replay {__version__}"])
     title = element("div", element("h1", text(name)), chip, **{"class": "title"})
     return element("header", title, element("p", text(about), **{"class": "about"}), **{"class": "top"})
 
@@ -92,13 +102,14 @@ def _panel(title: str, *content: Html) -> Html:
 
 def _totals(by_spec: Sequence[Total]) -> Html:
     names = ("case", "spec", "requirement")
-    numbers = ("satisfied", "violated", "unknown", "errors", "least robustness")
+    numbers = ("satisfied", "violated", "unknown", "errors", "failed", "least robustness")
     head = [*(element("th", each) for each in names), *(_number("th", each) for each in numbers)]
     rows = []
     for each in by_spec:
         group = each.group
         cells = [group["case"], group["spec"] or group["file"], group["requirement"] or ""]
-        counts = [f"{count:,}" for count in (each.satisfied, each.violated, each.unknown, each.errors)]
+        numbers_shown = (each.satisfied, each.violated, each.unknown, each.errors, each.failures)
+        counts = [f"{count:,}" for count in numbers_shown]
         least = "" if each.least is None else f"{each.least:.6g}"
         rows.append(
             element(
@@ -112,14 +123,16 @@ def _totals(by_spec: Sequence[Total]) -> Html:
 
 def _worst(rows: Sequence[Values], reports: Mapping[tuple[str, str], str]) -> Html:
     names = [element("th", each) for each in ("log", "spec")]
-    head = element("tr", *names, _number("th", "robustness"), element("th", "reason"))
+    texts = [element("th", each) for each in ("failure", "reason")]
+    head = element("tr", *names, _number("th", "robustness"), *texts)
     body = [
         element(
             "tr",
             element("td", _linked((row["case"], row["log"]), reports), **{"class": "log"}),
-            element("td", text(_title(row["spec"], row["object"]))),
+            element("td", text(result_name(row["spec"], row["object"]))),
             _number("td", "" if math.isnan(row["robustness"]) else f"{row['robustness']:.4g}"),
-            element("td", *_with_code(row["reason"] or row["failure"])),
+            element("td", text(row["failure"])),
+            element("td", *_with_code(row["reason"])),
         )
         for row in rows
     ]
@@ -200,6 +213,7 @@ def _matrix(
         words = f"The {len(cells):,} worst of {counted(logs, 'log')}; the table of the run has them all."
         yield element("p", words)
     cases = {case for case, _, _ in columns}
+    yield element("p", "Marked results fail.")
     titles = [f"{case} · {spec or file}" if len(cases) > 1 else spec or file for case, file, spec in columns]
     head = [_sortable("log", ""), *(_sortable(title, "number") for title in titles)]
     body = []
@@ -213,15 +227,22 @@ def _matrix(
 def _cell(row: Values | None) -> Html:
     if row is None:
         return element("td", "", **{"class": "number", "data-value": "1e400"})
-    if row["error"] is not None:
+    number, verdict, fails = row["robustness"], verdict_word(row), row["failure"] is not None
+    kind = f"number is-{verdict}{' fails' if fails else ''}"
+    was = row.get(BASELINE_ROBUSTNESS)
+    before = (
+        f" (was {was:.4g})" if fails and was is not None and was != number and not math.isnan(was) else ""
+    )
+    if row["verdict"] is None:
         return element(
-            "td", "error", title=row["error"], **{"class": "number is-error", "data-value": "-1e400"}
+            "td", f"{verdict}{before}", title=row["failure"], **{"class": kind, "data-value": "-1e400"}
         )
-    number, verdict = row["robustness"], row["verdict"]
     shown = verdict if math.isnan(number) else f"{number:.4g}"
     value = "0" if math.isnan(number) else f"{max(-1e300, min(1e300, number)):.17g}"
-    tip = f"{_title(row['spec'], row['object'])} is {verdict}. {row['reason']}"
-    return element("td", shown, title=tip, **{"class": f"number is-{verdict}", "data-value": value})
+    why = f": {row['failure']}" if fails else ""
+    tip = f"{result_name(row['spec'], row['object'])} is {verdict}{damage_word(row)}{why}. {row['reason']}"
+    shown = f"{shown}{damage_word(row)}{before}"
+    return element("td", shown, title=tip, **{"class": kind, "data-value": value})
 
 
 def _sortable(title: str, kind: str) -> Html:
@@ -230,10 +251,6 @@ def _sortable(title: str, kind: str) -> Html:
 
 def _number(tag: str, words: str) -> Html:
     return element(tag, words, **{"class": "number"})
-
-
-def _title(spec: str, object_name: str | None) -> str:
-    return spec if object_name is None else f"{spec}({object_name})"
 
 
 def _linked(log: tuple[str, str], reports: Mapping[tuple[str, str], str]) -> Html:

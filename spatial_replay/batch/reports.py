@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -12,7 +11,7 @@ from typing import Final
 from spatial_replay.batch.overview_page import overview_page
 from spatial_replay.batch.rows import Task, opened_task, parsed_specifications
 from spatial_replay.batch.run import BatchResult, Wanted
-from spatial_replay.batch.workers import Workers
+from spatial_replay.batch.workers import Progress, Workers, no_progress
 from spatial_replay.errors import OutputError, SpatialReplayError, UsageError
 from spatial_replay.logs.output_file import output_error, replacing
 from spatial_replay.report.write import write_report
@@ -37,8 +36,7 @@ def write_pages(
     name: str,
     workers: Workers,
     *,
-    begin: Callable[[int], None] = lambda pages: None,
-    advance: Callable[[int], None] = lambda pages: None,
+    progress: Progress = no_progress,
 ) -> dict[tuple[str, str], Path]:
     """Write the page over all logs, and one about each log with a verdict that fails.
 
@@ -47,8 +45,7 @@ def write_pages(
     Args:
         folder: made if need be; the page over all is its `index.html`.
         name: of the suite.
-        begin: called with the number of pages to write.
-        advance: called with 1 for each that is done.
+        progress: shows how many pages have been written.
 
     Returns:
         The pages, by case and log.
@@ -68,9 +65,9 @@ def write_pages(
     missing = {
         path: _Page(_task(failing[key]), path.resolve()) for key, path in pages.items() if not path.exists()
     }
-    begin(len(missing))
-    for _ in workers.results(_write_page, missing.values()):
-        advance(1)
+    with progress("reports", len(missing)) as advance:
+        for _ in workers.results(_write_page, missing.values()) if missing else ():
+            advance(1)
     pages = {key: path for key, path in pages.items() if path.exists()}
     links = {key: path.relative_to(folder).as_posix() for key, path in pages.items()}
     with replacing(folder / INDEX) as stream:
@@ -88,7 +85,8 @@ def _failing(result: BatchResult) -> dict[tuple[str, str], list[Wanted]]:
     for each in result.wanted:
         if (each.case.name, each.log.name) in found:
             found[each.case.name, each.log.name].append(each)
-    return found
+    # a result that is gone may have no log any more
+    return {key: wanted for key, wanted in found.items() if wanted}
 
 
 def _task(wanted: list[Wanted]) -> Task:

@@ -21,10 +21,10 @@ from spatial_replay.errors import (
     TraceError,
     UsageError,
 )
+from spatial_replay.logs.remote import log_file
 from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import MAPPED
 from spatial_replay.monitor.result import SpecResult
-from spatial_replay.monitor.sentences import reason_sentence
 from spatial_replay.monitor.vacuity import no_instances
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.replay.engine import Replay, Replayed
@@ -78,7 +78,8 @@ class ResultRow:
         robustness, lower, upper: NaN where not determined.
         first_satisfied_ns, violated_at_ns, satisfied_at_ns: as in `SpecResult`.
         atom, atom_time_ns, atom_objects: what decides the verdict: the first cause of a violation.
-        reason: one sentence on what decided; "" under the paper's semantics.
+        reason: what decided and, if that is not what the number is of, what gave it; "" under the paper's
+            semantics.
         explanation: what `explain` says, in sentences, but for since when a satisfied spec has held.
         vacuous: sentences on the parts that decided nothing.
         samples: how many were evaluated.
@@ -88,6 +89,7 @@ class ResultRow:
         seconds: how long reading and evaluating the log took, for all its specifications.
         error: why there is no verdict, or None.
         error_kind: see `ErrorKind`; None without an error.
+        source: the name of the file that was read; faults, remarks and errors name it.
     """
 
     spec: str
@@ -117,6 +119,7 @@ class ResultRow:
     seconds: float = 0.0
     error: str | None = None
     error_kind: ErrorKind | None = None
+    source: str = ""
 
 
 def rows_from_task(task: Task) -> tuple[tuple[ResultRow, ...], ...]:
@@ -136,8 +139,8 @@ def rows_from_task(task: Task) -> tuple[tuple[ResultRow, ...], ...]:
         rows = [_rows_of_file(replay, replayed, file, index) for index, file in enumerate(files)]
     except Exception as error:  # one log must not end a batch
         return error_rows(task, *error_from_exception(error))
-    seconds = time.perf_counter() - begin
-    return tuple(tuple(replace(row, seconds=seconds) for row in each) for each in rows)
+    seconds, source = time.perf_counter() - begin, log_file(task.log).name
+    return tuple(tuple(replace(row, seconds=seconds, source=source) for row in each) for each in rows)
 
 
 def opened_task(task: Task, files: Sequence[Specification]) -> tuple[Source, ReplayOptions]:
@@ -199,19 +202,26 @@ def error_rows(task: Task, message: str, kind: ErrorKind) -> tuple[tuple[ResultR
 
     A specification that cannot be parsed has one row, with an empty name.
     """
-    error = _cut(message)
+    error, source = _cut(message), log_file(task.log).name
     rows: list[tuple[ResultRow, ...]] = []
     for text in task.specs:
         try:
             (file,) = parsed_specifications((text,), replace(task.conditions, constants=()))
         except SpatialReplayError:
-            rows.append((ResultRow("", None, None, None, 1, error=error, error_kind=kind),))
+            rows.append((ResultRow("", None, None, None, 1, error=error, error_kind=kind, source=source),))
             continue
         lines = spec_lines(file)
         rows.append(
             tuple(
                 ResultRow(
-                    spec.name, None, spec.id, spec.title, lines[spec.name], error=error, error_kind=kind
+                    spec.name,
+                    None,
+                    spec.id,
+                    spec.title,
+                    lines[spec.name],
+                    error=error,
+                    error_kind=kind,
+                    source=source,
                 )
                 for spec in file.results
             )
@@ -271,7 +281,7 @@ def _row(log: ResultRow, result: SpecResult, first_ns: int, line: int) -> Result
         atom=None if deciding is None else _cut(deciding.text),
         atom_time_ns=None if witness is None else witness.time_ns,
         atom_objects=() if deciding is None else tuple(deciding.objects),
-        reason="" if witness is None else _cut(reason_sentence(witness, first_ns=first_ns)),
+        reason=_cut(result.reason(first_ns)),
         explanation=_some(result.sentences(first_ns)),
         vacuous=_some([part.message for part in result.vacuous]),
     )

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from os import PathLike
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from spatial_replay import __version__
-from spatial_replay.batch.data_set import FORMAT, ResultsFolder, run_columns, table_of, write_rows
-from spatial_replay.batch.log_files import FoundLog, Identities, find_logs
+from spatial_replay.batch.data_set import FORMAT, SOURCE, ResultsFolder, run_columns, table_of, write_rows
+from spatial_replay.batch.log_files import FoundLog, Identities
+from spatial_replay.batch.prepare import PreparedCase
 from spatial_replay.batch.result_files import result_files
 from spatial_replay.batch.rows import (
     ResultRow,
@@ -21,10 +23,18 @@ from spatial_replay.batch.rows import (
     error_rows,
     rows_from_task,
 )
-from spatial_replay.batch.spec_files import HASH_DIGITS, SpecFile, checked_spec_files
-from spatial_replay.batch.suite import Case, Conditions, Suite
-from spatial_replay.batch.workers import DaskCluster, LocalProcesses, ThisProcess, WorkerLost, Workers
-from spatial_replay.errors import UsageError
+from spatial_replay.batch.spec_files import HASH_DIGITS, SpecFile
+from spatial_replay.batch.suite import Case, Conditions
+from spatial_replay.batch.workers import (
+    DaskCluster,
+    LocalProcesses,
+    Progress,
+    ThisProcess,
+    WorkerLost,
+    Workers,
+    no_progress,
+)
+from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.mapping_file import load_mapping
 from spatial_replay.monitor.verdict import Verdict
 
@@ -92,48 +102,44 @@ def workers_of(jobs: int, dask: str | None = None) -> Workers:
 
 
 def run_batch(
-    suite: Suite,
+    cases: Sequence[PreparedCase],
     results: str | PathLike[str],
     workers: Workers,
     *,
     fail_on: frozenset[str] = frozenset(),
-    begin: Callable[[int], None] = lambda tasks: None,
-    advance: Callable[[int], None] = lambda tasks: None,
+    progress: Progress = no_progress,
 ) -> BatchResult:
     """Evaluate what is new, and return and store the results of all logs of a suite.
 
     Args:
         results: the folder of results or its address, made if need be.
         fail_on: "vacuous" and "unknown": what fails although the case allows it.
-        begin: called with the number of logs to evaluate.
-        advance: called with 1 for each log that is done.
+        progress: shows how many logs have been hashed, and evaluated.
 
     Raises:
-        UsageError: patterns without a log, files that cannot be used, a folder that is not one of results.
-        SpecificationError: specifications with errors.
+        UsageError: a folder that is not one of results.
         OutputError: rows cannot be written; those written so far stay.
+        ClusterError: the scheduler of a cluster is lost; rows written so far stay.
     """
-    files = checked_spec_files(suite)
-    logs = found_logs(suite)
     folder = ResultsFolder.create(results)
     with folder.locked():
         identities = Identities(folder.identities)
-        paths = list(dict.fromkeys(log.path for several in logs for log in several))
-        known = identities.of(paths, workers)
+        paths = list(dict.fromkeys(log.path for each in cases for log in each.logs))
+        known = identities.of(paths, workers, progress)
         identities.save()
-        wanted = _wanted(suite, files, logs, known)
+        wanted = _wanted(cases, known)
         stored = folder.keys()
         tasks = list(_tasks(wanted, stored))
-        begin(len(tasks))
         errors: dict[str, tuple[ResultRow, ...]] = {}
         work, joined = partial(evaluate_and_store, folder.location), folder.joined_rows()
-        for task, result in workers.results(work, tasks):
-            for key, spec_hash, rows in _rows_of(task, result):
-                if isinstance(rows, bytes):
-                    joined.add(spec_hash, key, rows)
-                else:
-                    errors[key] = rows
-            advance(1)
+        with progress("logs", len(tasks)) as advance:
+            for task, result in workers.results(work, tasks) if tasks else ():
+                for key, spec_hash, rows in _rows_of(task, result):
+                    if isinstance(rows, bytes):
+                        joined.add(spec_hash, key, rows)
+                    else:
+                        errors[key] = rows
+                advance(1)
         joined.finish()
         folder.join_files()
         table = _table(wanted, folder, errors, fail_on)
@@ -166,35 +172,14 @@ def _rows_of(
     return zip(stored.keys, stored.hashes, result, strict=True)
 
 
-def found_logs(suite: Suite) -> list[list[FoundLog]]:
-    """Return the logs of each case.
-
-    Raises:
-        UsageError: patterns without a log; all are listed.
-    """
-    logs, faults = [], []
-    for case in suite.cases:
-        try:
-            logs.append(find_logs(case.logs, suite.folder))
-        except UsageError as error:
-            faults.append(str(error))
-    if faults:
-        raise UsageError("\n".join(faults))
-    return logs
-
-
-def _wanted(
-    suite: Suite,
-    files: Sequence[Sequence[SpecFile]],
-    logs: Sequence[Sequence[FoundLog]],
-    identities: Mapping[str, str | None],
-) -> list[Wanted]:
+def _wanted(cases: Sequence[PreparedCase], identities: Mapping[str, str | None]) -> list[Wanted]:
     wanted = []
-    for case, own, several in zip(suite.cases, files, logs, strict=True):
+    for prepared in cases:
+        case = prepared.case
         conditions = _key_of(case.conditions)
-        for log in several:
+        for log in prepared.logs:
             identity = identities[log.path]
-            for file in own:
+            for file in prepared.files:
                 parts = [FORMAT, __version__, identity, conditions, file.hash]
                 key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:HASH_DIGITS]
                 wanted.append(Wanted(case, log, file, None if identity is None else key))
@@ -252,7 +237,34 @@ def _table(
             indices.append(place)
             asked.append(each)
     chosen = rows.take(pa.array(indices, pa.int64()))
-    return _judged(chosen, asked, fail_on)
+    return _judged(_named(chosen, asked), asked, fail_on)
+
+
+def _named(rows: pa.Table, asked: Sequence[Wanted]) -> pa.Table:
+    """Return rows whose texts name the file that was asked for, not another one that holds the same."""
+    import pyarrow as pa
+
+    sources = rows.column(SOURCE).to_pylist()
+    names = [log_file(each.log.path).name for each in asked]
+    other = [
+        place for place, (old, new) in enumerate(zip(sources, names, strict=True)) if old not in (None, new)
+    ]
+    if not other:
+        return rows
+    for column in ("faults", "remarks", "missing", "error"):
+        texts = rows.column(column).to_pylist()
+        for place in other:
+            texts[place] = _renamed(texts[place], sources[place], names[place])
+        field = rows.schema.field(column)
+        rows = rows.set_column(rows.schema.get_field_index(column), field, pa.array(texts, field.type))
+    return rows
+
+
+def _renamed(text: str | list[str] | None, old: str, new: str) -> str | list[str] | None:
+    """Return texts with another name of a file, where it is a word: "a.csv" is part of "b-a.csv.gz"."""
+    if isinstance(text, str):
+        return re.sub(rf"(?<![\w./-]){re.escape(old)}(?![\w-]|\.\w)", lambda _: new, text)
+    return text and [str(_renamed(each, old, new)) for each in text]
 
 
 def _unreadable(wanted: Wanted) -> tuple[ResultRow, ...]:
@@ -303,10 +315,9 @@ def _failure(
     if error is not None or verdict is None:
         return error
     failure = wanted.case.expectation.failure(Verdict(verdict), robustness)
-    if failure is not None:
-        return failure
-    if "unknown" in fail_on and verdict == Verdict.UNKNOWN:
-        return "unknown"
-    if "vacuous" in fail_on and vacuous:
-        return f"vacuous: {vacuous[0]}"
-    return f"the log is damaged: {faults[0]}" if faults else None
+    if failure is None and "unknown" in fail_on and verdict == Verdict.UNKNOWN:
+        failure = "unknown"
+    elif failure is None and "vacuous" in fail_on and vacuous:
+        failure = f"vacuous: {vacuous[0]}"
+    damage = f"the log is damaged: {faults[0]}" if faults else None
+    return "; ".join(filter(None, (failure, damage))) or None

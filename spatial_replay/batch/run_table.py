@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import ast
 import operator
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, cast
 
 from spatial_replay.errors import UsageError
-from spatial_replay.text import nearest_hint
+from spatial_replay.text import counted, nearest_hint
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -23,9 +24,10 @@ VERDICTS: Final = ("satisfied", "violated", "unknown")
 _GROUPS: Final[Mapping[By, tuple[str, ...]]] = MappingProxyType(
     {"spec": ("case", "file", "spec", "requirement"), "log": ("case", "log")}
 )
-_RANKS: Final[Mapping[str | None, int]] = MappingProxyType(
+RANKS: Final[Mapping[str | None, int]] = MappingProxyType(
     {"violated": 0, None: 1, "unknown": 2, "satisfied": 3}
 )
+"""Verdicts, the worst first; None is an error, or gone."""
 _LONGEST_CONDITION: Final = 1_000
 
 
@@ -48,6 +50,52 @@ class Total:
     errors: int
     failures: int
     least: float | None
+
+
+def result_name(spec: str, object_name: str | None) -> str:
+    """Return what a result is called: its spec, with the object of a template."""
+    return spec if object_name is None else f"{spec}({object_name})"
+
+
+def verdict_word(row: Values) -> str:
+    """Return the verdict of a row; "error" or "gone" in place of one."""
+    return row["verdict"] or ("gone" if row["error"] is None else "error")
+
+
+def damage_word(row: Values) -> str:
+    """Return what to add to the verdict of a row, if parts of its log are lost."""
+    return " (damaged log)" if row["faults"] and row["verdict"] else ""
+
+
+def summary_text(table: pa.Table) -> str:
+    """Return how many results a table has, how many of each verdict, and which of those were expected."""
+    passed, total, damaged = Counter[str](), Counter[str](), 0
+    names = ("verdict", "error", "failure", "faults")
+    for values in zip(*(table.column(name).to_pylist() for name in names), strict=True):
+        row = dict(zip(names, values, strict=True))
+        word = verdict_word(row)
+        total[word] += 1
+        passed[word] += row["failure"] is None
+        damaged += bool(damage_word(row))
+    parts = [
+        _expected(f"{total[name]:,} {name}", total[name], passed[name])
+        if name != "satisfied"
+        else f"{total[name]:,} satisfied"
+        + (f" ({bad:,} failed)" if (bad := total[name] - passed[name]) else "")
+        for name in VERDICTS
+        if total[name]
+    ]
+    parts += [counted(total["error"], "error")] if total["error"] else []
+    parts += [f"{total['gone']:,} gone"] if total["gone"] else []
+    parts += [f"{damaged:,} of damaged logs"] if damaged else []
+    return f"{counted(len(table), 'result')}: {', '.join(parts) or 'none'}"
+
+
+def _expected(text: str, total: int, passed: int) -> str:
+    """Say how many results with a verdict that fails unless it is expected were."""
+    if not passed:
+        return text
+    return f"{text} as expected" if passed == total else f"{text} ({passed:,} as expected)"
 
 
 def totals(table: pa.Table, by: By = "spec") -> list[Total]:
@@ -83,7 +131,7 @@ def worst_rows(table: pa.Table, count: int) -> list[Values]:
     import pyarrow.compute as pc
 
     verdict = table.column("verdict")
-    rank = pc.index_in(verdict, pa.array(list(_RANKS), pa.string()))
+    rank = pc.index_in(verdict, pa.array(list(RANKS), pa.string()))
     passes = pc.cast(pc.is_null(table.column("failure")), pa.int8())
     # rows of equal robustness keep their order
     order = pa.table(

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from os import PathLike
@@ -17,7 +18,14 @@ from typing import Any, Final, TypeAlias, TypeVar, cast
 
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import is_address
-from spatial_replay.mapping.yaml_document import Document, Place, checked_document, read_yaml_text
+from spatial_replay.mapping.yaml_document import (
+    Document,
+    Place,
+    document_from_text,
+    faults_by_place,
+    numbered_faults,
+    read_yaml_text,
+)
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.trace.time_points import time_point_from_text
@@ -120,6 +128,9 @@ class Case:
         logs: relative paths are relative to the suite's folder.
         specs: the specification files, or their addresses.
         requirements: ids of requirements that the case is about; a spec can have one of its own.
+        places: file and line of each key, for errors; none on a command line.
+        is_whole: whether its specs, and what is given for their constants and parameters, are all there:
+            what is wrong in the file is left out.
     """
 
     name: str
@@ -128,6 +139,13 @@ class Case:
     conditions: Conditions = DEFAULT_CONDITIONS
     expectation: Expectation = DEFAULT_EXPECTATION
     requirements: tuple[str, ...] = ()
+    places: Pairs[str] = ()
+    is_whole: bool = True
+
+    def place(self, key: str) -> str:
+        """Return where a key is written, as the beginning of an error; "" on a command line."""
+        places = dict(self.places)
+        return f"{places.get(key, places[''])}: case {self.name[:60]!r}: " if places else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,12 +157,14 @@ class Suite:
         folder: what relative paths of logs are relative to.
         cases: at least one; their names differ.
         path: the suite's file, or None.
+        faults: lines of the file and what is wrong there; `prepare` raises them with all that it finds.
     """
 
     name: str
     folder: Path
     cases: tuple[Case, ...]
     path: Path | None = None
+    faults: tuple[tuple[int, str], ...] = ()
 
     @classmethod
     def of_logs(
@@ -163,11 +183,11 @@ def load_suite(path: str | PathLike[str]) -> Suite:
     """Load a suite file (YAML; `schemas/suite.schema.json`).
 
     Keys beside `cases` hold for every case that does not have its own. Paths are relative to the file.
+    `faults` of the suite says what is wrong in it; `prepare` raises that with all else that is wrong.
 
     Raises:
         MissingFileError: there is no such file.
-        UsageError: the file is not a valid suite, or names a specification or mapping that does not exist;
-            all errors are listed, with their lines.
+        UsageError: it is not UTF-8.
     """
     path = Path(path)
     text = read_yaml_text(path, LARGEST_SUITE)
@@ -175,36 +195,60 @@ def load_suite(path: str | PathLike[str]) -> Suite:
     def find(document: Document) -> list[tuple[Place, str]]:
         return list(_contradictions(document.value, path.parent))
 
-    document = checked_document(text, path.name, _schema(), find, "a suite", LARGEST_SUITE)
-    value = cast("dict[str, Any]", document.value)
-    common = {key: each for key, each in value.items() if key != "cases"}
-    cases = tuple(
-        _case({**common, **entry}, _LogPlaces(document, path.name, number), path.parent)
-        for number, entry in enumerate(value["cases"])
+    document = document_from_text(text, "a suite", LARGEST_SUITE)
+    by_place = faults_by_place(document, _schema(), find)
+    faults = tuple(numbered_faults(document, by_place))
+    return Suite(
+        path.stem.removesuffix(".replay"), path.parent, tuple(_cases(document, by_place, path)), path, faults
     )
-    return Suite(path.stem.removesuffix(".replay"), path.parent, cases, path)
 
 
-@dataclass(frozen=True, slots=True)
-class _LogPlaces:
-    """Where the logs of a case are written."""
+def _cases(document: Document, faults: Mapping[Place, str], path: Path) -> Iterator[Case]:
+    """Yield the cases of a suite, without the values that are wrong."""
+    value = document.value if isinstance(document.value, dict) else {}
+    entries = value.get("cases")
+    wrong = {place[:end] for place in faults for end in range(1, len(place) + 1)}
+    for number, own in enumerate(entries if isinstance(entries, list) else ()):
+        if isinstance(own, dict):
+            at: Place = ("cases", number)
+            places: dict[str, Place] = {key: (key,) for key in value if key != "cases"}
+            places |= {key: (*at, key) for key in own}
+            yield _case({**value, **own}, {"": at, **places}, wrong, document, path)
 
-    document: Document = field(repr=False)
-    name: str
-    case: int
 
-    def place(self, number: int) -> str:
-        return f"{self.name}:{self.document.line_of(('cases', self.case, 'logs', number))}"
+def _case(
+    entry: Mapping[str, Any],
+    places: Mapping[str, Place],
+    wrong: AbstractSet[Place],
+    document: Document,
+    path: Path,
+) -> Case:
+    """Return a case from an entry.
 
+    Args:
+        places: of the case, for "", and of its keys.
+        wrong: places with a fault there or within.
+    """
+    folder = path.parent
+    lines = {key: f"{path.name}:{document.line_of(place)}" for key, place in places.items()}
 
-def _case(entry: Mapping[str, Any], places: _LogPlaces, folder: Path) -> Case:
-    """Return a case from an entry that is valid."""
+    def listed(key: str) -> Iterator[tuple[Place, str]]:
+        for number, each in enumerate(_listed(entry.get(key))):
+            place = (*places[key], number)
+            if isinstance(each, str) and place not in wrong:
+                yield place, each
+
+    logs = [LogPattern(log, f"{path.name}:{document.line_of(place)}") for place, log in listed("logs")]
+    specs = dict.fromkeys(spec for _, spec in listed("specs"))
+    is_whole = bool(specs) and not any(places.get(key) in wrong for key in ("specs", "each", "constants"))
+    name = str(entry.get("name", ""))
+    entry = {key: each for key, each in entry.items() if places.get(key) not in wrong}
     mapping = entry.get("mapping")
     start, end = entry.get("from"), entry.get("to")
     return Case(
-        name=entry["name"],
-        logs=tuple(LogPattern(log, places.place(n)) for n, log in enumerate(_listed(entry["logs"]))),
-        specs=tuple(_file(spec, folder) for spec in dict.fromkeys(_listed(entry["specs"]))),
+        name=name,
+        logs=tuple(logs),
+        specs=tuple(_file(spec, folder) for spec in specs),
         conditions=Conditions(
             mapping=None if mapping is None else _file(mapping, folder),
             reading=tuple((key, entry[key]) for key in _READING if key in entry),
@@ -221,7 +265,9 @@ def _case(entry: Mapping[str, Any], places: _LogPlaces, folder: Path) -> Case:
             entry.get("at_least"),
             entry.get("allow_unknown", False),
         ),
-        requirements=tuple(_listed(entry.get("requirements", ()))),
+        requirements=tuple(_listed(entry.get("requirements"))),
+        places=tuple(lines.items()),
+        is_whole=is_whole,
     )
 
 
@@ -282,7 +328,8 @@ def _pairs(table: Mapping[str, _Value]) -> Pairs[_Value]:
 
 
 def _listed(value: Any) -> Sequence[Any]:
-    return [value] if isinstance(value, str) else value
+    """Return what a key with one value or several lists; nothing for anything else."""
+    return [value] if isinstance(value, str) else value if isinstance(value, list) else ()
 
 
 @cache

@@ -7,22 +7,33 @@ its task runs again once, and then its result says so. There is no scheduler her
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from itertools import islice
 from multiprocessing.connection import Connection
-from typing import Any, Final, Protocol, TypeVar, cast
+from typing import Any, Final, Protocol, TypeAlias, TypeVar, cast
 
-from spatial_replay.errors import UsageError
+from spatial_replay.errors import ClusterError, UsageError
 
 _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
+
+Progress: TypeAlias = Callable[[str, int | None], AbstractContextManager[Callable[[int], None]]]
+"""Shows work: takes a label and the number of steps, and yields what is called with the steps done."""
 
 _AHEAD: Final = 2
 """Tasks for each process that are handed out at once, so that none has to wait for its next."""
@@ -30,6 +41,11 @@ _PRELOADED: Final = "spatial_replay.batch.run"
 """Imported once, by the process that all workers are copies of."""
 _ANSWER_S: Final = 15
 """How long the scheduler of a cluster has to answer."""
+
+
+def no_progress(label: str, total: int | None) -> AbstractContextManager[Callable[[int], None]]:
+    """Show nothing."""
+    return nullcontext(lambda steps: None)
 
 
 class WorkerLost(Exception):  # noqa: N818 - a result, not raised by this module
@@ -152,11 +168,12 @@ def _end_with(connection: Connection) -> None:
 class DaskCluster:
     """Works on a Dask cluster, through the executor of its client.
 
-    The cluster's scheduler decides how often the task of a worker that died runs again.
+    The cluster's scheduler decides how often the task of a worker that died runs again. Each use has a
+    connection of its own: a client that was closed cannot be opened again.
     """
 
     def __init__(self, address: str) -> None:
-        """Connect to a scheduler.
+        """Take a scheduler that answers.
 
         Args:
             address: such as "tcp://scheduler:8786".
@@ -164,40 +181,100 @@ class DaskCluster:
         Raises:
             UsageError: Dask is not installed, or no scheduler answers.
         """
+        self._address = address
+        with self._connected():
+            pass
+
+    def results(
+        self, work: Callable[[_Task], _Result], tasks: Iterable[_Task]
+    ) -> Iterator[tuple[_Task, _Result | WorkerLost]]:
+        """See `Workers.results`.
+
+        Raises:
+            UsageError: no scheduler answers.
+            ClusterError: it answers no more.
+        """
+        rest = iter(tasks)
+        waiting: dict[Future[_Result], _Task] = {}
+        with self._connected() as client:
+            pool = client.get_executor(pure=False)
+            try:
+                while self._hand_out(client, pool, work, rest, waiting):
+                    for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                        task = waiting.pop(future)
+                        yield task, self._result(future)
+            finally:
+                # without waiting for them, as the executor would: its scheduler may be gone
+                for future in waiting:
+                    future.cancel()
+
+    def _hand_out(
+        self,
+        client: Any,
+        pool: Executor,
+        work: Callable[[_Task], _Result],
+        tasks: Iterator[_Task],
+        waiting: dict[Future[_Result], _Task],
+    ) -> bool:
+        """Submit as many tasks as keep all workers busy, and return whether any is under way."""
+        try:
+            ahead = _AHEAD * max(1, sum(client.nthreads().values())) - len(waiting)
+            for task in islice(tasks, max(0, ahead)):
+                waiting[pool.submit(work, task)] = task
+        except (OSError, RuntimeError, ValueError) as error:
+            # a connection that is closed has many names
+            raise self._lost() from error
+        return bool(waiting)
+
+    def _result(self, future: Future[Any]) -> Any:
+        """Return the result of a task, or that its workers were lost; what its work raised is raised."""
+        from distributed import KilledWorker
+
+        try:
+            return future.result()
+        except KilledWorker:
+            return WorkerLost(f"the workers that evaluated it died{_MEMORY}")
+        except CancelledError as error:
+            raise self._lost() from error
+
+    def _lost(self) -> ClusterError:
+        return ClusterError(
+            f"--dask {self._address}: the scheduler answers no more; the results so far stay, and the same "
+            "command goes on from there"
+        )
+
+    @contextmanager
+    def _connected(self) -> Iterator[Any]:
+        """Connect a client, which closes whatever has become of the cluster."""
         try:
             import distributed
         except ImportError:
             remedy = "pip install 'spatial-replay[cluster]'"
             raise UsageError(f"clusters need Dask, which is not installed: {remedy}") from None
         try:
-            self._client: Any = cast(Any, distributed).Client(address, timeout=_ANSWER_S)
+            client = cast(Any, distributed).Client(self._address, timeout=_ANSWER_S, set_as_default=False)
         except (OSError, ValueError) as error:
             raise UsageError(
-                f"--dask {address}: no scheduler answers ({str(error).splitlines()[0]:.200}); "
+                f"--dask {self._address}: no scheduler answers ({str(error).splitlines()[0]:.200}); "
                 "start one with `dask scheduler`, and workers with `dask worker`"
             ) from None
-
-    def results(
-        self, work: Callable[[_Task], _Result], tasks: Iterable[_Task]
-    ) -> Iterator[tuple[_Task, _Result | WorkerLost]]:
-        """See `Workers.results`."""
-        from distributed import KilledWorker
-
-        rest = iter(tasks)
-        waiting: dict[Future[_Result], _Task] = {}
-        with self._client, self._client.get_executor(pure=False) as pool:
+        with _silent("distributed.client", "distributed.core", "tornado.application"):
             try:
-                while True:
-                    ahead = _AHEAD * max(1, sum(self._client.nthreads().values())) - len(waiting)
-                    waiting |= {pool.submit(work, task): task for task in islice(rest, max(0, ahead))}
-                    if not waiting:
-                        return
-                    for future in wait(waiting, return_when=FIRST_COMPLETED).done:
-                        task = waiting.pop(future)
-                        try:
-                            yield task, future.result()
-                        except KilledWorker:
-                            yield task, WorkerLost(f"the workers that evaluated it died{_MEMORY}")
+                yield client
             finally:
-                for future in waiting:
-                    future.cancel()
+                with suppress(OSError, RuntimeError, CancelledError):
+                    client.close()
+
+
+@contextmanager
+def _silent(*loggers: str) -> Iterator[None]:
+    """Keep loggers from writing tracebacks about what is raised as an error of ours."""
+    found = [logging.getLogger(name) for name in loggers]
+    before = [each.disabled for each in found]
+    try:
+        for each in found:
+            each.disabled = True
+        yield
+    finally:
+        for each, was in zip(found, before, strict=True):
+            each.disabled = was

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from contextlib import ExitStack
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,6 @@ import click
 from spatial_replay.cli.application import ExitCode, most_severe
 from spatial_replay.cli.batch_output import (
     exit_code_from_table,
-    headline,
     print_totals,
     print_worst,
     write_json_lines,
@@ -38,7 +36,8 @@ from spatial_replay.text import counted
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from spatial_replay.batch.baseline import Tolerance
+    from spatial_replay.batch.baseline import Difference, Tolerance
+    from spatial_replay.batch.prepare import PreparedCase
     from spatial_replay.batch.run import BatchResult
     from spatial_replay.batch.suite import Suite
     from spatial_replay.batch.workers import Workers
@@ -123,41 +122,54 @@ def batch(
       spatial-replay batch logs --spec safety.spatial --dask tcp://scheduler:8786
     """
     # imported here so that --help stays fast
+    from spatial_replay.batch.baseline import compare, with_baseline
     from spatial_replay.batch.github import is_github, worst_annotations, write_summary
     from spatial_replay.batch.junit import write_junit
+    from spatial_replay.batch.prepare import prepare
+    from spatial_replay.batch.reports import write_pages
     from spatial_replay.batch.run import workers_of
 
     if dask is not None and jobs is not None:
         raise UsageError("--jobs is for this machine, and a cluster has its own; remove --jobs or --dask")
     suite = _suite(logs, conditions, semantics)
+    cases = prepare(suite, progress)
     folder = outputs.output
     if folder is None:
         folder = "results" if suite.path is None else str(suite.folder / f"{suite.name}.results")
     tolerance, before = _baseline(outputs)
     _check_outputs(outputs, suite)
     workers = workers_of(jobs or os.cpu_count() or 1, dask)
-    result = _run(suite, folder, workers, fail_on)
+    found = _run(cases, folder, workers, fail_on)
+    differences = None if before is None else compare(found.table, before, tolerance)
+    # what is worse than the baseline fails wherever results are shown
+    result = (
+        found
+        if before is None
+        else replace(found, table=with_baseline(found.table, before, differences or ()))
+    )
     inputs = _inputs(suite)
-    pages = {} if outputs.html is None else _write_pages(result, outputs.html, suite, workers)
+    pages = {}
+    if outputs.html is not None:
+        pages = write_pages(result, outputs.html, suite.name, workers, progress=progress)
     if outputs.junit is not None:
         attached = {key: path.as_posix() for key, path in pages.items()}
         write_junit(outputs.junit, result.table, suite.name, attached, inputs=inputs)
     if outputs.json_file is not None:
         write_json_lines(result.table, outputs.json_file, inputs)
     if outputs.json_file != "-":
-        _print(result, folder)
-    _warn_of_names(result.table)
+        _print(found, folder)
+    _warn_of_names(found.table)
     if is_github():
         for line in worst_annotations(result.table, suite.folder):
             show(line, err=True)
         write_summary(result.table)
-    code = exit_code_from_table(result.table, fail_on)
-    if before is not None and _print_differences(result.table, before, tolerance, outputs.json_file == "-"):
+    code = exit_code_from_table(found.table, fail_on)
+    if differences is not None and _print_differences(differences, outputs.json_file == "-"):
         code = most_severe([code, ExitCode.VIOLATED])
     if outputs.update_baseline and outputs.baseline is not None:
         from spatial_replay.batch.data_set import ResultsFolder
 
-        ResultsFolder.create(outputs.baseline).write_run(result.table)
+        ResultsFolder.create(outputs.baseline).write_run(found.table)
         show(f"wrote {outputs.baseline}", err=outputs.json_file == "-")
     return code
 
@@ -260,46 +272,24 @@ def _baseline(outputs: BatchOutputs) -> tuple[Tolerance, pa.Table | None]:
     return tolerance, ResultsFolder.open(outputs.baseline).read_run()
 
 
-def _run(suite: Suite, folder: str, workers: Workers, fail_on: frozenset[str]) -> BatchResult:
+def _run(
+    cases: Sequence[PreparedCase], folder: str, workers: Workers, fail_on: frozenset[str]
+) -> BatchResult:
     from spatial_replay.batch.run import run_batch
 
-    with ExitStack() as stack:
-        steps: list[Any] = []
-        try:
-            return run_batch(
-                suite,
-                folder,
-                workers,
-                fail_on=fail_on,
-                begin=lambda tasks: steps.append(stack.enter_context(progress("logs", tasks))),
-                advance=lambda tasks: steps[0](tasks),
-            )
-        except KeyboardInterrupt as error:
-            error.add_note(f"what was evaluated so far is in {folder}; the same command goes on from there")
-            raise
-
-
-def _write_pages(
-    result: BatchResult, folder: Path, suite: Suite, workers: Workers
-) -> dict[tuple[str, str], Path]:
-    from spatial_replay.batch.reports import write_pages
-
-    with ExitStack() as stack:
-        steps: list[Any] = []
-        return write_pages(
-            result,
-            folder,
-            suite.name,
-            workers,
-            begin=lambda pages: steps.append(stack.enter_context(progress("reports", pages))),
-            advance=lambda pages: steps[0](pages),
-        )
+    try:
+        return run_batch(cases, folder, workers, fail_on=fail_on, progress=progress)
+    except KeyboardInterrupt as error:
+        error.add_note(f"what was evaluated so far is in {folder}; the same command goes on from there")
+        raise
 
 
 def _print(result: BatchResult, folder: str) -> None:
+    from spatial_replay.batch.run_table import summary_text
+
     known = result.logs - result.evaluated
     news = f"{result.evaluated:,} evaluated now, {known:,} known" if known else "all evaluated now"
-    show(f"{counted(result.logs, 'log')}, {headline(result.table)} ({news})")
+    show(f"{counted(result.logs, 'log')}, {summary_text(result.table)} ({news})")
     print_totals(result.table, "spec")
     failures = len(result.failures)
     if failures:
@@ -324,11 +314,8 @@ def _columns(table: pa.Table, *names: str) -> list[tuple[Any, ...]]:
     return list(zip(*(table.column(name).to_pylist() for name in names), strict=True))
 
 
-def _print_differences(table: pa.Table, before: pa.Table, tolerance: Tolerance, to_errors: bool) -> bool:
+def _print_differences(differences: Sequence[Difference], to_errors: bool) -> bool:
     """Print what differs from the baseline, and return whether any of it fails."""
-    from spatial_replay.batch.baseline import compare
-
-    differences = compare(table, before, tolerance)
     worse = [each for each in differences if each.fails]
     better = len(differences) - len(worse)
     heads = (

@@ -12,14 +12,16 @@ from typing import TYPE_CHECKING, Any, Final
 from spatial_replay.cli.application import ExitCode, most_severe
 from spatial_replay.cli.output import VERDICT_COLOURS
 from spatial_replay.cli.terminal import Coloured, show, show_file
-from spatial_replay.text import counted, json_number
+from spatial_replay.text import json_number
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from spatial_replay.batch.run_table import By, Total
 
-_COLOURS: Final = MappingProxyType({**VERDICT_COLOURS, "errors": "red"})
+_COLOURS: Final = MappingProxyType(
+    {**VERDICT_COLOURS, **dict.fromkeys(("error", "errors", "failures", "gone"), "red")}
+)
 _KIND_CODES: Final = {"usage": ExitCode.USAGE, "log": ExitCode.DAMAGED, "machine": ExitCode.INTERNAL}
 _BATCH: Final = 10_000
 """Rows that are turned into JSON at once."""
@@ -32,14 +34,18 @@ def print_totals(table: pa.Table, by: By) -> None:
 
     rows = totals(table, by)
     titles = [_title(each, by, len({each.group["case"] for each in rows}) > 1) for each in rows]
-    names = ["satisfied", "violated", "unknown", "errors"]
+    names = ["satisfied", "violated", "unknown", "errors", "failures"]
+    heads = [*names[:-1], "failed"]
     width = max([len(by), *map(len, titles)])
-    show(f"  {by:<{width}}  {'  '.join(f'{name:>9}' for name in names)}  least robustness")
+    show(f"  {by:<{width}}  {'  '.join(f'{head:>9}' for head in heads)}  least robustness")
     for title, each in zip(titles, rows, strict=True):
         line: list[str | Coloured] = [f"  {title:<{width}}"]
         for name in names:
             count = getattr(each, name)
-            line += ["  ", Coloured(f"{count:>9,}", _COLOURS[name]) if count else f"{'-':>9}"]
+            # of verdicts that all were expected, none is bad
+            colour = _COLOURS.get(name) if each.failures or name == "satisfied" else None
+            shown = f"{count:>9,}" if count else f"{'-':>9}"
+            line += ["  ", Coloured(shown, colour) if count and colour else shown]
         least = "not determined" if each.least is None else f"{each.least:.6g}"
         show((*line, f"  {least:>16}"))
 
@@ -50,32 +56,21 @@ def print_worst(table: pa.Table, count: int, *, failing: bool) -> None:
     Args:
         failing: only those that fail.
     """
-    from spatial_replay.batch.run_table import worst_rows
+    from spatial_replay.batch.run_table import damage_word, result_name, verdict_word, worst_rows
 
     for row in worst_rows(table, count):
         if failing and row["failure"] is None:
             return
         name = row["spec"] or row["file"]
-        name = name if row["object"] is None else f"{name}({row['object']})"
+        name = result_name(name, row["object"])
         name = f"{name} [{row['requirement']}]" if row["requirement"] else name
-        kind = "errors" if row["verdict"] is None else row["verdict"]
-        verdict = Coloured("error" if kind == "errors" else kind, _COLOURS[kind])
+        verdict = Coloured(f"{verdict_word(row)}{damage_word(row)}", _COLOURS[verdict_word(row)])
         number = "" if math.isnan(row["robustness"]) else f", robustness {row['robustness']:.6g}"
         show((f"  {row['log']}: {name}: ", verdict, number))
         usual = f"{row['verdict']}, expected satisfied"
         for line in (None if row["failure"] == usual else row["failure"], row["reason"]):
             if line:
                 show(*(f"      {each}" for each in line.split("\n")))
-
-
-def headline(table: pa.Table) -> str:
-    """Return how many results a table has, and how many of each verdict."""
-    verdicts = table.column("verdict").to_pylist()
-    counts = {name: verdicts.count(name) for name in ("satisfied", "violated", "unknown")}
-    parts = [f"{count:,} {name}" for name, count in counts.items() if count]
-    if errors := verdicts.count(None):
-        parts.append(counted(errors, "error"))
-    return f"{counted(len(table), 'result')}: {', '.join(parts) or 'none'}"
 
 
 def write_json_lines(table: pa.Table, file: str, inputs: Sequence[Path]) -> None:

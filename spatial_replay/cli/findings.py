@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
+from urllib.parse import quote
 
 from spatial_replay import __version__
 from spatial_replay.cli.terminal import PROGRAM, show, show_json
@@ -21,12 +22,15 @@ def show_findings(form: Form, path: Path, diagnoses: Sequence[Diagnosis]) -> Non
     """
     if form == "github":
         # imported here so that --help stays fast
-        from spatial_replay.batch.github import annotation
+        from spatial_replay.batch.github import annotation, repository_path
 
         for each in diagnoses:
-            show(annotation(_level(each), str(path), each.line, _message(each), column=each.column))
+            file = repository_path(path)
+            show(annotation(_level(each), file, each.line, _message(each), column=each.column))
     elif form == "sarif":
-        show_json(_sarif(path, diagnoses))
+        from spatial_replay.batch.github import repository_path
+
+        show_json(_sarif(repository_path(path), diagnoses))
 
 
 def _level(diagnosis: Diagnosis) -> Literal["error", "warning"]:
@@ -38,7 +42,7 @@ def _message(diagnosis: Diagnosis) -> str:
     return f"{diagnosis.message}; {hint}" if hint else diagnosis.message
 
 
-def _sarif(path: Path, diagnoses: Sequence[Diagnosis]) -> dict[str, Any]:
+def _sarif(path: str, diagnoses: Sequence[Diagnosis]) -> dict[str, Any]:
     """Return a SARIF 2.1.0 log with one run."""
     driver = {"name": PROGRAM, "version": __version__, "rules": [{"id": "specification"}]}
     results = [
@@ -49,7 +53,7 @@ def _sarif(path: Path, diagnoses: Sequence[Diagnosis]) -> dict[str, Any]:
             "locations": [
                 {
                     "physicalLocation": {
-                        "artifactLocation": {"uri": path.as_posix()},
+                        "artifactLocation": {"uri": quote(path)},
                         "region": {
                             "startLine": each.line,
                             "startColumn": each.column,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spatial_replay.cli.batch_output import headline, print_totals, print_worst, write_json_lines
+from spatial_replay.cli.batch_output import print_totals, print_worst, write_json_lines
 from spatial_replay.cli.terminal import show
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def results(folder: str, worst: int, where: str | None, by: By, json_file: str |
     """
     # imported here so that --help stays fast
     from spatial_replay.batch.data_set import ResultsFolder
-    from spatial_replay.batch.run_table import rows_where
+    from spatial_replay.batch.run_table import rows_where, summary_text
 
     table = ResultsFolder.open(folder).read_run()
     if where is not None:
@@ -45,7 +45,7 @@ def results(folder: str, worst: int, where: str | None, by: By, json_file: str |
         write_json_lines(table, json_file, ())
     if json_file == "-":
         return
-    show(headline(table))
+    show(summary_text(table))
     if len(table):
         print_totals(table, by)
         if worst:

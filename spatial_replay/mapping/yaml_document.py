@@ -153,7 +153,8 @@ def _scalar(text: str) -> Value:
     return text
 
 
-_MOST_FAULTS = 100
+MOST_FAULTS = 100
+"""Errors of a document that are listed."""
 
 
 def read_yaml_text(path: str | PathLike[str], largest: int = LARGEST_TEXT) -> str:
@@ -198,24 +199,37 @@ def checked_document(
     Raises:
         UsageError: the text is not valid; all errors are listed, with their lines.
     """
+    document = document_from_text(text, what, largest)
+    by_place = faults_by_place(document, schema, contradictions)
+    faults = [f"{name}:{line}: {fault}" for line, fault in numbered_faults(document, by_place)]
+    if faults:
+        more = [f"… and {len(faults) - MOST_FAULTS} more"] if len(faults) > MOST_FAULTS else []
+        raise UsageError("\n".join(faults[:MOST_FAULTS] + more))
+    return document
+
+
+def faults_by_place(
+    document: Document,
+    schema: Mapping[str, Any],
+    contradictions: Callable[[Document], list[tuple[Place, str]]],
+) -> dict[Place, str]:
+    """Return what is wrong with the values of a document; for the arguments see `checked_document`."""
+    if document.faults and document.value is None:
+        return {}
     from jsonschema import Draft202012Validator
 
-    document = document_from_text(text, what, largest)
-    faults = list(document.faults)
-    if not faults:
-        # one error for each place; a contradiction says more than the schema
-        errors = Draft202012Validator(schema).iter_errors(document.value)
-        violations = [fault for error in errors for fault in _described(error)]
-        by_place = dict(violations + contradictions(document))
-        faults = [
-            (document.line_of(place), f"{_text_from_place(place)}{fault}")
-            for place, fault in by_place.items()
-        ]
-    if faults:
-        lines = [f"{name}:{line}: {fault}" for line, fault in sorted(faults)]
-        more = [f"… and {len(lines) - _MOST_FAULTS} more"] if len(lines) > _MOST_FAULTS else []
-        raise UsageError("\n".join(lines[:_MOST_FAULTS] + more))
-    return document
+    # one error for each place; a contradiction says more than the schema
+    errors = Draft202012Validator(schema).iter_errors(document.value)
+    violations = [fault for error in errors for fault in _described(error)]
+    return dict(violations + contradictions(document))
+
+
+def numbered_faults(document: Document, by_place: Mapping[Place, str]) -> list[tuple[int, str]]:
+    """Return all that is wrong with a document, with lines, in their order."""
+    named = [
+        (document.line_of(place), f"{_text_from_place(place)}{fault}") for place, fault in by_place.items()
+    ]
+    return sorted(document.faults + named)
 
 
 def _text_from_place(place: Place) -> str:

@@ -15,7 +15,13 @@ from spatial_replay.lazy import Displayed, data_frame
 from spatial_replay.monitor.causes import Cause, Conjunct, LeastPart, conjuncts_of, find_causes, find_least
 from spatial_replay.monitor.offline import evaluate_offline, full_signal, window_signal
 from spatial_replay.monitor.semantics import Semantics, require_ltlf
-from spatial_replay.monitor.sentences import cause_sentences, sentences_of, verdict_sentence
+from spatial_replay.monitor.sentences import (
+    cause_sentences,
+    number_text,
+    reason_sentence,
+    sentences_of,
+    verdict_sentence,
+)
 from spatial_replay.monitor.stream import NEVER, InstanceStream, SeriesBlock
 from spatial_replay.monitor.vacuity import Vacuous, find_vacuous
 from spatial_replay.monitor.verdict import Verdict, final_verdict
@@ -335,6 +341,28 @@ class SpecResult(Displayed):
         lower, upper = (float(end[0]) + 0.0 for end in done.ends(0))
         end = End.of(final_verdict(lower, upper))
         return deciding_path(self.formula, done, self.times_ns, 0, end).steps[-1].node
+
+    def reason(self, first_ns: int) -> Sentence:
+        """Return what decided the verdict and, where that has another robustness, what gave it that.
+
+        The verdict may have been settled before the log ended, and what came later be worse or better. ""
+        without a witness (see `worst`).
+        """
+        decided = self.worst
+        if decided is None:
+            return Sentence("")
+        reason = reason_sentence(decided, first_ns=first_ns)
+        is_violated = self.verdict is Verdict.VIOLATED
+        number, own = (self.upper, decided.upper) if is_violated else (self.lower, decided.lower)
+        if decided.settled_ns is None or number == own or self.leaves is None:
+            return reason
+        since = Instant(decided.settled_ns, first_ns)
+        whole = find_witness(self.evidence, self.leaves, self.times_ns, flips=False)
+        least = "Least robustness" if is_violated else "Robustness"
+        return Sentence(
+            *(f"{str(self.verdict).capitalize()} since ", since, ": ", reason),
+            *(f" {least} {number_text(number)}: ", reason_sentence(whole, first_ns=first_ns)),
+        )
 
     def explain(self, *, first_ns: int | None = None) -> str:
         """Explain the verdict in sentences, one a line, as the command `explain` prints them.

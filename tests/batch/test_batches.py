@@ -39,6 +39,7 @@ def test_a_row_says_what_a_replay_of_the_log_says(fleet: Path) -> None:
         assert (row["requirement"], row["violated_at_ns"]) == (own.spec.id, own.violated_at_ns)
         if row["verdict"] == "violated":
             assert "\n".join(row["explanation"]) == own.explain()
+            # the distance is the same at all times, so what settled the verdict gave the number, too
             assert row["reason"] in row["explanation"][1].replace("What decides is ", "").replace(
                 ", which", ""
             )
@@ -84,12 +85,59 @@ def test_a_log_that_cannot_be_read_is_a_row_until_it_can(fleet: Path) -> None:
     assert "(1 evaluated now, 3 known)" in done.out
 
 
-def test_a_damaged_log_fails_whatever_its_verdict(fleet: Path) -> None:
-    log = Path("logs/run-0.jsonl")
-    log.write_text(log.read_text() + '{"time_ns": 9')
-    done = batch("logs/run-0.jsonl", "--spec", "gate.spatial")
+def test_a_damaged_log_fails_whatever_its_verdict_and_every_output_marks_it(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for log in (Path("logs/run-0.jsonl"), Path("logs/run-3.jsonl")):
+        log.write_text(log.read_text() + '{"time_ns": 9')
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", "summary.md")
+    done = batch("logs", "--spec", "gate.spatial", "--html", "pages")
     assert done.code == 3
     assert "the log is damaged: run-0.jsonl:5" in done.out
+    assert "8 results: 6 satisfied (3 failed), 2 violated, 4 of damaged logs" in done.out
+    assert "run-0.jsonl: apart [REQ-3]: satisfied (damaged log), robustness 0.2" in done.out
+    assert "run-3.jsonl: apart [REQ-3]: violated (damaged log), robustness -0.2" in done.out
+    assert "violated, expected satisfied; the log is damaged: run-3.jsonl:5" in done.out
+    for page in ("summary.md", "pages/index.html"):
+        assert "(damaged log)" in Path(page).read_text()
+
+
+def test_logs_that_hold_the_same_share_rows_but_errors_name_each_of_them(fleet: Path) -> None:
+    for name, text in (("broken", "{"), ("damaged", Path("logs/run-0.jsonl").read_text() + "{")):
+        for copy in ("a", "b-a"):
+            Path(f"logs/{copy}.{name}.jsonl").write_text(text)
+    # the second run takes what it can from the first, in which files had other names
+    for _ in range(2):
+        table = sr.evaluate_logs("logs", "gate.spatial", output="results").table
+        rows = [row for row in table.to_pylist() if row["error"] or row["faults"]]
+        assert len(rows) == 8
+        for row in rows:
+            name = Path(row["log"]).name
+            said = row["error"] or row["faults"][0]
+            assert said.startswith(name) and said.replace(name, "").count(".jsonl") == 0
+            assert name in row["failure"]
+        for copy in Path("logs").glob("*-a.*"):
+            copy.replace(f"logs/another.{copy.name}")
+
+
+def test_the_reason_is_about_the_number_beside_it(fleet: Path) -> None:
+    lines = [
+        Path(f"logs/run-{number}.jsonl").read_text().splitlines()[step]
+        for step, number in enumerate((0, 2, 3, 1))
+    ]
+    Path("later.jsonl").write_text("\n".join(lines))
+    Path("later.spatial").write_text(
+        "spec apart = G (cart dist person >= 0.3)\nspec near = F (cart dist person <= 0.3)"
+    )
+    apart, near = sr.evaluate_logs("later.jsonl", "later.spatial", output="results").table.to_pylist()
+    assert apart["reason"] == (
+        "Violated since 0.100 s: `cart dist person >= 0.3` fails by 0.1 at 0.100 s (within `apart`): "
+        "cart and person are 0.2 apart. Least robustness -0.2: `cart dist person >= 0.3` fails by 0.2 at "
+        "0.200 s (its least within `apart`): cart and person are 0.1 apart."
+    )
+    assert near["reason"].startswith("Satisfied since 0.100 s: ")
+    assert " Robustness 0.2: `cart dist person <= 0.3` holds by 0.2 at 0.200 s" in near["reason"]
 
 
 def test_a_suite_says_what_passes(fleet: Path) -> None:
@@ -113,6 +161,7 @@ def test_a_suite_says_what_passes(fleet: Path) -> None:
     done = batch("suite.yaml")
     assert done.code == 1
     assert "robustness 0.1, expected at least 0.15" in done.out
+    assert "satisfied (1 failed), 2 violated as expected, 5 unknown as expected" in done.out
     Path("suite.yaml").write_text(text.replace(", allow_unknown: true", ""))
     assert batch("suite.yaml").code == 4
     Path("suite.yaml").write_text(text.replace("specs: bad.spatial, expect: violated", "expect: unknown"))
@@ -153,7 +202,19 @@ def test_all_errors_of_a_suite_are_reported_at_once_with_their_lines(fleet: Path
         "    at_least: 1\n"
         "    mapping: none.yaml\n"
         "    colour: red\n"
+        "  - name: three\n"
+        "    logs: [logs, nightly/*.mcap]\n"
+        "    specs: [each.spatial, broken.spatial]\n"
+        "    mapping: wrong.yaml\n"
+        "  - name: four\n"
+        "    logs: gone.mcap\n"
+        "    specs: each.spatial\n"
+        "    constants: {near: 1}\n"
+        "  - {name: five, logs: logs, specs: each.spatial, each: {where: all}}\n"
     )
+    Path("each.spatial").write_text("spec calm(who) = G (who dist cart >= 1)")
+    Path("broken.spatial").write_text("spec a = G (cart dist")
+    Path("wrong.yaml").write_text("topics: 3")
     done = batch("suite.yaml")
     assert done.code == 2
     for line, what in [
@@ -168,8 +229,15 @@ def test_all_errors_of_a_suite_are_reported_at_once_with_their_lines(fleet: Path
         (13, "at_least applies to satisfied"),
         (14, "no file 'none.yaml'"),
         (15, "unknown key"),
+        (17, "nightly/*.mcap: no log matches"),
+        (21, "gone.mcap: no such file"),
+        (23, "there is no constant 'near'"),
+        (24, "no template has a parameter 'where'"),
+        (24, "calm is a template"),
     ]:
         assert any(f"suite.yaml:{line}: " in each and what in each for each in done.err.split("\n")), what
+    assert "wrong.yaml:1: topics: expected" in done.err
+    assert "broken.spatial:1:12: error: '(' is never closed; add a ')'" in done.err
 
 
 @pytest.mark.parametrize(
@@ -214,7 +282,9 @@ def test_two_batches_do_not_write_to_one_folder(fleet: Path) -> None:
     assert "another batch is writing to results" in done.err
 
 
-def test_a_baseline_fails_what_is_worse_or_gone(fleet: Path) -> None:
+def test_what_is_worse_than_a_baseline_or_gone_fails_in_every_output(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = ["logs", "--spec", "gate.spatial"]
     assert batch(*first, "--baseline", "main", "--update-baseline").code == 1
     assert "nothing is worse than the baseline" in batch(*first, "--baseline", "main").out
@@ -223,8 +293,37 @@ def test_a_baseline_fails_what_is_worse_or_gone(fleet: Path) -> None:
     write_log(Path("logs/run-1.jsonl"), 0.25)
     write_log(Path("logs/run-2.jsonl"), 0.6)
     Path("logs/run-3.jsonl").unlink()
-    done = batch(*first, "--baseline", "main", "--tolerance", "6%")
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", "summary.md")
+    outputs = ["--junit", "junit.xml", "--json", "rows.jsonl", "--html", "pages"]
+    done = batch(*first, "--baseline", "main", "--tolerance", "6%", *outputs)
     assert done.code == 1
+    _, _, listed = done.out.partition("worse than the baseline, or gone")
+    assert [line.split(":")[0].strip() for line in listed.splitlines()[1:]] == [
+        "logs/run-1.jsonl", "logs/run-3.jsonl", "logs/run-3.jsonl", "logs/run-2.jsonl",
+    ]  # fmt: skip
+    root = ElementTree.parse("junit.xml").getroot()
+    assert (root.get("tests"), root.get("failures")) == ("8", "4")
+    rows = [json.loads(line) for line in Path("rows.jsonl").read_text().splitlines()]
+    summary, page = Path("summary.md").read_text(), Path("pages/index.html").read_text()
+    for log, spec, said, was in (
+        ("run-1", "apart", "violated with robustness -0.05; it was satisfied with robustness 0.1", 0.1),
+        ("run-2", "arrives", "satisfied with robustness 0.4; it was satisfied with robustness 0.8", 0.8),
+        ("run-3", "arrives", "gone; it was satisfied with robustness 0.9", 0.9),
+    ):
+        name = f"logs/{log}.jsonl"
+        cases = root.iterfind(f"testsuite[@name='logs.{spec}']/testcase[@name='{name}']/failure")
+        assert [said in str(each.get("message")) for each in cases] == [True]
+        (row,) = (row for row in rows if (row["log"], row["spec"]) == (name, spec))
+        assert said in row["failure"] and row["baseline_robustness"] == pytest.approx(was)
+        assert any(
+            line.startswith("::error") and name in line and said in line for line in done.err.split("\n")
+        )
+        assert any(name in line and said in line for line in summary.split("\n"))
+        assert said in page
+    assert "gone (was 0.9)" in page
+    # what the run itself found is kept without the comparison
+    assert len(sr.read_results("results")) == 6
     assert "run-0" not in done.out.partition("worse than the baseline")[2]
     assert (
         "logs/run-1.jsonl: apart is violated with robustness -0.05; "
@@ -288,7 +387,35 @@ def test_github_gets_annotations_at_the_lines_of_specs_and_a_summary(
         "::error file=gate.spatial,line=2,title=REQ-3 apart::logs/run-3.jsonl: violated"
     )
     summary = Path("summary.md").read_text()
-    assert "| logs | apart | REQ-3 | 2 | 2 | 0 | 0 | -0.2 |" in summary
+    assert "| logs | apart | REQ-3 | 2 | 2 | 0 | 0 | 2 | -0.2 |" in summary
+
+
+def test_annotations_name_files_from_the_top_of_the_repository(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    monkeypatch.delenv("GITHUB_WORKSPACE", raising=False)
+    Path("broken.spatial").write_text("spec a = G (cart dist")
+    Path("suite.yaml").write_text("cases: [{name: one, logs: logs, specs: gate.spatial}]")
+
+    def names() -> set[str]:
+        done = [command("check", "broken.spatial", "--format", "github").out, batch("suite.yaml").err]
+        lines = "".join(done).splitlines()
+        found = {line.split(",")[0].removeprefix("::error file=") for line in lines if line.startswith("::")}
+        sarif = json.loads(command("check", "broken.spatial", "--format", "sarif").out)
+        place = sarif["runs"][0]["results"][0]["locations"][0]["physicalLocation"]
+        return found | {place["artifactLocation"]["uri"]}
+
+    assert names() == {"broken.spatial", "gate.spatial"}
+    Path("gates").mkdir()
+    for name in ("broken.spatial", "gate.spatial", "suite.yaml", "logs"):
+        shutil.move(name, "gates")
+    Path(".git").mkdir()
+    monkeypatch.chdir("gates")
+    assert names() == {"gates/broken.spatial", "gates/gate.spatial"}
+    monkeypatch.setenv("GITHUB_WORKSPACE", str(fleet.parent))
+    below = f"{fleet.name}/gates"
+    assert names() == {f"{below}/broken.spatial", f"{below}/gate.spatial"}
 
 
 def test_logs_at_addresses_are_evaluated_once_for_each_version(fleet: Path) -> None:

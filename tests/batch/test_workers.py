@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,7 +21,7 @@ from batch.fleet import command, write_fleet
 from cli.program import PROGRAM, environment
 from spatial_replay.batch.workers import LocalProcesses, WorkerLost
 
-LOGS = 16
+LOGS = 20
 
 
 def test_the_task_of_a_worker_that_dies_runs_once_more_and_no_other_is_lost(tmp_path: Path) -> None:
@@ -151,27 +152,58 @@ def test_a_full_disk_ends_a_batch_and_what_was_written_stays(fleet: Path) -> Non
     assert sr.evaluate_logs("logs", "gate.spatial", output="results").evaluated < LOGS
 
 
-@pytest.mark.filterwarnings("default")
-def test_a_cluster_evaluates_a_batch_and_outlives_a_worker(fleet: Path) -> None:
-    distributed = pytest.importorskip("distributed")
-    cluster = distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
-    )
-    with cluster:
-        victim = next(iter(cluster.workers.values())).pid
+CLUSTER = """
+import sys, distributed
+cluster = distributed.LocalCluster(
+    n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
+)
+print(cluster.scheduler_address, *(worker.pid for worker in cluster.workers.values()), flush=True)
+sys.stdin.read()
+"""
 
-        def kill() -> None:
-            while not keys_of_files(fleet):
-                time.sleep(0.005)
-            os.kill(victim, signal.SIGKILL)
 
-        killer = threading.Thread(target=kill)
-        killer.start()
-        done = command("batch", "logs", "--spec", "gate.spatial", "--dask", cluster.scheduler_address)
+def when_stored(folder: Path, rows: int, pid: int) -> threading.Thread:
+    """Start to wait until so many files of rows are there, and then kill a process."""
+
+    def kill() -> None:
+        while len(keys_of_files(folder)) < rows:
+            time.sleep(0.005)
+        os.kill(pid, signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    return killer
+
+
+def test_a_cluster_evaluates_a_batch_outlives_a_worker_and_ends_with_its_scheduler(fleet: Path) -> None:
+    pytest.importorskip("distributed")
+    with subprocess.Popen(
+        [sys.executable, "-c", CLUSTER],
+        env=environment(),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        address, victim, _ = process.stdout.readline().split()
+        # with so many logs, the cluster hashes them, evaluates them, and writes the reports
+        arguments = ["batch", "logs", "--spec", "gate.spatial", "--dask", address]
+        killer = when_stored(fleet, 1, int(victim))
+        done = command(*arguments, "--html", "pages")
         killer.join()
-    assert done.code == 1, done.err
-    assert f"{2 * LOGS} results: 22 satisfied, 10 violated" in done.out
-    assert set(keys_of(fleet / "results").values()) == {1}
+        assert done.code == 1, done.err
+        assert f"{2 * LOGS} results: 30 satisfied, 10 violated" in done.out
+        assert set(keys_of(fleet / "results").values()) == {1}
+        assert len(list(fleet.glob("pages/reports/*.html"))) == 10
+
+        shutil.rmtree(fleet / "results")
+        killer = when_stored(fleet, 1, process.pid)
+        done = command(*arguments)
+        killer.join()
+    assert (done.code, "the scheduler answers no more" in done.err) == (70, True), done.err
+    assert "Traceback" not in done.err
+    assert sr.evaluate_logs("logs", "gate.spatial", output="results").evaluated < LOGS
 
 
 def test_a_scheduler_that_does_not_answer_is_an_error(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:

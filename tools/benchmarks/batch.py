@@ -14,6 +14,7 @@ from typing import Any
 
 import spatial_replay as sr
 from spatial_replay.batch.data_set import ResultsFolder, run_columns
+from spatial_replay.batch.prepare import prepare
 from spatial_replay.batch.rows import Task, rows_from_task
 from spatial_replay.batch.run import run_batch
 from spatial_replay.batch.run_table import worst_rows
@@ -51,7 +52,7 @@ def bench_batch(bench: Any) -> None:
         few = Suite("few", folder, Suite.of_logs(["logs/000*.mcap"], [spec]).cases)
 
         def run(workers: Workers, results: str, suite: Suite = suite) -> float:
-            return _seconds(lambda: run_batch(suite, folder / results, workers))
+            return _seconds(lambda: run_batch(prepare(suite), folder / results, workers))
 
         text = read_specification_text(spec)
         tasks = [Task(str(log), (text,)) for log in sorted((folder / "logs").iterdir())]

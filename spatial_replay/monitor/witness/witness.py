@@ -104,6 +104,7 @@ def find_witness(
     *,
     goes_on: bool = False,
     whole: tuple[Floats, Integers] | None = None,
+    flips: bool = True,
 ) -> Witness:
     """Return the witness of a node.
 
@@ -116,6 +117,7 @@ def find_witness(
         node: its id.
         goes_on: whether samples may follow these, which settle the node's verdict whatever comes.
         whole: leaves and times of the whole log, if the number that flips the verdict is sought over it.
+        flips: whether that number is sought at all.
     """
     instance = evidence.instance
     evaluate, verdict_of = (
@@ -137,7 +139,7 @@ def find_witness(
 
     found, path, deciding = follow(end)
     threshold = None
-    if deciding is not None:
+    if deciding is not None and flips:
         over, open_ended = (whole, False) if whole is not None else ((leaves, times_ns), goes_on)
         threshold = threshold_of(evidence, *over, node, verdict, deciding, goes_on=open_ended)
     open_end = None
