@@ -139,8 +139,8 @@ def rows_from_task(task: Task) -> tuple[tuple[ResultRow, ...], ...]:
         rows = [_rows_of_file(replay, replayed, file, index) for index, file in enumerate(files)]
     except Exception as error:  # one log must not end a batch
         return error_rows(task, *error_from_exception(error))
-    seconds, source = time.perf_counter() - begin, log_file(task.log).name
-    return tuple(tuple(replace(row, seconds=seconds, source=source) for row in each) for each in rows)
+    seconds, name = time.perf_counter() - begin, log_file(task.log).name
+    return tuple(tuple(replace(row, seconds=seconds, source=name) for row in each) for each in rows)
 
 
 def opened_task(task: Task, files: Sequence[Specification]) -> tuple[Source, ReplayOptions]:
