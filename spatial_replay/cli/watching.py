@@ -17,7 +17,7 @@ from spatial_replay.cli.options import EvaluationArguments, EvaluationInputs, op
 from spatial_replay.cli.output import print_verdicts
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, show_diagnostics
-from spatial_replay.errors import SpatialReplayError
+from spatial_replay.errors import MissingFileError, SpatialReplayError, SpecificationError
 from spatial_replay.logs.downloads import local_copy
 
 if TYPE_CHECKING:
@@ -35,19 +35,41 @@ watch_option = click.option(
 
 
 def files_to_watch(request: EvaluationArguments) -> SpecificationFiles:
-    """Return the files to watch, from their present state on.
+    """Return the files to watch, from their first state on that can be read: errors are shown until then.
 
     Raises:
-        UsageError: no file, or values of constants that none has.
-        SpecificationError, MissingFileError: a file cannot be evaluated.
+        UsageError: no file, values of constants that none has, a folder that does not exist.
+        LogError: the log cannot be read.
     """
     # imported here so that --help stays fast
     from spatial_replay.replay import SpecificationFiles
 
     specs = [local_copy(each) for each in request.specs]
     files = SpecificationFiles(specs, profile=request.profile, constants=request.constants)
-    files.load()
+    try:
+        files.load()
+    except (SpecificationError, MissingFileError) as error:
+        if not all(path.parent.is_dir() and not path.is_dir() for path in files.paths):
+            raise
+        # with a log that cannot be read, no save would help
+        open_inputs(replace(request, specs=(), constants={}), can_do_without=True)
+        _wait_for_files(files, error)
     return files
+
+
+def _wait_for_files(files: SpecificationFiles, error: SpatialReplayError) -> None:
+    """Wait until files that have errors, or are not there, are saved without."""
+    saved: Sequence[Specification] | SpatialReplayError | None = error
+    saves = files.iter_saves()
+    while saved is None or isinstance(saved, SpatialReplayError):
+        if saved is not None:
+            report_error(saved)
+            show(f"waiting for {_names(files)} to be saved; stop with Ctrl-C", err=True)
+        saved = next(saves)
+
+
+def _names(files: SpecificationFiles) -> str:
+    return ", ".join(path.name for path in files.paths)
 
 
 def load_log(
@@ -66,7 +88,10 @@ def load_log(
 
 def watch_log(request: EvaluationArguments, semantics: Semantics) -> ExitCode:
     """Evaluate a log, and again whenever a specification file is saved, until Ctrl-C."""
-    files = files_to_watch(request)
+    try:
+        files = files_to_watch(request)
+    except KeyboardInterrupt:
+        return ExitCode.INTERRUPTED
     inputs = open_inputs(request)
     # no messages of the log are needed
     loaded = load_log(inputs, replace(inputs.options(semantics), keep=()), files)
@@ -100,7 +125,7 @@ def follow_saves(
         refuse: takes the error of a file that cannot be read.
         check: called about ten times a second; raises an error that ends it.
     """
-    names = ", ".join(path.name for path in files.paths)
+    names = _names(files)
     try:
         with pressed_keys() as keys:
             hint = "; w writes constants into it" if sys.stdin.isatty() else ""

@@ -164,6 +164,10 @@ class LoadedLog:
             )
         return self._saved.write(self._by_file(values))
 
+    def was_written(self, name: str) -> bool:
+        """Say whether a constant has the value in its file that `write_constants` gave it."""
+        return self._saved is not None and self._saved.was_written(*self._places[name])
+
     def _missing(self, selection: Selection) -> tuple[Diagnostic, ...]:
         names = LogNames()
         names.add(self.trace)

@@ -5,28 +5,51 @@ from __future__ import annotations
 import stat
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
-from typing import Final
+from threading import Lock
+from typing import Final, NamedTuple
 
 from spatial_replay.errors import MissingFileError, SpatialReplayError, UsageError
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.format import format_duration
-from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.formula import Constant, Specification
+from spatial_replay.spec.load import load_specification
 from spatial_replay.spec.overrides import load_specifications
 
 _MARK: Final = b"\xef\xbb\xbf"
-_SETTLE_S: Final = 0.1
+_SETTLE_S: Final = 0.04
+"""How long size and time of a file that is written in place have to stay before it counts as saved."""
+_ERROR_SETTLE_S: Final = 0.1
 """How long a file with errors, or one that is gone, is left to an editor that may be writing it."""
+_PATIENCE_S: Final = 1.0
+"""How long a file that changes all the time is waited for before others get a turn."""
 _IDLE_MS: Final = 100
 _STEP_MS: Final = 10
 """The longest wait for a change, and how long to wait for more after one."""
 
 
+class _State(NamedTuple):
+    """What differs when a file is saved."""
+
+    file: int
+    size: int
+    modified_ns: int
+    changed_ns: int
+
+    def replaces(self, before: _State | None) -> bool:
+        """Say whether another file got this name after it was written, as many editors save."""
+        is_other = before is None or before.file != self.file
+        # a new name changes the entry of a file, and not its content
+        return is_other and self.changed_ns > self.modified_ns
+
+
 class SpecificationFiles:
     """Specification files, read again when they are saved.
 
-    Holds which state of the files was read last. For one thread.
+    Holds which state of the files was read last, and which constants were written into them. One thread
+    watches; others may write.
     """
 
     def __init__(
@@ -49,8 +72,10 @@ class SpecificationFiles:
             raise UsageError("watching needs a specification file to watch; give --spec FILE")
         self.paths = tuple(dict.fromkeys(paths))
         self._profile, self._constants = profile, dict(constants or {})
-        self._read: object = None
+        self._read: list[_State | None] = []
         self._sources: list[str] = []
+        self._written: dict[tuple[int, str], Constant] = {}
+        self._turn = Lock()
 
     def load(self) -> list[Specification]:
         """Parse the files.
@@ -58,17 +83,28 @@ class SpecificationFiles:
         Raises:
             MissingFileError, SpecificationError, UsageError: as `load_specifications`.
         """
-        # before the files are read: what is saved while they are is a change
-        self._read, self._sources = self._state(), []
-        files = load_specifications(self.paths, profile=self._profile, constants=self._constants)
-        self._sources = [file.source for file in files]
-        return files
+        with self._turn:
+            # before the files are read: what is saved while they are is a change
+            self._read, self._sources = self._state(), []
+            files = load_specifications(self.paths, profile=self._profile, constants=self._constants)
+            self._sources = [file.source for file in files]
+            self._written = {
+                (index, name): value
+                for (index, name), value in self._written.items()
+                if files[index].constants.get(name) == value
+            }
+            return files
+
+    def was_written(self, index: int, name: str) -> bool:
+        """Say whether a constant of a file, by its number, has the value that `write` gave it."""
+        return (index, name) in self._written
 
     def iter_saves(self) -> Iterator[list[Specification] | SpatialReplayError | None]:
         """Yield the files whenever one is saved with another text, or why they cannot be read.
 
         Between saves it yields None, about ten times a second. A file may be replaced by another of its name,
-        as many editors do, be gone for a while, and be caught in the middle of being written.
+        as many editors do: that counts at once. One that is written in place counts as saved when its size
+        and time have stayed for 0.04 s, and with errors, or while it is gone, for 0.1 s more.
 
         Raises:
             UsageError: the library that watches files is not installed.
@@ -103,11 +139,15 @@ class SpecificationFiles:
         Raises:
             MissingFileError, SpecificationError, UsageError, OutputError: see `write_constants`.
         """
+        with self._turn:
+            return self._write(values)
+
+    def _write(self, values: Sequence[Mapping[str, float | str]]) -> dict[str, float | str]:
         files = load_specifications(self.paths, profile=self._profile, constants=self._constants)
         plain = load_specifications(self.paths, profile=self._profile)
         changed: dict[str, float | str] = {}
-        for path, own, with_given, written in zip(
-            self.paths, values or [{}] * len(self.paths), files, plain, strict=True
+        for index, (path, own, with_given, written) in enumerate(
+            zip(self.paths, values or [{}] * len(self.paths), files, plain, strict=True)
         ):
             given = {
                 name: value
@@ -115,35 +155,53 @@ class SpecificationFiles:
                 if with_given.constants[name] != written.constants[name]
             }
             new = {**given, **own}
-            changed |= {name: new[name] for name in write_constants(path, new, profile=self._profile)}
+            names = write_constants(path, new, profile=self._profile)
+            changed |= {name: new[name] for name in names}
+            after = load_specification(path, profile=self._profile) if names else written
+            self._written |= {(index, name): after.constants[name] for name in names}
         self._constants = {}
         return changed
 
     def _saved(self) -> list[Specification] | SpatialReplayError | None:
-        """Return the files as saved; None if their text is the one before."""
-        before, failed = self._sources, False
-        while True:
+        """Return the files as saved; None if their text is the one before, or they change all the time."""
+        before, give_up = self._sources, time.monotonic() + _PATIENCE_S
+        state, failure = self._state(), None
+        is_settled = all(
+            now == then or (now is not None and now.replaces(then))
+            for now, then in zip_longest(state, self._read)
+        )
+        while time.monotonic() < give_up:
+            if not is_settled:
+                time.sleep(_SETTLE_S)
+                is_settled, state = self._state() == state, self._state()
+                continue
             try:
                 files = self.load()
             except SpatialReplayError as error:
-                if failed:
+                if failure is not None:
                     return error
                 state = self._read
-                time.sleep(_SETTLE_S)
-                failed = self._state() == state
+                time.sleep(_ERROR_SETTLE_S)
+                is_settled = self._state() == state
+                failure = error if is_settled else None
                 continue
-            return files if self._sources != before else None
+            is_settled, state = self._state() == self._read, self._read
+            if is_settled:
+                return files if self._sources != before else None
+        # what was read may be half a file: the next turn reads it again
+        self._read, self._sources = [], before
+        return None
 
-    def _state(self) -> object:
-        """Return what differs when a file is saved."""
-        states: list[tuple[int, int, int] | None] = []
+    def _state(self) -> list[_State | None]:
+        """Return the states of the files; None for one that is gone."""
+        states: list[_State | None] = []
         for path in self.paths:
             try:
                 found = path.stat()
             except (OSError, ValueError):
                 states.append(None)
             else:
-                states.append((found.st_mtime_ns, found.st_size, found.st_ino))
+                states.append(_State(found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns))
         return states
 
 

@@ -180,7 +180,9 @@ class Session:
             kept = {
                 name: value
                 for name, value in before.given.items()
-                if name in loaded.constants and loaded.constants[name] == written[name]
+                if name in loaded.constants
+                # what a viewer set while a former value of it was being written is newer than the file
+                and (loaded.constants[name] == written[name] or loaded.was_written(name))
             }
             try:
                 edited = loaded.edit(kept)

@@ -6,7 +6,9 @@ import os
 import pty
 import signal
 import subprocess
+import time
 from pathlib import Path
+from threading import Thread
 
 import pytest
 
@@ -60,12 +62,43 @@ def test_the_table_follows_the_file_and_a_key_writes_constants(tmp_path: Path) -
     os.close(theirs)
 
 
+def test_a_file_that_is_broken_at_the_start_is_waited_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "table.spatial"
+    text = (RECORDINGS / "table.spatial").read_text()
+    shown: list[str] = []
+
+    def save() -> None:
+        while "no such file" not in (said := capsys.readouterr()).err:
+            time.sleep(0.02)
+        shown.append(said.err)
+        path.write_text(text.replace("const deadline", "cosnt deadline"))
+        while "cosnt" not in (said := capsys.readouterr()).err:
+            time.sleep(0.02)
+        shown.append(said.err)
+        path.write_text(text)
+        while "watching table.spatial" not in (said := capsys.readouterr()).out:
+            shown.append(said.out)
+            time.sleep(0.02)
+        shown.append(said.out)
+        # Ctrl-C
+        signal.raise_signal(signal.SIGINT)
+
+    saving = Thread(target=save)
+    saving.start()
+    assert run(["replay", LOG, "--spec", str(path), "--watch"]) == 130
+    saving.join()
+    assert all("waiting for table.spatial to be saved" in each for each in shown[:2])
+    assert "table_set  satisfied" in "".join(shown)
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
         (("--watch",), "give --spec FILE"),
         (("--spec", str(RECORDINGS / "table.spatial"), "--watch", "--json", "-"), "remove --json"),
-        (("--spec", "none.spatial", "--watch"), "none.spatial: no such file"),
+        (("--spec", "none/none.spatial", "--watch"), "none.spatial: no such file"),
     ],
 )
 def test_what_cannot_be_watched_is_refused(

@@ -6,7 +6,7 @@ import stat
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 
 import pytest
 from hypothesis import given, settings
@@ -99,6 +99,43 @@ def test_a_file_caught_while_it_is_written_is_read_when_it_is_whole(path: Path) 
     writing.start()
     assert near(saved(saves)) == 80
     writing.join()
+
+
+def test_half_of_a_file_is_not_taken_for_a_save_although_it_parses(path: Path) -> None:
+    _, saves = watched(path)
+    begin = TEXT.replace("70", "80") + "spec t = G cube dist cup <= near\n"
+
+    def write_in_two_parts() -> None:
+        with path.open("w") as file:
+            for part in (begin, "spec u = F cube dist cup <= near\n"):
+                file.write(part)
+                file.flush()
+                time.sleep(0.01)
+
+    writing = Thread(target=write_in_two_parts)
+    writing.start()
+    outcome = saved(saves)
+    writing.join()
+    assert isinstance(outcome, list)
+    assert [spec.name for spec in outcome[0].specs] == ["s", "t", "u"]
+
+
+def test_a_file_that_is_written_all_the_time_keeps_no_one_else_waiting(path: Path) -> None:
+    _, saves = watched(path)
+    has_turned = Event()
+
+    def write_on_and_on() -> None:
+        number = 0
+        while not has_turned.wait(0.005):
+            number += 1
+            path.write_text(TEXT.replace("pixels", f"pixels {number}").replace("70", "80"))
+
+    writing = Thread(target=write_on_and_on)
+    writing.start()
+    assert [next(saves) for _ in range(2)] == [None, None]
+    has_turned.set()
+    writing.join()
+    assert near(saved(saves)) == 80
 
 
 def test_what_the_command_line_gives_stands_until_it_is_written(path: Path) -> None:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from itertools import accumulate
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import spatial_replay as sr
+from spatial_replay.logs import MemorySource
+from spatial_replay.replay import LoadedLog, SpecificationFiles
 from spatial_replay.serve.pace import FASTEST, SLOWEST, Status, Transport
+from spatial_replay.serve.session import Session
 
 START_NS, END_NS = 5_000_000_000, 65_000_000_000
 SECOND_NS = 1_000_000_000
@@ -71,3 +76,23 @@ def test_the_speed_stays_within_limits(speed: float) -> None:
     transport = Transport(START_NS, END_NS)
     transport.set_speed(speed, 0.0)
     assert SLOWEST <= transport.state(0.0).speed <= FASTEST
+
+
+def test_what_a_viewer_sets_while_its_former_value_is_written_stays(tmp_path: Path) -> None:
+    path = tmp_path / "s.spatial"
+    text = "const near = 70\nspec s = F cube dist cup <= near\n"
+    path.write_text(text)
+    files = SpecificationFiles([path])
+    cube = {"cube": sr.Footprint.box(0, 0, 1, 1), "cup": sr.Footprint.box(2, 0, 3, 1)}
+    loaded = LoadedLog(MemorySource(sr.Trace.from_samples([sr.Sample(0, cube)])), files.load(), saved=files)
+    session = Session(loaded, 0, 1)
+    session.set_constants({"near": 80.0})
+    edited = session.edited
+    session.set_constants({"near": 90.0})
+    assert edited.loaded.write_constants(edited.given) == {"near": 80.0}
+    session.replace_log(loaded.with_files(files.load()))
+    assert session.values == {"near": 90.0}
+    # the text changed it after that
+    path.write_text(text.replace("70", "60"))
+    session.replace_log(session.edited.loaded.with_files(files.load()))
+    assert session.values == {"near": 60.0}
