@@ -217,7 +217,7 @@ class Viewer:
 
 def constants_of(parameters: dict[str, Any]) -> dict[str, Any]:
     """The parameters that do not steer the playback."""
-    return {name: value for name, value in parameters.items() if not name.startswith("playback.")}
+    return {name: value for name, value in parameters.items() if not name.startswith(("playback.", "scene."))}
 
 
 @asynccontextmanager
