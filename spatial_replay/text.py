@@ -85,6 +85,17 @@ def counted(count: int, noun: str) -> str:
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
+DIGITS: Final = 4
+LARGEST_PLAIN: Final = 1e12
+"""Digits of numbers in texts; from here on they are written with an exponent."""
+
+
+def number_text(number: float) -> str:
+    """Return a number with four digits, enough for a reader; JSON and logs have all of them."""
+    is_long = 10.0**DIGITS <= abs(number) < LARGEST_PLAIN
+    return f"{number:.0f}" if is_long else f"{number:.{DIGITS}g}"
+
+
 def json_number(number: float) -> float | str | None:
     """Return a number as valid JSON: infinities become the strings "inf" and "-inf", NaN becomes null."""
     if math.isnan(number):

@@ -53,7 +53,7 @@ EXPECTED = {
         2,
         (
             "301 samples",
-            "`robot dist cart >= 0.5`, which fails by 0.0313518 at 13.800 s",
+            "`robot dist cart >= 0.5`, which fails by 0.03135 at 13.800 s",
             "too close from 13.8 s on, by up to 0.103 m",
             "violated annotated.mcap drive.bag drive.html drive.yaml",
         ),

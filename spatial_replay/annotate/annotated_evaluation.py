@@ -26,7 +26,8 @@ from spatial_replay.trace.trace import Trace
 if TYPE_CHECKING:
     from spatial_replay.annotate.annotator import Annotator
     from spatial_replay.annotate.automaton_state import SpecAutomaton
-    from spatial_replay.annotate.foxglove_layout import LayoutContents, SceneBounds
+    from spatial_replay.annotate.foxglove_layout import LayoutContents
+    from spatial_replay.annotate.rings import SceneBounds
     from spatial_replay.annotate.scene_update import SceneFrames, SceneState
 
 _MOST_NAMED: Final = 10
@@ -90,7 +91,7 @@ class AnnotatedEvaluation:
 
     def messages(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
         """Return what to write beside samples, from the blocks that `extend` returned for them."""
-        from spatial_replay.annotate.foxglove_layout import SceneBounds
+        from spatial_replay.annotate.rings import SceneBounds
 
         self._extent = SceneBounds.of(trace, self._extent)
         self._has_samples |= len(trace) > 0

@@ -21,7 +21,7 @@ from spatial_replay.annotate.robustness import encode_robustness
 from spatial_replay.annotate.scene_entities import encode_frame
 from spatial_replay.annotate.scene_update import SceneEncoder, SceneFrames, SceneState
 from spatial_replay.annotate.specification import ReportedTree, encode_specification
-from spatial_replay.annotate.standing import Outcome, StandingEncoder
+from spatial_replay.annotate.standing import FinalStanding, StandingEncoder
 from spatial_replay.annotate.violations import EvaluatedResult, leaf_pairs, violated_since
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Channel, Messages, messages_of
@@ -114,7 +114,7 @@ class Annotator:
         return self._scene
 
     @property
-    def outcomes(self) -> Sequence[Outcome]:
+    def outcomes(self) -> Sequence[FinalStanding]:
         """What each result came to, once the log has ended."""
         return self._standing.outcomes
 

@@ -7,9 +7,8 @@ from collections.abc import Mapping
 from typing import Final
 
 from spatial_replay.annotate.verdict_changes import FAILING, HOLDING, SATISFIED, VIOLATED, Period
-from spatial_replay.monitor.sentences import number_text
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.text import time_text
+from spatial_replay.text import number_text, time_text
 
 _NOW: Final[Mapping[int, str]] = {
     HOLDING: "holds so far",

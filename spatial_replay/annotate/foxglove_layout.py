@@ -10,13 +10,11 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
-import numpy as np
-
 from spatial_replay.annotate.curves import curved_nodes
+from spatial_replay.annotate.rings import SceneBounds
 from spatial_replay.annotate.scene_entities import FRAMES
 from spatial_replay.annotate.specification import MIXED, ReportedTree, unit_of, unit_words
-from spatial_replay.annotate.standing import Outcome, named_parts, part_title
-from spatial_replay.geometry.arrays import Floats
+from spatial_replay.annotate.standing import FinalStanding, named_parts, part_title
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.schemas.Robustness_pb2 import (
     FAILS_SO_FAR,
@@ -49,9 +47,8 @@ from spatial_replay.palette import (
     lighter,
 )
 from spatial_replay.spec.formula import Formula
-from spatial_replay.text import shortened_formula
+from spatial_replay.text import number_text, shortened_formula
 from spatial_replay.trace.axes import OUR_AXES, Axes
-from spatial_replay.trace.trace import Trace
 
 _MOST_CURVES: Final = 12
 _MOST_STRIPS: Final = 8
@@ -106,7 +103,7 @@ def scene_panel(camera: Mapping[str, Any], topics: Collection[str], axes: Axes =
     return _titled("3D!scene", "Scene" if axes == OUR_AXES else f"Scene, {axes}", config)
 
 
-def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[Outcome] = ()) -> list[Panel]:
+def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[FinalStanding] = ()) -> list[Panel]:
     """Return a light for each result, in the colour of how it stands at the cursor.
 
     Args:
@@ -250,12 +247,12 @@ def summary() -> Panel:
     return _titled("RawMessages!summary", "The whole log", {"topicPath": f"{CURVES_TOPIC}.summary"})
 
 
-def _violation_text(outcome: Outcome) -> str:
+def _violation_text(outcome: FinalStanding) -> str:
     if outcome.standing != VIOLATED:
         return ""
     unit = f" {outcome.unit}" if outcome.unit and outcome.unit != MIXED else ""
     over = f": {shortened_formula(outcome.over)}" if outcome.over else ""
-    return f", violated since {outcome.since_s:.3f} s by {outcome.by:.4g}{unit}{over}"
+    return f", violated since {outcome.since_s:.3f} s by {number_text(outcome.by)}{unit}{over}"
 
 
 def _titled(identifier: str, title: str, config: Config) -> Panel:
@@ -350,30 +347,6 @@ _MARGIN = 1.5
 """The height of the picture by the size of what is in it; a panel may be narrower than it is high."""
 
 
-class SceneBounds(NamedTuple):
-    """The box that a log's footprints lie in, in footprint units."""
-
-    xmin: float
-    ymin: float
-    xmax: float
-    ymax: float
-
-    @classmethod
-    def of(cls, trace: Trace, before: SceneBounds | None = None) -> SceneBounds | None:
-        """Return the box of some samples and of those before; None without any footprint."""
-        vertices = trace.footprints.vertices
-        low, high = _corners(vertices)
-        if not np.isfinite([low, high]).all():
-            vertices = vertices[np.isfinite(vertices).all(axis=1)]
-            low, high = _corners(vertices)
-        if not len(vertices):
-            return before
-        if before is not None:
-            low = [min(low[0], before.xmin), min(low[1], before.ymin)]
-            high = [max(high[0], before.xmax), max(high[1], before.ymax)]
-        return cls(low[0], low[1], high[0], high[1])
-
-
 class LayoutContents(NamedTuple):
     """What a layout shows of a log.
 
@@ -391,7 +364,7 @@ class LayoutContents(NamedTuple):
     extent: SceneBounds | None
     topics: Collection[str]
     axes: Axes = OUR_AXES
-    outcomes: Sequence[Outcome] = ()
+    outcomes: Sequence[FinalStanding] = ()
 
 
 def layout_attachment(contents: LayoutContents) -> Attachment:
@@ -499,13 +472,6 @@ def _split(direction: str, parts: Sequence[tuple[_Tree, float]]) -> _Tree:
         "second": _split(direction, rest),
         "splitPercentage": round(100.0 * share / whole),
     }
-
-
-def _corners(vertices: Floats) -> tuple[list[float], list[float]]:
-    """Return the least and the greatest coordinates of vertices (V, 2); infinite without any."""
-    columns = [vertices[:, axis] for axis in (0, 1)]
-    low = [float(column.min(initial=np.inf)) for column in columns]
-    return low, [float(column.max(initial=-np.inf)) for column in columns]
 
 
 def _camera(extent: SceneBounds | None) -> dict[str, Any]:

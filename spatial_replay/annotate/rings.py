@@ -9,6 +9,7 @@ import numpy as np
 from spatial_replay.geometry.arrays import Floats, Integers, flat_index, starts_from_counts
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Footprint
+from spatial_replay.trace.trace import Trace
 
 ROUND: Final = 32
 """Points on the ring of a rounded part."""
@@ -118,3 +119,34 @@ def _forms(footprints: FootprintBatch, lengths: Integers) -> tuple[Integers, tup
         for row in examples.tolist()
     )
     return form.astype(np.int64), forms
+
+
+class SceneBounds(NamedTuple):
+    """The box that a log's footprints lie in, in footprint units."""
+
+    xmin: float
+    ymin: float
+    xmax: float
+    ymax: float
+
+    @classmethod
+    def of(cls, trace: Trace, before: SceneBounds | None = None) -> SceneBounds | None:
+        """Return the box of some samples and of those before; None without any footprint."""
+        vertices = trace.footprints.vertices
+        low, high = _corners(vertices)
+        if not np.isfinite([low, high]).all():
+            vertices = vertices[np.isfinite(vertices).all(axis=1)]
+            low, high = _corners(vertices)
+        if not len(vertices):
+            return before
+        if before is not None:
+            low = [min(low[0], before.xmin), min(low[1], before.ymin)]
+            high = [max(high[0], before.xmax), max(high[1], before.ymax)]
+        return cls(low[0], low[1], high[0], high[1])
+
+
+def _corners(vertices: Floats) -> tuple[list[float], list[float]]:
+    """Return the least and the greatest coordinates of vertices (V, 2); infinite without any."""
+    columns = [vertices[:, axis] for axis in (0, 1)]
+    low = [float(column.min(initial=np.inf)) for column in columns]
+    return low, [float(column.max(initial=-np.inf)) for column in columns]

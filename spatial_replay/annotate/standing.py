@@ -68,7 +68,7 @@ class _Layout(NamedTuple):
     final: bool
 
 
-class Outcome(NamedTuple):
+class FinalStanding(NamedTuple):
     """What a result came to over the finished log.
 
     Attributes:
@@ -110,7 +110,7 @@ class StandingEncoder:
         self._first_ns: int | None = None
         self._written_ns: int | None = None
         self._templates: dict[_Layout, WireTemplate] = {}
-        self.outcomes: tuple[Outcome, ...] = ()
+        self.outcomes: tuple[FinalStanding, ...] = ()
 
     def encode(
         self, times_ns: Integers, blocks: Sequence[SeriesBlock], over: Sequence[str]
@@ -178,7 +178,7 @@ class StandingEncoder:
             low, high = ended[0, 2:, 0].tolist()
             by = -high if code == VIOLATED else low if code == SATISFIED else math.nan
             since_s = (violated_ns - first_ns) / 1e9
-            outcomes.append(Outcome(code, since_s, by, unit_of(tree.formula, {}), said))
+            outcomes.append(FinalStanding(code, since_s, by, unit_of(tree.formula, {}), said))
         self.outcomes = tuple(outcomes)
         words, times_ns = np.array(self._words, object)[:, None], np.array([time_ns], np.int64)
         [payload] = self._messages(times_ns, series, words, np.array(since_ns)[:, None], over, final=True)

@@ -25,7 +25,7 @@ from spatial_replay.cli.options import (
 from spatial_replay.cli.terminal import Coloured, Line, StatusLine, show, show_diagnostics, show_file, warn
 from spatial_replay.cli.viewer_options import ServingArguments, serving_options
 from spatial_replay.errors import UsageError
-from spatial_replay.text import counted, escaped, time_text
+from spatial_replay.text import counted, escaped, number_text, time_text
 from spatial_replay.trace.time_points import duration_ns_from_text
 
 if TYPE_CHECKING:
@@ -420,6 +420,8 @@ class _Run:
 def _numbers(ending: Ending) -> str:
     robustness, lower, upper = ending.robustness, ending.lower, ending.upper
     if math.isnan(robustness):
-        return f"robustness not determined, between {lower:.6g} and {upper:.6g}"
-    between = "" if lower == upper == robustness else f", between {lower:.6g} and {upper:.6g}"
-    return f"robustness {robustness:.6g}{between}"
+        return f"robustness not determined, between {number_text(lower)} and {number_text(upper)}"
+    between = (
+        "" if lower == upper == robustness else f", between {number_text(lower)} and {number_text(upper)}"
+    )
+    return f"robustness {number_text(robustness)}{between}"

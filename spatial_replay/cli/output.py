@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from spatial_replay.cli.terminal import Coloured, fitted, show, show_json
-from spatial_replay.text import counted, escaped, json_number, requirement_text, time_text
+from spatial_replay.text import counted, escaped, json_number, number_text, requirement_text, time_text
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
@@ -165,7 +165,7 @@ def _over_window(result: SpecResult, first_ns: int, window_ns: int) -> str:
 
 
 def _shown(number: float) -> str:
-    return "not determined" if math.isnan(number) else f"{number:.6g}"
+    return "not determined" if math.isnan(number) else number_text(number)
 
 
 _LONGEST: Final = 400

@@ -14,8 +14,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
-from spatial_replay.monitor.sentences import number_text
-from spatial_replay.text import Instant, Sentence, counted
+from spatial_replay.text import Instant, Sentence, counted, number_text
 from spatial_replay.trace.trace import Trace
 
 _OTHER_UNITS: Final = 8.0

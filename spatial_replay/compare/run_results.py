@@ -11,10 +11,10 @@ import numpy as np
 from spatial_replay.compare.alignment import Alignment, Parting, parting_of
 from spatial_replay.compare.movement import ObjectDiff
 from spatial_replay.monitor.result import SpecResult
-from spatial_replay.monitor.sentences import number_text, reason_sentence
+from spatial_replay.monitor.sentences import reason_sentence
 from spatial_replay.spec.formula import Atom, Specification, iter_nodes
 from spatial_replay.spec.walks import other_names
-from spatial_replay.text import Instant, Sentence, json_number
+from spatial_replay.text import Instant, Sentence, json_number, number_text
 from spatial_replay.trace.trace import Trace
 
 

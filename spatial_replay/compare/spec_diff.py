@@ -14,8 +14,8 @@ from spatial_replay.compare.edit_cause import EditOutcome
 from spatial_replay.compare.trees import Edit, TreeDiff
 from spatial_replay.lazy import Displayed
 from spatial_replay.monitor.result import SpecResult
-from spatial_replay.monitor.sentences import number_text, reason_sentence
-from spatial_replay.text import Instant, Sentence, counted, json_number
+from spatial_replay.monitor.sentences import reason_sentence
+from spatial_replay.text import Instant, Sentence, counted, json_number, number_text
 
 
 class FirstDifference(NamedTuple):

@@ -13,11 +13,20 @@ from spatial_replay.monitor.witness.path import End, MissedResponse
 from spatial_replay.monitor.witness.threshold import Threshold
 from spatial_replay.monitor.witness.witness import Witness, WitnessStep
 from spatial_replay.spec.expressions import Number, Scaled
+from spatial_replay.spec.format import format_number
 from spatial_replay.spec.formula import Atom, Formula
 from spatial_replay.spec.walks import iter_expressions, iter_formulas
-from spatial_replay.text import Instant, Sentence, counted, requirement_text, shortened_formula
+from spatial_replay.text import (
+    DIGITS,
+    LARGEST_PLAIN,
+    Instant,
+    Sentence,
+    counted,
+    number_text,
+    requirement_text,
+    shortened_formula,
+)
 
-_DIGITS = 6
 _RESIDUE = 1e-12
 """A difference of so little, to what is compared, is the rounding error of its two numbers."""
 _ENDED = ", for the log has ended"
@@ -117,11 +126,6 @@ def verdict_text(verdict: Verdict, robustness: float) -> str:
     return f"{verdict}, robustness {number}"
 
 
-def number_text(number: float) -> str:
-    """Return a number with six digits."""
-    return f"{number:.{_DIGITS}g}"
-
-
 def divisor_of(atom: Formula) -> float:
     """Return what `scale` divides the number of an atom by; 1 for others."""
     expression = atom.expression if isinstance(atom, Atom) else None
@@ -133,7 +137,7 @@ def amount_text(number: float, atom: Formula) -> str:
     divisor, number = divisor_of(atom), without_residue(number, atom)
     if divisor == 1.0:
         return number_text(number)
-    return f"{number_text(number * divisor)} ({number_text(number)} on its scale of {number_text(divisor)})"
+    return f"{number_text(number * divisor)} ({number_text(number)} on its scale of {format_number(divisor)})"
 
 
 def without_residue(number: float, atom: Formula) -> float:
@@ -287,9 +291,11 @@ def _flip(
     elif witness.is_settled and witness.verdict is Verdict.VIOLATED:
         would = "It would not have been violated then"
     if threshold.is_written:
-        limit = f"{change} in place of {number_text(threshold.value)}"
+        limit = f"{change} in place of {format_number(threshold.value)}"
         return f"{would} with {limit} in `{deciding.text}`."
     margin = change.removeprefix("-").removesuffix(" or less").removesuffix(" or more")
+    if change.startswith("anything"):
+        margin = f"more than {number_text(abs(threshold.flips_at))}"
     if divisor_of(deciding.atom) != 1.0:
         margin = amount_text(abs(threshold.flips_at), deciding.atom)
     how = "were allowed to fail by" if threshold.flips_at < 0.0 else "had to hold by"
@@ -303,18 +309,21 @@ def _change(threshold: Threshold) -> str:
     rises = threshold.flips_at > threshold.value
     if threshold.flips_at == 0.0:
         return "0"
-    for limit in (threshold.value, 0.0):
+    nearest = float(number_text(threshold.flips_at))
+    for limit in (threshold.value, 0.0, nearest):
         # a change that is only a rounding error is left out of the number
         if abs(threshold.flips_at - limit) <= 1e-12 * max(abs(threshold.value), 1.0):
-            return f"anything {'above' if rises else 'below'} {number_text(limit)}"
+            if limit >= threshold.flips_at if rises else limit <= threshold.flips_at:
+                return f"{format_number(limit)} or {'more' if rises else 'less'}"
+            return f"anything {'above' if rises else 'below'} {format_number(limit)}"
     return f"{_rounded(threshold.flips_at, up=rises)} or {'more' if rises else 'less'}"
 
 
 def _rounded(number: float, *, up: bool) -> str:
-    """Return six digits, rounded so that the change is no smaller."""
+    """Return four digits, rounded so that the change is no smaller."""
     rounding = ROUND_CEILING if up else ROUND_FLOOR
-    rounded = Context(prec=_DIGITS, rounding=rounding).create_decimal(Decimal(number))
-    is_plain = -5 <= rounded.adjusted() < 2 * _DIGITS
+    rounded = Context(prec=DIGITS, rounding=rounding).create_decimal(Decimal(number))
+    is_plain = rounded.adjusted() >= -5 and abs(rounded) < LARGEST_PLAIN
     return f"{rounded.normalize():f}" if is_plain else str(rounded.normalize()).lower()
 
 

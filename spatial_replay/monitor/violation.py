@@ -17,7 +17,6 @@ from spatial_replay.monitor.sentences import (
     amount_text,
     divisor_of,
     missed_text,
-    number_text,
     sentences_of,
     without_residue,
 )
@@ -30,7 +29,7 @@ from spatial_replay.monitor.witness.witness import Witness, find_witness
 from spatial_replay.spec.checks import object_names, signal_names
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import NamedSpec, Number, Specification
-from spatial_replay.text import Instant, Sentence
+from spatial_replay.text import Instant, Sentence, number_text
 from spatial_replay.trace.sample import FOREVER, Sample
 from spatial_replay.trace.trace import Trace
 

@@ -18,7 +18,8 @@ from typing import Final
 from spatial_replay.annotate.annotated_evaluation import AnnotatedEvaluation
 from spatial_replay.annotate.annotator import Annotator
 from spatial_replay.annotate.curves import encode_curves
-from spatial_replay.annotate.foxglove_layout import SceneBounds, live_layout_attachment
+from spatial_replay.annotate.foxglove_layout import live_layout_attachment
+from spatial_replay.annotate.rings import SceneBounds
 from spatial_replay.annotate.scene_update import SceneState
 from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.errors import SpecificationError, UsageError

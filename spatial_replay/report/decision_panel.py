@@ -21,10 +21,10 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanGuard,
     PlanTarget,
 )
-from spatial_replay.monitor.sentences import number_text
 from spatial_replay.planning.decision_log import decision_from_payload, latest_decisions
 from spatial_replay.planning.decisions import Reason
 from spatial_replay.report.compact import Packing, singles
+from spatial_replay.text import number_text
 
 MOST_CELLS: Final = 1_500_000
 """Cells of all maps of a page together, at most; maps of chosen targets come first."""

@@ -17,7 +17,7 @@ from spatial_replay.monitor.verdict import final_verdict
 from spatial_replay.report.compact import Packing
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Boolean, Formula, Temporal, iter_nodes, operands_of, operator_of
-from spatial_replay.text import json_number
+from spatial_replay.text import json_number, number_text
 
 MOST_NODES: Final = 400
 """Nodes of a tree that a page shows, at most."""
@@ -118,14 +118,9 @@ def final_text(robustness: float, lower: float, upper: float) -> str:
     """Return a node's final robustness, or the ends of its interval."""
     if math.isnan(robustness) or not (lower == upper == robustness):
         if math.isnan(lower):
-            return "" if math.isnan(robustness) else short_number(robustness)
-        return f"{short_number(lower)} … {short_number(upper)}"
-    return short_number(robustness)
-
-
-def short_number(number: float) -> str:
-    """Return a number with four digits, as the page shows them."""
-    return f"{number:.4g}"
+            return "" if math.isnan(robustness) else number_text(robustness)
+        return f"{number_text(lower)} … {number_text(upper)}"
+    return number_text(robustness)
 
 
 def named_nodes(formula: Formula) -> tuple[int, ...]:

@@ -181,7 +181,7 @@ def test_what_is_violated_is_explained_at_once(open_page: Open) -> None:
     page = open_page("violated")
     expect(page.locator(".verdict[open]")).to_have_count(1)
     page.locator(".verdict", has_text="poured").locator("summary").click()
-    expect(page.get_by_text("milk and cup are 0.113693 apart")).to_be_visible()
+    expect(page.get_by_text("milk and cup are 0.1137 apart")).to_be_visible()
     expect(open_page("satisfied").locator(".verdict[open]")).to_have_count(3)
 
 
@@ -380,7 +380,7 @@ def test_each_object_of_a_template_can_be_looked_into(open_page: Open) -> None:
 def test_text_arrow_tree_and_curve_are_of_one_atom_when_the_page_opens(open_page: Open) -> None:
     page = open_page("violated", height=1400)
     atom, number = "spoon dist plate <= 0.08", f"{MINUS}0.1552"
-    expect(page.locator(".verdict.chosen")).to_contain_text(f"{atom}, which fails by 0.155214")
+    expect(page.locator(".verdict.chosen")).to_contain_text(f"{atom}, which fails by 0.1552")
     expect(page.locator(".caption")).to_contain_text(f"{atom} of table_set fails by 0.1552")
     decides = page.locator(".tree .row.decides").last
     expect(decides).to_be_in_viewport()
@@ -463,7 +463,7 @@ def test_without_scripts_verdicts_can_be_read(browser: Browser, pages: Mapping[s
     context = browser.new_context(java_script_enabled=False)
     page = context.new_page()
     page.goto(pages["violated"].as_uri())
-    expect(page.locator("#verdicts")).to_contain_text("which fails by 0.155214 at 4.000 s")
+    expect(page.locator("#verdicts")).to_contain_text("which fails by 0.1552 at 4.000 s")
     assert page.locator("noscript").bounding_box() is not None
     context.close()
 

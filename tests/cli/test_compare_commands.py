@@ -34,7 +34,7 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str,
 def test_the_edit_that_flips_a_verdict_is_named_with_its_lines(capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = said(capsys, "diff", *TABLE)
     assert code == 1
-    assert "table_set: satisfied (0.0248667) → violated (-0.155214)" in out
+    assert "table_set: satisfied (0.02487) → violated (-0.1552)" in out
     assert "because: constant deadline: `F[0s, 8s] …` to `F[0s, 4s] …`, in `laid`" in out
     assert "+ table_edited.spatial:2: const deadline = 4s" in out
     code, out, _ = said(capsys, "diff", *TABLE, "--json")
@@ -61,7 +61,7 @@ def test_new_names_alone_are_listed_and_are_no_difference(capsys: pytest.Capture
     files = ("table.jsonl", "--spec", "table.spatial", "--spec", "renamed.spatial")
     code, out, _ = said(capsys, "diff", *files)
     assert code == 0
-    assert "table_laid (was table_set): satisfied (0.0248667), the same" in out
+    assert "table_laid (was table_set): satisfied (0.02487), the same" in out
     assert "    renamed table_set to table_laid" in out
     assert json.loads(said(capsys, "diff", *files, "--json")[1])["same"]
 

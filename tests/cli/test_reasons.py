@@ -132,7 +132,7 @@ def test_explain_has_one_object_of_facts_for_each_result(
     assert (found["specification"], found["name"], found["node"]) == ("mission", "mission", 0)
     assert found["since_ns"] == mission["violated_at_ns"] == found["time_ns"]
     assert found["atom"] == mission["worst"]["atom"]
-    assert found["explanation"][0].startswith("`mission` is violated: robustness -0.144867, certain since")
+    assert found["explanation"][0].startswith("`mission` is violated: robustness -0.1449, certain since")
 
 
 def test_a_failed_implication_names_the_response_that_was_missing(
@@ -142,10 +142,10 @@ def test_a_failed_implication_names_the_response_that_was_missing(
     (folder / "respond.spatial").write_text(f"spec respond = {formula}\n")
     missed = "`cup dist plate <= 0.3` held at 5.267 s, but `F[0s, 1s] (fork dist plate <= 0.02)` did not"
     run(["replay", str(LOG), "--spec", "respond.spatial", "-o", "out.mcap"])
-    assert f"{missed}: cup and plate are 0.290207 apart." in capsys.readouterr().out
+    assert f"{missed}: cup and plate are 0.2902 apart." in capsys.readouterr().out
     run(["explain", str(LOG), "--spec", "respond.spatial"])
     out = capsys.readouterr().out
-    assert f"{missed}: cup and plate are 0.290207 apart." in out.splitlines()
+    assert f"{missed}: cup and plate are 0.2902 apart." in out.splitlines()
     assert "holds by" not in out
     (respond,) = _document(folder, "respond.spatial")[1]["specifications"]
     assert respond["worst"]["missed"]["response"] == "F[0s, 1s] (fork dist plate <= 0.02)"
@@ -157,7 +157,7 @@ def test_amounts_are_said_in_the_unit_of_the_log_where_scale_divides_them(
     (folder / "scaled.spatial").write_text("scale lengths = 0.5\nspec safe = G (cup dist plate >= 0.2)\n")
     run(["replay", str(LOG), "--spec", "scaled.spatial"])
     said = capsys.readouterr().out
-    assert "`cup dist plate >= 0.2` fails by 0.00128379 (0.00256758 on its scale of 0.5) at 5.533 s" in said
+    assert "`cup dist plate >= 0.2` fails by 0.001284 (0.002568 on its scale of 0.5) at 5.533 s" in said
 
 
 def test_explain_lists_every_failing_spec_the_settled_one_first(
@@ -166,7 +166,7 @@ def test_explain_lists_every_failing_spec_the_settled_one_first(
     assert run(["explain", str(LOG), "--spec", "mission.spatial"]) == 1
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "REQ-7: done and safe"
-    assert lines[1].startswith("`mission` is violated: robustness -0.144867, certain since 5.533 s")
+    assert lines[1].startswith("`mission` is violated: robustness -0.1449, certain since 5.533 s")
     assert lines[2] == "`safe` is violated since 5.533 s, whatever came after."
     assert any(line.startswith("`goal` is violated, for the log has ended: ") for line in lines[3:])
 
@@ -188,7 +188,7 @@ def test_a_named_part_is_explained_by_what_settled_it(
 ) -> None:
     assert run(["explain", str(LOG), "--spec", "mission.spatial", "--node", "safe"]) == 1
     assert capsys.readouterr().out.startswith(
-        "`safe` is violated: robustness -0.144867, certain since 5.533 s, least at 9.767 s."
+        "`safe` is violated: robustness -0.1449, certain since 5.533 s, least at 9.767 s."
     )
 
 

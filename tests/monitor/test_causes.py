@@ -104,16 +104,16 @@ def test_explanations_name_every_cause_and_what_would_have_prevented_it() -> Non
         "`safe` is violated since 3.000 s, whatever came after.",
         "What decides is `red dist vase >= 0.1`, which fails by 0.03 at 3.000 s (within `safe`): "
         "red and vase are 0.07 apart.",
-        "It would not have been violated then with 0.0699999 or less in place of 0.1 in "
+        "It would not have been violated then with anything below 0.07 in place of 0.1 in "
         "`red dist vase >= 0.1`.",
         "`charged` is violated since 4.000 s, whatever came after.",
         "What decides is `battery >= 0.2`, which fails by 0.06 at 4.000 s (within `charged`): "
         "battery is 0.14.",
-        "It would not have been violated then with 0.139999 or less in place of 0.2 in `battery >= 0.2`.",
+        "It would not have been violated then with anything below 0.14 in place of 0.2 in `battery >= 0.2`.",
         "`deliver` is violated, for the log has ended: robustness -7.76.",
         "What decides is `red enclosedin bin`, which fails by 7.76 at 4.000 s (its greatest within "
         "`deliver`): red sticks out of bin by 7.76.",
-        "It would be satisfied if `red enclosedin bin` were allowed to fail by 7.76001.",
+        "It would be satisfied if `red enclosedin bin` were allowed to fail by more than 7.76.",
     ]
 
 

@@ -179,7 +179,7 @@ class StandingUpdate(google.protobuf.message.Message):
 
     @property
     def violated(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___Violation]:
-        """The results that are violated for good, the one that was so first before the others."""
+        """The results that are violated, whatever comes, the one that was so first before the others."""
 
     def __init__(
         self,
@@ -199,7 +199,7 @@ global___StandingUpdate = StandingUpdate
 
 @typing.final
 class Violation(google.protobuf.message.Message):
-    """A result that is violated for good, for tables: numbers are rounded to four digits."""
+    """A violated result, for tables: numbers are rounded to four digits."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
