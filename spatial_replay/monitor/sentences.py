@@ -61,6 +61,8 @@ def sentences_of(
         is_measured = witness.missed.is_condition and is_decided
         measured = f": {_what_was_measured(witness.deciding)}" if is_measured and witness.deciding else ""
         sentences.append(Sentence(missed_text(witness.missed, first_ns), f"{measured}."))
+        if witness.closest is not None:
+            sentences.append(_closest(*witness.closest, first_ns))
     if witness.deciding is None:
         sentences.append(_dead_end(witness.path[-1], first_ns))
     elif witness.deciding.unknown:
@@ -173,7 +175,8 @@ def reason_sentence(witness: Witness, *, first_ns: int) -> Sentence:
         return Sentence(missed, ". ", reason) if missed else reason
     if witness.missed is not None and witness.missed.is_condition:
         # how well the condition held is not what went wrong
-        return Sentence(missed, f": {_what_was_measured(deciding)}.")
+        said = Sentence(missed, f": {_what_was_measured(deciding)}.")
+        return said if witness.closest is None else Sentence(said, " ", _closest(*witness.closest, first_ns))
     how = Sentence(f"`{deciding.text}` ", _how_it_decides(witness, deciding, first_ns))
     return Sentence(missed, ": ", how) if missed else how
 
@@ -182,6 +185,12 @@ def missed_text(missed: MissedResponse, first_ns: int) -> Sentence:
     """Return a clause on an implication that failed: its condition held, and its response did not."""
     when = Instant(missed.time_ns, first_ns)
     return Sentence(f"`{missed.condition}` held at ", when, f", but `{missed.response}` did not")
+
+
+def _closest(best: DecidingAtom, time_ns: int, first_ns: int) -> Sentence:
+    """Return a sentence on what a missed response came to at best."""
+    what = f": {_what_was_measured(best)}."
+    return Sentence(f"The nearest that it came to `{best.text}` was at ", Instant(time_ns, first_ns), what)
 
 
 def _how_it_decides(

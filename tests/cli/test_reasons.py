@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+import spatial_replay as sr
 from spatial_replay.cli import run
 
 LOG = Path(__file__).parent.parent.parent / "recordings" / "table.jsonl"
@@ -142,10 +143,17 @@ def test_a_failed_implication_names_the_response_that_was_missing(
     (folder / "respond.spatial").write_text(f"spec respond = {formula}\n")
     missed = "`cup dist plate <= 0.3` held at 5.267 s, but `F[0s, 1s] (fork dist plate <= 0.02)` did not"
     run(["replay", str(LOG), "--spec", "respond.spatial", "-o", "out.mcap"])
-    assert f"{missed}: cup and plate are 0.2902 apart." in capsys.readouterr().out
+    closest = "The nearest that it came to `fork dist plate <= 0.02` was at "
+    out = " ".join(capsys.readouterr().out.split())
+    assert f"{missed}: cup and plate are 0.2902 apart. {closest}" in out
     run(["explain", str(LOG), "--spec", "respond.spatial"])
     out = capsys.readouterr().out
     assert f"{missed}: cup and plate are 0.2902 apart." in out.splitlines()
+    [line] = [line for line in out.splitlines() if line.startswith(closest)]
+    trace = sr.read_trace(LOG)
+    fork = sr.evaluate(sr.parse_specification("spec near = F fork dist plate <= 0.02"), trace).results[0]
+    now = fork.nodes[1].now[(trace.times_ns >= 5_266_000_000) & (trace.times_ns <= 6_267_000_000)]
+    assert line.endswith(f": fork and plate are {0.02 - now.max():.4g} apart.")
     assert "holds by" not in out
     (respond,) = _document(folder, "respond.spatial")[1]["specifications"]
     assert respond["worst"]["missed"]["response"] == "F[0s, 1s] (fork dist plate <= 0.02)"

@@ -163,8 +163,9 @@ def deciding_path(
     end: End,
     *,
     goes_on: bool = False,
+    sample: int = 0,
 ) -> DecidingPath:
-    """Return the path to what decides a node at the first sample.
+    """Return the path to what decides a node at a sample.
 
     Ties go to the operand that leads to the earliest sample, then to the first operand; in a window, to the
     earliest sample.
@@ -173,7 +174,7 @@ def deciding_path(
         done: every node at every sample of `times_ns` (T,).
         goes_on: whether samples may follow; `done` is then that of `evaluate_unfinished`.
     """
-    return _Walk(formula, done, times_ns, goes_on=goes_on).follow(node, 0, end)
+    return _Walk(formula, done, times_ns, goes_on=goes_on).follow(node, sample, end)
 
 
 class _Walk:
@@ -345,12 +346,15 @@ class MissedResponse:
         condition, response: their names, or their texts, shortened.
         time_ns: of the sample at which the condition held.
         is_condition: whether the deciding atom is in the condition.
+        node, sample: the id of the response, and the index of the sample at which it should have held.
     """
 
     condition: str
     response: str
     time_ns: int
     is_condition: bool
+    node: int
+    sample: int
 
 
 def missed_response(
@@ -371,6 +375,8 @@ def missed_response(
                 each.name or shortened_formula(format_formula(each)) for each in operands_of(node)
             )
             # nodes are numbered in the order of the text
-            is_condition = below.node == step.node + 1
-            return MissedResponse(condition, response, int(times_ns[step.sample]), is_condition)
+            first = step.node + 1
+            after = first + sum(1 for _ in iter_nodes(operands_of(node)[0]))
+            time_ns, is_condition = int(times_ns[step.sample]), below.node == first
+            return MissedResponse(condition, response, time_ns, is_condition, after, step.sample)
     return None

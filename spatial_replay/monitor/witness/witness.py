@@ -64,6 +64,8 @@ class Witness:
             threshold are then those of that moment. None if it is about the whole log.
         missed: the outermost implication on the path that failed, or None.
         gaps: of an unknown atom, when what it is about is missing.
+        closest: of a missed response, the atom by which it came closest to holding, and the time of its
+            sample; None if that is what decides, or if there is no such atom.
     """
 
     name: str
@@ -79,6 +81,7 @@ class Witness:
     settled_ns: int | None = None
     missed: MissedResponse | None = None
     gaps: tuple[Gap, ...] = ()
+    closest: tuple[DecidingAtom, int] | None = None
 
     @property
     def node(self) -> int:
@@ -129,8 +132,10 @@ def find_witness(
     end = End.of(verdict)
     nodes = [evidence.bound(formula) for _, _, formula in iter_nodes(instance.formula)]
 
-    def follow(end: End) -> tuple[DecidingPath, tuple[WitnessStep, ...], DecidingAtom | None]:
-        found = deciding_path(instance.formula, done, times_ns, node, end, goes_on=goes_on)
+    def follow(
+        end: End, node: int = node, sample: int = 0
+    ) -> tuple[DecidingPath, tuple[WitnessStep, ...], DecidingAtom | None]:
+        found = deciding_path(instance.formula, done, times_ns, node, end, goes_on=goes_on, sample=sample)
         path = tuple(_step(step.node, nodes[step.node], int(times_ns[step.sample])) for step in found.steps)
         leaf = nodes[path[-1].node]
         if not isinstance(leaf, Atom | Quantified):
@@ -147,6 +152,12 @@ def find_witness(
         _, other_path, other = follow(end.turned)
         if other is not None and other.lower < other.upper:
             open_end = other, other_path[-1].time_ns
+    missed = missed_response(found, nodes, done, times_ns) if verdict is Verdict.VIOLATED else None
+    closest = None
+    if missed is not None and missed.is_condition:
+        _, best_path, best = follow(End.HIGH, missed.node, missed.sample)
+        if best is not None and not best.unknown:
+            closest = best, best_path[-1].time_ns
     return Witness(
         instance.name,
         instance.object,
@@ -159,8 +170,9 @@ def find_witness(
         None if isinstance(threshold, Threshold) else threshold,
         open_end,
         int(times_ns[-1]) if goes_on else None,
-        missed_response(found, nodes, done, times_ns) if verdict is Verdict.VIOLATED else None,
+        missed,
         evidence.gaps(deciding.atom) if deciding is not None and deciding.unknown else (),
+        closest,
     )
 
 
