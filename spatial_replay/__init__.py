@@ -62,11 +62,12 @@ if TYPE_CHECKING:
     from spatial_replay.monitor.witness.path import MissedResponse
     from spatial_replay.monitor.witness.threshold import Threshold
     from spatial_replay.monitor.witness.witness import Witness, WitnessStep
-    from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Step
+    from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Outcome, Step
     from spatial_replay.planning.planner import Planner
     from spatial_replay.planning.settings import Settings
     from spatial_replay.recording.clip_log import TriggeredClip
     from spatial_replay.recording.message_channel import MessageChannel
+    from spatial_replay.recording.plan_loop import plan
     from spatial_replay.recording.recorder import Recorder
     from spatial_replay.recording.trigger import Trigger
     from spatial_replay.replay.engine import Replayed
@@ -121,6 +122,7 @@ __all__ = [
     "NodeUpdate",
     "ObjectDiff",
     "ObjectOverview",
+    "Outcome",
     "OutputError",
     "Overview",
     "Parting",
@@ -167,6 +169,7 @@ __all__ = [
     "info",
     "load_specification",
     "parse_specification",
+    "plan",
     "read_results",
     "read_trace",
     "replay_log",
@@ -218,12 +221,13 @@ __getattr__, __dir__ = loaded_when_used(
         "monitor.witness.path": ("MissedResponse",),
         "monitor.witness.threshold": ("Threshold",),
         "monitor.witness.witness": ("Witness", "WitnessStep"),
-        "planning.decisions": ("Candidate", "Consideration", "Guards", "Step"),
+        "planning.decisions": ("Candidate", "Consideration", "Guards", "Outcome", "Step"),
         "planning.planner": ("Planner",),
         "planning.settings": ("Settings",),
         "recording.clip_log": ("TriggeredClip",),
         "recording.trigger": ("Trigger",),
         "recording.message_channel": ("MessageChannel",),
+        "recording.plan_loop": ("plan",),
         "recording.recorder": ("Recorder",),
         "replay.engine": ("Replayed",),
         "replay.verification": ("Verified",),

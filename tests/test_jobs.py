@@ -88,6 +88,23 @@ def follow(page: str, names: dict[str, object], capsys: pytest.CaptureFixture[st
 
 
 @pytest.mark.usefixtures("desk")
+def test_a_robot_of_ones_own_is_planned_for_and_recorded(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("edited.spatial").write_text("F (red dist blue <= 0.1)", "utf-8")
+    page = "your-own-robot.md"
+    names: dict[str, object] = {}
+    for block in blocks(page):
+        if block.language == "python":
+            exec(compile(block.text, page, "exec"), names)  # noqa: S102
+            printed = capsys.readouterr().out
+        elif block.language == "text":
+            assert printed == block.text
+        else:
+            assert [(line, typed(line).code) for line, _ in commands(block)] == [
+                (line, code) for line, code in commands(block)
+            ]
+
+
+@pytest.mark.usefixtures("desk")
 def test_a_loop_stops_its_robot_at_the_first_violation_and_its_log_says_why(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

@@ -253,6 +253,8 @@ def _edge_lines(edge: PlanEdge, *, is_aim: bool) -> Iterator[str]:
         yield f"    never     {_some([guard.text for guard in edge.constraints])}"
     for candidate in edge.candidates:
         yield f"    {_candidate(candidate)}"
+    if len(edge.motions) > 1:
+        yield f"    planned   {', then '.join(_place(each) for each in edge.motions)}"
     if edge.pruned:
         yield f"    given up: {Reason.from_text(edge.pruned).kind}"
 
@@ -281,6 +283,10 @@ def _target(target: PlanTarget) -> str:
         f"{target.object} to ({target.x:.4g}, {target.y:.4g}){turned}, path length {length:.4g}, "
         f"robustness {target.robustness:.4g}"
     )
+
+
+def _place(target: PlanTarget) -> str:
+    return f"{target.object} to ({target.x:.4g}, {target.y:.4g})"
 
 
 def _either(texts: Sequence[str]) -> str:

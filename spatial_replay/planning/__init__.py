@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.planning.decision_log import PLAN_METADATA, BlackBox
+    from spatial_replay.planning.decision_log import PLAN_METADATA, BlackBox, plan_metadata
     from spatial_replay.planning.decisions import Candidate, Executor, Outcome, Reason, Step, Target
     from spatial_replay.planning.maps import (
         FREE,
@@ -47,6 +47,7 @@ __all__ = [
     "centre_of",
     "gradient_map",
     "moved_object",
+    "plan_metadata",
     "planner_of",
     "proposition_maps",
     "read_decisions",
@@ -60,7 +61,7 @@ __all__ = [
 __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
-        "decision_log": ("PLAN_METADATA", "BlackBox"),
+        "decision_log": ("PLAN_METADATA", "BlackBox", "plan_metadata"),
         "decisions": ("Candidate", "Executor", "Outcome", "Reason", "Step", "Target"),
         "maps": ("FREE", "GradientMap", "centre_of", "gradient_map", "moved_object", "proposition_maps"),
         "paths": ("shortest_path",),

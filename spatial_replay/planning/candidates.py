@@ -58,6 +58,20 @@ def find_target(
     return _nearest_cell(gradient, good, tracked, settings)
 
 
+def target_in(
+    gradient: GradientMap, tracked: TrackedObject, settings: Settings, pose: tuple[float, float, float]
+) -> Target | str:
+    """Return the target for an object at one pose (x, y, turn) of a map, or why it cannot get there."""
+    place = gradient.cell_of(*pose)
+    if gradient.blocked[place] != FREE:
+        return REASONS[gradient.blocked[place]]
+    only = np.zeros(gradient.blocked.shape, np.bool_)
+    only[place] = True
+    if settings.skill == "place":
+        return _target(gradient, tracked, place, (centre_of(tracked.footprint), pose[:2]))
+    return _nearest_cell(gradient, only, tracked, settings)
+
+
 def _best_cell(gradient: GradientMap, good: np.ndarray, tracked: TrackedObject, settings: Settings) -> Target:
     roomy = good & (gradient.clearance >= settings.room)
     values = np.where(roomy if roomy.any() else good, gradient.robustness, -np.inf)
@@ -162,14 +176,22 @@ class Movables:
         self._sample, self._settings = sample, settings
         self._maps: dict[str, PropositionMaps] = {}
 
+    @property
+    def sample(self) -> Sample:
+        """The sample."""
+        return self._sample
+
+    @property
+    def names(self) -> list[str]:
+        """The movable objects, in the order of the settings."""
+        movable, present = self._settings.movable, self._sample.objects
+        return [name for name in (sorted(present) if movable is None else movable) if name in present]
+
     def names_for(self, progress: Guards) -> list[str]:
         """Return the movable objects that a progress set depends on, in the order of the settings."""
         about = {number for cube in progress.cubes for number, _ in cube}
-        movable, present = self._settings.movable, self._sample.objects
         return [
-            name
-            for name in (sorted(present) if movable is None else movable)
-            if name in present and any(concerns(self._propositions[number], name) for number in about)
+            name for name in self.names if any(concerns(self._propositions[number], name) for number in about)
         ]
 
     def candidate(
@@ -187,7 +209,7 @@ class Movables:
         if not isinstance(tracked, TrackedObject):
             raise TraceError(f"object {name!r} is {tracked!r}; give a TrackedObject")
         gradient = gradient_map(
-            self._maps_of(name, tracked),
+            self.maps_of(name),
             consideration.progress.cubes,
             consideration.constraints.cubes,
             self._settings.workspace,
@@ -198,7 +220,15 @@ class Movables:
             return Candidate(name, gradient, None, target)
         return Candidate(name, gradient, target)
 
-    def _maps_of(self, name: str, tracked: TrackedObject) -> PropositionMaps:
+    def maps_of(self, name: str) -> PropositionMaps:
+        """Return the maps of all propositions over the cells of an object.
+
+        Raises:
+            TraceError: the sample has no footprint for the object.
+        """
+        tracked = self._sample.objects[name]
+        if not isinstance(tracked, TrackedObject):
+            raise TraceError(f"object {name!r} is {tracked!r}; give a TrackedObject")
         if name not in self._maps:
             workspace = self._settings.workspace
             pushes = self._settings.skill == "push"
@@ -217,15 +247,21 @@ def with_choice(
     The best candidate has the shortest path if it is pushed, the greatest robustness if it is placed; the
     first one wins a tie.
     """
+    order = by_cost(candidates, settings)
+    if not order:
+        causes = "; ".join(f"{each.name}: {each.rejected}" for each in candidates)
+        kind = "no object can do it" if causes else "no object that can be moved matters to it"
+        return replace(consideration, candidates=tuple(candidates), pruned=Reason(kind, causes))
+    chosen = order[0]
+    marked = (replace(each, is_chosen=number == chosen) for number, each in enumerate(candidates))
+    return replace(consideration, candidates=tuple(marked))
+
+
+def by_cost(candidates: Sequence[Candidate], settings: Settings) -> list[int]:
+    """Return the candidates that have a target, by number, the best first."""
     costs = {
         number: each.target.length if settings.skill == "push" else -each.target.robustness
         for number, each in enumerate(candidates)
         if each.target is not None
     }
-    if not costs:
-        causes = "; ".join(f"{each.name}: {each.rejected}" for each in candidates)
-        kind = "no object can do it" if causes else "no object that can be moved matters to it"
-        return replace(consideration, candidates=tuple(candidates), pruned=Reason(kind, causes))
-    chosen = min(costs, key=costs.__getitem__)
-    marked = (replace(each, is_chosen=number == chosen) for number, each in enumerate(candidates))
-    return replace(consideration, candidates=tuple(marked))
+    return sorted(costs, key=costs.__getitem__)

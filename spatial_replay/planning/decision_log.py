@@ -45,6 +45,7 @@ from spatial_replay.planning.decisions import (
 )
 from spatial_replay.planning.maps import GradientMap, centre_of, moved_object
 from spatial_replay.planning.planner import Planner
+from spatial_replay.planning.settings import text_from_settings
 from spatial_replay.trace.sample import Sample
 
 PLAN_METADATA: Final = "spatial_replay_plan"
@@ -176,6 +177,19 @@ class BlackBox:
         return merge(streams)
 
 
+def plan_metadata(planner: Planner, filename: str) -> dict[str, str]:
+    """Return the metadata from which decisions can be recomputed.
+
+    Args:
+        filename: of the specification, as the log names it.
+    """
+    return {
+        "settings": text_from_settings(planner.settings),
+        "file": filename,
+        "specification": planner.automaton.name,
+    }
+
+
 def decision_from_payload(payload: bytes) -> PlanDecision:
     """Decode a message on the topic of decisions.
 
@@ -282,6 +296,8 @@ def _edge(consideration: Consideration, numbers: Mapping[TurnedMap, int]) -> Pla
         constraints=_guards(consideration.constraints),
         candidates=[_candidate(each, numbers) for each in consideration.candidates],
         pruned=str(consideration.pruned or ""),
+        motions=map(_target, consideration.motions),
+        joint=consideration.is_joint,
     )
 
 

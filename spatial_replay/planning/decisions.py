@@ -116,6 +116,10 @@ class Consideration:
         constraints: what must not hold on the way, since it takes another edge.
         candidates: the objects considered, in the order of the settings' `movable`; without it, by name.
         pruned: why the edge was pruned; None if it was not.
+        motions: the motions planned from here to acceptance, the chosen candidate's first; empty if the
+            planner does not look ahead.
+        is_joint: whether objects are moved together for the edge; the chosen candidate's map then has the
+            others where these motions bring them.
     """
 
     path: tuple[int, ...]
@@ -124,6 +128,8 @@ class Consideration:
     constraints: Guards
     candidates: tuple[Candidate, ...]
     pruned: Reason | None = None
+    motions: tuple[Target, ...] = ()
+    is_joint: bool = False
 
 
 @dataclass(frozen=True, slots=True)

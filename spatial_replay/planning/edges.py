@@ -23,6 +23,8 @@ Symbol: TypeAlias = tuple[bool | None, ...]
 
 _LISTED: Final = 4
 """The most edges that a reason names; the others are counted."""
+LATER: Final = "what has to come after it cannot be done"
+"""The kind of reason of an edge that could be taken now, and leads nowhere."""
 
 
 class Observer:
@@ -166,7 +168,11 @@ def why_no_path(automaton: Automaton, state: int, pruned: Mapping[Edge, Reason])
         if source in reachable:
             edges.setdefault(reason.kind, []).append(f"{source} -> {target}")
     reasons = "; ".join(f"{_listed(each)}: {kind}" for kind, each in edges.items())
-    return f"no path left: every way from state {state} was given up ({reasons})"
+    later = [
+        each.detail for edge, each in sorted(pruned.items()) if edge[0] in reachable and each.kind == LATER
+    ]
+    what = f"; what cannot be done: {later[0]}" if later else ""
+    return f"no path left: every way from state {state} was given up ({reasons}){what}"
 
 
 def _listed(edges: Sequence[str]) -> str:

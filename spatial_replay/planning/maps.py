@@ -87,13 +87,22 @@ class GradientMap(Displayed):
         free = self.blocked == FREE
         return float(self.robustness[free].max()) if free.any() else -np.inf
 
+    def cell_of(self, x: float, y: float, turn: float) -> tuple[int, int, int]:
+        """Return the turn, row and column of a pose."""
+        return (int(np.argmin(np.abs(self.turns - turn))), *self.grid.cell(x, y))
+
     def __repr__(self) -> str:
         cells = f"{self.grid.columns} x {self.grid.rows}"
         return f"<GradientMap of {self.name}: {cells} cells, {self.best():.4g} at best>"
 
 
 def gradient_map(
-    maps: PropositionMaps, progress: Cubes, constraints: Cubes, workspace: Workspace, margin: float = 0.0
+    maps: PropositionMaps,
+    progress: Cubes,
+    constraints: Cubes,
+    workspace: Workspace,
+    margin: float = 0.0,
+    after: PropositionMaps | None = None,
 ) -> GradientMap:
     """Return the map of a progress set, blocked where the constraint set would hold.
 
@@ -102,11 +111,13 @@ def gradient_map(
         constraints: the robustness of each of these has to be less than -`margin`; unknown values count as
             holding.
         margin: in the unit of the relations, at least 0.
+        after: the maps when other objects have been moved, too, for the robustness; cells are blocked as now.
     """
     shape = maps.clearance.shape
+    then = maps if after is None else after
     robustness = np.full(shape, -np.inf)
     for cube in progress:
-        np.maximum(robustness, _holds(maps.lower, maps.upper, cube, shape), out=robustness)
+        np.maximum(robustness, _holds(then.lower, then.upper, cube, shape), out=robustness)
     danger = np.full(shape, -np.inf)
     for cube in constraints:
         np.maximum(danger, _holds(maps.upper, maps.lower, cube, shape), out=danger)

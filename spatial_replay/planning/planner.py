@@ -9,6 +9,7 @@ from typing import Final
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compile import automaton as automaton_of
+from spatial_replay.automata.guards import Transition
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.planning.candidates import Movables, with_choice
 from spatial_replay.planning.decisions import Consideration, Edge, Kind, Outcome, Reason, Step, Target
@@ -22,6 +23,7 @@ from spatial_replay.planning.edges import (
     why_no_path,
     worst_state,
 )
+from spatial_replay.planning.foresight import Foresight
 from spatial_replay.planning.maps import Cubes, refuse_delays, refuse_unknown
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.workspace import Workspace, kind_faults, refuse_faults
@@ -51,6 +53,7 @@ class Planner:
     and outcomes give equal steps.
 
     Attributes:
+        specification: what is planned for.
         automaton: of the specification.
     """
 
@@ -74,6 +77,7 @@ class Planner:
         self.automaton: Automaton = automaton_of(specification, name)
         refuse_template(specification, self.automaton.name)
         self._settings = settings
+        self.specification = specification
         self._regions = specification.regions
         self._formulas = [each.formula for each in self.automaton.propositions]
         refuse_delays(self._formulas)
@@ -103,6 +107,11 @@ class Planner:
     def states(self) -> tuple[int, ...]:
         """The states that the automaton can be in; one if all propositions were known."""
         return tuple(sorted(self._states))
+
+    @property
+    def has_observed(self) -> bool:
+        """Whether it has observed a sample."""
+        return self._sample is not None
 
     @property
     def is_accepting(self) -> bool:
@@ -207,13 +216,15 @@ class Planner:
         idle = idle_transitions(self.automaton, state, self._symbol)
         movables = Movables(self._formulas, self._regions, self._newest(), self.settings)
         considered: list[Consideration] = []
+        about = self.automaton, self._formulas, self._regions, self.settings
+        foresight = Foresight(*about, self._attempts.places_of) if self.settings.motions > 1 else None
         # time takes idle transitions without any object being moved, so they stay possible
         pruned = set(self._pruned) - idle.edges
         while (path := next(self.automaton.paths(state, pruned), None)) is not None:
             consideration = consideration_of(self.automaton, path, pruned, self._symbol)
             if ahead := idle.along(path):
                 return self._waiting_step([*considered, consideration], ahead)
-            considered.append(self._considered(consideration, movables))
+            considered.append(self._considered(consideration, path, movables, foresight))
             if (reason := considered[-1].pruned) is None:
                 return self._running_step(considered)
             edge = consideration.edge
@@ -221,7 +232,13 @@ class Planner:
             pruned |= {edge, *equivalent_edges(self.automaton, consideration, idle, pruned, self._symbol)}
         return self._decided("no path", considered, why_no_path(self.automaton, state, self._pruned))
 
-    def _considered(self, consideration: Consideration, movables: Movables) -> Consideration:
+    def _considered(
+        self,
+        consideration: Consideration,
+        path: tuple[Transition, ...],
+        movables: Movables,
+        foresight: Foresight | None,
+    ) -> Consideration:
         """Return an edge with its candidates, or pruned."""
         exhausted = self._attempts.why_exhausted(consideration.edge, self.settings.attempts)
         if exhausted is not None:
@@ -230,7 +247,8 @@ class Planner:
             movables.candidate(name, consideration, self._attempts.failed_places(consideration, name))
             for name in movables.names_for(consideration.progress)
         ]
-        return with_choice(consideration, candidates, self.settings)
+        alone = with_choice(consideration, candidates, self.settings)
+        return alone if foresight is None else foresight.decide(alone, path, movables, self._pruned)
 
     def _waiting_step(self, considered: list[Consideration], ahead: tuple[int, ...]) -> Step:
         reason = f"wait for {counted(len(ahead), 'sample')}: time alone leads on, to state {ahead[-1]}"
@@ -244,7 +262,8 @@ class Planner:
         self._attempts.begin(aim.edge)
         verb = "push" if self.settings.skill == "push" else "place"
         edge = f"{aim.edge[0]} -> {aim.edge[1]}: {aim.progress}"
-        reason = f"{verb} {target.name} at ({target.x:.4g}, {target.y:.4g}) for the edge {edge}"
+        which = f", the first of {len(aim.motions)} motions," if aim.is_joint and len(aim.motions) > 1 else ""
+        reason = f"{verb} {target.name} at ({target.x:.4g}, {target.y:.4g}){which} for the edge {edge}"
         return replace(self._decided("execute", considered, reason), target=target)
 
     def _decided(self, kind: Kind, considered: Iterable[Consideration], reason: str) -> Step:
@@ -272,6 +291,7 @@ class _Attempts:
         self._failed: Counter[Edge] = Counter()
         self._total: Counter[Edge] = Counter()
         self._places: dict[tuple[Cubes, str], tuple[tuple[float, float], ...]] = {}
+        self._left: dict[Edge, int] = {}
 
     def why_exhausted(self, edge: Edge, most_failed: int) -> Reason | None:
         """Return why an edge is not tried again; None if it may be."""
@@ -292,6 +312,14 @@ class _Attempts:
             self._places[key] = (*self._places.get(key, ()), (target.x, target.y))
         elif tuple(states) == aim.edge[1:]:
             del self._failed[aim.edge]
+        elif aim.is_joint and len(aim.motions) < self._left.get(aim.edge, MOST_MOTIONS):
+            # one of several motions, and fewer are left than ever before
+            self._left[aim.edge] = len(aim.motions)
+            self._failed[aim.edge] -= 1
+
+    def places_of(self, name: str) -> tuple[tuple[float, float], ...]:
+        """Return the places (x, y) where moving an object failed, whatever it was for."""
+        return tuple(place for (_, moved), each in self._places.items() if moved == name for place in each)
 
     def failed_places(self, aim: Consideration, name: str) -> tuple[tuple[float, float], ...]:
         """Return the places (x, y) where moving an object for the same progress failed."""

@@ -24,7 +24,7 @@ Skill: TypeAlias = Literal["push", "place"]
 """What the robot does with an object: push it along a path in the plane, or pick and place it."""
 
 _SKILLS = ("push", "place")
-_PLAIN = ("skill", "movable", "margin", "constraint_margin", "room", "attempts")
+_PLAIN = ("skill", "movable", "margin", "constraint_margin", "room", "attempts", "motions")
 """Settings that stand in the text as they are."""
 
 
@@ -41,6 +41,8 @@ class Settings:
         room: preferred clearance of a placed object, in footprint units, so that it and its neighbours can be
             grasped later; at least 0. Targets with less are used if there is no other.
         attempts: how many failed motions prune an edge, at least 1.
+        motions: how many objects are moved for one edge at most, at least 1. With 1, the planner takes one
+            edge by one motion and looks no further, as in the paper.
 
     Raises:
         UsageError: invalid values, all of them reported.
@@ -53,6 +55,7 @@ class Settings:
     constraint_margin: float = 0.0
     room: float = 0.0
     attempts: int = 3
+    motions: int = 6
 
     def __post_init__(self) -> None:
         refuse_faults(self._faults())
@@ -68,7 +71,7 @@ class Settings:
             yield from member_faults("movable", self.movable, tuple, str, "a tuple of names")
         distances = {name: getattr(self, name) for name in ("margin", "constraint_margin", "room")}
         yield from number_faults(distances, 0)
-        yield from count_faults({"attempts": self.attempts})
+        yield from count_faults({"attempts": self.attempts, "motions": self.motions})
 
 
 def text_from_settings(settings: Settings) -> str:
@@ -126,4 +129,6 @@ def _settings(read: dict[str, Any]) -> Settings:
         constraint_margin=float(read["constraint_margin"]),
         room=float(read["room"]),
         attempts=int(read["attempts"]),
+        # logs of planners that did not look ahead do not have it
+        motions=int(read.get("motions", 1)),
     )

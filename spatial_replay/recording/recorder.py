@@ -12,7 +12,7 @@ from itertools import takewhile
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from spatial_replay.errors import OutputError, SpatialReplayError, TraceError, UsageError
 from spatial_replay.logs.messages import Channel, Messages
@@ -28,6 +28,12 @@ from spatial_replay.spec.formula import Specification
 from spatial_replay.text import times_apart
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
+
+if TYPE_CHECKING:
+    # most recorders have no planner, and start without its kernels
+    from spatial_replay.planning.decision_log import BlackBox
+    from spatial_replay.planning.decisions import Outcome, Step
+    from spatial_replay.planning.planner import Planner
 
 FLUSH_S = 0.3
 """About the longest time from writing a sample until the operating system has it."""
@@ -67,6 +73,7 @@ class SampleWriter:
         self._last_ns = -1
         self._unsafe_s: float | None = None
         self._closed = False
+        self._drains = False
         self._failure: SpatialReplayError | None = None
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
@@ -176,6 +183,9 @@ class SampleWriter:
             taken = now if len(samples) < _TOGETHER else taken
             self._record(samples, self._messages.take())
             self._report_events()
+            # decisions come before the samples that follow them
+            while self._drains and len(messages := self._messages.take()):
+                self._record([], messages)
             if self._failure is None and time.monotonic() - flushed >= FLUSH_S:
                 self._try(self._log.flush)
                 flushed = time.monotonic()
@@ -268,6 +278,9 @@ class Recorder(SampleWriter):
             joints = recorder.channel("/joint_states")
             joints.write(time_ns, {"position": [0.1, 0.2]})
             recorder.write(sample)
+
+    With a planner, its decisions are recorded as well: samples, decisions and outcomes go through the
+    recorder, in the order in which they happen; or `plan(planner, robot, recorder)` does that.
     """
 
     def __init__(
@@ -280,6 +293,7 @@ class Recorder(SampleWriter):
         block: bool = True,
         trigger: Trigger | None = None,
         durability: Durability = "process",
+        planner: Planner | None = None,
     ) -> None:
         """Begin a log.
 
@@ -296,15 +310,18 @@ class Recorder(SampleWriter):
             trigger: when to write what, instead of everything.
             durability: "process" for a log that survives the end of the process; "disk" for one that
                 survives that of the machine, too: then each flush waits for the disk (fsync).
+            planner: observes the samples that are written; its decisions are recorded, see `next_step`.
 
         Raises:
             UsageError: a specification that cannot be recorded, a limit below 1, a trigger that names none of
-                the specs.
+                the specs, a planner together with a trigger or without `block`.
             OutputError: the file cannot be written.
         """
         if waiting < 1:
             raise UsageError(f"waiting is {waiting}; give 1 or more samples")
         files = [specifications] if isinstance(specifications, Specification) else list(specifications)
+        if planner is not None and planner.specification not in files:
+            files.insert(0, planner.specification)
         refuse_templates(files)
         self._path = Path(path)
         self._clips: ClipLog | None = None
@@ -314,7 +331,102 @@ class Recorder(SampleWriter):
         else:
             log = self._clips = ClipLog(self._path, files, about, trigger)
         self._entered = ExitStack()
+        self._files = tuple(files)
+        self._box: BlackBox | None = None
         super().__init__(log, self._path.name, waiting, block=block)
+        if planner is not None:
+            self.attach(planner)
+
+    @property
+    def planner(self) -> Planner | None:
+        """The planner whose decisions are recorded."""
+        return None if self._box is None else self._box.planner
+
+    def attach(self, planner: Planner) -> None:
+        """Let a planner observe every sample that is written from now on, and record its decisions.
+
+        Raises:
+            UsageError: a second planner, one whose specification is not recorded, one that has observed
+                samples; a recorder with a trigger, or one that drops samples.
+        """
+        from spatial_replay.planning.decision_log import BlackBox
+
+        self._refuse_planner(planner)
+        self._box = BlackBox(planner)
+        self._drains = True
+
+    def _refuse_planner(self, planner: Planner) -> None:
+        if self._box is not None:
+            raise UsageError(f"{self._name} has a planner already; open another recorder")
+        if self._clips is not None or not self._blocks:
+            raise UsageError(
+                f"{self._name} may leave samples out, on which decisions depend; open a Recorder without a "
+                "trigger, and with block=True"
+            )
+        if planner.specification not in self._files:
+            raise UsageError(
+                f"{self._name} does not record {planner.specification.filename}, which is planned for; open "
+                "the Recorder with planner=planner"
+            )
+        if self._last_ns >= 0 or planner.has_observed:
+            raise UsageError("decisions depend on all samples; attach a new planner before the first one")
+
+    def write(self, sample: Sample) -> None:
+        """Hand over the next sample; a planner observes it, too.
+
+        Returns at once unless the queue is full.
+
+        Raises:
+            TraceError: a time that is not after the last one.
+            OutputError: an earlier sample could not be written.
+            UsageError: not a sample, or the recorder is closed; at the first sample, settings of the planner
+                that do not fit it.
+        """
+        super().write(sample)
+        if self._box is not None:
+            is_first = not self._box.planner.has_observed
+            self._box.observe(sample)
+            if is_first:
+                self._add_plan(self._box.planner)
+
+    def _add_plan(self, planner: Planner) -> None:
+        """Write the settings, which may depend on the first sample."""
+        from spatial_replay.planning.decision_log import PLAN_METADATA, plan_metadata
+
+        if isinstance(self._log, FileLog):
+            name = self._log.files[self._files.index(planner.specification)]
+            self._log.add_metadata(PLAN_METADATA, plan_metadata(planner, name))
+
+    def next_step(self) -> Step:
+        """Return the planner's next step, and record it with everything that it depends on.
+
+        Raises:
+            UsageError: there is no planner, nothing was written yet, or the last step was not concluded.
+            OutputError: something before could not be written.
+        """
+        step, messages = self._require_box().decide()
+        self._write_decision(messages)
+        return step
+
+    def conclude(self, outcome: Outcome) -> None:
+        """Record the outcome of the last step, after the samples of its motion.
+
+        Raises:
+            UsageError: there is no planner, not an outcome, or no step is being executed.
+            OutputError: something before could not be written.
+        """
+        self._write_decision(self._require_box().conclude(outcome))
+
+    def _require_box(self) -> BlackBox:
+        if self._box is None:
+            raise UsageError(f"{self._name} has no planner; open the Recorder with planner=planner")
+        return self._box
+
+    def _write_decision(self, messages: Messages) -> None:
+        topics = messages.channels
+        columns = messages.channel.tolist(), messages.log_time_ns.tolist(), messages.payloads
+        for number, time_ns, payload in zip(*columns, strict=True):
+            self._messages.channel(topics[number]).copy(time_ns, payload)
 
     def channel(
         self,

@@ -99,6 +99,7 @@ class FileLog:
         """Begin the file, with everything compiled that writing to it takes."""
         self.backlog = 0
         self._unevaluated: deque[Trace] = deque()
+        self._metadata: deque[tuple[str, Mapping[str, str]]] = deque()
         self._at_once = _AT_FIRST
         self._stream = open_output(path, durability)
         try:
@@ -113,6 +114,8 @@ class FileLog:
 
     def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
         """See `RecorderLog`."""
+        while self._metadata:
+            self._writer.add_metadata(*self._metadata.popleft())
         if len(trace) or len(messages):
             self._recording.add_samples(trace, messages)
         if len(trace):
@@ -124,6 +127,15 @@ class FileLog:
     def report(self, event: RunEvent) -> None:
         """See `RecorderLog`."""
         self._recording.report(event)
+
+    @property
+    def files(self) -> Sequence[str]:
+        """The names of the specifications in the log."""
+        return [file.filename for file in self._recording.files]
+
+    def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
+        """Write a metadata record with what is added next; from any thread."""
+        self._metadata.append((name, data))
 
     @property
     def is_busy(self) -> bool:

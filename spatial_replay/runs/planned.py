@@ -1,6 +1,6 @@
 """A simulated world whose robot executes a planner's steps, recorded with every decision.
 
-`record_plan` sets up world, planner and log; `PlanLoop` observes, decides and executes until the end.
+`record_plan` sets up world, planner and log; `recording.plan_loop` lets them observe, decide and execute.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.logs.output_file import Durability
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.planning.decision_log import PLAN_METADATA, BlackBox
-from spatial_replay.planning.decisions import Executor, Kind, Outcome, Step
+from spatial_replay.planning.decision_log import PLAN_METADATA, BlackBox, plan_metadata
+from spatial_replay.planning.decisions import Kind, Outcome, Step
 from spatial_replay.planning.planner import Planner
-from spatial_replay.planning.settings import Settings, Skill, text_from_settings
+from spatial_replay.planning.settings import Settings, Skill
 from spatial_replay.planning.workspace import Grid, Workspace
+from spatial_replay.recording.plan_loop import run_plan
 from spatial_replay.runs.run_log import RunLog, run_log
 from spatial_replay.runs.scripted import about_run, refuse_unknown_names
 from spatial_replay.simulation.injection import Injection
@@ -103,33 +104,22 @@ class WorldExecutor:
         return Outcome(done.succeeded, done.reason)
 
 
-HOLDING_SAMPLES = 30
-"""How many samples the specification has to stay satisfied before a run ends."""
-MOST_WAITING_SAMPLES = 150
-"""The most samples without progress between two motions, before a run ends."""
-
-
 class PlanLoop:
-    """Let a planner decide and an executor act until there is nothing more to do.
-
-    Every sample goes to `observe`, also during an execution. The loop ends: motions are bounded by the
-    attempts at the automaton's edges, waiting by the samples in which the automaton reaches no new state.
+    """A planner in the loop of a simulated run: its decisions go to the log as its samples do.
 
     Attributes:
-        executed: the number of motions.
         planning_s: time spent planning, in seconds of real time.
     """
 
-    def __init__(self, box: BlackBox, log: RunLog, executor: Executor, look: Callable[[], None]) -> None:
-        """Begin before the first sample.
-
-        Args:
-            executor: executes steps; its samples have to go to `observe`.
-            look: takes one more sample, which has to go to `observe`, while nothing moves.
-        """
-        self._box, self._log, self._executor, self._look = box, log, executor, look
-        self.executed = 0
+    def __init__(self, box: BlackBox, log: RunLog) -> None:
+        """Begin before the first sample."""
+        self._box, self._log = box, log
         self.planning_s = 0.0
+
+    @property
+    def planner(self) -> Planner:
+        """The planner."""
+        return self._box.planner
 
     def observe(self, sample: Sample) -> None:
         """Log the next sample and update the planner.
@@ -143,38 +133,17 @@ class PlanLoop:
         self._box.observe(sample)
         self.planning_s += time.perf_counter() - began
 
-    def run(self) -> Step:
-        """Look, decide and act; return the last decision."""
-        self._look()
-        waited, reached = 0, {self._box.planner.states}
-        while True:
-            step = self._decide()
-            if step.kind == "execute":
-                outcome = self._executor.execute(step)
-                self._log.write_messages(self._box.conclude(outcome))
-                self.executed, waited, reached = self.executed + 1, 0, {self._box.planner.states}
-            elif step.kind == "wait" and waited < MOST_WAITING_SAMPLES:
-                self._look()
-                # samples count only while the automaton reaches no new state
-                waited += not step.ahead or self._box.planner.states in reached
-                reached.add(self._box.planner.states)
-            elif step.kind != "hold" or self._holds():
-                return step
-
-    def _decide(self) -> Step:
+    def next_step(self) -> Step:
+        """Return the planner's next step, and log it."""
         began = time.perf_counter()
         step, messages = self._box.decide()
         self.planning_s += time.perf_counter() - began
         self._log.write_messages(messages)
         return step
 
-    def _holds(self) -> bool:
-        """Look for a while without a motion; return whether the specification stays satisfied."""
-        for _ in range(HOLDING_SAMPLES):
-            self._look()
-        planner = self._box.planner
-        # no motion can remove doubt about the past
-        return planner.is_accepting or planner.is_doubtful
+    def conclude(self, outcome: Outcome) -> None:
+        """Take the outcome of the last step, and log it."""
+        self._log.write_messages(self._box.conclude(outcome))
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,15 +220,16 @@ def record_plan(
         warm_up_planner()
         known = _known(kept, planner.automaton)
         with run_log(output, [kept], about, inputs, known, durability) as log:
-            log.add_metadata(PLAN_METADATA, _plan(planner, kept))
-            loop = PlanLoop(BlackBox(planner), log, WorldExecutor(world, world.skill), world.step)
+            log.add_metadata(PLAN_METADATA, plan_metadata(planner, kept.filename))
+            loop = PlanLoop(BlackBox(planner), log)
 
             def observe(sample: Sample) -> None:
                 loop.observe(sample)
                 advance(1)
 
             world.attach(observe)
-            last = loop.run()
+            end = run_plan(loop, WorldExecutor(world, world.skill).execute, world.step)
+        last = end.last
         return PlannedRun(
             samples=log.samples,
             seconds=log.seconds,
@@ -267,19 +237,10 @@ def record_plan(
             name=planner.automaton.name,
             verdict=log.verdicts[planner.automaton.name],
             reason=last.reason,
-            steps=loop.executed,
+            steps=end.motions,
             pruned=len(last.pruned),
             planning_s=loop.planning_s,
         )
-
-
-def _plan(planner: Planner, file: Specification) -> dict[str, str]:
-    """Return the metadata from which the decisions can be recomputed."""
-    return {
-        "settings": text_from_settings(planner.settings),
-        "file": file.filename,
-        "specification": planner.automaton.name,
-    }
 
 
 def _refuse_missing(file: Specification, name: str | None) -> None:

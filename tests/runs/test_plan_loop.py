@@ -11,7 +11,8 @@ import spatial_replay as sr
 from planning.kinematics import Table, block
 from spatial_replay import Planner, Settings
 from spatial_replay.planning import BlackBox, Grid, Workspace
-from spatial_replay.runs.planned import HOLDING_SAMPLES, MOST_WAITING_SAMPLES, PlanLoop
+from spatial_replay.recording.plan_loop import HOLDING_SAMPLES, MOST_WAITING_SAMPLES, run_plan
+from spatial_replay.runs.planned import PlanLoop
 from spatial_replay.runs.run_log import run_log
 
 TABLE = Settings(Workspace(Grid.over(0, 0, 10, 10, 0.5), supports=frozenset({"plate"})))
@@ -38,21 +39,21 @@ class Camera:
 
 
 def run(path, text, hides, things=THINGS, **options):
-    """Return the last decision, the planner, the loop and the log's verdict."""
+    """Return the last decision, the planner, the number of motions and the log's verdict."""
     specification = sr.parse_specification(text)
     planner = Planner(specification, TABLE)
     with run_log(path, [specification]) as log:
         table = Table(dict(things), None, **options)
-        loop = PlanLoop(BlackBox(planner), log, table, table.look)
+        loop = PlanLoop(BlackBox(planner), log)
         table.planner = Camera(loop, TABLE, hides)
-        last = loop.run()
+        end = run_plan(loop, table.execute, table.look)
     assert log.samples == len(table.samples)
-    return last, planner, loop, log.verdicts["spec"]
+    return end.last, planner, end.motions, log.verdicts["spec"]
 
 
 def test_a_doubt_that_remains_does_not_prolong_a_run(tmp_path):
     text = "(G (fork rightof plate)) and F (cup enclosedin plate)"
-    last, planner, loop, verdict = run(
+    last, planner, motions, verdict = run(
         tmp_path / "run.mcap", text, lambda number, name: name == "fork" and number == 1
     )
     assert last.kind == "hold"
@@ -60,23 +61,23 @@ def test_a_doubt_that_remains_does_not_prolong_a_run(tmp_path):
     assert planner.is_doubtful
     assert not planner.is_accepting
     assert verdict == "unknown"
-    assert loop.executed == 1
+    assert motions == 1
 
 
 def test_a_run_ends_while_waiting_for_an_object_that_never_appears(tmp_path):
     text = "(G (fork rightof plate)) and F (cup enclosedin plate)"
-    last, _, loop, _ = run(tmp_path / "run.mcap", text, lambda number, name: name == "fork")
+    last, _, motions, _ = run(tmp_path / "run.mcap", text, lambda number, name: name == "fork")
     assert last.kind == "wait"
-    assert loop.executed == 0
+    assert motions == 0
     assert last.number == 0
     assert len(sr.read_trace(tmp_path / "run.mcap")) == 1 + MOST_WAITING_SAMPLES
 
 
 def test_a_run_waits_for_a_bound_in_the_future(tmp_path):
     text = f"F[{2 * MOST_WAITING_SAMPLES},{3 * MOST_WAITING_SAMPLES}] (cup enclosedin plate)"
-    last, _, loop, verdict = run(tmp_path / "run.mcap", text, lambda number, name: False)
+    last, _, motions, verdict = run(tmp_path / "run.mcap", text, lambda number, name: False)
     assert (last.kind, verdict) == ("hold", "satisfied")
-    assert loop.executed == 1
+    assert motions == 1
     assert last.number == 2
 
 
@@ -107,11 +108,11 @@ def test_a_satisfied_specification_is_observed_for_some_samples(tmp_path):
 )
 def test_a_run_ends_whichever_objects_are_hidden(tmp_path, text, seed):
     random = np.random.default_rng(seed)
-    last, planner, loop, verdict = run(
+    last, planner, motions, verdict = run(
         tmp_path / "run.mcap", text, lambda number, name: number > 0 and random.random() < 0.2, slips=2
     )
     motions = TABLE.attempts * len(planner.automaton.transitions)
-    assert loop.executed <= motions
+    assert motions <= motions
     assert last.number <= (motions + 1) * (MOST_WAITING_SAMPLES + 2)
     if verdict == "satisfied":
         assert last.kind == "hold"

@@ -131,10 +131,16 @@ class PlanEdge(google.protobuf.message.Message):
     CONSTRAINTS_FIELD_NUMBER: builtins.int
     CANDIDATES_FIELD_NUMBER: builtins.int
     PRUNED_FIELD_NUMBER: builtins.int
+    MOTIONS_FIELD_NUMBER: builtins.int
+    JOINT_FIELD_NUMBER: builtins.int
     source: builtins.int
     target: builtins.int
     pruned: builtins.str
     """Why it was given up, or empty."""
+    joint: builtins.bool
+    """Whether several objects are moved together for this edge. The map of the chosen one then has the others where
+    their motions bring them.
+    """
     @property
     def path(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]:
         """The states of the shortest path to acceptance that begins with it."""
@@ -151,6 +157,12 @@ class PlanEdge(google.protobuf.message.Message):
     def candidates(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PlanCandidate]:
         """The objects looked at."""
 
+    @property
+    def motions(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PlanTarget]:
+        """The motions planned from here to acceptance, the first of which is that of the decision; empty if the planner
+        does not look ahead.
+        """
+
     def __init__(
         self,
         *,
@@ -161,9 +173,11 @@ class PlanEdge(google.protobuf.message.Message):
         constraints: collections.abc.Iterable[global___PlanGuard] | None = ...,
         candidates: collections.abc.Iterable[global___PlanCandidate] | None = ...,
         pruned: builtins.str = ...,
+        motions: collections.abc.Iterable[global___PlanTarget] | None = ...,
+        joint: builtins.bool = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["_source", b"_source", "_target", b"_target", "source", b"source", "target", b"target"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_source", b"_source", "_target", b"_target", "candidates", b"candidates", "constraints", b"constraints", "path", b"path", "progress", b"progress", "pruned", b"pruned", "source", b"source", "target", b"target"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["_source", b"_source", "_target", b"_target", "candidates", b"candidates", "constraints", b"constraints", "joint", b"joint", "motions", b"motions", "path", b"path", "progress", b"progress", "pruned", b"pruned", "source", b"source", "target", b"target"]) -> None: ...
     @typing.overload
     def WhichOneof(self, oneof_group: typing.Literal["_source", b"_source"]) -> typing.Literal["source"] | None: ...
     @typing.overload

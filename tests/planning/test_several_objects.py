@@ -1,0 +1,172 @@
+"""Goals about several objects, things in the way, and what cannot be done in the end."""
+
+from __future__ import annotations
+
+import pytest
+
+import spatial_replay as sr
+from planning.kinematics import BLOCKS, Table, block, run
+from planning.plans import record_plan_of
+from spatial_replay import Planner, Settings
+from spatial_replay.planning import (
+    Grid,
+    Workspace,
+    read_decisions,
+    recompute_decisions,
+    settings_from_text,
+    text_from_settings,
+)
+from spatial_replay.sources import open_source
+
+TABLE = Settings(
+    Workspace(Grid.over(0, 0, 10, 10, 0.25), supports=frozenset({"plate"}), clearance=0.05),
+    movable=("a", "b", "c", "d"),
+    margin=0.02,
+)
+THINGS = {name: block(x, y, size=1) for name, x, y in [("a", 1, 1), ("b", 3, 1), ("c", 8, 1), ("d", 8, 8)]}
+
+
+def planned(text, settings=TABLE, things=THINGS, **options):
+    """Return the names of the objects moved, how the run ends, and the steps and the table."""
+    specification = sr.parse_specification(text)
+    steps, table = run(Planner(specification, settings), things, **options)
+    verdict = sr.evaluate(specification, sr.Trace.from_samples(table.samples)).verdict
+    assert (steps[-1].kind == "hold") == (verdict == "satisfied")
+    return [step.target.name for step in steps if step.target], steps[-1].kind, steps, table
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "group reds = a, b\nspec s = F (forall r in reds: r enclosedin goal)",
+        "spec s = F G (a enclosedin goal and b rightof a)",
+        "spec s = F (a enclosedin goal and b enclosedin goal and a above b)",
+    ],
+)
+def test_a_goal_about_two_objects_takes_two_motions(text):
+    moved, end, steps, _ = planned(f"region goal = box(4, 4, 7, 7)\n{text}")
+    assert sorted(moved) == ["a", "b"]
+    assert end == "hold"
+    assert "the first of 2 motions" in steps[0].reason
+
+
+def test_four_objects_are_arranged_in_a_tight_place():
+    both = " and ".join(f"{name} enclosedin goal" for name in "abcd")
+    moved, end, steps, _ = planned(f"region goal = box(4, 4, 6.55, 6.55)\nspec s = F ({both})")
+    assert sorted(moved) == ["a", "b", "c", "d"]
+    assert end == "hold"
+    assert [each.name for each in steps[0].aim.motions] == moved
+
+
+def test_blocks_are_pushed_to_a_goal_about_all_of_them():
+    settings = Settings(
+        Workspace(Grid.over(0.3, -0.225, 0.75, 0.225, 0.01)), "push", margin=0.01, constraint_margin=0.005
+    )
+    text = "use spatial_spec\nspec s = F (green rightof red and red rightof blue and green above blue)"
+    _, end, _, _ = planned(text, settings, BLOCKS)
+    assert end == "hold"
+
+
+def test_what_is_in_the_way_is_moved_first():
+    moved, end, _, _ = planned("region spot = box(7.2, 0.2, 8.8, 1.8)\nspec s = F (a enclosedin spot)")
+    assert moved == ["c", "a"]
+    assert end == "hold"
+
+
+def test_a_slot_for_two_is_not_taken_in_the_middle():
+    text = "region slot = box(4, 4, 6.6, 5.6)\n"
+    text += "spec s = (F G (a enclosedin slot)) and (F (a leftof d and b enclosedin slot))"
+    moved, end, _, _ = planned(text)
+    assert sorted(moved) == ["a", "b"]
+    assert end == "hold"
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("(F (a enclosedin goal)) and (F (b leftof c)) and F (d enclosedin tiny)", "d enclosedin tiny"),
+        ("(F G (a enclosedin slot)) and (F (c above d)) and F G (b enclosedin slot)", "enclosedin slot"),
+    ],
+)
+def test_what_cannot_be_done_in_the_end_is_said_before_the_first_motion(text, named):
+    regions = "region goal = box(4, 4, 7, 7)\nregion tiny = box(4, 4, 4.5, 4.5)\n"
+    moved, end, steps, _ = planned(f"{regions}region slot = box(4, 4, 5.5, 5.5)\nspec s = {text}")
+    assert (moved, end) == ([], "no path")
+    assert named in steps[0].reason
+
+
+def test_a_planner_that_plans_one_motion_at_a_time_gives_joint_goals_up():
+    alone = Settings(TABLE.workspace, movable=TABLE.movable, margin=0.02, motions=1)
+    moved, end, _, _ = planned(
+        "region goal = box(4, 4, 7, 7)\nspec s = F (a enclosedin goal and b enclosedin goal)", alone
+    )
+    assert (moved, end) == ([], "no path")
+
+
+def test_settings_of_older_logs_plan_one_motion_at_a_time():
+    text = text_from_settings(TABLE)
+    assert settings_from_text(text).motions == TABLE.motions
+    assert settings_from_text(text.replace(f', "motions": {TABLE.motions}', "")).motions == 1
+
+
+def test_a_motion_that_slips_is_planned_again():
+    moved, end, _, _ = planned(
+        "region goal = box(4, 4, 7, 7)\nspec s = F (a enclosedin goal and b enclosedin goal)", slips=1
+    )
+    assert len(moved) == 3
+    assert end == "hold"
+
+
+JOINT = "region goal = box(4, 4, 7, 7)\nspec s = F (a enclosedin goal and b enclosedin goal)"
+
+
+def test_joint_decisions_are_logged_and_recomputed(tmp_path):
+    steps = record_plan_of(tmp_path / "run.mcap", JOINT, THINGS, TABLE)
+    first, *_ = read_decisions(tmp_path / "run.mcap").decisions
+    assert first.considered[-1].joint
+    assert [each.object for each in first.considered[-1].motions] == ["a", "b"]
+    recomputed = recompute_decisions(open_source(tmp_path / "run.mcap"))
+    assert recomputed.differences == ()
+    assert recomputed.decisions == len(steps)
+
+
+class Robot(Table):
+    """A robot of one's own: it moves things and writes what it sees to the recorder."""
+
+    def look(self):
+        sample = sr.Sample(self.time_ns, dict(self.objects))
+        self.time_ns += 100_000_000
+        self.samples.append(sample)
+        self.recorder.write(sample)
+
+
+@pytest.mark.parametrize("is_attached", [False, True])
+def test_a_recorder_is_the_black_box_of_any_robot(tmp_path, is_attached):
+    specification = sr.parse_specification(JOINT)
+    planner = Planner(specification, TABLE)
+    robot = Robot(dict(THINGS), planner)
+    options = {"specifications": [specification]} if is_attached else {"planner": planner}
+    with sr.Recorder(tmp_path / "run.mcap", **options) as recorder:
+        robot.recorder = recorder
+        last = sr.plan(planner, robot, recorder)
+    assert last.kind == "hold"
+    source = open_source(tmp_path / "run.mcap")
+    recomputed = recompute_decisions(source)
+    assert (recomputed.decisions, recomputed.differences, recomputed.faults) == (3, (), ())
+    assert read_decisions(tmp_path / "run.mcap").decisions[0].outcome.succeeded
+    assert sr.read_trace(tmp_path / "run.mcap").times_ns[-1] == robot.samples[-1].time_ns
+
+
+def test_a_recorder_takes_one_planner_before_its_first_sample(tmp_path):
+    specification = sr.parse_specification(JOINT)
+    with sr.Recorder(tmp_path / "run.mcap") as recorder:
+        with pytest.raises(sr.UsageError, match="has no planner"):
+            recorder.next_step()
+        with pytest.raises(sr.UsageError, match="planner=planner"):
+            recorder.attach(Planner(specification, TABLE))
+    with sr.Recorder(tmp_path / "run.mcap", specifications=[specification]) as recorder:
+        recorder.write(sr.Sample(0, THINGS))
+        with pytest.raises(sr.UsageError, match="before the first one"):
+            recorder.attach(Planner(specification, TABLE))
+    with pytest.raises(sr.UsageError, match="block=True"):
+        sr.Recorder(tmp_path / "run.mcap", planner=Planner(specification, TABLE), block=False)
