@@ -127,7 +127,11 @@ class AnnotatedEvaluation:
         return channels_of_results(self.trees)
 
     def contents(
-        self, extent: SceneBounds | None, topics: Collection[str] = (), axes: Axes = OUR_AXES
+        self,
+        extent: SceneBounds | None,
+        topics: Collection[str] = (),
+        axes: Axes = OUR_AXES,
+        images: Collection[str] = (),
     ) -> LayoutContents:
         """Return what an annotated log of these results has for a viewer to show.
 
@@ -135,28 +139,36 @@ class AnnotatedEvaluation:
             extent: of all footprints; None without any.
             topics: those of messages that are not derived from samples.
             axes: those of the source.
+            images: those of the topics that have images.
         """
         from spatial_replay.annotate.foxglove_layout import LayoutContents
 
         has_states = [each.automaton is not None for each in self.automata]
         # every result has events: a verdict is reported when it is reached, or else when the log ends
         derived = {SCENE, *(DERIVED if self.trees else ())} - set(() if any(has_states) else (AUTOMATON,))
-        return LayoutContents(self.trees, has_states, extent, derived | set(topics), axes)
+        return LayoutContents(
+            self.trees, has_states, extent, derived | set(topics), axes, images=sorted(images)
+        )
 
-    def layout(self, topics: Collection[str] = (), axes: Axes = OUR_AXES) -> Attachment:
+    def layout(
+        self, topics: Collection[str] = (), axes: Axes = OUR_AXES, images: Collection[str] = ()
+    ) -> Attachment:
         """Return the layout that opens the log in a viewer, once everything else is written.
 
         Args:
             topics: those of messages that are not derived from samples.
             axes: those of the source.
+            images: those of the topics that have images.
         """
         from spatial_replay.annotate.foxglove_layout import LayoutContents, layout_attachment
 
         if not self._has_samples:
             return layout_attachment(
-                LayoutContents(self.trees, [False] * len(self.trees), None, topics, axes)
+                LayoutContents(
+                    self.trees, [False] * len(self.trees), None, topics, axes, images=sorted(images)
+                )
             )
-        contents = self.contents(self._extent, topics, axes)
+        contents = self.contents(self._extent, topics, axes, images)
         return layout_attachment(contents._replace(outcomes=self._annotator.outcomes))
 
     def automata_metadata(self) -> Mapping[str, str]:

@@ -24,6 +24,9 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
     VIOLATED,
 )
 from spatial_replay.logs.topics import (
+    CAMERA_ANNOTATIONS,
+    CAMERA_CALIBRATION,
+    CAMERA_VIDEO,
     CURVES_TOPIC,
     EVENT_LOG,
     GRADIENT_MAP,
@@ -236,6 +239,17 @@ def decision_reason() -> Panel:
     return _titled("RawMessages!decision", "Why the planner decided so", config)
 
 
+def image_panel(images: Sequence[str], topics: Collection[str]) -> Panel:
+    """Return the picture of a camera, of our own or else of the first of the topics with images, with the
+    outlines that we draw on it."""
+    mode: Config = {"imageTopic": CAMERA_VIDEO if CAMERA_VIDEO in images else images[0]}
+    if CAMERA_CALIBRATION in topics:
+        mode["calibrationTopic"] = CAMERA_CALIBRATION
+    if CAMERA_ANNOTATIONS in topics:
+        mode["annotations"] = {CAMERA_ANNOTATIONS: {"visible": True}}
+    return _titled("Image!camera", "Camera", {"imageMode": mode, "synchronize": False})
+
+
 def constants() -> Panel:
     """Return the playback and the constants, which a live server lets a viewer edit."""
     title = "Playback and constants of the specification"
@@ -357,6 +371,7 @@ class LayoutContents(NamedTuple):
         topics: all that have messages.
         axes: those of the source, which the title of the scene says where they are not ours.
         outcomes: of each tree, what it came to; empty while that can change.
+        images: the topics with images.
     """
 
     trees: Sequence[ReportedTree]
@@ -365,6 +380,7 @@ class LayoutContents(NamedTuple):
     topics: Collection[str]
     axes: Axes = OUR_AXES
     outcomes: Sequence[FinalStanding] = ()
+    images: Sequence[str] = ()
 
 
 def layout_attachment(contents: LayoutContents) -> Attachment:
@@ -404,9 +420,10 @@ _Weighted = tuple[Panel, float]
 
 
 def _scene_panels(contents: LayoutContents) -> list[_Weighted]:
-    """Return the scene and, of a planner, its reasons."""
+    """Return the picture of a camera, the scene and, of a planner, its reasons."""
     scene = scene_panel(_camera(contents.extent), contents.topics, contents.axes)
-    return [(scene, 4.0), *([(decision_reason(), 1.0)] if PLAN_DECISION in contents.topics else [])]
+    camera = [(image_panel(contents.images, contents.topics), 4.0)] if contents.images else []
+    return [*camera, (scene, 4.0), *([(decision_reason(), 1.0)] if PLAN_DECISION in contents.topics else [])]
 
 
 def _evaluation_panels(contents: LayoutContents) -> list[_Weighted]:

@@ -18,6 +18,16 @@ READERS: dict[bytes, type[MessageReader]] = {BAG_MAGIC: Ros1Bag, SQLITE_MAGIC: S
 """The reader of a file, by its first bytes."""
 
 
+def is_log(path: LogFile) -> bool:
+    """Return whether a file or a folder looks like a log of messages.
+
+    Raises:
+        MissingFileError: there is no such file, or it cannot be opened.
+    """
+    head = _head(path)
+    return head is None or any(head.startswith(magic) for magic in READERS)
+
+
 def open_messages(path: LogFile) -> MessageReader:
     """Return a reader of the log in a file or a folder; the content decides, not the name.
 
@@ -25,14 +35,25 @@ def open_messages(path: LogFile) -> MessageReader:
         MissingFileError: there is no such file, or it cannot be opened.
         LogError: it is not a log of messages.
     """
-    try:
-        if isinstance(path, Path) and path.is_dir():
-            return BagFolder(path)
-        with open_file(path) as stream:
-            head = stream.read(len(SQLITE_MAGIC))
-    except (OSError, ValueError) as error:
-        raise MissingFileError.of(path, error) from None
+    head = _head(path)
+    if head is None and isinstance(path, Path):
+        return BagFolder(path)
     for magic, reader in READERS.items():
-        if head.startswith(magic):
+        if head is not None and head.startswith(magic):
             return reader(path)
     raise LogError(f"{path.name} is neither a ROS bag nor an MCAP log")
+
+
+def _head(path: LogFile) -> bytes | None:
+    """Return the first bytes of a file; None of a folder.
+
+    Raises:
+        MissingFileError: there is no such file, or it cannot be opened.
+    """
+    try:
+        if isinstance(path, Path) and path.is_dir():
+            return None
+        with open_file(path) as stream:
+            return stream.read(len(SQLITE_MAGIC))
+    except (OSError, ValueError) as error:
+        raise MissingFileError.of(path, error) from None

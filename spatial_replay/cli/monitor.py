@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,29 +21,22 @@ from spatial_replay.cli.options import (
     profile_option,
     specs_option,
 )
-from spatial_replay.cli.terminal import Coloured, Line, StatusLine, show, show_diagnostics, show_file, warn
+from spatial_replay.cli.output import change_line, ending_lines
+from spatial_replay.cli.terminal import Line, StatusLine, show, show_diagnostics, show_file, warn
 from spatial_replay.cli.viewer_options import ServingArguments, serving_options
 from spatial_replay.errors import UsageError
-from spatial_replay.text import counted, escaped, number_text, time_text
+from spatial_replay.text import counted, time_text
 from spatial_replay.trace.time_points import duration_ns_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.live import LiveSession, LiveUpdate
     from spatial_replay.live.viewing import Viewing
     from spatial_replay.mapping import LogMapping
-    from spatial_replay.monitor.monitor import Ending
     from spatial_replay.recording import Recorder
     from spatial_replay.recording.recorder import SampleWriter
     from spatial_replay.recording.trigger import Trigger
     from spatial_replay.spec.formula import Specification
 
-_COLOURS: Final = {
-    "satisfied": "blue",
-    "holds": "blue",
-    "violated": "red",
-    "pending": "yellow",
-    "unknown": "yellow",
-}
 _STATUS_S: Final = 0.5
 _UNITS: Final = {"kb": 2**10, "mb": 2**20, "gb": 2**30}
 
@@ -377,9 +369,7 @@ class _Run:
         for note in update.notes:
             self._print(f"  {note}")
         for change in update.changes:
-            when = time_text(update.time_ns, self.first_ns)
-            label = Coloured(f"{change.state:<9}", _COLOURS[change.state])
-            self._print((f"{when:>12}  ", label, f"  {change.sentence}"))
+            self._print(change_line(change, self.first_ns))
 
     def _is_over(self, update: LiveUpdate) -> bool:
         verdicts = {str(spec.verdict) for spec in update.specs}
@@ -407,21 +397,8 @@ class _Run:
             lost = f"; dropped {counted(status.dropped, 'sample')} and"
             lost += f" {counted(status.messages_dropped, 'message')}: verdicts are over the others"
         show(f"{counted(status.samples, 'sample')} over {span}{lost}")
-        width = max(len(escaped(each.spec.name)) for each in endings)
-        for each in endings:
-            verdict = Coloured(f"{each.verdict:<9}", _COLOURS[str(each.verdict)])
-            show((f"  {escaped(each.spec.name):<{width}}  ", verdict, f"  {_numbers(each)}"))
+        show(*ending_lines(endings))
 
     def _print(self, line: Line) -> None:
         self._status.clear()
         show(line)
-
-
-def _numbers(ending: Ending) -> str:
-    robustness, lower, upper = ending.robustness, ending.lower, ending.upper
-    if math.isnan(robustness):
-        return f"robustness not determined, between {number_text(lower)} and {number_text(upper)}"
-    between = (
-        "" if lower == upper == robustness else f", between {number_text(lower)} and {number_text(upper)}"
-    )
-    return f"robustness {number_text(robustness)}{between}"

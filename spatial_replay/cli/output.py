@@ -11,7 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-from spatial_replay.cli.terminal import Coloured, fitted, show, show_json
+from spatial_replay.cli.terminal import Coloured, Line, fitted, show, show_json
 from spatial_replay.text import counted, escaped, json_number, number_text, requirement_text, time_text
 
 if TYPE_CHECKING:
@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
     from spatial_replay.logs.remote import LogFile
     from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanCandidate, PlanDecision, PlanEdge, PlanTarget
+    from spatial_replay.monitor.monitor import Ending
     from spatial_replay.monitor.result import SpecResult
+    from spatial_replay.recording.changes import VerdictChange
     from spatial_replay.replay import Replayed
 
 _WORST_FIRST: Final = ("violated", "unknown", "satisfied")
@@ -29,6 +31,35 @@ _MOST_SHOWN: Final = 20
 """Results that are printed; of more, as templates have, the worst of them, and how many others there are."""
 _SHOWN: Final = 12
 VERDICT_COLOURS: Final = MappingProxyType({"satisfied": "blue", "violated": "red", "unknown": "yellow"})
+_CHANGE_COLOURS: Final = MappingProxyType({**VERDICT_COLOURS, "holds": "blue", "pending": "yellow"})
+
+
+def change_line(change: VerdictChange, first_ns: int) -> Line:
+    """Return a change of a verdict as a line.
+
+    Args:
+        first_ns: that times are counted from.
+    """
+    label = Coloured(f"{change.state:<9}", _CHANGE_COLOURS[change.state])
+    return f"{time_text(change.time_ns, first_ns):>12}  ", label, f"  {change.sentence}"
+
+
+def ending_lines(endings: Sequence[Ending]) -> Iterator[Line]:
+    """Yield a line for the result of each spec when a run ends."""
+    width = max((len(escaped(each.spec.name)) for each in endings), default=0)
+    for each in endings:
+        verdict = Coloured(f"{each.verdict:<9}", _CHANGE_COLOURS[str(each.verdict)])
+        yield f"  {escaped(each.spec.name):<{width}}  ", verdict, f"  {_ending_numbers(each)}"
+
+
+def _ending_numbers(ending: Ending) -> str:
+    robustness, lower, upper = ending.robustness, ending.lower, ending.upper
+    if math.isnan(robustness):
+        return f"robustness not determined, between {number_text(lower)} and {number_text(upper)}"
+    between = (
+        "" if lower == upper == robustness else f", between {number_text(lower)} and {number_text(upper)}"
+    )
+    return f"robustness {number_text(robustness)}{between}"
 
 
 def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | None = None) -> None:

@@ -26,6 +26,7 @@ from spatial_replay.cli.options import (
     warn_of_input,
 )
 from spatial_replay.cli.progress import progress
+from spatial_replay.cli.record_video import video
 from spatial_replay.cli.terminal import show
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.text import counted
@@ -170,11 +171,15 @@ def record() -> None:
     Examples:
       spatial-replay record tracks blocks.jsonl.gz -o run.mcap
       spatial-replay record push -o run.mcap
+      spatial-replay record video table.mp4 --tags tags.yaml -o run.mcap
     """
 
 
 for _scenario in SCENARIOS:
     record.add_command(recording_command(_scenario))
+
+
+record.add_command(video)
 
 
 @record.command()

@@ -36,6 +36,12 @@ GRADIENT_MAP = "/plan/gradient_map"
 PLAN_PATH = "/plan/path"
 """Topics that a planner writes; a replay copies them."""
 
+CAMERA_VIDEO = "/camera/video"
+CAMERA_ANNOTATIONS = "/camera/annotations"
+CAMERA_CALIBRATION = "/camera/calibration"
+CAMERA_FRAMES = "/tf"
+"""Topics of a run that a camera saw; a replay copies them."""
+
 MAGIC = b"\x89MCAP0\r\n"
 """The first bytes of an MCAP file, and the last."""
 
@@ -72,8 +78,25 @@ LAYOUT = "layout.json"
 RECORDED_PREFIX = "recorded/"
 """Inputs of a recording as attachments; they stay in every copy."""
 
+CAMERA_PREFIX = "camera/"
+"""The tags file of a camera's run as an attachment; it stays in every copy."""
+
 REPLAYED_PREFIX = "replayed/"
 """Inputs of a replay as attachments; the next replay replaces them."""
+
+
+_IMAGES = frozenset({"CompressedImage", "CompressedVideo", "Image", "RawImage"})
+
+
+def is_image_type(name: str) -> bool:
+    """Return whether messages of a type are images or frames of a video: of ROS or of Foxglove."""
+    package, _, short = name.replace(".", "/").rpartition("/")
+    return short in _IMAGES and package.split("/")[0] in ("sensor_msgs", "foxglove", "foxglove_msgs")
+
+
+def image_topics(channels: Iterable[Channel]) -> set[str]:
+    """Return the topics whose messages are images."""
+    return {each.topic for each in channels if each.schema is not None and is_image_type(each.schema.name)}
 
 
 ALL, MAPPED = "all", "mapped"

@@ -23,6 +23,7 @@ from spatial_replay.logs.topics import (
     OBJECTS,
     RECORDED_PREFIX,
     VERDICTS,
+    image_topics,
     protobuf_channel,
 )
 from spatial_replay.monitor.instances import find_instances
@@ -77,6 +78,7 @@ class Recording:
         )
         self._samples = self._messages = self._end_ns = 0
         self._topics: set[str] = set()
+        self._images: set[str] = set()
         self._hashes = EvaluationHashes([(tree.name, tree.object) for tree in self._evaluation.trees])
         sink.add_metadata(METADATA, _metadata(files, about or {}))
         if self._evaluation.trees:
@@ -159,6 +161,7 @@ class Recording:
         if beside is not None and len(beside):
             own = merge([own, beside])
             self._topics.update(channel.topic for channel in beside.channels.values())
+            self._images |= image_topics(beside.channels.values())
             self._messages += len(beside)
         if len(own):
             self._end_ns = max(self._end_ns, int(own.log_time_ns[-1]))
@@ -176,7 +179,7 @@ class Recording:
         ending = self._ending(interrupted, dropped, messages_dropped)
         if self._samples:
             self._sink.write_messages(self._evaluation.end(self._end_ns))
-        layout = self._evaluation.layout(self._topics, self._axes)
+        layout = self._evaluation.layout(self._topics, self._axes, self._images)
         self._sink.add_attachment(layout.name, layout.media_type, layout.data)
         streams = self._evaluation.streams
         if self._samples and streams:

@@ -17,7 +17,7 @@ from spatial_replay.annotate.specification import (
 )
 from spatial_replay.logs.messages import Attachment, Messages, merge
 from spatial_replay.logs.source import Source, axes_of
-from spatial_replay.logs.topics import REPLAYED_PREFIX
+from spatial_replay.logs.topics import REPLAYED_PREFIX, image_topics
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import SeriesBlock, join_blocks
@@ -134,6 +134,7 @@ class Replay:
         self._faults: list[str] = []
         self._remarks: list[str] = []
         self._topics: set[str] = set()
+        self._images: set[str] = set()
         self._names = LogNames()
         self._samples = self._unreadable = self._encoded = self._end_ns = 0
         self._times: list[int] = []
@@ -169,6 +170,7 @@ class Replay:
             self._remarks += block.remarks
             if not layer:
                 self._topics.update(channel.topic for channel in own.channels.values())
+                self._images |= image_topics(own.channels.values())
             self._add(inside, own, stretches)
             if write is not None:
                 derived = self._evaluation.messages(inside, stretches)
@@ -195,7 +197,7 @@ class Replay:
 
     def layout(self) -> Attachment:
         """Return the viewer layout of the annotated log; call it after `run`."""
-        return self._evaluation.layout(self._topics, axes_of(self._source))
+        return self._evaluation.layout(self._topics, axes_of(self._source), self._images)
 
     def _add(self, trace: Trace, own: Messages, stretches: Sequence[SeriesBlock]) -> None:
         self._faults += trace.faults

@@ -1,0 +1,162 @@
+"""`spatial-replay record video`: what a camera saw, from a file, a log or the camera itself, as a log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from spatial_replay.cli.application import exit_code_from_verdicts
+from spatial_replay.cli.options import (
+    LogPath,
+    constants_option,
+    durability_option,
+    load_spec_options,
+    log_output_option,
+    naming_option,
+    profile_option,
+    specs_option,
+)
+from spatial_replay.cli.output import change_line, ending_lines
+from spatial_replay.cli.progress import progress
+from spatial_replay.cli.terminal import show, show_diagnostics, warn
+from spatial_replay.errors import UsageError
+from spatial_replay.logs.remote import LogFile, local_files
+from spatial_replay.text import counted
+from spatial_replay.trace.time_points import duration_ns_from_text
+
+if TYPE_CHECKING:
+    from spatial_replay.logs.output_file import Durability
+    from spatial_replay.recording.changes import VerdictChange
+    from spatial_replay.runs.seen import FrameSource, KeepVideo
+
+
+def duration_ns(context: click.Context, parameter: click.Parameter, text: str | None) -> int | None:
+    """Return the value of an option that is a duration, in nanoseconds."""
+    if text is None:
+        return None
+    with naming_option(parameter.opts[0]):
+        return duration_ns_from_text(text)
+
+
+@click.command()
+@click.argument("source", metavar="[FILE|LOG]", type=LogPath(), required=False)
+@click.option("--camera", metavar="N", type=click.IntRange(0), help="Camera of this machine, such as 0.")
+@click.option("--topic", metavar="TOPIC", help="Of a log: its image topic.  [default: the only one]")
+@click.option(
+    "--tags",
+    "tags_file",
+    metavar="TAGS",
+    type=LogPath(),
+    required=True,
+    help="Tags file (YAML): which tag is on which object, and where the plane is.",
+)
+@log_output_option("Log to write (MCAP).")
+@durability_option
+@specs_option("Specification to evaluate while recording; repeat for several.")
+@constants_option
+@profile_option
+@click.option(
+    "--keep-video",
+    "keep",
+    type=click.Choice(["copy", "h264", "none"]),
+    help="Keep the picture as it came, encode it as H.264, or leave it out."
+    "  [default: copy where possible, else h264]",
+)
+@click.option(
+    "--hold",
+    "hold_ns",
+    metavar="T",
+    callback=duration_ns,
+    help="Keep a hidden object where it was for so long, ever less certain, such as 200ms.  [default: 0s]",
+)
+@click.option("--rate", metavar="HZ", type=float, help="Frames a second, for a video without time stamps.")
+@click.option(
+    "--for", "length_ns", metavar="T", callback=duration_ns, help="Of a camera: end after so much time."
+)
+def video(
+    source: LogFile | None,
+    camera: int | None,
+    topic: str | None,
+    tags_file: LogFile,
+    output: Path,
+    durability: Durability,
+    specs: tuple[LogFile, ...],
+    constants: Mapping[str, float | str],
+    profile: str | None,
+    keep: KeepVideo | None,
+    hold_ns: int | None,
+    rate: float | None,
+    length_ns: int | None,
+) -> int:
+    """Record the tagged objects that a camera saw, with verdicts as they change.
+
+    Reads a video file, an image topic of a log, or a camera of this machine. Objects carry AprilTags; the
+    tags file says which. Every footprint comes with its uncertainty, so that a verdict near a threshold is
+    unknown rather than guessed. Needs the extra `vision`.
+
+    Exits with 0 if all specifications are satisfied, 1 if any is violated, 4 if none is violated and any is
+    unknown, 3 if the video is damaged: what was recorded up to then is whole.
+
+    \b
+    Examples:
+      spatial-replay record video table.mp4 --tags tags.yaml --spec table.spatial -o run.mcap
+      spatial-replay record video drive.bag --topic /camera/image_raw --tags tags.yaml -o run.mcap
+      spatial-replay record video --camera 0 --tags tags.yaml --spec table.spatial -o run.mcap --for 60s
+    """
+    # imported here so that --help stays fast
+    from spatial_replay.perception.tags_file import load_tags
+    from spatial_replay.runs.seen import record_seen
+
+    if (source is None) == (camera is None):
+        raise UsageError("give either a video or a log, or --camera N")
+    if length_ns is not None and camera is None:
+        raise UsageError("--for ends a run with --camera; leave it out")
+    files = load_spec_options(specs, profile, constants)
+    show_diagnostics(warning for file in files for warning in file.warnings)
+    tags = load_tags(tags_file)
+    frames = _opened(source, camera, topic, rate, length_ns)
+    first_ns: list[int] = []
+
+    def show_change(change: VerdictChange) -> None:
+        show(change_line(change, first_ns[0] if first_ns else change.time_ns))
+
+    given = [*([source] if source is not None else []), tags_file, *specs]
+    with progress("frames") as advance:
+        seen = record_seen(
+            frames,
+            tags,
+            output,
+            files,
+            hold_ns=hold_ns or 0,
+            keep=keep,
+            inputs=local_files(given),
+            begin=first_ns.append,
+            show=show_change,
+            advance=advance,
+            durability=durability,
+        )
+    warn(*seen.remarks, *seen.faults)
+    show(f"wrote {output}: {counted(seen.samples, 'sample')} over {seen.seconds:.3f} s")
+    if seen.fit is not None:
+        number, off = seen.fit.worst
+        show(f"reference tags fit within {seen.fit.rms:.2f} pixels; tag {number} is off most, by {off:.2f}")
+    show(*ending_lines(seen.endings))
+    verdicts = [str(each.verdict) for each in seen.endings]
+    return exit_code_from_verdicts(verdicts or ["satisfied"], damaged=bool(seen.faults))
+
+
+def _opened(
+    source: LogFile | None, camera: int | None, topic: str | None, rate: float | None, length_ns: int | None
+) -> FrameSource:
+    from spatial_replay.perception.camera_frames import CameraFrames
+    from spatial_replay.perception.image_topics import open_frames
+
+    if source is not None:
+        return open_frames(source, topic=topic, rate=rate)
+    for option, value in (("--topic", topic), ("--rate", rate)):
+        if value is not None:
+            raise UsageError(f"{option} does not apply to a camera; leave it out")
+    return CameraFrames(camera or 0, length_ns=length_ns)

@@ -1,0 +1,163 @@
+"""Image topics of MCAP files and ROS bags as frames, with the stamps inside their messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
+
+from spatial_replay.bags.open import is_log, open_messages
+from spatial_replay.bags.topic import Topic
+from spatial_replay.errors import LogError, UsageError
+from spatial_replay.logs.downloads import local_copy
+from spatial_replay.logs.remote import LogFile
+from spatial_replay.logs.topics import is_image_type
+from spatial_replay.mapping.message_types import short_type
+from spatial_replay.perception.frame import Frame, Image
+from spatial_replay.perception.opencv import decode_image
+from spatial_replay.perception.video import H264Decoder, VideoFile
+from spatial_replay.text import nearest_hint
+
+_CHANNELS: Final[Mapping[str, tuple[int, tuple[int, ...]]]] = MappingProxyType(
+    {
+        "mono8": (1, (0,)),
+        "8uc1": (1, (0,)),
+        "rgb8": (3, (2, 1, 0)),
+        "8uc3": (3, (0, 1, 2)),
+        "bgr8": (3, (0, 1, 2)),
+        "rgba8": (4, (2, 1, 0)),
+        "bgra8": (4, (0, 1, 2)),
+    }
+)
+"""Encodings of raw images: bytes of a pixel, and which of them are blue, green and red, or grey."""
+
+_LARGEST: Final = 64_000_000
+
+
+class ImageTopic:
+    """Frames of one image topic of a log; a process for one run.
+
+    Attributes:
+        name: of the log.
+        topic: its name.
+        channel: the topic as the log declares it.
+        faults: what was lost so far, each with its place.
+    """
+
+    copy_fault = None
+
+    def __init__(self, path: LogFile, topic: str | None = None) -> None:
+        """Open the log, and choose the topic.
+
+        Args:
+            topic: its name; None for the only one with images.
+
+        Raises:
+            MissingFileError: there is no such file.
+            LogError: it is no log of messages.
+            UsageError: no such topic, or none or several with images.
+        """
+        self._reader = open_messages(path)
+        self.name = self._reader.name
+        chosen = _chosen(self.name, self._reader.topics(), topic)
+        self.topic, self._type = chosen.name, short_type(chosen.type)
+        self.channel = next(iter(self._reader.channels({self.topic}).values()), None)
+        self._decode = self._reader.decoder(self.topic)
+        self.faults: list[str] = []
+
+    def __iter__(self) -> Iterator[Frame]:
+        decoder = H264Decoder() if "CompressedVideo" in self._type else None
+        last_ns = -1
+        for message in self._reader.iter_messages({self.topic}):
+            place = f"{self.name}: {self.topic} at {message.log_time_ns} ns"
+            try:
+                value: Any = self._decode(message.payload)
+                image = _image(value, self._type, decoder)
+            except LogError as error:
+                self.faults.append(f"{place}: {error}; left out")
+                continue
+            time_ns = _stamp_ns(value) or message.log_time_ns
+            if image is None:
+                continue
+            if time_ns <= last_ns:
+                self.faults.append(f"{place}: its stamp is not after that of the frame before; left out")
+                continue
+            last_ns = time_ns
+            yield Frame(time_ns, image, message.payload)
+        self.faults += self._reader.take_faults()
+
+
+def _chosen(name: str, topics: tuple[Topic, ...], wanted: str | None) -> Topic:
+    images = {each.name: each for each in topics if is_image_type(each.type)}
+    if wanted is None:
+        if len(images) == 1:
+            return next(iter(images.values()))
+        what = f"several image topics: {', '.join(images)}" if images else "no topic with images"
+        raise UsageError(f"{name} has {what}; choose one with --topic" if images else f"{name} has {what}")
+    if wanted in images:
+        return images[wanted]
+    every = [each.name for each in topics]
+    if wanted in every:
+        found = next(each for each in topics if each.name == wanted)
+        raise UsageError(f"{name}: {wanted} has messages of {found.type}, which are not images")
+    hint = nearest_hint(wanted, every) or f"image topics are {', '.join(images) or 'none'}"
+    raise UsageError(f"{name} has no topic {wanted!r}; {hint}")
+
+
+def _image(value: Any, type_name: str, decoder: H264Decoder | None) -> Image | None:
+    """Return the image in a message; None for one that only later frames are decoded from.
+
+    Raises:
+        LogError: it is damaged, or in an encoding that is not known.
+    """
+    data = bytes(value.data)
+    if decoder is not None:
+        if str(value.format).lower() not in ("h264", ""):
+            raise LogError(f"the video is {value.format!r:.40}; H.264 is read")
+        return decoder.decode(data)
+    if "Compressed" in type_name:
+        return decode_image(data)
+    encoding, width, height = str(value.encoding).lower(), int(value.width), int(value.height)
+    if encoding not in _CHANNELS:
+        raise LogError(f"the encoding {encoding!r:.40} is not known; known are {', '.join(_CHANNELS)}")
+    size, order = _CHANNELS[encoding]
+    step = int(value.step) or width * size
+    if not (0 < width * height <= _LARGEST and width * size <= step and step * height <= len(data)):
+        raise LogError(f"an image of {width} x {height} ({encoding}) does not fit its {len(data)} bytes")
+    rows = np.frombuffer(data, np.uint8, step * height).reshape(height, step)[:, : width * size]
+    pixels = rows.reshape(height, width, size)
+    return np.ascontiguousarray(pixels[..., 0] if size == 1 else pixels[..., order])
+
+
+def _stamp_ns(value: Any) -> int:
+    """Return the stamp inside a message; 0 without one."""
+    stamp = getattr(value, "timestamp", None) or getattr(getattr(value, "header", None), "stamp", None)
+    for seconds, nanoseconds in (("seconds", "nanos"), ("sec", "nanosec"), ("secs", "nsecs")):
+        if hasattr(stamp, seconds):
+            return int(getattr(stamp, seconds)) * 10**9 + int(getattr(stamp, nanoseconds))
+    return 0
+
+
+def open_frames(
+    path: LogFile, *, topic: str | None = None, rate: float | None = None
+) -> VideoFile | ImageTopic:
+    """Open a video, or the image topic of a log of messages; the content decides which it is.
+
+    Args:
+        topic: of a log; None for the only one with images.
+        rate: frames a second of a video, instead of its own stamps.
+
+    Raises:
+        MissingFileError: there is no such file.
+        LogError: it is neither.
+        UsageError: an option that does not fit what it is, or a topic that is not there.
+    """
+    if is_log(path):
+        if rate is not None:
+            raise UsageError(f"{path.name} is a log, whose messages have stamps; leave out --rate")
+        return ImageTopic(path, topic)
+    if topic is not None:
+        raise UsageError(f"{path.name} is no log of messages; leave out --topic")
+    return VideoFile(local_copy(path), rate=rate)

@@ -1,0 +1,295 @@
+"""Detection of tags, camera geometry and single images: the only module that knows OpenCV.
+
+Pixels are those of OpenCV: the centre of the first pixel of an image is (0, 0), y points down. Detectors of
+the AprilTag family count from that pixel's outer corner, half a pixel further; `corners_from_apriltag` brings
+theirs here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from spatial_replay.errors import LogError, UsageError
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.perception.corners import refined_corners
+from spatial_replay.perception.frame import Image
+
+FAMILIES: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "16h5": "DICT_APRILTAG_16h5",
+        "25h9": "DICT_APRILTAG_25h9",
+        "36h10": "DICT_APRILTAG_36h10",
+        "36h11": "DICT_APRILTAG_36h11",
+    }
+)
+"""Families of AprilTags, and what OpenCV calls them."""
+
+_OURS_FROM_OPENCV: Final = [1, 0, 3, 2]
+"""OpenCV's pictures of AprilTags are upside down, and its corners begin at their top left, clockwise."""
+
+
+class Detection(NamedTuple):
+    """A tag in an image.
+
+    Attributes:
+        id: its number in the family.
+        corners: (4, 2) in pixels, of the black square: bottom left, bottom right, top right, top left as
+            seen on an upright tag.
+    """
+
+    id: int
+    corners: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """What a camera does to directions: a pinhole with lens distortion, as OpenCV calibrates it.
+
+    Attributes:
+        focal: (fx, fy) in pixels.
+        centre: (cx, cy), the principal point in pixels.
+        distortion: k1, k2, p1, p2, k3, …; none for a pinhole.
+        size: (width, height) of its images in pixels.
+    """
+
+    focal: tuple[float, float]
+    centre: tuple[float, float]
+    size: tuple[int, int]
+    distortion: tuple[float, ...] = ()
+
+    @property
+    def matrix(self) -> Floats:
+        """The matrix K (3, 3)."""
+        (fx, fy), (cx, cy) = self.focal, self.centre
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    def directions(self, pixels: Floats) -> Floats:
+        """Return where pixels (…, 2) are on the plane in front of the camera, at distance 1, undistorted."""
+        if not self.distortion:
+            return np.asarray((pixels - np.array(self.centre)) / np.array(self.focal), np.float64)
+        flat = np.ascontiguousarray(pixels, np.float64).reshape(-1, 1, 2)
+        undistorted = _load().undistortPoints(flat, self.matrix, np.array(self.distortion))
+        return np.asarray(undistorted, np.float64).reshape(pixels.shape)
+
+    def pixels(self, points: Floats) -> Floats:
+        """Return where points (N, 3) in the camera's frame are in the image, (N, 2)."""
+        zero = np.zeros(3)
+        flat = np.ascontiguousarray(points, np.float64)
+        projected, _ = _load().projectPoints(flat, zero, zero, self.matrix, np.array(self.distortion))
+        return np.asarray(projected, np.float64).reshape(-1, 2)
+
+
+class TagDetector:
+    """Finds the tags of one family in images, in one thread; equal images give equal corners."""
+
+    def __init__(self, family: str) -> None:
+        """Prepare the dictionary of the family.
+
+        Raises:
+            UsageError: there is no such family, or OpenCV is not installed.
+        """
+        cv2 = _load()
+        parameters = cv2.aruco.DetectorParameters()
+        # its own refinement looks around corners, and is half a pixel off on small tags; see `corners`
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+        # one bit of a neighbour is the most that is corrected: a wrong tag is worse than a hidden one
+        parameters.errorCorrectionRate = 0.4
+        dictionary = _dictionary(family)
+        self._cells = dictionary.markerSize + 2
+        self._detector = cv2.aruco.ArucoDetector(dictionary, parameters)
+
+    def detect(self, image: Image) -> list[Detection]:
+        """Return the tags in a grey or coloured image, by id, then from left to right."""
+        grey = image if image.ndim == 2 else _load().cvtColor(image, _load().COLOR_BGR2GRAY)
+        grey = np.ascontiguousarray(grey)
+        corners, ids, _ = self._detector.detectMarkers(grey)
+        if ids is None:
+            return []
+        ours = np.array(corners, np.float64).reshape(-1, 4, 2)[:, _OURS_FROM_OPENCV]
+        refined = refined_corners(grey, ours, self._cells)
+        found = [Detection(int(number), each) for number, each in zip(np.ravel(ids), refined, strict=True)]
+        return sorted(found, key=lambda each: (each.id, *each.corners[0].tolist()))
+
+
+def corners_from_apriltag(corners: Floats) -> Floats:
+    """Return corners (…, 2) of pupil-apriltags, pyapriltags or apriltag_ros in our pixels."""
+    return corners - 0.5
+
+
+def tag_cells(family: str, number: int) -> Image:
+    """Return the cells of an upright tag with its black border, 0 or 255, one pixel each.
+
+    Raises:
+        UsageError: there is no such family, or it has no such tag.
+    """
+    dictionary = _dictionary(family)
+    count = len(dictionary.bytesList)
+    if not 0 <= number < count:
+        raise UsageError(f"family {family} has no tag {number}; its tags are 0 to {count - 1}")
+    cells = dictionary.markerSize + 2
+    picture = _load().aruco.generateImageMarker(dictionary, number, cells, borderBits=1)
+    return np.ascontiguousarray(np.asarray(picture, np.uint8)[::-1, ::-1])
+
+
+def fit_homography(source: Floats, target: Floats) -> Floats | None:
+    """Return the homography (3, 3) that takes points (N, 2) to others with the least squared error; None if
+    there is none."""
+    matrix, _ = _load().findHomography(np.asarray(source), np.asarray(target), 0)
+    return None if matrix is None or not np.isfinite(matrix).all() else np.asarray(matrix, np.float64)
+
+
+def fit_pose(points: Floats, pixels: Floats, camera: Camera) -> Floats | None:
+    """Return the pose (6,), rotation vector and translation to the camera's frame, with which points (N, 3)
+    appear at pixels (N, 2); None if there is none."""
+    cv2 = _load()
+    matrix, distortion = camera.matrix, np.array(camera.distortion)
+    found, turn, shift = cv2.solvePnP(
+        np.ascontiguousarray(points), np.ascontiguousarray(pixels), matrix, distortion
+    )
+    if not found:
+        return None
+    turn, shift = cv2.solvePnPRefineLM(points, np.ascontiguousarray(pixels), matrix, distortion, turn, shift)
+    pose = np.concatenate([turn.ravel(), shift.ravel()]).astype(np.float64)
+    return pose if np.isfinite(pose).all() else None
+
+
+def projection(points: Floats, pose: Floats, camera: Camera) -> tuple[Floats, Floats]:
+    """Return where points (N, 3) appear, (N, 2), and its derivative (N, 2, 6) by a pose as of `fit_pose`."""
+    pixels, jacobian = _load().projectPoints(
+        np.ascontiguousarray(points), pose[:3], pose[3:], camera.matrix, np.array(camera.distortion)
+    )
+    derivative = np.asarray(jacobian, np.float64)[:, :6].reshape(-1, 2, 6)
+    return np.asarray(pixels, np.float64).reshape(-1, 2), derivative
+
+
+class Calibration(NamedTuple):
+    """A calibrated camera.
+
+    Attributes:
+        rms: of the reprojection, in pixels.
+        deviations: standard deviations of fx, fy, cx, cy in pixels.
+    """
+
+    camera: Camera
+    rms: float
+    deviations: tuple[float, float, float, float]
+
+
+def calibrate(points: list[Floats], pixels: list[Floats], size: tuple[int, int]) -> Calibration:
+    """Calibrate a camera from views of known points (N, 3) at pixels (N, 2).
+
+    Args:
+        size: (width, height) of the images.
+    """
+    cv2 = _load()
+    # k3 is left out: from tags on a sheet it is seldom determined
+    rms, matrix, distortion, _, _, spread, *_ = cv2.calibrateCameraExtended(
+        [np.asarray(each, np.float32) for each in points],
+        [np.asarray(each, np.float32).reshape(-1, 1, 2) for each in pixels],
+        size,
+        None,
+        None,
+        flags=cv2.CALIB_FIX_K3,
+    )
+    numbers = tuple(round(float(each), 8) for each in np.ravel(distortion)[:4])
+    camera = Camera(
+        (float(matrix[0, 0]), float(matrix[1, 1])), (float(matrix[0, 2]), float(matrix[1, 2])), size, numbers
+    )
+    fx, fy, cx, cy = np.ravel(spread)[:4].tolist()
+    return Calibration(camera, float(rms), (fx, fy, cx, cy))
+
+
+# -------------------------------------------------------------------------------------------------- images
+
+
+def decode_image(data: bytes) -> Image:
+    """Decode a JPEG, PNG or WebP image to blue, green, red.
+
+    Raises:
+        LogError: it is damaged, or none of these.
+    """
+    cv2 = _load()
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise LogError("an image is damaged, or neither JPEG nor PNG nor WebP")
+    return np.asarray(image, np.uint8)
+
+
+def encode_jpeg(image: Image, width: int, quality: int = 70) -> bytes:
+    """Return an image as JPEG, at most `width` pixels wide."""
+    cv2 = _load()
+    if image.shape[1] > width:
+        height = max(1, round(image.shape[0] * width / image.shape[1]))
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return bytes(data)
+
+
+def warp(image: Image, matrix: Floats, size: tuple[int, int]) -> Image:
+    """Return an image moved by a homography (3, 3) of pixels into one of another size (width, height);
+    what lies outside of it is 0."""
+    cv2 = _load()
+    return np.asarray(cv2.warpPerspective(image, matrix, size, flags=cv2.INTER_NEAREST), np.uint8)
+
+
+def reduce(image: Image, factor: int) -> Image:
+    """Return an image with `factor` x `factor` pixels averaged into one."""
+    cv2 = _load()
+    size = (image.shape[1] // factor, image.shape[0] // factor)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def blur(image: Image, sigma: float) -> Image:
+    """Return an image blurred by a Gaussian of so many pixels."""
+    return np.asarray(_load().GaussianBlur(image, (0, 0), sigma), np.uint8)
+
+
+def open_camera(number: int) -> Any:
+    """Open a camera of this machine.
+
+    Raises:
+        UsageError: there is no such camera.
+    """
+    cv2 = _load()
+    capture = cv2.VideoCapture(number)
+    if not capture.isOpened():
+        raise UsageError(
+            f"camera {number} cannot be opened; check that it is plugged in (/dev/video{number}) and that no"
+            " other program uses it"
+        )
+    return capture
+
+
+@cache
+def _dictionary(family: str) -> Any:
+    cv2 = _load()
+    if family not in FAMILIES:
+        raise UsageError(f"there is no tag family {family!r}; known are {', '.join(FAMILIES)}")
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, FAMILIES[family]))
+
+
+@cache
+def _load() -> Any:
+    """Import OpenCV.
+
+    Raises:
+        UsageError: it is not installed.
+    """
+    try:
+        import cv2
+    except ImportError:
+        raise UsageError(
+            "cameras need OpenCV, which is not installed: pip install 'spatial-replay[vision]'"
+        ) from None
+    # one thread: results that do not depend on the machine, and no fight with the caller's threads
+    cv2.setNumThreads(1)
+    return cv2

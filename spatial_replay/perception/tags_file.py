@@ -1,0 +1,403 @@
+"""Tags files: which tag is on which object, where the plane is, and what the camera does."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files
+from os import PathLike
+from types import MappingProxyType
+from typing import Any, Final, Literal, cast
+
+import numpy as np
+
+from spatial_replay.errors import GeometryError, UsageError
+from spatial_replay.geometry.arrays import Floats
+from spatial_replay.geometry.footprint import Footprint
+from spatial_replay.logs.remote import log_file
+from spatial_replay.mapping.yaml_document import Document, Place, checked_document, read_yaml_text
+from spatial_replay.perception.opencv import Camera
+
+SCHEMA_FILE: Final = "tags.schema.json"
+LEAST_REFERENCES: Final = 4
+"""Reference tags that a plane takes without a calibrated camera; with one, a single tag could do, but a wrong
+place of it would not be noticed."""
+
+_UNITS: Final = {"": 1.0, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
+_LENGTH: Final = re.compile(r"([-+]?[0-9]*\.?[0-9]+)\s*(mm|cm|m)")
+_ANGLE: Final = re.compile(r"([-+]?[0-9]*\.?[0-9]+)\s*deg")
+
+
+@dataclass(frozen=True, slots=True)
+class MountedTag:
+    """A tag on an object, in the object's own frame.
+
+    Attributes:
+        id: its number.
+        size: edge of its black square, in footprint units.
+        x, y: where its centre is.
+        yaw: radians, counter-clockwise from the object's x axis to the tag's, which points to its right.
+        z: height of the tag above the plane, for objects that stay on it.
+    """
+
+    id: int
+    size: float
+    x: float = 0.0
+    y: float = 0.0
+    yaw: float = 0.0
+    z: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class TaggedObject:
+    """An object with tags.
+
+    Attributes:
+        footprint: in its own frame.
+        height: (bottom, top) above the plane, or None.
+        is_lifted: whether it may leave the plane: the pose of a tag is then found in space.
+        fastest: units a second, by which a held object's uncertainty grows.
+    """
+
+    name: str
+    footprint: Footprint
+    tags: tuple[MountedTag, ...]
+    class_name: str | None = None
+    height: tuple[float, float] | None = None
+    is_lifted: bool = False
+    fastest: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceTag:
+    """A tag whose place in the plane is known; attributes as of `MountedTag`, in the plane's frame."""
+
+    id: int
+    size: float
+    x: float
+    y: float
+    yaw: float = 0.0
+
+    @property
+    def corners(self) -> Floats:
+        """(4, 2), in the order of a detection."""
+        half = self.size / 2
+        turn = np.array([[math.cos(self.yaw), math.sin(self.yaw)], [-math.sin(self.yaw), math.cos(self.yaw)]])
+        square = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
+        corners: Floats = square @ turn + np.array([self.x, self.y])
+        return corners
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TagsFile:
+    """A valid tags file.
+
+    Attributes:
+        name: of the file.
+        family: of all its tags.
+        is_image: whether the plane is the image itself, in pixels.
+        references: tags whose places are known.
+        camera: None if it is not calibrated.
+        pose: (6,), rotation vector and translation from the plane's frame to the camera's; None where the
+            reference tags give it.
+        corner_error: standard deviation of a corner in pixels; None to measure it.
+        reference_error: how far a reference tag may be from its place, in footprint units.
+        sigmas: standard deviations that the stated uncertainty covers.
+        by_id: the object that a tag is on, and how.
+        text: its text.
+    """
+
+    name: str
+    family: str
+    objects: tuple[TaggedObject, ...]
+    is_image: bool = False
+    references: tuple[ReferenceTag, ...] = ()
+    camera: Camera | None = None
+    pose: Floats | None = None
+    corner_error: float | None = None
+    reference_error: float = 0.0
+    sigmas: float = 4.0
+    by_id: Mapping[int, tuple[TaggedObject, MountedTag]] = field(default_factory=lambda: MappingProxyType({}))
+    text: str = field(default="", repr=False)
+
+    @property
+    def unit(self) -> Literal["m", "px"]:
+        """The unit of footprints."""
+        return "px" if self.is_image else "m"
+
+    @property
+    def ids(self) -> frozenset[int]:
+        """All tags that it names."""
+        return frozenset([*self.by_id, *(each.id for each in self.references)])
+
+
+def load_tags(path: str | PathLike[str]) -> TagsFile:
+    """Load a tags file, from a path or an address.
+
+    Raises:
+        MissingFileError: there is no such file.
+        UsageError: the file is not valid; all errors are listed.
+    """
+    return parse_tags(read_yaml_text(path), log_file(path).name)
+
+
+def parse_tags(text: str, name: str = "tags") -> TagsFile:
+    """Parse the text of a tags file.
+
+    Args:
+        name: of the file, for errors.
+
+    Raises:
+        UsageError: the text is not valid; all errors are listed.
+    """
+    document = checked_document(text, name, _schema(), _contradictions, "a tags file")
+    value: Any = document.value
+    camera_value = value.get("camera") or {}
+    size = value.get("size")
+    plane = value.get("plane", {})
+    is_image = plane == "image"
+    camera = _camera(camera_value) if camera_value else None
+    try:
+        objects = tuple(
+            _object(own_name, entry, size, value, has_camera=camera is not None)
+            for own_name, entry in value["objects"].items()
+        )
+        references = () if is_image else tuple(_references(plane, size))
+        pose = _pose(camera_value["pose"]) if "pose" in camera_value else None
+    except (UsageError, GeometryError) as error:
+        raise UsageError(f"{name}: {error}") from None
+    return TagsFile(
+        name=name,
+        family=value.get("family", "36h11"),
+        objects=objects,
+        is_image=is_image,
+        references=references,
+        camera=camera,
+        pose=pose,
+        corner_error=value.get("corner_error"),
+        reference_error=0.0 if is_image else _length(plane.get("error", 0.0)),
+        sigmas=float(value.get("sigmas", 4.0)),
+        by_id=MappingProxyType({tag.id: (each, tag) for each in objects for tag in each.tags}),
+        text=text,
+    )
+
+
+def camera_text(camera: Camera) -> str:
+    """Return the part of a tags file that describes a camera."""
+    (fx, fy), (cx, cy), (width, height) = camera.focal, camera.centre, camera.size
+    lines = [
+        "camera:",
+        f"  size: [{width}, {height}]",
+        f"  focal: [{fx:.3f}, {fy:.3f}]",
+        f"  centre: [{cx:.3f}, {cy:.3f}]",
+    ]
+    if camera.distortion:
+        lines.append(f"  distortion: [{', '.join(f'{each:.6g}' for each in camera.distortion)}]")
+    return "\n".join(lines) + "\n"
+
+
+def _object(
+    name: str, entry: Mapping[str, Any], size: Any, defaults: Mapping[str, Any], *, has_camera: bool
+) -> TaggedObject:
+    height = entry.get("height")
+    interval = None if height is None else (_length(height[0]), _length(height[1]))
+    # without a calibrated camera everything is in the plane of the reference tags
+    top = interval[1] if interval is not None and has_camera else 0.0
+    mounted = entry["tags"] if "tags" in entry else [entry["tag"]]
+    tags = []
+    for each in mounted:
+        tag = each if isinstance(each, dict) else {"id": each}
+        x, y = (_length(number) for number in tag.get("at", (0.0, 0.0)))
+        edge = _length(tag.get("size", 0.0 if size is None else size))
+        tags.append(
+            MountedTag(tag["id"], edge, x, y, _angle(tag.get("yaw", 0.0)), _length(tag.get("z", top)))
+        )
+    return TaggedObject(
+        name,
+        _footprint(entry),
+        tuple(tags),
+        entry.get("class"),
+        interval,
+        entry.get("lifted", False),
+        _length(entry.get("fastest", defaults.get("fastest", 1000.0 if _is_image(defaults) else 1.0))),
+    )
+
+
+def _footprint(entry: Mapping[str, Any]) -> Footprint:
+    if "box" in entry:
+        length, width = (_length(each) / 2 for each in entry["box"])
+        return Footprint.box(-length, -width, length, width)
+    if "disc" in entry:
+        return Footprint.disc(0.0, 0.0, _length(entry["disc"]))
+    return Footprint.polygon([[_length(each) for each in corner] for corner in entry["polygon"]])
+
+
+def _references(plane: Mapping[str, Any], size: Any) -> list[ReferenceTag]:
+    tags = []
+    for number, entry in plane.get("tags", {}).items():
+        tag = entry if isinstance(entry, dict) else {"at": entry}
+        x, y = (_length(each) for each in tag["at"])
+        edge = _length(tag.get("size", plane.get("size", size)))
+        tags.append(ReferenceTag(int(number), edge, x, y, _angle(tag.get("yaw", 0.0))))
+    return tags
+
+
+def _camera(value: Mapping[str, Any]) -> Camera:
+    width, height = value["size"]
+    (fx, fy), (cx, cy) = value["focal"], value.get("centre", ((width - 1) / 2, (height - 1) / 2))
+    return Camera(
+        (float(fx), float(fy)),
+        (float(cx), float(cy)),
+        (width, height),
+        tuple(map(float, value.get("distortion", ()))),
+    )
+
+
+def _pose(value: Mapping[str, Any]) -> Floats:
+    """Return the pose (6,) of a camera that is at a place and looks at a point."""
+    eye, target = (np.array([_length(each) for each in value[key]]) for key in ("position", "look_at"))
+    return pose_looking_at(eye, target, np.array(value.get("up", (0.0, 0.0, 1.0)), np.float64))
+
+
+def pose_looking_at(eye: Floats, target: Floats, up: Floats) -> Floats:
+    """Return the pose (6,), rotation vector and translation from the plane's frame to that of a camera.
+
+    Args:
+        eye, target: (3,), where the camera is, and a point in the middle of its image.
+        up: (3,), what points up in the image.
+
+    Raises:
+        UsageError: the camera is at the target, or `up` is where it looks.
+    """
+    forward = target - eye
+    right = np.cross(forward, up)
+    if not np.linalg.norm(forward) > 0 or not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward):
+        raise UsageError(
+            "the camera's pose is not determined: give another look_at than its position, and an up that is"
+            " not where it looks, such as up: [0, 1, 0] for a camera that looks straight down"
+        )
+    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return np.concatenate([rotation_vector(rotation), -rotation @ eye])
+
+
+def rotation_vector(rotation: Floats) -> Floats:
+    """Return the rotation vector (3,) of a rotation matrix (3, 3)."""
+    # through the quaternion, whose largest component is never small
+    xx, yy, zz = np.diag(rotation)
+    four = np.array([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz])
+    index = int(four.argmax())
+    part = math.sqrt(max(four[index], 0.0)) / 2
+    antisymmetric = np.array(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    symmetric = rotation + rotation.T
+    if index == 0:
+        w, vector = part, antisymmetric / (4 * part)
+    else:
+        axis = index - 1
+        w = antisymmetric[axis] / (4 * part)
+        vector = symmetric[axis] / (4 * part)
+        vector[axis] = part
+    if w < 0:
+        w, vector = -w, -vector
+    sine = float(np.linalg.norm(vector))
+    angle = 2 * math.atan2(sine, w)
+    turn: Floats = vector * (angle / sine if sine > 1e-12 else 2.0)
+    return turn
+
+
+def _length(value: Any) -> float:
+    if isinstance(value, str):
+        match = _LENGTH.fullmatch(value)
+        if match is None:
+            raise UsageError(f"{value!r} is not a length; write 40mm, 4cm or 0.04m")
+        return float(match[1]) * _UNITS[match[2]]
+    return float(value)
+
+
+def _angle(value: Any) -> float:
+    if isinstance(value, str):
+        match = _ANGLE.fullmatch(value)
+        if match is None:
+            raise UsageError(f"{value!r} is not an angle; write 90deg, or radians as a number")
+        return math.radians(float(match[1]))
+    return float(value)
+
+
+def _is_image(value: Mapping[str, Any]) -> bool:
+    return value.get("plane") == "image"
+
+
+def _contradictions(document: Document) -> list[tuple[Place, str]]:
+    """Find what a schema cannot express: tags that are used twice, planes without enough to find them."""
+    value: Any = document.value
+    if not isinstance(value, dict) or not isinstance(value.get("objects"), dict):
+        return []
+    faults: list[tuple[Place, str]] = []
+    used: dict[int, str] = {}
+
+    def use(number: Any, place: Place, what: str) -> None:
+        if not isinstance(number, int) or isinstance(number, bool):
+            return
+        if number in used:
+            faults.append((place, f"tag {number} is {used[number]} already; a tag is in one place"))
+        used.setdefault(number, what)
+
+    camera = value.get("camera")
+    for name, entry in cast("dict[str, Any]", value["objects"]).items():
+        if not isinstance(entry, dict):
+            continue
+        place: Place = ("objects", name)
+        shapes = [key for key in ("box", "disc", "polygon") if key in entry]
+        if len(shapes) != 1:
+            faults.append(
+                (place, "give one of box, disc and polygon, the footprint around the object's centre")
+            )
+        if ("tag" in entry) == ("tags" in entry):
+            faults.append((place, "give either tag, a number, or tags, a list"))
+        tags = entry["tags"] if isinstance(entry.get("tags"), list) else [entry.get("tag")]
+        for index, tag in enumerate(tags):
+            own = (*place, "tags", index) if "tags" in entry else (*place, "tag")
+            use(tag.get("id") if isinstance(tag, dict) else tag, own, f"on {name}")
+            if isinstance(tag, dict) and tag.get("z") and not camera:
+                faults.append((own, "z needs a calibrated camera; without one, all tags are in one plane"))
+            has_size = "size" in value or (isinstance(tag, dict) and "size" in tag)
+            if entry.get("lifted") and not has_size:
+                faults.append((own, "a lifted object is found by the size of its tags; give size"))
+        if entry.get("lifted") and not camera:
+            faults.append(
+                (place, "lifted needs a calibrated camera; add camera (tags calibrate measures one)")
+            )
+    plane = value.get("plane")
+    tags = plane.get("tags") if isinstance(plane, dict) else None
+    if isinstance(tags, dict):
+        for key, entry in tags.items():
+            own = ("plane", "tags", key)
+            if not key.isdecimal():
+                faults.append((own, f"expected the number of a tag; got {key[:40]!r}"))
+                continue
+            use(int(key), own, "a reference tag")
+            own_size = isinstance(entry, dict) and "size" in entry
+            if not own_size and "size" not in value and "size" not in plane:
+                faults.append((own, "the size of the tag is missing; give size for all, or for this one"))
+    has_pose = isinstance(camera, dict) and "pose" in camera
+    if plane != "image" and not has_pose and (not isinstance(tags, dict) or len(tags) < LEAST_REFERENCES):
+        faults.append(
+            (
+                ("plane",),
+                f"the plane is not determined: give {LEAST_REFERENCES} or more tags with known places, or the"
+                " camera with its pose, or write plane: image for pixels",
+            )
+        )
+    return faults
+
+
+@cache
+def _schema() -> Mapping[str, Any]:
+    text = files(__package__).joinpath(SCHEMA_FILE).read_text(encoding="utf-8")
+    return cast("Mapping[str, Any]", json.loads(text))

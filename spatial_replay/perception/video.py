@@ -1,0 +1,310 @@
+"""Video files and H.264 frames: the only module that knows PyAV.
+
+What a log keeps of a video is H.264 in Annex B form, one frame a message, with parameter sets before each key
+frame and without B frames: what `foxglove.CompressedVideo` demands.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from fractions import Fraction
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from spatial_replay.errors import LogError, MissingFileError, OutputError, UsageError
+from spatial_replay.perception.frame import Frame, Image
+
+_KEY_FRAMES: Final = 30
+"""Frames from one key frame to the next in what we encode: a viewer seeks to the one before the cursor."""
+
+_NS: Final = Fraction(1, 10**9)
+_IDR, _SEQUENCE_PARAMETERS = 5, 7
+"""Kinds of units in H.264."""
+
+_LARGEST: Final = 64_000_000
+"""Pixels of one frame; no camera has more, and a damaged header may claim it."""
+
+
+class VideoFile:
+    """Frames of a video file, with their own stamps from the first frame on; a process for one run.
+
+    Attributes:
+        name: of the file.
+        channel: None, since it is no topic.
+        faults: what was lost so far, each with its place.
+    """
+
+    channel = None
+
+    def __init__(self, path: Path, *, rate: float | None = None) -> None:
+        """Open the file.
+
+        Args:
+            rate: frames a second, instead of the file's own stamps.
+
+        Raises:
+            MissingFileError: there is no such file.
+            LogError: it is no video, or its codec is not there.
+            UsageError: PyAV is not installed, or the rate is not above 0.
+        """
+        if rate is not None and not (math.isfinite(rate) and rate > 0):
+            raise UsageError(f"the rate is {rate!r}; give frames a second, above 0")
+        self.name, self._path, self._rate = path.name, path, rate
+        self.faults: list[str] = []
+        av = _load()
+        try:
+            with path.open("rb"):
+                pass
+        except OSError as error:
+            raise MissingFileError.of(path, error) from None
+        try:
+            self._container = av.open(str(path))
+        except (av.FFmpegError, ValueError) as error:
+            raise LogError(
+                f"{self.name} is no video that can be read ({_reason(error)}); a file that was not closed"
+                " properly lacks its index: give the whole file, or record as .mkv or .ts"
+            ) from None
+        streams = self._container.streams.video
+        if not streams:
+            self.close()
+            raise LogError(f"{self.name} has no video stream; give a file with pictures")
+        self._stream = streams[0]
+        context = self._stream.codec_context
+        if context is None:
+            self.close()
+            raise LogError(
+                f"{self.name} has a video that no codec here decodes; convert it, as with"
+                f" ffmpeg -i {self.name} -c:v libx264 table.mp4"
+            )
+        # one thread, one frame out for one in
+        self._stream.thread_type = "NONE"
+        self._stream.thread_count = 1
+
+    @property
+    def copy_fault(self) -> str | None:
+        """Why its frames cannot be copied into a log as they are; None if they can."""
+        context = self._stream.codec_context
+        if context.name != "h264":
+            return f"{self.name} holds {context.name}, not H.264"
+        if context.has_b_frames:
+            return f"{self.name} has B frames, which a log cannot hold"
+        return None
+
+    def __iter__(self) -> Iterator[Frame]:
+        av = _load()
+        last_ns, first, count = -1, None, 0
+        try:
+            length_ns = self._length_ns()
+            for packet, frame in self._decoded():
+                stamp = self._stamp_ns(frame, count)
+                count += 1
+                first = stamp if first is None else first
+                time_ns = stamp - first
+                if time_ns <= last_ns:
+                    self._add_fault(f"{self.name}: frame {count} is not after the one before it; left out")
+                    continue
+                last_ns = time_ns
+                yield Frame(time_ns, frame.to_ndarray(format="bgr24"), packet, _has_key(packet))
+            if count > 1 and last_ns + 2 * (last_ns // (count - 1)) < length_ns:
+                ends = f"{last_ns / 1e9:.3f} s, though its header says {length_ns / 1e9:.3f} s"
+                self._add_fault(f"{self.name} breaks off after {ends}")
+        except (av.FFmpegError, EOFError) as error:
+            at = "before its first frame" if last_ns < 0 else f"after {last_ns / 1e9:.3f} s"
+            self._add_fault(f"{self.name} breaks off {at} ({_reason(error)})")
+        finally:
+            self.close()
+
+    def _decoded(self) -> Iterator[tuple[bytes, Any]]:
+        """Yield frames, each with its bytes if it can be copied."""
+        av = _load()
+        packets: dict[int | None, bytes] = {}
+        convert = None
+        if self.copy_fault is None:
+            convert = av.bitstream.BitStreamFilterContext("h264_mp4toannexb", self._stream)
+        for packet in self._container.demux(self._stream):
+            # the filter takes the packet's content, and its time with it
+            pts = packet.pts
+            if packet.is_corrupt:
+                self._add_fault(f"{self.name}: a packet is damaged")
+            frames = []
+            try:
+                frames = packet.decode()
+            except av.InvalidDataError as error:
+                self._add_fault(f"{self.name}: a frame cannot be decoded ({_reason(error)}); left out")
+            if convert is not None and packet.size:
+                packets[pts] = b"".join(bytes(each) for each in convert.filter(packet))
+            for frame in frames:
+                if frame.width * frame.height > _LARGEST:
+                    raise LogError(f"{self.name}: a frame of {frame.width} x {frame.height} is too large")
+                yield packets.pop(frame.pts, b""), frame
+
+    def _length_ns(self) -> int:
+        """Return how long the file says that the video is; 0 if it does not."""
+        if self._rate is not None:
+            return 0
+        stream, container = self._stream, self._container
+        if stream.duration is not None:
+            return int(stream.duration * stream.time_base / _NS)
+        # of several streams another one may be longer
+        return 1000 * (container.duration or 0) if len(container.streams) == 1 else 0
+
+    def _stamp_ns(self, frame: Any, count: int) -> int:
+        if self._rate is not None:
+            return round(count * 1e9 / self._rate)
+        if frame.pts is None or frame.time_base is None:
+            raise LogError(
+                f"{self.name} has no time stamps; say how many frames a second it has, as in --rate 30"
+            )
+        stamp: Fraction = frame.pts * frame.time_base / _NS
+        return round(stamp)
+
+    def _add_fault(self, text: str) -> None:
+        self.faults.append(text)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._container.close()
+
+
+class H264Encoder:
+    """Frames to H.264, one message each; a process for one video."""
+
+    def __init__(self, width: int, height: int, rate: int = 30) -> None:
+        """Open the encoder; a picture with an odd edge loses a row or column of pixels.
+
+        Raises:
+            UsageError: PyAV is not installed.
+        """
+        av = _load()
+        self._size = width - width % 2, height - height % 2
+        context = av.CodecContext.create("libx264", "w")
+        context.width, context.height = self._size
+        context.pix_fmt = "yuv420p"
+        context.time_base = Fraction(1, 1_000_000)
+        context.framerate = Fraction(rate)
+        context.gop_size = _KEY_FRAMES
+        context.max_b_frames = 0
+        context.thread_count = 1
+        context.options = {
+            "preset": "ultrafast",
+            "tune": "zerolatency",
+            "crf": "23",
+            "x264-params": "repeat-headers=1",
+        }
+        self._context = context
+
+    def encode(self, frame: Frame) -> bytes:
+        """Return the next frame, times increasing."""
+        av = _load()
+        width, height = self._size
+        image = frame.image[:height, :width]
+        form = "gray" if image.ndim == 2 else "bgr24"
+        picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format=form)
+        picture.pts = frame.time_ns // 1000
+        picture.time_base = Fraction(1, 1_000_000)
+        return b"".join(bytes(packet) for packet in self._context.encode(picture))
+
+
+class H264Decoder:
+    """H.264 messages to images, in their order; a process for one topic."""
+
+    def __init__(self) -> None:
+        """Open the decoder; frames before the first key frame are not decoded."""
+        self._context = _load().CodecContext.create("h264", "r")
+        self._context.thread_count = 1
+        self._is_ready = False
+
+    def decode(self, data: bytes) -> Image | None:
+        """Return the image of a message; None before the first key frame.
+
+        Raises:
+            LogError: it is damaged.
+        """
+        self._is_ready |= _has_key(data)
+        if not self._is_ready:
+            return None
+        av = _load()
+        try:
+            frames = self._context.decode(av.Packet(data))
+        except av.FFmpegError as error:
+            raise LogError(f"a frame cannot be decoded ({_reason(error)})") from None
+        return np.asarray(frames[-1].to_ndarray(format="bgr24"), np.uint8) if frames else None
+
+
+def write_video(path: Path, frames: Iterable[Frame], rate: int = 30) -> int:
+    """Write frames as a video (H.264, no B frames), and return how many there are.
+
+    Raises:
+        OutputError: the file cannot be written.
+        UsageError: PyAV is not installed, or the name's ending is not that of a video.
+    """
+    av = _load()
+    count = 0
+    try:
+        container = av.open(str(path), "w")
+    except ValueError:
+        raise UsageError(f"{path}: give the name of a video, such as {path.stem}.mp4") from None
+    except OSError as error:
+        raise OutputError(f"{path}: {_reason(error)}") from None
+    with container:
+        stream: Any = None
+        for frame in frames:
+            height, width = (edge - edge % 2 for edge in frame.image.shape[:2])
+            if stream is None:
+                stream = container.add_stream("libx264", rate=rate)
+                stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+                stream.codec_context.time_base = Fraction(1, 90_000)
+                stream.codec_context.thread_count = 1
+                stream.codec_context.max_b_frames = 0
+                stream.codec_context.gop_size = _KEY_FRAMES
+                stream.options = {"preset": "ultrafast", "tune": "zerolatency", "crf": "18"}
+            form = "gray" if frame.image.ndim == 2 else "bgr24"
+            image = np.ascontiguousarray(frame.image[:height, :width])
+            picture = av.VideoFrame.from_ndarray(image, format=form)
+            picture.time_base = Fraction(1, 90_000)
+            picture.pts = round(frame.time_ns * _NS / picture.time_base)
+            container.mux(stream.encode(picture))
+            count += 1
+        if stream is not None:
+            container.mux(stream.encode(None))
+    return count
+
+
+def _has_key(data: bytes) -> bool:
+    """Return whether H.264 in Annex B form can be decoded from here on."""
+    at = data.find(b"\x00\x00\x01")
+    while 0 <= at < len(data) - 3:
+        if data[at + 3] & 31 in (_IDR, _SEQUENCE_PARAMETERS):
+            return True
+        at = data.find(b"\x00\x00\x01", at + 3)
+    return False
+
+
+def _reason(error: BaseException) -> str:
+    reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    return f"{reason!s:.200}".lower()
+
+
+@cache
+def _load() -> Any:
+    """Import PyAV.
+
+    Raises:
+        UsageError: it is not installed.
+    """
+    try:
+        import av
+        import av.bitstream
+    except ImportError:
+        raise UsageError(
+            "videos need PyAV, which is not installed: pip install 'spatial-replay[vision]'"
+        ) from None
+    # its messages would go to the terminal; errors are raised
+    with suppress(AttributeError):
+        av.logging.set_level(None)
+    return av

@@ -1,0 +1,257 @@
+"""`spatial-replay record video`: a video, an image topic or a camera to a log with verdicts."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from perception.filmed import TABLE, approaching, film, write_approach
+from spatial_replay import Monitor, Recorder, load_specification, read_trace, replay_log
+from spatial_replay.cli import run
+
+pytest.importorskip("av")
+pytest.importorskip("cv2")
+
+COUNT = 12
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a video, its tags file, a specification, and the log of them."""
+    folder = tmp_path_factory.mktemp("table")
+    write_approach(folder, COUNT)
+    arguments = ["--tags", f"{folder}/tags.yaml", "--spec", f"{folder}/apart.spatial"]
+    assert run(["record", "video", f"{folder}/table.mp4", *arguments, "-o", f"{folder}/run.mcap"]) == 1
+    return folder
+
+
+def recorded(folder: Path, source: str, *more: str) -> Path:
+    output = folder / "other.mcap"
+    arguments = ["--tags", f"{folder}/tags.yaml", "--spec", f"{folder}/apart.spatial", *more]
+    assert run(["record", "video", f"{folder}/{source}", *arguments, "-o", str(output)]) == 1
+    return output
+
+
+def payloads(log: Path, topic: str) -> list[bytes]:
+    with log.open("rb") as stream:
+        return [message.data for *_, message in make_reader(stream).iter_messages(topics=[topic])]
+
+
+def test_verdicts_are_printed_as_they_change(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recorded(folder, "table.mp4")
+    first, second, wrote, fit, end = capsys.readouterr().out.splitlines()
+    assert "0.000 s  holds      `apart` holds so far" in first
+    assert "violated   `apart` is violated, whatever comes: red is" in second
+    assert wrote.endswith("12 samples over 0.440 s")
+    assert fit.startswith("reference tags fit within 0.0")
+    assert end.startswith("  apart  violated   robustness -0.02")
+
+
+def test_the_log_holds_truth_within_its_uncertainty_and_a_replay_gives_the_same_bytes(folder: Path) -> None:
+    trace = read_trace(folder / "run.mcap")
+    assert list(trace.names) == ["blue", "red"] or set(trace.names) == {"blue", "red"}
+    replayed = replay_log(folder / "run.mcap", output=folder / "again.mcap")
+    (result,) = replayed.results
+    # at the end they are 0.145 apart less two halves of 50 mm, so 15 mm: 25 mm too close
+    assert result.lower <= 0.145 - 0.1 - 0.05 + 0.02 - 0.04 <= result.upper
+    for topic in ("/spatial/robustness", "/camera/video", "/camera/annotations"):
+        assert payloads(folder / "run.mcap", topic) == payloads(folder / "again.mcap", topic)
+    assert run(["verify", f"{folder}/run.mcap"]) == 0
+
+
+def test_equal_videos_give_equal_bytes(folder: Path) -> None:
+    assert recorded(folder, "table.mp4").read_bytes() == (folder / "run.mcap").read_bytes()
+
+
+def test_the_video_in_the_log_is_what_viewers_demand(folder: Path) -> None:
+    from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
+
+    for log in (folder / "run.mcap", recorded(folder, "table.mp4", "--keep-video", "h264")):
+        frames = [CompressedVideo.FromString(each) for each in payloads(log, "/camera/video")]
+        assert [each.format for each in frames] == ["h264"] * COUNT
+        kinds = [units(each.data) for each in frames]
+        # parameter sets before the key frame; one picture a message, none of them a B frame's
+        assert {7, 8, 5} <= set(kinds[0])
+        assert all(sum(unit in (1, 5) for unit in own) == 1 for own in kinds)
+    assert payloads(recorded(folder, "table.mp4", "--keep-video", "none"), "/camera/video") == []
+
+
+def units(data: bytes) -> list[int]:
+    """Return the kinds of the units of an H.264 frame in Annex B form."""
+    return [part[0] & 31 for part in data.split(b"\x00\x00\x01")[1:]]
+
+
+def test_outlines_are_drawn_where_the_objects_are_in_the_colour_of_what_is_asked(folder: Path) -> None:
+    from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+
+    every = [
+        ImageAnnotations.FromString(each) for each in payloads(folder / "run.mcap", "/camera/annotations")
+    ]
+    assert {each.text for each in every[0].texts} == {"0", "1", "10", "11", "12", "13", "blue", "red"}
+    colours = [
+        {(round(p.outline_color.r, 2)) for p in each.points if p.thickness > 2}
+        for each in (every[0], every[-1])
+    ]
+    # blue while it holds, vermillion when it is violated
+    assert colours == [{0.0}, {0.83}] or colours == [{0.0}, {0.84}]
+
+
+def test_the_layout_has_a_panel_for_the_picture(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["info", f"{folder}/run.mcap", "--layout"]) == 0
+    mode = json.loads(capsys.readouterr().out)["configById"]["Image!camera"]["imageMode"]
+    assert mode["imageTopic"] == "/camera/video"
+    assert mode["calibrationTopic"] == "/camera/calibration"
+    assert mode["annotations"] == {"/camera/annotations": {"visible": True}}
+
+
+def test_a_video_in_a_log_is_read_again_and_kept_as_it_came(folder: Path) -> None:
+    again = recorded(folder, "run.mcap")
+    assert payloads(again, "/camera/video") == payloads(folder / "run.mcap", "/camera/video")
+    assert payloads(again, "/spatial/robustness") == payloads(folder / "run.mcap", "/spatial/robustness")
+
+
+def test_image_topics_of_ros_give_the_samples_of_their_stamps(folder: Path) -> None:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    from spatial_replay.perception.opencv import encode_jpeg
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    time, header = store.types["builtin_interfaces/msg/Time"], store.types["std_msgs/msg/Header"]
+    raw, compressed = store.types["sensor_msgs/msg/Image"], store.types["sensor_msgs/msg/CompressedImage"]
+    with Writer(folder / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        rgb = writer.add_connection("/camera/image", raw.__msgtype__, typestore=store)
+        jpeg = writer.add_connection("/camera/jpeg", compressed.__msgtype__, typestore=store)
+        for frame in film(approaching(4), 4):
+            image = np.repeat(frame.image[..., None], 3, axis=2)
+            stamp = header(time(5, frame.time_ns), "camera")
+            height, width = frame.image.shape
+            message = raw(stamp, height, width, "rgb8", 0, 3 * width, image.ravel())
+            # recorded three seconds after it was taken
+            writer.write(rgb, 8 * 10**9 + frame.time_ns, store.serialize_cdr(message, raw.__msgtype__))
+            data = np.frombuffer(encode_jpeg(image, 1000, 98), np.uint8)
+            other = store.serialize_cdr(compressed(stamp, "jpeg", data), compressed.__msgtype__)
+            writer.write(jpeg, 8 * 10**9 + frame.time_ns, other)
+    tags = f"{folder}/tags.yaml"
+    stated = []
+    for topic in ("/camera/image", "/camera/jpeg"):
+        log = folder / "ros.mcap"
+        assert (
+            run(["record", "video", f"{folder}/bag", "--topic", topic, "--tags", tags, "-o", str(log)]) == 0
+        )
+        trace = read_trace(log)
+        assert trace.times_ns.tolist() == [5 * 10**9 + 40_000_000 * index for index in range(4)]
+        stated.append(trace.footprints.vertices)
+        assert len(payloads(log, topic)) == 4
+    assert stated[0] == pytest.approx(stated[1], abs=0.003)
+
+
+def test_in_python_frames_become_samples_for_a_monitor_and_a_recorder(folder: Path, tmp_path: Path) -> None:
+    from spatial_replay.perception import load_tags, observe_frames, open_frames
+
+    specification = load_specification(folder / "apart.spatial")
+    monitor = Monitor(specification)
+    verdicts = []
+    with Recorder(tmp_path / "own.mcap", specifications=[specification]) as recorder:
+        for seen in observe_frames(open_frames(folder / "table.mp4"), load_tags(folder / "tags.yaml")):
+            recorder.write(seen.sample)
+            verdicts.append(str(monitor.update(seen.sample).verdict))
+    assert (verdicts[0], verdicts[-1]) == ("pending", "violated")
+    assert payloads(tmp_path / "own.mcap", "/spatial/objects") == payloads(
+        folder / "run.mcap", "/spatial/objects"
+    )
+
+
+def test_a_video_that_breaks_off_is_recorded_up_to_there(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # what was recorded as .mkv needs no index at its end
+    video = write_approach(folder, COUNT, "cut.mkv")
+    video.write_bytes(video.read_bytes()[: video.stat().st_size * 2 // 3])
+    output, tags = folder / "cut.mcap", f"{folder}/tags.yaml"
+    code = run(["record", "video", str(video), "--tags", tags, "-o", str(output)])
+    assert 4 <= len(read_trace(output)) < COUNT
+    assert run(["verify", str(output)]) == 0
+    said = capsys.readouterr().err
+    assert (code, "cut.mkv breaks off after 0.") == (
+        3,
+        next(each[:27] for each in said.split(": ") if "off" in each),
+    )
+
+
+BAD = {
+    "no video": (["bad.mp4"], 3, "bad.mp4 is no video that can be read"),
+    "not there": (["none.mp4"], 2, "no such file"),
+    "a log without images": (["plain.mcap"], 2, "has no topic with images"),
+    "no such topic": (["run.mcap", "--topic", "/camera/vide"], 2, "did you mean '/camera/video'?"),
+    "a topic of a video": (["table.mp4", "--topic", "/a"], 2, "leave out --topic"),
+    "a rate for a log": (["run.mcap", "--rate", "30"], 2, "leave out --rate"),
+    "no camera": (["--camera", "93"], 2, "camera 93 cannot be opened"),
+    "nothing": ([], 2, "give either a video or a log, or --camera N"),
+    "a video that cannot be copied": (["mpeg.avi", "--keep-video", "copy"], 2, "write --keep-video h264"),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_bad_input_is_refused_in_words_and_nothing_is_written(
+    folder: Path, what: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments, code, said = BAD[what]
+    (folder / "bad.mp4").write_bytes(b"\x00\x00\x00\x18ftypmp42" + bytes(range(256)) * 9)
+    (folder / "a.jsonl").write_text('{"time_ns": 0, "objects": []}\n')
+    run(["record", "tracks", f"{folder}/a.jsonl", "-o", f"{folder}/plain.mcap"])
+    _write_mpeg(folder / "mpeg.avi")
+    given = [
+        each if each.startswith(("-", "/")) or each in ("30", "93", "copy", "h264") else f"{folder}/{each}"
+        for each in arguments
+    ]
+    output = folder / "refused.mcap"
+    assert run(["record", "video", *given, "--tags", f"{folder}/tags.yaml", "-o", str(output)]) == code
+    assert said in capsys.readouterr().err
+    assert not output.exists()
+
+
+def _write_mpeg(path: Path) -> None:
+    import av
+
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 480, 360, "yuv420p"
+        for frame in film(approaching(2), 2):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame.image, format="gray")))
+        container.mux(stream.encode(None))
+
+
+def test_a_video_of_another_codec_is_encoded_and_frames_keep_their_own_uneven_times(folder: Path) -> None:
+    import av
+
+    path = folder / "uneven.mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=1000)
+        stream.width, stream.height, stream.pix_fmt = 480, 360, "yuv420p"
+        for number, frame in zip((0, 33, 101, 140), film(approaching(4), 4), strict=True):
+            picture = av.VideoFrame.from_ndarray(frame.image, format="gray")
+            picture.pts = number
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    output = folder / "uneven.mcap"
+    assert run(["record", "video", str(path), "--tags", f"{folder}/tags.yaml", "-o", str(output)]) == 0
+    assert (read_trace(output).times_ns // 10**6).tolist() == [0, 33, 101, 140]
+    assert len(payloads(output, "/camera/video")) == 4
+
+
+def test_a_camera_that_is_unplugged_leaves_a_whole_log(folder: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+
+    from spatial_replay.perception import CameraFrames, parse_tags
+    from spatial_replay.runs.seen import record_seen
+
+    # a capture that ends is what an unplugged camera is
+    camera = CameraFrames(0, opened=lambda number: cv2.VideoCapture(str(folder / "table.mp4")))
+    seen = record_seen(camera, parse_tags(TABLE), folder / "camera.mcap")
+    assert seen.samples == COUNT and "is it unplugged?" in seen.faults[0]
+    assert len(read_trace(folder / "camera.mcap")) == COUNT
