@@ -30,7 +30,8 @@ class Instant:
     first_ns: int
 
     def __str__(self) -> str:
-        return f"{(self.time_ns - self.first_ns) / 1e9:.3f} s"
+        # what rounds to 0 has no sign
+        return f"{round((self.time_ns - self.first_ns) / 1e9, 3) + 0.0:.3f} s"
 
 
 class Sentence(str):
@@ -131,12 +132,12 @@ def time_text(time_ns: int, first_ns: int = 0) -> str:
     return str(Instant(time_ns, first_ns))
 
 
-def times_apart(*times_ns: int) -> tuple[str, ...]:
+def times_apart(*times_ns: int) -> tuple[Sentence, ...]:
     """Return times in seconds; in nanoseconds, too, if some that differ would read the same."""
-    texts = tuple(time_text(each) for each in times_ns)
-    if len(set(texts)) == len(set(map(int, times_ns))):
-        return texts
-    return tuple(f"{text} ({each} ns)" for text, each in zip(texts, times_ns, strict=True))
+    times = tuple(Sentence(Instant(each, 0)) for each in times_ns)
+    if len(set(times)) == len(set(map(int, times_ns))):
+        return times
+    return tuple(Sentence(time, f" ({each} ns)") for time, each in zip(times, times_ns, strict=True))
 
 
 def requirement_text(identifier: str | None, title: str | None) -> str:

@@ -280,3 +280,21 @@ def test_the_extension_for_viewers_is_printed(log: Path, capfdbinary: pytest.Cap
     assert run(["info", "--panel", str(log)]) == 2
     assert run(["info", "--panel", "--json"]) == 2
     assert run(["info"]) == 2
+
+
+def test_faults_of_track_files_count_seconds_from_the_start(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start_ns = 1_700_000_000_000_000_000
+    columns = "time_ns,name,class,x,y,yaw,length,width\n"
+    rows = [f"{start_ns + late * 10**6},{name},,0,0,0,1,1\n" for late, name in ((0, "a"), (200, "a"))]
+    rows += [f"{start_ns + 10**8},a,,0,0,0,1,1\n", f"{start_ns + 3 * 10**8},,,0,0,0,1,1\n"]
+    (tmp_path / "run.csv").write_text(columns + "".join(rows))
+    lines = [json.dumps({"time_ns": start_ns + late * 10**6, "objects": []}) for late in (0, 200, 100)]
+    (tmp_path / "run.jsonl").write_text("\n".join(lines))
+    assert run(["info", str(tmp_path / "run.csv")]) == 3
+    said = capsys.readouterr().err
+    assert "run.csv:4: its time is 0.100 s, before 0.200 s" in said
+    assert "the sample at 0.300 s is left out" in said
+    assert run(["info", str(tmp_path / "run.jsonl")]) == 3
+    assert "run.jsonl:3: its time is 0.100 s, not after 0.200 s" in capsys.readouterr().err

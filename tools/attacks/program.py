@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import faulthandler
 import io
 import os
 import re
+import select
 import signal
 import sys
 import time
@@ -15,6 +17,8 @@ from typing import NamedTuple
 from spatial_replay.cli import run
 
 CODES = (0, 1, 2, 3, 4)
+PATIENCE_S = 120.0
+"""How long a command on a terminal may take."""
 _OURS = re.compile(r"\x1b\[(?:[0-3]|3[0-7]|38;5;\d+|22|0;\d\d)?m|\r\x1b\[2K|\x1b\[(?:1A|2K|\?25[lh])|\r\n")
 """Colours, line ends of a terminal, and the moves of the progress bar."""
 
@@ -76,9 +80,16 @@ def on_terminal(
     os.close(theirs)
     during(process)
     written = bytearray()
+    end_s = time.monotonic() + PATIENCE_S
     # how Linux says that the other end of a terminal is closed
     with suppress(OSError):
-        while block := os.read(ours, 65_536):
+        while True:
+            if not select.select([ours], [], [], max(0.0, end_s - time.monotonic()))[0]:
+                # it prints where each of its threads is, and ends
+                os.kill(process, signal.SIGABRT)
+                end_s += PATIENCE_S
+            if not (block := os.read(ours, 65_536)):
+                break
             written += block
     os.close(ours)
     return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]), bytes(written)
@@ -93,6 +104,7 @@ def _become(terminal: int, arguments: Sequence[str]) -> None:
         for name in ("stdin", "stdout", "stderr"):
             mode = "r" if name == "stdin" else "w"
             setattr(sys, name, os.fdopen(os.dup(1), mode, encoding="utf-8", errors="backslashreplace"))
+        faulthandler.enable(sys.stderr)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.argv = ["spatial-replay", *arguments]
         from spatial_replay.cli.application import main

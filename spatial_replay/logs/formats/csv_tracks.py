@@ -11,7 +11,7 @@ from spatial_replay.errors import LogError
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.formats.tracks import ObjectReport, ReportedSample, iter_lines, iter_traces
 from spatial_replay.logs.read_options import FaultList
-from spatial_replay.text import time_text, times_apart
+from spatial_replay.text import Instant, Sentence, times_apart
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
 
@@ -44,9 +44,10 @@ def _samples(path: Path, faults: FaultList) -> Iterator[ReportedSample]:
             at = _time(row["time_ns"])
             if at < time_ns:
                 this, last = times_apart(at, time_ns)
-                raise _NoObjectError(f"its time is {this}, before {last}; give times that do not go back")
+                what = Sentence("its time is ", this, ", before ", last, "; give times that do not go back")
+                raise _NoObjectError(what)
         except _NoObjectError as error:
-            faults.add(f"{here}: {error}")
+            faults.add(Sentence(f"{here}: ", *error.args))
             continue
         if at > time_ns:
             if reports and not broken:
@@ -58,7 +59,7 @@ def _samples(path: Path, faults: FaultList) -> Iterator[ReportedSample]:
                 raise _NoObjectError(f"object {report.name!r} is there twice; name each object once a sample")
             reports[report.name] = report
         except _NoObjectError as error:
-            faults.add(f"{here}: {error}; the sample at {time_text(at)} is left out")
+            faults.add(Sentence(f"{here}: {error}; the sample at ", Instant(at, 0), " is left out"))
             broken = True
     if reports and not broken:
         yield time_ns, place, list(reports.values()), {}

@@ -22,7 +22,7 @@ from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.read_options import FaultList
-from spatial_replay.text import is_encodable, times_apart
+from spatial_replay.text import Sentence, is_encodable, times_apart
 from spatial_replay.trace.observations import Observations, trace_from_observations
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
@@ -205,9 +205,10 @@ def _jsonl_samples(path: Path, faults: FaultList) -> Iterator[ReportedSample]:
             time_ns, reports, signals = _sample(line)
             if time_ns <= latest:
                 at, before = times_apart(time_ns, latest)
-                raise _NoSampleError(f"its time is {at}, not after {before}; give times that increase")
+                what = Sentence("its time is ", at, ", not after ", before, "; give times that increase")
+                raise _NoSampleError(what)
         except _NoSampleError as error:
-            faults.add(f"{place}: {error}")
+            faults.add(Sentence(f"{place}: ", *error.args))
             continue
         latest = time_ns
         yield time_ns, place, reports, signals
