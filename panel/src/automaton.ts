@@ -1,10 +1,11 @@
 // The panel of the automaton: its drawing, the present states, what is still to be done, and the moves taken.
 
 import {
-  describe, drawAutomaton, element, keepInSight, keepInView, light, printable, secondsText, type DrawnAutomaton, type DrawnStates,
+  describe, drawAutomaton, element, keepInView, legendOf, light, printable, secondsText, type DrawnAutomaton, type DrawnStates,
 } from "report-drawing";
 import { createElement, type ReactElement } from "react";
 
+import { TimedList } from "./event-list";
 import { type AutomatonMessage, type AutomatonStateMessage, type EventMessage, type ResultMessage, type SpecificationMessage } from "./messages";
 import { EVENTS, Results } from "./results";
 import { Series } from "./series";
@@ -28,20 +29,18 @@ export class AutomatonView implements View {
   private readonly drawing = element("div", { class: "drawing" });
   private readonly tasks = element("div", { class: "tasks" });
   private readonly words = element("div", { class: "moves" });
-  private readonly taken = element("ol", { class: "list" });
+  private readonly taken = new TimedList();
   private run: Run | null = null;
   private drawn: DrawnStates | null = null;
   private automaton: DrawnAutomaton | null = null;
   private distances = new Map<number, number>();
   private shown = "";
-  private rows: HTMLElement[] = [];
-  private here = -1;
   private length = -1;
 
   constructor(private readonly viewer: Viewer) {
     this.results = new Results(viewer);
     this.body.append(this.drawing, this.tasks, element("details", { open: true },
-      element("summary", {}, "Moves taken"), this.taken),
+      element("summary", {}, "Moves taken"), this.taken.made),
     element("details", {}, element("summary", {}, "Moves from here"), this.words));
   }
 
@@ -114,7 +113,7 @@ export class AutomatonView implements View {
     }
     this.run = result ? new Run(result) : null;
     this.drawn = this.automaton ? drawAutomaton(this.automaton) : null;
-    this.drawing.replaceChildren(...(this.drawn ? [this.drawn.made] : []));
+    this.drawing.replaceChildren(...(this.drawn && this.automaton ? [this.drawn.made, legendOf(this.automaton)] : []));
     this.tasks.replaceChildren();
     this.words.replaceChildren();
     this.body.hidden = !this.automaton;
@@ -148,22 +147,12 @@ export class AutomatonView implements View {
     const taken = run.taken();
     if (taken.length !== this.length) {
       this.length = taken.length;
-      this.here = -1;
-      this.rows = taken.map((each) => element("button", {
+      this.taken.fill(taken.map((each) => each.time), taken.map((each) => element("button", {
         type: "button", class: "event", onclick: () => this.viewer.seek(each.time),
       }, element("span", {}), element("time", {}, secondsText(each.time)), element("span", { class: "sentence" },
-        `${each.source ?? "?"} → ${each.targets.join(" or ")} `, each.guard ? element("code", {}, printable(each.guard)) : "")));
-      this.taken.replaceChildren(...this.rows.map((row) => element("li", {}, row)));
+        `${each.source ?? "?"} → ${each.targets.join(" or ")} `, each.guard ? element("code", {}, printable(each.guard)) : ""))));
     }
-    let here = -1;
-    while (here + 1 < taken.length && taken[here + 1]!.time <= cursor.time + 1e-9) here += 1;
-    if (here === this.here) return;
-    this.rows[this.here]?.removeAttribute("aria-current");
-    this.here = here;
-    const row = this.rows[here];
-    if (!row) return;
-    row.setAttribute("aria-current", "true");
-    keepInSight(this.taken, row.parentElement!);
+    this.taken.show(cursor.time);
   }
 }
 
@@ -240,7 +229,8 @@ function drawnOf(message: AutomatonMessage): DrawnAutomaton {
       won: !each.can_reject,
     })),
     moves: message.moves.map((each) => ({
-      source: each.source ?? 0, target: each.target ?? 0, guard: printable(each.guard),
+      source: each.source ?? 0, target: each.target ?? 0, guard: printable(each.guard), label: printable(each.label ?? ""),
     })),
+    legend: (message.legend ?? []).map(printable),
   };
 }

@@ -22,9 +22,8 @@ export interface NodeMessage {
   readonly operator: string;
   readonly name: string;
   readonly text: string;
-  readonly span_start?: number;
-  readonly span_end?: number;
   readonly unit: string;
+  readonly written?: string;
 }
 
 export interface AutomatonMessage {
@@ -38,8 +37,15 @@ export interface AutomatonMessage {
     readonly can_reject: boolean;
     readonly distance?: number | null;
   }[];
-  readonly moves: readonly { readonly source?: number; readonly target?: number; readonly guard: string }[];
+  readonly moves: readonly {
+    readonly source?: number;
+    readonly target?: number;
+    readonly guard: string;
+    /** Absent in logs of earlier versions, as are `legend` and `written`. */
+    readonly label?: string;
+  }[];
   readonly left_out: number;
+  readonly legend?: readonly string[];
 }
 
 export interface ResultMessage {

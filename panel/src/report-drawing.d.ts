@@ -39,7 +39,8 @@ declare module "report-drawing" {
     states: {
       number: number; at: [number, number]; about: string; accepting: boolean; lost: boolean; won: boolean;
     }[];
-    moves: { source: number; target: number; guard: string }[];
+    moves: { source: number; target: number; guard: string; label: string }[];
+    legend: string[];
   }
   export interface DrawnEvent {
     time: number;
@@ -114,6 +115,7 @@ declare module "report-drawing" {
     shown: { quantity: number; hidden: Set<number> }, width: number): { axes: { size: number }[]; height: number };
   export interface DrawnStates { made: SVGElement; states: Map<number, SVGElement> }
   export function drawAutomaton(automaton: DrawnAutomaton): DrawnStates;
+  export function legendOf(automaton: DrawnAutomaton): HTMLElement;
   export function light(drawn: DrawnStates, states: number[]): void;
   export function keepInView(drawing: HTMLElement, state: SVGElement | undefined): void;
   export function describe(automaton: DrawnAutomaton, states: number[]): Node[];

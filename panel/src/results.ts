@@ -20,7 +20,6 @@ export interface Event extends DrawnEvent {
 
 /** Which result is shown: the reader's choice or, without one, the one that went worst. */
 export class Results {
-  files: SpecificationMessage["files"] = [];
   all: readonly ResultMessage[] = [];
   events: Event[] = [];
   private chosen: string | null;
@@ -32,7 +31,6 @@ export class Results {
   }
 
   specify(message: SpecificationMessage): void {
-    this.files = message.files;
     this.all = message.results;
     this.findWorst();
   }
@@ -101,17 +99,6 @@ export class Results {
       if (isOfResult && each.known <= time && (!newest || each.known >= newest.known)) newest = each;
     }
     return newest;
-  }
-
-  /** Returns the nodes as they are written in their file; what a `def` stands for, in canonical form. */
-  written(result: ResultMessage): string[] {
-    const source = Array.from(this.files[result.file ?? 0]?.source ?? "");
-    const spans = result.nodes.map((node) => `${node.span_start ?? 0} ${node.span_end ?? 0}`);
-    return result.nodes.map((node, index) => {
-      const isExpanded = index > 0 && spans[index] === spans[node.parent ?? 0];
-      const text = isExpanded ? "" : source.slice(node.span_start ?? 0, node.span_end ?? 0).join("");
-      return printable(text || node.text).replace(/\s+/g, " ");
-    });
   }
 }
 

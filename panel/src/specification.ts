@@ -94,7 +94,7 @@ export class SpecificationView implements View {
 
   private build(): void {
     const { shown } = this.results;
-    this.tree = shown ? new Tree(shown, this.results, (node) => this.choose(node)) : null;
+    this.tree = shown ? new Tree(shown, (node) => this.choose(node)) : null;
     this.place.replaceChildren(...(this.tree ? [this.tree.made] : []));
     const { node } = this.viewer.state;
     this.tree?.mark(typeof node === "number" ? node : null);

@@ -6,7 +6,7 @@ import {
 } from "report-drawing";
 
 import { titleOf, type NodeMessage, type ResultMessage, type RobustnessMessage } from "./messages";
-import type { Event, Results } from "./results";
+import type { Event } from "./results";
 import { Series } from "./series";
 
 const TEMPORAL = new Set(["F", "G", "U", "R", "W", "X", "WX", "Y", "O", "H", "S"]);
@@ -72,14 +72,13 @@ export class Tree {
   private last: Uint8Array;
   private lit = new Set<number>();
 
-  constructor(readonly message: ResultMessage, results: Results, choose: (node: number) => void) {
+  constructor(readonly message: ResultMessage, choose: (node: number) => void) {
     const count = message.nodes.length;
     this.series = new Series(4 * count);
     this.last = new Uint8Array(count);
     this.operators = message.nodes.map((node) => node.operator);
-    const written = results.written(message);
     const nodes = message.nodes.map(
-      (node, index) => new TreeNode(node, index, written[index]!, this.series, this.last));
+      (node, index) => new TreeNode(node, index, printable(node.written || node.text), this.series, this.last));
     for (const node of nodes) {
       if (node.parent === null) continue;
       const above = nodes[node.parent]!;

@@ -98,10 +98,13 @@ class Annotator:
         self._runs = [
             None
             if kept.automaton is None
-            else AutomatonRun(tree.name, tree.object, kept.automaton, tree.formula, instance.program.leaves)
+            else AutomatonRun(
+                tree.name, tree.object, kept.automaton, tree.formula, instance.program.leaves, tree.named
+            )
             for tree, instance, kept in zip(trees, instances, automata, strict=True)
         ]
-        self._standing = StandingEncoder(trees, self._runs)
+        written = [tree.written(files[tree.file].source) for tree in trees]
+        self._standing = StandingEncoder(trees, self._runs, written)
         self._encoder = SceneEncoder(shown_regions(files))
         self._latest: tuple[Trace, list[SeriesBlock]] | None = None
         self._scene = scene or SceneState()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,7 @@ from spatial_replay.annotate.specification import ReportedTree
 from spatial_replay.automata.automaton import FALSE, TRUE, UNKNOWN, Automaton, TransitionTable
 from spatial_replay.automata.compile import automaton, stored_text
 from spatial_replay.automata.dot_hoa import size_words
+from spatial_replay.automata.guards import Transition
 from spatial_replay.errors import NoAutomatonError
 from spatial_replay.geometry.arrays import Flags, Integers
 from spatial_replay.logs.messages import Attachment
@@ -52,6 +53,7 @@ class AutomatonRun:
         automaton: Automaton,
         formula: Formula,
         order: Sequence[Atom | Quantified],
+        named: Callable[[str], str] = str,
     ) -> None:
         """Start before the first sample.
 
@@ -60,8 +62,9 @@ class AutomatonRun:
             object: the object that a template's parameter stands for, or None.
             formula: what the automaton is of.
             order: the leaves, in the order of a block's.
+            named: writes the object in place of the parameter.
         """
-        self._name, self._object = name, object
+        self._name, self._object, self._named = name, object, named
         self._automaton = automaton
         self._order = order
         self._table = TransitionTable.of(automaton)
@@ -140,8 +143,11 @@ class AutomatonRun:
             meaning = "not satisfied yet"
         else:
             [first, *_] = next(self._automaton.paths(states[0]))
-            meaning = f"still to come: {_shortened(self._automaton.guard_words(first), _LONGEST_STEP)}"
+            meaning = f"still to come: {_shortened(self._guard(first), _LONGEST_STEP)}"
         return f"{title}: {meaning}"
+
+    def _guard(self, move: Transition) -> str:
+        return self._named(self._automaton.guard_words(move))
 
     def _values(self, block: SeriesBlock) -> Flags:
         """Return (P, T): whether each proposition is true in each sample, or unknown."""
@@ -202,7 +208,7 @@ class AutomatonRun:
             message.source = sources[0]
         if len(sources) == len(targets) == 1 and sources != targets:
             taken = self._automaton.transition(sources[0], targets[0])
-            message.guard = "" if taken is None else _shortened(self._automaton.guard_words(taken))
+            message.guard = "" if taken is None else _shortened(self._guard(taken))
         message.accepting = message.can_accept = message.can_reject = AutomatonState_pb2.TRUTH_TRUE
         return message
 

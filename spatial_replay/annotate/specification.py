@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -32,6 +33,7 @@ from spatial_replay.spec.formula import (
     operator_of,
 )
 from spatial_replay.spec.relations import RELATION_NAMES
+from spatial_replay.spec.tokens import written_name
 
 if TYPE_CHECKING:
     from spatial_replay.automata.automaton import Automaton
@@ -51,6 +53,7 @@ class ReportedTree(NamedTuple):
         file: index of its specification among the files.
         requirement: the id of the requirement that it stands for, or None.
         sentence: that requirement in words, or None.
+        parameter: the name of the parameter, or None.
     """
 
     name: str
@@ -59,12 +62,47 @@ class ReportedTree(NamedTuple):
     formula: Formula
     requirement: str | None = None
     sentence: str | None = None
+    parameter: str | None = None
 
     @property
     def title(self) -> str:
         """What a reader knows it by: "REQ-12 calm(bike)"."""
         title = self.name if self.object is None else f"{self.name}({self.object})"
         return title if self.requirement is None else f"{self.requirement} {title}"
+
+    def named(self, text: str) -> str:
+        """Return a text about the formula with the object in place of the template's parameter."""
+        if self.parameter is None or self.object is None:
+            return text
+        own = re.escape(self.parameter)
+        name = written_name(self.object, RELATION_NAMES)
+        return re.sub(rf'(?<![\w"]){own}(?![\w"])', lambda _: name, text)
+
+    def written(self, source: str) -> list[str]:
+        """Return the text of each node as the file writes it, with the object in place of the parameter.
+
+        What a `def` stands for is in canonical form, below the node that has its call.
+
+        Args:
+            source: of the file.
+        """
+        texts, spans = [], []
+        for _, parent, node in iter_nodes(self.formula):
+            spans.append(node.span)
+            is_expanded = parent is not None and spans[parent] == node.span
+            text = "" if is_expanded else " ".join(source[node.span.start : node.span.end].split())
+            texts.append(self.named(text or format_formula(node)))
+        return texts
+
+    def calls(self, source: str) -> dict[int, str]:
+        """Return the text of each node that is a `def` with its arguments, as the file writes it."""
+        nodes, written = list(iter_nodes(self.formula)), self.written(source)
+        spans = [node.span for _, _, node in nodes]
+        return {
+            parent: written[parent]
+            for identifier, parent, _ in nodes
+            if parent is not None and spans[parent] == spans[identifier] and nodes[parent][2].name is None
+        }
 
 
 def reported_trees(
@@ -82,7 +120,8 @@ def reported_trees(
             clashes = names.count(instance.name) > 1
             name = f"{PurePath(file.filename).stem}.{instance.name}" if clashes else instance.name
             spec = instance.spec
-            trees.append(ReportedTree(name, instance.object, index, spec.formula, spec.id, spec.title))
+            of = spec.id, spec.title, spec.parameter
+            trees.append(ReportedTree(name, instance.object, index, spec.formula, *of))
     return trees
 
 
@@ -114,10 +153,10 @@ def encode_specification(
     for index, tree in enumerate(trees):
         result = message.results.add(name=tree.name, object=tree.object or "", file=tree.file)
         result.propositions.extend(propositions[index] if propositions is not None else ())
-        _add_nodes(result, tree.formula, RELATION_NAMES | files[tree.file].relations, signal_units or {})
+        _add_nodes(result, tree, files[tree.file], signal_units or {})
         own = automata[index] if automata else None
         if own is not None:
-            _add_automaton(result, own)
+            _add_automaton(result, tree, own)
     return message.SerializeToString(deterministic=True)
 
 
@@ -144,9 +183,10 @@ def unit_words(unit: str) -> str:
 
 
 def _add_nodes(
-    result: SpecificationResult, formula: Formula, relations: frozenset[str], signal_units: Mapping[str, str]
+    result: SpecificationResult, tree: ReportedTree, file: Specification, signal_units: Mapping[str, str]
 ) -> None:
-    for identifier, parent, formula_node in iter_nodes(formula):
+    relations, written = RELATION_NAMES | file.relations, tree.written(file.source)
+    for identifier, parent, formula_node in iter_nodes(tree.formula):
         node = result.nodes.add(
             id=identifier,
             operator=operator_of(formula_node),
@@ -155,15 +195,18 @@ def _add_nodes(
             span_start=formula_node.span.start,
             span_end=formula_node.span.end,
             unit=unit_of(formula_node, signal_units),
+            written=written[identifier],
         )
         if parent is not None:
             node.parent = parent
 
 
-def _add_automaton(result: SpecificationResult, automaton: Automaton) -> None:
+def _add_automaton(result: SpecificationResult, tree: ReportedTree, automaton: Automaton) -> None:
+    from spatial_replay.automata.dot_hoa import abbreviated, meanings
     from spatial_replay.automata.drawing import draw_automaton
 
-    drawing = draw_automaton(automaton)
+    drawing, short = draw_automaton(automaton), abbreviated(automaton)
+    result.automaton.legend.extend(map(tree.named, meanings(short)))
     result.automaton.summary = drawing.summary
     result.automaton.left_out = drawing.left_out
     for state in drawing.states:
@@ -176,8 +219,9 @@ def _add_automaton(result: SpecificationResult, automaton: Automaton) -> None:
             can_reject=not state.is_won,
             distance=state.distance,
         )
-    for move in drawing.moves:
-        result.automaton.moves.add(source=move.source, target=move.target, guard=move.guard)
+    for move, brief in zip(drawing.moves, draw_automaton(short).moves, strict=True):
+        guard, label = tree.named(move.guard), tree.named(brief.guard)
+        result.automaton.moves.add(source=move.source, target=move.target, guard=guard, label=label)
 
 
 def _atom_unit(expression: Expression, signal_units: Mapping[str, str]) -> str:

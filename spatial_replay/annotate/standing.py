@@ -27,7 +27,6 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
 )
 from spatial_replay.monitor.online.operators import looks_ahead
 from spatial_replay.monitor.stream import SeriesBlock
-from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, iter_nodes
 from spatial_replay.trace.sample import LATEST_NS
 
@@ -95,12 +94,19 @@ class StandingEncoder:
         outcomes: of each result, once the log has ended.
     """
 
-    def __init__(self, trees: Sequence[ReportedTree], runs: Sequence[AutomatonRun | None]) -> None:
+    def __init__(
+        self,
+        trees: Sequence[ReportedTree],
+        runs: Sequence[AutomatonRun | None],
+        written: Sequence[Sequence[str]],
+    ) -> None:
         """Start before the first sample.
 
         Args:
             runs: of each tree, the run of its automaton, which takes in the same samples.
+            written: of each tree, its nodes as the file writes them.
         """
+        self._written = written
         self._trees, self._runs = trees, runs
         self._parts = [named_parts(tree) for tree in trees]
         self._nodes = [[node for _, _, node in iter_nodes(tree.formula)] for tree in trees]
@@ -259,9 +265,9 @@ class StandingEncoder:
             for name, (_, node) in parts.items():
                 unit = unit_of(node, {})
                 message.results.add(name=part_title(name, tree), standing=UNKNOWN, robustness=1.0, unit=unit)
-        for node in self._nodes[worst][:_MOST_ROWS]:
+        for node, said in zip(self._nodes[worst][:_MOST_ROWS], self._written[worst], strict=False):
             unit = unit_of(node, {})
-            text = format_formula(node) if node.name is None else node.name
+            text = said if node.name is None else node.name
             message.nodes.add(text=text, now=1.0, value=1.0, unit=unit, standing=UNKNOWN)
         for index, over in violated:
             tree = self._trees[index]

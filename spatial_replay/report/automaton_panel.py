@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,8 +50,12 @@ class StatePathCollector:
         return StatePath(times_ns, codes, tuple(self._sets))
 
 
-def automaton_value(automaton: Automaton, path: StatePath) -> Mapping[str, Any]:
-    """Return an automaton as the page draws it: states with their places, transitions with their guards."""
+def automaton_value(automaton: Automaton, path: StatePath, named: Callable[[str], str]) -> Mapping[str, Any]:
+    """Return an automaton as the page draws it: states with their places, transitions with their guards.
+
+    Args:
+        named: writes the object in place of a template's parameter.
+    """
     visited = {state for states in path.sets for state in states}
     drawing, short = draw_automaton(automaton, visited), abbreviated(automaton)
     return {
@@ -70,8 +74,8 @@ def automaton_value(automaton: Automaton, path: StatePath) -> Mapping[str, Any]:
         ],
         # the same words on arrows, and the same legend, as in a drawing by Graphviz
         "moves": [
-            {**move._asdict(), "label": brief.guard}
+            {**move._asdict(), "guard": named(move.guard), "label": named(brief.guard)}
             for move, brief in zip(drawing.moves, draw_automaton(short, visited).moves, strict=True)
         ],
-        "legend": meanings(short),
+        "legend": list(map(named, meanings(short))),
     }

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+from spatial_replay.annotate.specification import ReportedTree
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.result import NodeResult, SpecResult
@@ -50,8 +51,9 @@ class ReportedResult:
     """One result of a run, with its explanation and its path through its automaton.
 
     Attributes:
+        tree: under which it is reported.
+        source: the text of its file.
         relations: the names of relations that its file may use.
-
         sentences: the explanation of its verdict; none if the page does not explain it.
         decided_ns: the sample that decided it; None without an explanation.
         decided_node: the id of the node that decided it; None without an explanation.
@@ -64,6 +66,8 @@ class ReportedResult:
     """
 
     result: SpecResult
+    tree: ReportedTree
+    source: str
     relations: frozenset[str]
     sentences: tuple[Sentence, ...]
     decided_ns: int | None

@@ -208,7 +208,12 @@ def _result_value(
         "samples": len(here),
         "decided": _place_of(each),
         "nodes": tree_value(
-            each.formula, each.result.values, each.result.final, each.relations, report.signal_units
+            each.formula,
+            each.result.values,
+            each.result.final,
+            each.relations,
+            report.signal_units,
+            each.tree.calls(each.source),
         ),
         "requirements": requirement_values(each.result, samples, scene.entities_of, packing),
         "series": packing.add(singles(series), "f4"),
@@ -218,7 +223,7 @@ def _result_value(
     if each.automaton is not None:
         inside = np.searchsorted(each.path.times_ns, here)
         value["automaton"] = {
-            **automaton_value(each.automaton, each.path),
+            **automaton_value(each.automaton, each.path, each.tree.named),
             "sets": each.path.sets,
             "path": packing.add(each.path.codes[inside], "i4"),
         }

@@ -55,6 +55,7 @@ def tree_value(
     final: Floats,
     relations: frozenset[str],
     signal_units: Mapping[str, str],
+    calls: Mapping[int, str],
 ) -> list[Mapping[str, Any]]:
     """Return the shown nodes, each with its text and its final verdict.
 
@@ -63,6 +64,7 @@ def tree_value(
         robustness: (N,), each node's value on the whole log.
         final: (N, 2), lower and upper end of each node for the finished log.
         signal_units: those that are declared.
+        calls: of nodes that are a `def` with its arguments, as the file writes them.
     """
     shown, initial = shown_nodes(formula), initial_nodes(formula)
     place = {identifier: index for index, identifier in enumerate(shown)}
@@ -71,7 +73,7 @@ def tree_value(
             "id": identifier,
             "parent": None if parent is None else place[parent],
             "name": node.name or "",
-            "head": _cut(_head(node, relations)),
+            "head": _cut(calls.get(identifier) or _head(node, relations)),
             "text": _cut(format_formula(node, relations=relations)),
             "unit": unit_of(node, signal_units),
             "divisor": divisor_of(node),

@@ -146,17 +146,19 @@ def _results(replay: Replay, replayed: Replayed, collector: Collector) -> Iterat
     explained = _explained(replayed)
     for index, result in enumerate(replayed.results):
         tree, compiled = replay.trees[index], replay.automata[index]
-
+        file = replay.files[tree.file]
         is_explained = index in explained
         witness = result.worst if is_explained else None
         yield ReportedResult(
             result=result,
-            relations=RELATION_NAMES | replay.files[tree.file].relations,
+            tree=tree,
+            source=file.source,
+            relations=RELATION_NAMES | file.relations,
             sentences=result.sentences(replayed.first_ns) if is_explained else (),
             decided_ns=None if witness is None else witness.time_ns,
             decided_node=None if witness is None else witness.path[-1].node,
             pointer=None if witness is None else _pointer(witness),
-            named={spec.name: spec for spec in replay.files[tree.file].specs},
+            named={spec.name: spec for spec in file.specs},
             units=units_of(result.formula),
             automaton=compiled.automaton,
             no_automaton=compiled.reason,

@@ -128,6 +128,7 @@ class AutomatonDrawing(google.protobuf.message.Message):
     STATES_FIELD_NUMBER: builtins.int
     MOVES_FIELD_NUMBER: builtins.int
     LEFT_OUT_FIELD_NUMBER: builtins.int
+    LEGEND_FIELD_NUMBER: builtins.int
     summary: builtins.str
     """Its size, in words."""
     left_out: builtins.int
@@ -136,6 +137,10 @@ class AutomatonDrawing(google.protobuf.message.Message):
     def states(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___AutomatonNode]: ...
     @property
     def moves(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___AutomatonMove]: ...
+    @property
+    def legend(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.str]:
+        """What the short names in labels stand for: "p0: cup leftof plate"."""
+
     def __init__(
         self,
         *,
@@ -143,8 +148,9 @@ class AutomatonDrawing(google.protobuf.message.Message):
         states: collections.abc.Iterable[global___AutomatonNode] | None = ...,
         moves: collections.abc.Iterable[global___AutomatonMove] | None = ...,
         left_out: builtins.int = ...,
+        legend: collections.abc.Iterable[builtins.str] | None = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["left_out", b"left_out", "moves", b"moves", "states", b"states", "summary", b"summary"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["left_out", b"left_out", "legend", b"legend", "moves", b"moves", "states", b"states", "summary", b"summary"]) -> None: ...
 
 global___AutomatonDrawing = AutomatonDrawing
 
@@ -206,19 +212,23 @@ class AutomatonMove(google.protobuf.message.Message):
     SOURCE_FIELD_NUMBER: builtins.int
     TARGET_FIELD_NUMBER: builtins.int
     GUARD_FIELD_NUMBER: builtins.int
+    LABEL_FIELD_NUMBER: builtins.int
     source: builtins.int
     target: builtins.int
     guard: builtins.str
     """The condition, in words."""
+    label: builtins.str
+    """The condition as it is written on the arrow, with short names for long propositions."""
     def __init__(
         self,
         *,
         source: builtins.int | None = ...,
         target: builtins.int | None = ...,
         guard: builtins.str = ...,
+        label: builtins.str = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["_source", b"_source", "_target", b"_target", "source", b"source", "target", b"target"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_source", b"_source", "_target", b"_target", "guard", b"guard", "source", b"source", "target", b"target"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["_source", b"_source", "_target", b"_target", "guard", b"guard", "label", b"label", "source", b"source", "target", b"target"]) -> None: ...
     @typing.overload
     def WhichOneof(self, oneof_group: typing.Literal["_source", b"_source"]) -> typing.Literal["source"] | None: ...
     @typing.overload
@@ -240,6 +250,7 @@ class Node(google.protobuf.message.Message):
     SPAN_START_FIELD_NUMBER: builtins.int
     SPAN_END_FIELD_NUMBER: builtins.int
     UNIT_FIELD_NUMBER: builtins.int
+    WRITTEN_FIELD_NUMBER: builtins.int
     id: builtins.int
     """Number of the node, from the root, 0, in the order of the text."""
     parent: builtins.int
@@ -255,6 +266,10 @@ class Node(google.protobuf.message.Message):
     span_end: builtins.int
     unit: builtins.str
     """Unit of the node's robustness; empty for footprint units."""
+    written: builtins.str
+    """The subformula as the file writes it, with the object in place of a template's parameter; what a `def`
+    stands for, in canonical form.
+    """
     def __init__(
         self,
         *,
@@ -266,9 +281,10 @@ class Node(google.protobuf.message.Message):
         span_start: builtins.int | None = ...,
         span_end: builtins.int | None = ...,
         unit: builtins.str = ...,
+        written: builtins.str = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["_id", b"_id", "_parent", b"_parent", "_span_end", b"_span_end", "_span_start", b"_span_start", "id", b"id", "parent", b"parent", "span_end", b"span_end", "span_start", b"span_start"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_id", b"_id", "_parent", b"_parent", "_span_end", b"_span_end", "_span_start", b"_span_start", "id", b"id", "name", b"name", "operator", b"operator", "parent", b"parent", "span_end", b"span_end", "span_start", b"span_start", "text", b"text", "unit", b"unit"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["_id", b"_id", "_parent", b"_parent", "_span_end", b"_span_end", "_span_start", b"_span_start", "id", b"id", "name", b"name", "operator", b"operator", "parent", b"parent", "span_end", b"span_end", "span_start", b"span_start", "text", b"text", "unit", b"unit", "written", b"written"]) -> None: ...
     @typing.overload
     def WhichOneof(self, oneof_group: typing.Literal["_id", b"_id"]) -> typing.Literal["id"] | None: ...
     @typing.overload

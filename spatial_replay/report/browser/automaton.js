@@ -139,7 +139,7 @@ function describe(automaton, states) {
     const moves = automaton.moves.filter((move) => move.source === number);
     parts.push(element("ul", {}, ...moves.map((move) => element("li", {},
       move.target === number ? "stays if " : `to ${move.target} if `,
-      element("code", {title: move.guard}, move.label ?? move.guard)))));
+      element("code", {title: move.guard}, move.label || move.guard)))));
   }
   if (automaton.left_out) parts.push(element("p", {class: "quiet"}, `${automaton.left_out} states are not drawn.`));
   return states.length > 1
