@@ -19,6 +19,7 @@ from spatial_replay.cli import run
 CODES = (0, 1, 2, 3, 4)
 PATIENCE_S = 120.0
 """How long a command on a terminal may take."""
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _OURS = re.compile(r"\x1b\[(?:[0-3]|3[0-7]|38;5;\d+|22|0;\d\d)?m|\r\x1b\[2K|\x1b\[(?:1A|2K|\?25[lh])|\r\n")
 """Colours, line ends of a terminal, and the moves of the progress bar."""
 
@@ -74,9 +75,12 @@ def on_terminal(
         during: called with the number of the process while it runs.
     """
     ours, theirs = os.openpty()
+    # a signal waits until the program is there to take it
+    signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     process = os.fork()
     if process == 0:
         _become(theirs, arguments)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
     os.close(theirs)
     during(process)
     written = bytearray()
@@ -109,9 +113,12 @@ def _become(terminal: int, arguments: Sequence[str]) -> None:
         sys.argv = ["spatial-replay", *arguments]
         from spatial_replay.cli.application import main
 
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
         main()
     except SystemExit as leaving:
         code = int(leaving.code or 0)
+    except KeyboardInterrupt:
+        code = 130
     finally:
         with suppress(Exception):
             sys.stdout.flush()
