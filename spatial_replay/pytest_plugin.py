@@ -86,11 +86,11 @@ class ReplayItem(pytest.Item):
 
     def _failure(self, row: ResultRow) -> str | None:
         """Return what is wrong with a result and what explains it; None if it passes."""
+        from spatial_replay.batch.rows import with_damage
+
         failure = row.error
         if row.verdict is not None:
-            failure = self._case.expectation.failure(row.verdict, row.robustness)
-            if failure is None and row.faults:
-                failure = f"the log is damaged: {row.faults[0]}"
+            failure = with_damage(self._case.expectation.failure(row.verdict, row.robustness), row.faults)
         if failure is None:
             return None
         title = row.spec if row.object is None else f"{row.spec}[{row.object}]"

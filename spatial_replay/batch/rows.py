@@ -182,6 +182,12 @@ def parsed_specifications(
     return tuple(load_specifications(specs, profile=conditions.profile, constants=dict(conditions.constants)))
 
 
+def with_damage(failure: str | None, faults: Sequence[str]) -> str | None:
+    """Return why a result does not pass: what a log has lost adds to that; None if nothing does."""
+    damage = f"the log is damaged: {faults[0]}" if faults else None
+    return "; ".join(filter(None, (failure, damage))) or None
+
+
 def error_from_exception(error: Exception) -> tuple[str, ErrorKind]:
     """Return what an error says, and whose it is."""
     kind: ErrorKind = "machine"

@@ -22,6 +22,7 @@ from spatial_replay.batch.rows import (
     Task,
     error_rows,
     rows_from_task,
+    with_damage,
 )
 from spatial_replay.batch.spec_files import HASH_DIGITS, SpecFile
 from spatial_replay.batch.suite import Case, Conditions
@@ -319,5 +320,4 @@ def _failure(
         failure = "unknown"
     elif failure is None and "vacuous" in fail_on and vacuous:
         failure = f"vacuous: {vacuous[0]}"
-    damage = f"the log is damaged: {faults[0]}" if faults else None
-    return "; ".join(filter(None, (failure, damage))) or None
+    return with_damage(failure, faults)
