@@ -20,7 +20,13 @@ from spatial_replay.cli.options import (
     require_choice,
 )
 from spatial_replay.cli.progress import progress
-from spatial_replay.cli.record import SCENARIOS, SimulationArguments, parse_injections, simulation_options
+from spatial_replay.cli.record import (
+    SCENARIOS,
+    SimulationArguments,
+    parse_injections,
+    show_film,
+    simulation_options,
+)
 from spatial_replay.cli.terminal import show
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.text import counted
@@ -97,6 +103,7 @@ def planning_command(scenario: str) -> click.Command:
                 noise_m=simulation["noise"],
                 injections=parse_injections(simulation["inject"]),
                 gui=simulation["gui"],
+                camera=simulation["camera"],
                 inputs=local_files(named),
                 advance=advance,
                 durability=durability,
@@ -105,6 +112,7 @@ def planning_command(scenario: str) -> click.Command:
             f"wrote {output}: {counted(planned.samples, 'sample')} over {planned.seconds:.3f} s; "
             f"{counted(planned.steps, 'motion')}, {counted(planned.pruned, 'edge')} given up"
         )
+        show_film(simulation)
         show(f"planning took {planned.planning_s:.2f} s", err=True)
         show(f"the planner: {planned.reason}")
         if planned.ended == "no path":

@@ -70,6 +70,13 @@ _SIMULATION = (
         is_flag=True,
         help="Show the world in a window, no faster than real time. Needs a display.",
     ),
+    click.option(
+        "--camera",
+        metavar="VIDEO",
+        type=click.Path(path_type=Path),
+        help="Film the run with AprilTags on the objects: a video, and its tags file beside it. Needs the"
+        " extra `vision`.",
+    ),
 )
 
 
@@ -80,11 +87,20 @@ class SimulationArguments(TypedDict):
     noise: float
     inject: tuple[str, ...]
     gui: bool
+    camera: Path | None
 
 
 def simulation_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that say how to simulate a world; the command takes them as `simulation`."""
     return add_options(_SIMULATION, gather("simulation", SimulationArguments, command))
+
+
+def show_film(simulation: SimulationArguments) -> None:
+    """Print how to read the video of a run, if there is one."""
+    video = simulation["camera"]
+    if video is not None:
+        tags = video.with_suffix(".tags.yaml")
+        show(f"filmed {video}: spatial-replay record video {video} --tags {tags} -o seen.mcap")
 
 
 def parse_injections(texts: Sequence[str]) -> list[Injection]:
@@ -149,6 +165,7 @@ def recording_command(scenario: str) -> click.Command:
                 noise_m=simulation["noise"],
                 injections=parse_injections(simulation["inject"]),
                 gui=simulation["gui"],
+                camera=simulation["camera"],
                 inputs=local_files(specs),
                 advance=advance,
                 durability=durability,
@@ -158,6 +175,7 @@ def recording_command(scenario: str) -> click.Command:
             f"{counted(len(recorded.objects), 'object')}: {', '.join(recorded.objects)}"
         )
         show(f"the robot: {recorded.outcome}")
+        show_film(simulation)
         return ExitCode.SATISFIED
 
     return command

@@ -7,12 +7,12 @@ frame and without B frames: what `foxglove.CompressedVideo` demands.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 
@@ -23,6 +23,7 @@ _KEY_FRAMES: Final = 30
 """Frames from one key frame to the next in what we encode: a viewer seeks to the one before the cursor."""
 
 _NS: Final = Fraction(1, 10**9)
+_TICK: Final = Fraction(1, 90_000)
 _IDR, _SEQUENCE_PARAMETERS = 5, 7
 """Kinds of units in H.264."""
 
@@ -236,43 +237,55 @@ class H264Decoder:
         return np.asarray(frames[-1].to_ndarray(format="bgr24"), np.uint8) if frames else None
 
 
-def write_video(path: Path, frames: Iterable[Frame], rate: int = 30) -> int:
-    """Write frames as a video (H.264, no B frames), and return how many there are.
+class VideoWriter:
+    """Writes frames as a video (H.264, no B frames), as a context manager; a process for one file."""
 
-    Raises:
-        OutputError: the file cannot be written.
-        UsageError: PyAV is not installed, or the name's ending is not that of a video.
-    """
-    av = _load()
-    count = 0
-    try:
-        container = av.open(str(path), "w")
-    except ValueError:
-        raise UsageError(f"{path}: give the name of a video, such as {path.stem}.mp4") from None
-    except OSError as error:
-        raise OutputError(f"{path}: {_reason(error)}") from None
-    with container:
-        stream: Any = None
-        for frame in frames:
-            height, width = (edge - edge % 2 for edge in frame.image.shape[:2])
-            if stream is None:
-                stream = container.add_stream("libx264", rate=rate)
-                stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-                stream.codec_context.time_base = Fraction(1, 90_000)
-                stream.codec_context.thread_count = 1
-                stream.codec_context.max_b_frames = 0
-                stream.codec_context.gop_size = _KEY_FRAMES
-                stream.options = {"preset": "ultrafast", "tune": "zerolatency", "crf": "18"}
-            form = "gray" if frame.image.ndim == 2 else "bgr24"
-            image = np.ascontiguousarray(frame.image[:height, :width])
-            picture = av.VideoFrame.from_ndarray(image, format=form)
-            picture.time_base = Fraction(1, 90_000)
-            picture.pts = round(frame.time_ns * _NS / picture.time_base)
-            container.mux(stream.encode(picture))
-            count += 1
-        if stream is not None:
-            container.mux(stream.encode(None))
-    return count
+    def __init__(self, path: Path, rate: int = 30) -> None:
+        """Open the file.
+
+        Raises:
+            OutputError: the file cannot be written.
+            UsageError: PyAV is not installed, or the name's ending is not that of a video.
+        """
+        av = _load()
+        self._rate = rate
+        self._stream: Any = None
+        try:
+            self._container = av.open(str(path), "w")
+        except ValueError:
+            raise UsageError(f"{path}: give the name of a video, such as {path.stem}.mp4") from None
+        except OSError as error:
+            raise OutputError(f"{path}: {_reason(error)}") from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._stream is not None:
+            self._container.mux(self._stream.encode(None))
+        self._container.close()
+
+    def write(self, frame: Frame) -> None:
+        """Add a frame; an odd edge of the picture loses a row or column of pixels."""
+        av = _load()
+        height, width = (edge - edge % 2 for edge in frame.image.shape[:2])
+        if self._stream is None:
+            self._stream = self._opened(width, height)
+        form = "gray" if frame.image.ndim == 2 else "bgr24"
+        image = np.ascontiguousarray(frame.image[:height, :width])
+        picture = av.VideoFrame.from_ndarray(image, format=form)
+        picture.time_base = _TICK
+        picture.pts = round(frame.time_ns * _NS / _TICK)
+        self._container.mux(self._stream.encode(picture))
+
+    def _opened(self, width: int, height: int) -> Any:
+        stream = self._container.add_stream("libx264", rate=self._rate)
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        context = stream.codec_context
+        context.time_base, context.thread_count = _TICK, 1
+        context.max_b_frames, context.gop_size = 0, _KEY_FRAMES
+        stream.options = {"preset": "ultrafast", "tune": "zerolatency", "crf": "18"}
+        return stream
 
 
 def _has_key(data: bytes) -> bool:

@@ -26,6 +26,7 @@ from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, Skill
 from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.recording.plan_loop import run_plan
+from spatial_replay.runs.filmed import open_film
 from spatial_replay.runs.run_log import RunLog, run_log
 from spatial_replay.runs.scripted import about_run, refuse_unknown_names
 from spatial_replay.simulation.injection import Injection
@@ -189,6 +190,7 @@ def record_plan(
     noise_m: float = 0.0,
     injections: Sequence[Injection] = (),
     gui: bool = False,
+    camera: Path | None = None,
     inputs: Sequence[Path] = (),
     advance: Callable[[int], None] = lambda samples: None,
     durability: Durability = "process",
@@ -198,6 +200,7 @@ def record_plan(
     Args:
         file: the specification to plan for; None takes that of the scenario.
         name: the result to plan for, if there are several. All are evaluated.
+        camera: a video to make of the run, beside which its tags file is written.
         inputs: files that the output must not be.
         advance: called with the number of new samples.
         durability: "disk" for a log of which the disk has each chunk as soon as it is written.
@@ -219,12 +222,17 @@ def record_plan(
         planner = Planner(kept, settings_for(world), name=name)
         warm_up_planner()
         known = _known(kept, planner.automaton)
-        with run_log(output, [kept], about, inputs, known, durability) as log:
+        with (
+            open_film(world, camera, seed=seed) as film,
+            run_log(output, [kept], about, inputs, known, durability) as log,
+        ):
             log.add_metadata(PLAN_METADATA, plan_metadata(planner, kept.filename))
             loop = PlanLoop(BlackBox(planner), log)
 
             def observe(sample: Sample) -> None:
                 loop.observe(sample)
+                if film is not None:
+                    film.take(sample)
                 advance(1)
 
             world.attach(observe)

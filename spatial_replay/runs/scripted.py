@@ -10,6 +10,7 @@ from pathlib import Path
 
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.logs.output_file import Durability
+from spatial_replay.runs.filmed import Film, open_film
 from spatial_replay.runs.run_log import RunLog, run_log
 from spatial_replay.simulation.injection import Injection
 from spatial_replay.simulation.tabletop import Tabletop
@@ -63,6 +64,7 @@ def record_script(
     noise_m: float = 0.0,
     injections: Sequence[Injection] = (),
     gui: bool = False,
+    camera: Path | None = None,
     inputs: Sequence[Path] = (),
     advance: Callable[[int], None] = lambda samples: None,
     durability: Durability = "process",
@@ -71,6 +73,7 @@ def record_script(
 
     Args:
         files: specifications to evaluate during the run; None takes that of the scenario.
+        camera: a video to make of the run, beside which its tags file is written.
         duration_ns: duration in simulated time; None ends with the script.
         inputs: files that the output must not be.
         advance: called with the number of new samples.
@@ -88,8 +91,11 @@ def record_script(
     # an error in the world or a missing name leaves the output untouched
     with closing(make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, gui=gui)) as world:
         refuse_unknown_names(files, world.sample())
-        with run_log(output, files, about, inputs, durability=durability) as log:
-            result = _follow_script(world, log, duration_ns, advance)
+        with (
+            open_film(world, camera, seed=seed) as film,
+            run_log(output, files, about, inputs, durability=durability) as log,
+        ):
+            result = _follow_script(world, log, film, duration_ns, advance)
         outcome = "stopped in the middle of its motion" if result is None else result.reason
         return SimulatedRun(log.samples, log.seconds, tuple(world.scene.bodies), outcome)
 
@@ -101,12 +107,14 @@ def about_run(scenario: str, *, seed: int, noise_m: float, injections: Sequence[
 
 
 def _follow_script(
-    world: Tabletop, log: RunLog, duration_ns: int | None, advance: Callable[[int], None]
+    world: Tabletop, log: RunLog, film: Film | None, duration_ns: int | None, advance: Callable[[int], None]
 ) -> Execution | None:
     """Follow the script and log every sample; return its result, None if the duration ended before it."""
 
     def observe(sample: Sample) -> None:
         log.write(sample)
+        if film is not None:
+            film.take(sample)
         advance(1)
 
     world.attach(observe)

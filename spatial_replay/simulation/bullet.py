@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ from types import MappingProxyType, ModuleType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
@@ -31,6 +33,9 @@ _WOOD = 0.5
 """Default friction."""
 _FRICTION = MappingProxyType({"lateralFriction": _WOOD, "spinningFriction": 2e-3, "rollingFriction": 2e-3})
 """Friction of bodies; rolling friction brings rolling bodies to rest, as on a real table."""
+
+_NEAR, _FAR = 0.05, 5.0
+"""From where to where a camera sees, in metres."""
 
 
 class Engine:
@@ -138,6 +143,32 @@ class Engine:
             self._call("getContactPoints", self._robot, self._bodies[name], finger) for finger in FINGERS
         )
         return sum(bool(points) for points in touching)
+
+    def picture(
+        self,
+        size: tuple[int, int],
+        focal: float,
+        eye: tuple[float, float, float],
+        look_at: tuple[float, float, float],
+    ) -> tuple[NDArray[np.uint8], Floats]:
+        """Return what a camera sees: red, green, blue (height, width, 3), and distances along its axis.
+
+        Args:
+            size: width and height in pixels.
+            focal: focal length in pixels; the principal point is in the middle.
+        """
+        width, height = size
+        angle = math.degrees(2 * math.atan(height / 2 / focal))
+        bullet = self._bullet
+        view = bullet.computeViewMatrix(eye, look_at, (0.0, 0.0, 1.0))
+        lens = bullet.computeProjectionMatrixFOV(angle, width / height, _NEAR, _FAR)
+        seen = self._call(
+            "getCameraImage", width, height, view, lens, renderer=bullet.ER_TINY_RENDERER, shadow=0
+        )
+        # without numpy at its build, the simulator returns tuples
+        colours = np.asarray(seen[2], np.uint8).reshape(height, width, 4)[..., :3]
+        share = np.asarray(seen[3], np.float64).reshape(height, width)
+        return colours, _FAR * _NEAR / (_FAR - (_FAR - _NEAR) * share)
 
     def set_grip(self, friction: float) -> None:
         """Set the friction of the fingers: 1 for rubber, close to 0 for oil."""

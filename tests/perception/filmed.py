@@ -12,7 +12,7 @@ from spatial_replay.perception import Frame, TagsFile, parse_tags
 from spatial_replay.perception.opencv import Camera
 from spatial_replay.perception.rendering import Flaws, Plate, render
 from spatial_replay.perception.tags_file import pose_looking_at
-from spatial_replay.perception.video import write_video
+from spatial_replay.perception.video import VideoWriter
 
 PERIOD_NS = 40_000_000
 CAMERA = "camera: {size: [480, 360], focal: [640, 640]}"
@@ -73,5 +73,7 @@ def write_approach(folder: Path, count: int = 12, name: str = "table.mp4") -> Pa
     """Write a video of the approach and the tags file, and return the video's path."""
     (folder / "tags.yaml").write_text(TABLE)
     (folder / "apart.spatial").write_text("spec apart = G (red dist blue >= 0.04)\n")
-    write_video(folder / name, film(approaching(count), count), rate=25)
+    with VideoWriter(folder / name, 25) as writer:
+        for frame in film(approaching(count), count):
+            writer.write(frame)
     return folder / name

@@ -1,0 +1,55 @@
+"""Simulated worlds through a camera: what is read from the video holds the truth that the run's log has."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spatial_replay import Trace, read_trace
+from spatial_replay.cli import run
+
+for each in ("av", "cv2", "pybullet", "py_trees"):
+    pytest.importorskip(each)
+
+
+def outlines(trace: Trace, sample: int) -> dict[str, np.ndarray]:
+    """Return the corners of each object that is known in a sample."""
+    rows = {name: int(trace.rows[sample, column]) for column, name in enumerate(trace.names)}
+    return {name: trace.footprints.select(np.array([row])).vertices for name, row in rows.items() if row >= 0}
+
+
+@pytest.mark.parametrize(
+    ("command", "world", "length"),
+    [("record", "push", "300ms"), ("record", "pick-place", "100ms"), ("record", "table-setting", "100ms")],
+)
+def test_the_truth_of_a_run_is_within_what_its_video_says(
+    command: str, world: str, length: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    video, truth, seen = tmp_path / "run.mp4", tmp_path / "truth.mcap", tmp_path / "seen.mcap"
+    filmed = [command, world, "-o", str(truth), "--camera", str(video), "--duration", length]
+    assert run(filmed) == 0
+    tags = tmp_path / "run.tags.yaml"
+    assert f"record video {video} --tags {tags} -o seen.mcap" in capsys.readouterr().out
+    assert run(["record", "video", str(video), "--tags", str(tags), "-o", str(seen)]) == 0
+    there, found = read_trace(truth), read_trace(seen)
+    assert (there.times_ns // 10**6).tolist() == (found.times_ns // 10**6).tolist()
+    stated = []
+    for sample in range(len(there)):
+        true, read = outlines(there, sample), outlines(found, sample)
+        # what lies on something may hide its tags; the arm hides nothing yet
+        assert len(read) >= len(true) - 1
+        for name, corners in read.items():
+            row = int(found.rows[sample, list(found.names).index(name)])
+            off = [np.linalg.norm(corners - corner, axis=1).min() for corner in true[name]]
+            stated.append(found.uncertainty[row])
+            assert max(off) <= stated[-1]
+    # centimetres for what may be lifted, millimetres for what stays on the table
+    assert np.median(stated) < (0.025 if world != "push" else 0.002)
+
+
+def test_a_film_is_named_as_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["record", "push", "-o", f"{tmp_path}/a.mcap", "--camera", f"{tmp_path}/a.yaml"]) == 2
+    assert "name it a.mp4" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
