@@ -74,23 +74,33 @@ def footprints_from_solids(solids: Solids, count: int) -> FootprintBatch:
     Args:
         count: R.
     """
-    solids = _with_boxes(solids)
+    if not _MAYBE_BOXES.isdisjoint(solids.kind.tolist()):
+        solids = _with_boxes(solids)
     kind, size = solids.kind, solids.size
-    boxes, polygons, hulls = (np.flatnonzero(kind == each) for each in (BOX, POLYGON, HULL))
-    tilted = boxes[~np.isnan(size[boxes, 2])]
+    # few solids are of few kinds, and what is not there need not be looked for
+    present = set(kind.tolist())
+    boxes, polygons, hulls = (
+        np.flatnonzero(kind == each) if each in present else _NO_SOLIDS for each in (BOX, POLYGON, HULL)
+    )
+    tilted = boxes[~np.isnan(size[boxes, 2])] if len(boxes) else _NO_SOLIDS
     if len(tilted):
         tilted = tilted[~is_upright(solids.rotation[tilted])]
     flat = np.setdiff1d(boxes, tilted, assume_unique=True) if len(tilted) else boxes
     rings = [_ring(solids, piece) for piece in hulls.tolist()]
     vertex_counts = _VERTICES[kind]
-    vertex_counts[tilted] = 6
-    vertex_counts[polygons] = counts_from_starts(solids.point_start)[polygons]
-    vertex_counts[hulls] = [len(ring) for ring in rings]
+    if len(tilted):
+        vertex_counts[tilted] = 6
+    if len(polygons):
+        vertex_counts[polygons] = counts_from_starts(solids.point_start)[polygons]
+    if len(hulls):
+        vertex_counts[hulls] = [len(ring) for ring in rings]
     start = starts_from_counts(vertex_counts)
     vertices = np.empty((int(start[-1]), 2))
+    radius = np.zeros(len(kind))
     if len(boxes) + len(polygons) + len(hulls) < len(kind):
         rounds = np.flatnonzero(_IS_ROUND[kind])
         vertices[start[rounds]] = solids.position[rounds, :2]
+        radius[rounds] = size[rounds, 0] / 2
     for pieces, corners in ((flat, _rectangles), (tilted, _hexagons)):
         if len(pieces):
             _fill(vertices, start, pieces, corners(solids, size, pieces))
@@ -105,13 +115,15 @@ def footprints_from_solids(solids: Solids, count: int) -> FootprintBatch:
         part_start=starts_from_counts(parts),
         vertex_start=start,
         vertices=vertices,
-        radius=np.where(_IS_ROUND[kind], size[:, 0] / 2, 0.0),
+        radius=radius,
         bottom=bottom,
         top=top,
     )
 
 
 _VERTICES = np.array([4, 1, 1, 1, 0, 0], np.int64)
+_MAYBE_BOXES = frozenset({CYLINDER, SPHERE})
+_NO_SOLIDS = np.empty(0, np.int64)
 _IS_ROUND = np.array([False, True, True, True, False, False])
 
 
@@ -119,8 +131,6 @@ def _with_boxes(solids: Solids) -> Solids:
     """Replace the cylinders and spheres that count as their bounding boxes."""
     kind, size = solids.kind, solids.size
     doubtful = np.flatnonzero((kind == CYLINDER) | (kind == SPHERE))
-    if not len(doubtful):
-        return solids
     kind, size = kind[doubtful], size[doubtful]
     unequal = size[:, 0] != size[:, 1]
     cylinder = (kind == CYLINDER) & (unequal | ~is_upright(solids.rotation[doubtful]))
@@ -132,6 +142,9 @@ def _with_boxes(solids: Solids) -> Solids:
 
 def _fill(vertices: Floats, start: Integers, pieces: Integers, corners: Floats) -> None:
     """Write the corners (K, C, 2) of some solids to their places in `vertices`."""
+    if len(vertices) == corners.shape[0] * corners.shape[1]:
+        vertices[:] = corners.reshape(-1, 2)
+        return
     counts = np.full(len(pieces), corners.shape[1])
     vertices[flat_index(start[pieces], counts)] = corners.reshape(-1, 2)
 

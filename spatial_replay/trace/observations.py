@@ -168,7 +168,7 @@ def _wrong_numbers(observed: Observations, readable: Booleans) -> dict[int, str]
         )
     faults: dict[int, str] = {}
     for wrong, what in checks:
-        for row in (wrong & readable).nonzero()[0].tolist():
+        for row in np.flatnonzero(wrong & readable).tolist() if wrong.any() else ():
             name = observed.names[observed.name[row]]
             faults.setdefault(int(observed.sample[row]), f"object {name!r} {what}")
     return faults
