@@ -269,7 +269,9 @@ class LiveSession:
             self._begin()
             self._early, early = Inbox(), self._early
             for item in early.take():
-                inbox.put(item)
+                # it has waited for the beginning, not for evaluation that falls behind
+                is_message = isinstance(item, Received)
+                inbox.put(item._replace(arrived_s=time.monotonic()) if is_message else item)
         if silent := self._silent_topics(now_s):
             self._silent |= {*silent}
             listed = ", ".join(silent)
