@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cached_property
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from spatial_replay.annotate.specification import reported_trees
@@ -53,6 +54,7 @@ class AnnotatedEvaluation:
         known: Sequence[SpecAutomaton] = (),
         show: Callable[[SceneFrames], None] = lambda frames: None,
         arrow: str = "",
+        units: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         """Start before the first sample.
 
@@ -62,6 +64,7 @@ class AnnotatedEvaluation:
             known: automata of specs of these files, which are not compiled again.
             show: takes what the messages of the scene show.
             arrow: the title of the result whose violation the scene points at; "" for the first one.
+            units: those that are declared, see `unit_of`.
 
         Raises:
             UsageError: no result has that title.
@@ -71,7 +74,7 @@ class AnnotatedEvaluation:
         self._compiled_before = compiled_before
         self._known = known
         self._show = show
-        self._arrow = arrow
+        self._arrow, self._units = arrow, units
 
         self._evaluations = [
             EvaluationStream(own, file.regions, semantics) for own, file in zip(instances, files, strict=True)
@@ -147,7 +150,13 @@ class AnnotatedEvaluation:
         # every result has events: a verdict is reported when it is reached, or else when the log ends
         derived = {SCENE, *(DERIVED if self.trees else ())} - set(() if any(has_states) else (AUTOMATON,))
         return LayoutContents(
-            self.trees, has_states, extent, derived | set(topics), axes, images=sorted(images)
+            self.trees,
+            has_states,
+            extent,
+            derived | set(topics),
+            axes,
+            images=sorted(images),
+            units=self._units,
         )
 
     def layout(
@@ -165,7 +174,13 @@ class AnnotatedEvaluation:
         if not self._has_samples:
             return layout_attachment(
                 LayoutContents(
-                    self.trees, [False] * len(self.trees), None, topics, axes, images=sorted(images)
+                    self.trees,
+                    [False] * len(self.trees),
+                    None,
+                    topics,
+                    axes,
+                    images=sorted(images),
+                    units=self._units,
                 )
             )
         contents = self.contents(self._extent, topics, axes, images)
@@ -201,7 +216,15 @@ class AnnotatedEvaluation:
 
         instances = [stream.instance for stream in self.streams]
         return Annotator(
-            self._files, self.trees, instances, self.automata, self._semantics, scene, self._show, arrow
+            self._files,
+            self.trees,
+            instances,
+            self.automata,
+            self._semantics,
+            scene,
+            self._show,
+            arrow,
+            self._units,
         )
 
     @cached_property

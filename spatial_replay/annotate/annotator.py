@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 from foxglove_schemas_protobuf.Event_pb2 import Event
@@ -66,6 +67,7 @@ class Annotator:
         scene: SceneState | None = None,
         show: Callable[[SceneFrames], None] = lambda frames: None,
         arrow: str = "",
+        units: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         """Start before the first sample.
 
@@ -75,7 +77,9 @@ class Annotator:
             show: takes what the messages of the scene show.
             arrow: the title of the result whose violation the scene points at; "" for the first one, and one
                 that there is not.
+            units: those that are declared, see `unit_of`.
         """
+        self._units = units
         self._files = files
         self._trees = trees
         self._requirements = [
@@ -104,7 +108,7 @@ class Annotator:
             for tree, instance, kept in zip(trees, instances, automata, strict=True)
         ]
         written = [tree.written(files[tree.file].source) for tree in trees]
-        self._standing = StandingEncoder(trees, self._runs, written)
+        self._standing = StandingEncoder(trees, self._runs, written, units)
         self._encoder = SceneEncoder(shown_regions(files))
         self._latest: tuple[Trace, list[SeriesBlock]] | None = None
         self._scene = scene or SceneState()
@@ -230,9 +234,7 @@ class Annotator:
     def specification(self) -> bytes:
         """Return the message of the specifications and the trees of their results."""
         propositions = [() if run is None else run.propositions for run in self._runs]
-        return encode_specification(
-            self._files, self._trees, propositions=propositions, automata=self._automata
-        )
+        return encode_specification(self._files, self._trees, self._units, propositions, self._automata)
 
     def _robustness(self, blocks: Sequence[SeriesBlock]) -> Messages:
         """Return one message per sample and result."""

@@ -136,38 +136,39 @@ def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[FinalStanding] 
     ]
 
 
-def result_curves(trees: Sequence[ReportedTree]) -> list[Panel]:
+def result_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> list[Panel]:
     """Return the curves of the results, those of each unit in a panel of their own."""
     curves = [
-        _Curve(tree.title, _standing_path(tree.title, "robustness"), unit_of(tree.formula, {}))
+        _Curve(tree.title, _standing_path(tree.title, "robustness"), unit_of(tree.formula, units))
         for tree in trees
     ]
     return _plots("robustness", "Robustness of results", curves)
 
 
-def part_curves(trees: Sequence[ReportedTree]) -> list[Panel]:
+def part_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> list[Panel]:
     """Return the curves of named specs, those of each unit in a panel of their own."""
     curves = [
         _Curve(
             name if is_clear else part_title(name, tree),
             _standing_path(part_title(name, tree), "robustness"),
-            unit_of(node, {}),
+            unit_of(node, units),
         )
         for tree, name, node, is_clear in _parts(trees)
     ]
     return _plots("parts", "Robustness of named specs", curves)
 
 
-def whole_curves(trees: Sequence[ReportedTree]) -> list[Panel]:
+def whole_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> list[Panel]:
     """Return the curves over the whole log of each result, then of its named specs."""
     curves = [
-        _Curve(tree.title, f"{_curves_path(tree, 0)}.value[:]", unit_of(tree.formula, {})) for tree in trees
+        _Curve(tree.title, f"{_curves_path(tree, 0)}.value[:]", unit_of(tree.formula, units))
+        for tree in trees
     ]
     curves += [
         _Curve(
             part_title(node.name, tree),
             f"{_curves_path(tree, identifier)}.{_shown_number(node)}[:]",
-            unit_of(node, {}),
+            unit_of(node, units),
         )
         for tree in trees
         for identifier, node in curved_nodes(tree.formula).items()
@@ -370,6 +371,7 @@ class LayoutContents(NamedTuple):
         extent: where its footprints are; None if it has none.
         topics: all that have messages.
         axes: those of the source, which the title of the scene says where they are not ours.
+        units: those that are declared, see `unit_of`.
         outcomes: of each tree, what it came to; empty while that can change.
         images: the topics with images.
     """
@@ -379,6 +381,7 @@ class LayoutContents(NamedTuple):
     extent: SceneBounds | None
     topics: Collection[str]
     axes: Axes = OUR_AXES
+    units: Mapping[str, str] = MappingProxyType({})
     outcomes: Sequence[FinalStanding] = ()
     images: Sequence[str] = ()
 
@@ -408,8 +411,8 @@ def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
     panels = _evaluation_panels(contents)
     if panels:
         # the curves of the whole log include those played so far
-        played = len(result_curves(contents.trees))
-        panels[:played] = [(panel, 3.0) for panel in whole_curves(contents.trees)]
+        played = len(result_curves(contents.trees, contents.units))
+        panels[:played] = [(panel, 3.0) for panel in whole_curves(contents.trees, contents.units)]
         panels.insert(0, (violation_table(), 1.5))
         left.append((summary(), 0.7))
     return _layout(contents, left, panels)
@@ -431,10 +434,10 @@ def _evaluation_panels(contents: LayoutContents) -> list[_Weighted]:
     trees = contents.trees
     if not trees:
         return []
-    panels = [(panel, 3.0) for panel in result_curves(trees)]
+    panels = [(panel, 3.0) for panel in result_curves(trees, contents.units)]
     if any(outcome.standing == VIOLATED for outcome in contents.outcomes):
         panels.insert(0, (violation_table(), 1.5))
-    panels += [(panel, 2.0) for panel in part_curves(trees)]
+    panels += [(panel, 2.0) for panel in part_curves(trees, contents.units)]
     panels.append((state_strips(trees, contents.has_states), 3.0))
     if EVENT_LOG in contents.topics:
         panels.append((event_list(), 2.0))

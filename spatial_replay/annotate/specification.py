@@ -128,14 +128,14 @@ def reported_trees(
 def encode_specification(
     files: Sequence[Specification],
     trees: Sequence[ReportedTree],
-    signal_units: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
     propositions: Sequence[Sequence[int]] | None = None,
     automata: Sequence[Automaton | None] = (),
 ) -> bytes:
     """Return the message with the specifications of a log; equal arguments give equal bytes.
 
     Args:
-        signal_units: units of the log's signals, where known.
+        units: those that are declared, of signals by their names, of lengths by "".
         propositions: of each tree, the nodes that are propositions of its automaton.
         automata: of each tree, its automaton.
     """
@@ -153,27 +153,28 @@ def encode_specification(
     for index, tree in enumerate(trees):
         result = message.results.add(name=tree.name, object=tree.object or "", file=tree.file)
         result.propositions.extend(propositions[index] if propositions is not None else ())
-        _add_nodes(result, tree, files[tree.file], signal_units or {})
+        _add_nodes(result, tree, files[tree.file], units or {})
         own = automata[index] if automata else None
         if own is not None:
             _add_automaton(result, tree, own)
     return message.SerializeToString(deterministic=True)
 
 
-def unit_of(formula: Formula, signal_units: Mapping[str, str]) -> str:
+def unit_of(formula: Formula, units: Mapping[str, str]) -> str:
     """Return the unit of a formula's robustness: that of its atoms, if they share one.
 
-    Footprint units are "", numbers without a unit "1"; a signal without a known unit has "units of
-    NAME". A formula over atoms of several units has "mixed".
+    Footprint units are "" where nothing declares them, numbers without a unit "1"; a signal without a known
+    unit has "units of NAME". A formula over atoms of several units has "mixed".
+
+    Args:
+        units: those that are declared, of signals by their names, of lengths by "".
     """
-    units = {
-        _atom_unit(node.expression, signal_units)
-        for node in iter_subformulas(formula)
-        if isinstance(node, Atom)
+    found = {
+        _atom_unit(node.expression, units) for node in iter_subformulas(formula) if isinstance(node, Atom)
     }
-    if len(units) > 1:
+    if len(found) > 1:
         return MIXED
-    return units.pop() if units else FOOTPRINT_UNITS
+    return found.pop() if found else units.get(FOOTPRINT_UNITS, FOOTPRINT_UNITS)
 
 
 def unit_words(unit: str) -> str:
@@ -183,7 +184,7 @@ def unit_words(unit: str) -> str:
 
 
 def _add_nodes(
-    result: SpecificationResult, tree: ReportedTree, file: Specification, signal_units: Mapping[str, str]
+    result: SpecificationResult, tree: ReportedTree, file: Specification, units: Mapping[str, str]
 ) -> None:
     relations, written = RELATION_NAMES | file.relations, tree.written(file.source)
     for identifier, parent, formula_node in iter_nodes(tree.formula):
@@ -194,7 +195,7 @@ def _add_nodes(
             text=format_formula(formula_node, relations=relations),
             span_start=formula_node.span.start,
             span_end=formula_node.span.end,
-            unit=unit_of(formula_node, signal_units),
+            unit=unit_of(formula_node, units),
             written=written[identifier],
         )
         if parent is not None:
@@ -224,14 +225,14 @@ def _add_automaton(result: SpecificationResult, tree: ReportedTree, automaton: A
         result.automaton.moves.add(source=move.source, target=move.target, guard=guard, label=label)
 
 
-def _atom_unit(expression: Expression, signal_units: Mapping[str, str]) -> str:
-    units = set(_units(expression, signal_units))
-    if len(units) > 1:
+def _atom_unit(expression: Expression, units: Mapping[str, str]) -> str:
+    found = set(_units(expression, units))
+    if len(found) > 1:
         return MIXED
-    return units.pop() if units else FOOTPRINT_UNITS
+    return found.pop() if found else units.get(FOOTPRINT_UNITS, FOOTPRINT_UNITS)
 
 
-def _units(expression: Expression, signal_units: Mapping[str, str]) -> Iterator[str]:
+def _units(expression: Expression, units: Mapping[str, str]) -> Iterator[str]:
     """Yield the units of everything measured in an expression; constants have none of their own."""
     stack = [expression]
     while stack:
@@ -245,13 +246,13 @@ def _units(expression: Expression, signal_units: Mapping[str, str]) -> Iterator[
             case Minimum(operands) | Maximum(operands):
                 stack.extend(operands)
             case Signal(name):
-                yield signal_units.get(name) or f"units of {name}"
+                yield units.get(name) or f"units of {name}"
             case Misalignment():
                 yield DIMENSIONLESS
             case Number():
                 pass
             case _:
-                yield FOOTPRINT_UNITS
+                yield units.get(FOOTPRINT_UNITS, FOOTPRINT_UNITS)
 
 
 def logged_specifications(files: Sequence[Specification]) -> list[Specification]:

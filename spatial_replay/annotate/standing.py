@@ -6,7 +6,7 @@ Viewers need no other topic of numbers: one message has every result, and of the
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -99,14 +99,16 @@ class StandingEncoder:
         trees: Sequence[ReportedTree],
         runs: Sequence[AutomatonRun | None],
         written: Sequence[Sequence[str]],
+        units: Mapping[str, str],
     ) -> None:
         """Start before the first sample.
 
         Args:
             runs: of each tree, the run of its automaton, which takes in the same samples.
             written: of each tree, its nodes as the file writes them.
+            units: those that are declared, see `unit_of`.
         """
-        self._written = written
+        self._written, self._units = written, units
         self._trees, self._runs = trees, runs
         self._parts = [named_parts(tree) for tree in trees]
         self._nodes = [[node for _, _, node in iter_nodes(tree.formula)] for tree in trees]
@@ -184,7 +186,7 @@ class StandingEncoder:
             low, high = ended[0, 2:, 0].tolist()
             by = -high if code == VIOLATED else low if code == SATISFIED else math.nan
             since_s = (violated_ns - first_ns) / 1e9
-            outcomes.append(FinalStanding(code, since_s, by, unit_of(tree.formula, {}), said))
+            outcomes.append(FinalStanding(code, since_s, by, unit_of(tree.formula, self._units), said))
         self.outcomes = tuple(outcomes)
         words, times_ns = np.array(self._words, object)[:, None], np.array([time_ns], np.int64)
         [payload] = self._messages(times_ns, series, words, np.array(since_ns)[:, None], over, final=True)
@@ -259,19 +261,19 @@ class StandingEncoder:
         worst, words, violated, final = layout
         message = StandingUpdate(time_ns=1, worst=self._trees[worst].title, final=final)
         for tree, said in zip(self._trees, words, strict=True):
-            unit = unit_of(tree.formula, {})
+            unit = unit_of(tree.formula, self._units)
             message.results.add(name=tree.title, standing=UNKNOWN, robustness=1.0, unit=unit, automaton=said)
         for tree, parts in zip(self._trees, self._parts, strict=True):
             for name, (_, node) in parts.items():
-                unit = unit_of(node, {})
+                unit = unit_of(node, self._units)
                 message.results.add(name=part_title(name, tree), standing=UNKNOWN, robustness=1.0, unit=unit)
         for node, said in zip(self._nodes[worst][:_MOST_ROWS], self._written[worst], strict=False):
-            unit = unit_of(node, {})
+            unit = unit_of(node, self._units)
             text = said if node.name is None else node.name
             message.nodes.add(text=text, now=1.0, value=1.0, unit=unit, standing=UNKNOWN)
         for index, over in violated:
             tree = self._trees[index]
-            unit = unit_of(tree.formula, {})
+            unit = unit_of(tree.formula, self._units)
             message.violated.add(name=tree.title, since=1.0, by=1.0, unit=unit, over=over)
         return message
 

@@ -178,9 +178,10 @@ def axes_of(source: Source) -> Axes:
     return axes if isinstance(axes, Axes) else OUR_AXES
 
 
-def signal_units_of(source: Source) -> Mapping[str, str]:
-    """Return the units that a source declares for its signals, by their names."""
-    return dict(getattr(source, "signal_units", {}))
+def units_of(source: Source) -> Mapping[str, str]:
+    """Return the units that a source declares: for its signals by their names, for lengths by ""."""
+    unit = axes_of(source).unit
+    return {**getattr(source, "signal_units", {}), **({"": unit} if unit else {})}
 
 
 def reading_options(source: Source) -> dict[str, object]:

@@ -89,7 +89,9 @@ def _mapping(document: Document, name: str) -> LogMapping:
         sampling=Sampling(sample.get("topic"), duration_ns(sample["every"]) if "every" in sample else None),
         max_age_ns=age_ns(value["max_age"]) if "max_age" in value else None,
         origin=_origin(value.get("origin")),
-        axes=Axes(value.get("axes", {}).get("y", "up"), float(value.get("scale", 1.0))),
+        axes=Axes(
+            value.get("axes", {}).get("y", "up"), float(value.get("scale", 1.0)), value.get("unit", "")
+        ),
     )
 
 

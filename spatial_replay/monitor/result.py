@@ -17,7 +17,6 @@ from spatial_replay.monitor.offline import evaluate_offline, full_signal, window
 from spatial_replay.monitor.semantics import Semantics, require_ltlf
 from spatial_replay.monitor.sentences import (
     cause_sentences,
-    number_text,
     reason_sentence,
     sentences_of,
     verdict_sentence,
@@ -31,7 +30,7 @@ from spatial_replay.monitor.witness.witness import Witness, find_witness, time_o
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, NamedSpec, iter_nodes, operator_of
-from spatial_replay.text import Instant, Sentence, shortened_formula
+from spatial_replay.text import Instant, Sentence, number_text, shortened_formula
 
 
 @dataclass(frozen=True, eq=False)

@@ -74,7 +74,10 @@ class Recording:
         self._sink = sink
         self._axes = Axes.from_metadata(about or {})
         self._evaluation = AnnotatedEvaluation(
-            files, [find_instances(file, {}, (), 0, FOREVER) for file in files], known=known
+            files,
+            [find_instances(file, {}, (), 0, FOREVER) for file in files],
+            known=known,
+            units={"": self._axes.unit} if self._axes.unit else {},
         )
         self._samples = self._messages = self._end_ns = 0
         self._topics: set[str] = set()

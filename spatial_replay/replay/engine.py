@@ -16,7 +16,7 @@ from spatial_replay.annotate.specification import (
     specification_attachments,
 )
 from spatial_replay.logs.messages import Attachment, Messages, merge
-from spatial_replay.logs.source import Source, axes_of
+from spatial_replay.logs.source import Source, axes_of, units_of
 from spatial_replay.logs.topics import REPLAYED_PREFIX, image_topics
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
@@ -124,6 +124,7 @@ class Replay:
             source.attachments,
             show=show,
             arrow=options.arrow,
+            units=units_of(source),
         )
         self.trees = self._evaluation.trees
         self._keep_series, self._keep_leaves = keep_series, keep_leaves

@@ -24,7 +24,7 @@ from spatial_replay.annotate.scene_update import SceneState
 from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.logs.messages import Attachment
-from spatial_replay.logs.source import MemorySource, Source
+from spatial_replay.logs.source import MemorySource, Source, units_of
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
@@ -214,7 +214,9 @@ class LoadedLog:
         options = replace(self.options, window=replace(self.options.window, every=1))
         selection = Selection(MemorySource(self.trace, self.name), edited.files, options)
         instances = [selection.instances(file) for file in edited.files]
-        evaluation = AnnotatedEvaluation(edited.files, instances, options.semantics, self._attachments)
+        evaluation = AnnotatedEvaluation(
+            edited.files, instances, options.semantics, self._attachments, units=units_of(self._source)
+        )
         self._check_size(evaluation)
         return Evaluated(self, edited, selection, evaluation, tuple(evaluation.extend(self.trace)))
 

@@ -116,7 +116,7 @@ class RunReport:
         vacuous: templates that no object fits.
         observed_ns: from when on all is observed that unknown results are about; or None.
         unreadable: how many observations have no finite numbers.
-        signal_units: those that are declared, by the signals' names.
+        declared_units: those of signals by their names, and of lengths by "".
     """
 
     log: str
@@ -128,7 +128,7 @@ class RunReport:
     faults: tuple[str, ...]
     remarks: tuple[str, ...]
     unreadable: int
-    signal_units: Mapping[str, str]
+    declared_units: Mapping[str, str]
     semantics: Semantics
     certificate: Mapping[str, str]
     files: tuple[Specification, ...]

@@ -212,7 +212,7 @@ def _result_value(
             each.result.values,
             each.result.final,
             each.relations,
-            report.signal_units,
+            report.declared_units,
             each.tree.calls(each.source),
         ),
         "requirements": requirement_values(each.result, samples, scene.entities_of, packing),

@@ -54,7 +54,7 @@ def tree_value(
     robustness: Floats,
     final: Floats,
     relations: frozenset[str],
-    signal_units: Mapping[str, str],
+    units: Mapping[str, str],
     calls: Mapping[int, str],
 ) -> list[Mapping[str, Any]]:
     """Return the shown nodes, each with its text and its final verdict.
@@ -63,7 +63,7 @@ def tree_value(
         formula: with the object that it is about in place of a template's parameter.
         robustness: (N,), each node's value on the whole log.
         final: (N, 2), lower and upper end of each node for the finished log.
-        signal_units: those that are declared.
+        units: those that are declared.
         calls: of nodes that are a `def` with its arguments, as the file writes them.
     """
     shown, initial = shown_nodes(formula), initial_nodes(formula)
@@ -75,7 +75,7 @@ def tree_value(
             "name": node.name or "",
             "head": _cut(calls.get(identifier) or _head(node, relations)),
             "text": _cut(format_formula(node, relations=relations)),
-            "unit": unit_of(node, signal_units),
+            "unit": unit_of(node, units),
             "divisor": divisor_of(node),
             "initial": identifier in initial,
             "verdict": str(final_verdict(*final[identifier].tolist())),

@@ -17,7 +17,8 @@ from spatial_replay.logs import topics as log_topics
 from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.output_file import refuse_inputs, replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
-from spatial_replay.logs.source import Source, axes_of, signal_units_of
+from spatial_replay.logs.source import Source, axes_of
+from spatial_replay.logs.source import units_of as declared_units
 from spatial_replay.monitor.sentences import divisor_of
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.monitor.witness.witness import Witness
@@ -129,7 +130,7 @@ def _report(source: Source, replay: Replay, replayed: Replayed, collector: Colle
         faults=replayed.faults,
         remarks=replayed.remarks,
         unreadable=replayed.unreadable,
-        signal_units=signal_units_of(source),
+        declared_units=declared_units(source),
         semantics=replayed.semantics,
         certificate=replayed.certificate,
         files=tuple(replay.files),

@@ -28,28 +28,35 @@ class Axes:
     Attributes:
         y: where its y points.
         scale: footprint units per unit of the source.
+        unit: what a footprint unit is, for readers: "m"; "" where nothing declares it.
     """
 
     y: Literal["up", "down"] = "up"
     scale: float = 1.0
+    unit: str = ""
 
     @classmethod
     def from_metadata(cls, about: Mapping[str, str]) -> Axes:
         """Return the axes that a log's metadata say its source had; ours, where they say nothing."""
         try:
             found = json.loads(about.get(AXES_KEY, "{}"))
-            return cls("down" if found.get("y") == "down" else "up", float(found.get("scale", 1.0)))
+            y: Literal["up", "down"] = "down" if found.get("y") == "down" else "up"
+            return cls(y, float(found.get("scale", 1.0)), str(found.get("unit", "")))
         except (ValueError, TypeError, AttributeError):
             return cls()
 
     def metadata(self) -> dict[str, str]:
         """Return the entry for the metadata of a log; none where the source has our axes."""
-        return {} if self == OUR_AXES else {AXES_KEY: json.dumps({"scale": self.scale, "y": self.y})}
+        if self == OUR_AXES:
+            return {}
+        unit = {"unit": self.unit} if self.unit else {}
+        return {AXES_KEY: json.dumps({"scale": self.scale, **unit, "y": self.y})}
 
     def __str__(self) -> str:
         turned = " (down in the source)" if self.y == "down" else ""
         scaled = "" if self.scale == 1.0 else f"; 1 unit of the source is {self.scale:g}"
-        return f"y up{turned}{scaled}"
+        lengths = f"; lengths in {self.unit}" if self.unit else ""
+        return f"y up{turned}{scaled}{lengths}"
 
     def convert_shapes(self, shapes: FootprintBatch) -> FootprintBatch:
         """Return footprints of the source as those of samples."""
@@ -78,7 +85,7 @@ class Axes:
 
     def convert_trace(self, trace: Trace) -> Trace:
         """Return samples of the source with our axes."""
-        if self == OUR_AXES:
+        if (self.y, self.scale) == ("up", 1.0):
             return trace
         return replace(
             trace,

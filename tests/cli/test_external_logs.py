@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from annotate.layouts import layout_of
 from spatial_replay import read_trace
 from spatial_replay.cli import run
+from spatial_replay.logs.schemas.Robustness_pb2 import StandingUpdate
+from spatial_replay.logs.schemas.Specification_pb2 import Specification
+from spatial_replay.logs.topics import STANDING
 
 TURTLES = """\
 sample: {topic: /turtle2/pose}    # the later of the two: no sample without the other
@@ -190,3 +196,30 @@ def test_a_clock_that_jumps_back_is_an_error_or_ends_the_log(
     said = capsys.readouterr()
     assert json.loads(said.out)["log"]["samples"] == 10
     assert "the log is taken to end there" in said.err
+
+
+def test_a_declared_unit_of_lengths_is_at_axes_in_tables_and_in_what_is_made_of_the_log(
+    data_folder: Path, folder: Path
+) -> None:
+    (folder / "metres.yaml").write_text("unit: m\n" + TURTLES)
+    described = "/spatial/specification"
+    bag, spec = str(data_folder / "bags" / "two_turtles.bag"), ["--spec", "turtles.spatial"]
+    run(["replay", bag, *spec, "--mapping", "metres.yaml", "--to", "2s", "-o", "annotated.mcap"])
+    run(["replay", "annotated.mcap", *spec, "-o", "again.mcap"])
+    for log in ("annotated.mcap", "again.mcap"):
+        panels = layout_of(folder / log)["configById"]
+        assert panels["Plot!robustness"]["yAxisLabel"] == "m"
+        assert panels["3D!scene"]["lichtblickPanelTitle"] == "Scene, y up; lengths in m"
+        with (folder / log).open("rb") as stream:
+            messages = [
+                (channel.topic, message.data)
+                for _, channel, message in make_reader(stream).iter_messages([STANDING, described])
+            ]
+        standing = [StandingUpdate.FromString(data) for topic, data in messages if topic == STANDING]
+        assert {each.unit for message in standing for each in (*message.results, *message.nodes)} == {"m"}
+        [found] = [Specification.FromString(data) for topic, data in messages if topic == described]
+        assert {node.unit for result in found.results for node in result.nodes} == {"m"}
+    run(["report", "annotated.mcap", "-o", "run.html"])
+    facts = re.search(r'id="facts">(.*?)</script>', (folder / "run.html").read_text(encoding="utf-8"))
+    assert facts is not None
+    assert {node["unit"] for each in json.loads(facts[1])["results"] for node in each["nodes"]} == {"m"}
