@@ -80,7 +80,7 @@ def _headline(table: pa.Table) -> str:
 def _header(table: pa.Table, name: str) -> Html:
     failed = table.column("failure").null_count < len(table)
     chip = element("span", _headline(table), **{"class": f"chip is-{'violated' if failed else 'satisfied'}"})
-    logs = len(set(zip(table.column("case").to_pylist(), table.column("log").to_pylist(), strict=True)))
+    logs = len(set(table.column("log").to_pylist()))
     about = " · ".join([counted(logs, "log"), summary_text(table), f"spatial-replay {__version__}"])
     title = element("div", element("h1", text(name)), chip, **{"class": "title"})
     return element("header", title, element("p", text(about), **{"class": "about"}), **{"class": "top"})

@@ -99,7 +99,7 @@ def check(
         )
     if log is None:
         _refuse_log_options(reading, strict_names)
-    shown = Path(str(specification))
+    shown = str(specification)
     with _findings_of(shown, form):
         (parsed,) = load_spec_options([specification], profile, constants)
     inputs = local_files([specification] if log is None else [specification, log])
@@ -120,7 +120,7 @@ def check(
 
 
 @contextmanager
-def _findings_of(specification: Path, form: Form) -> Iterator[None]:
+def _findings_of(specification: str, form: Form) -> Iterator[None]:
     """Print the errors of a specification that cannot be parsed in the form that was asked for, too."""
     try:
         yield

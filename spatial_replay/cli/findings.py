@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, Literal, TypeAlias
 from urllib.parse import quote
 
@@ -14,11 +13,11 @@ from spatial_replay.errors import Diagnosis
 Form: TypeAlias = Literal["text", "github", "sarif"]
 
 
-def show_findings(form: Form, path: Path, diagnoses: Sequence[Diagnosis]) -> None:
+def show_findings(form: Form, path: str, diagnoses: Sequence[Diagnosis]) -> None:
     """Print errors and warnings as workflow commands of GitHub, or as one SARIF object; not as text.
 
     Args:
-        path: the file that they are about, as it was given.
+        path: the file that they are about, or its address, as it was given.
     """
     if form == "github":
         # imported here so that --help stays fast
