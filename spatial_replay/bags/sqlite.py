@@ -44,7 +44,8 @@ _MOST_PROBES = 10_000
 """Parts of a damaged table that are tried; what is left then counts as lost."""
 
 Row = tuple[int, int, Any, Any]
-"""Id, topic, time and content of a message; a damaged file may hold anything as the last two."""
+"""Id, topic, time and content of a message."""
+_TYPES = (int, int, int, bytes)
 RowHead = tuple[int, int, int]
 """Id, topic and time of a message."""
 _Span = tuple[int, int]
@@ -125,7 +126,8 @@ class SqliteBag(MessageReader):
         after = (-1, -1)
         with _opened(self._whole) as database:
             try:
-                for rows in _batches(database.execute(query, (*sorted(wanted), first, last - 1))):
+                found = database.execute(query, (*sorted(wanted), first, last - 1))
+                for rows in self._sound(_batches(found)):
                     yield self._columns(rows, wanted)
                     after = key(rows[-1])
                 return
@@ -137,7 +139,7 @@ class SqliteBag(MessageReader):
                 (row for row in intact if row[1] in wanted and first <= row[2] < last and key(row) > after),
                 key=key,
             )
-            for rows in _batches(_contents(database, following, lost)):
+            for rows in self._sound(_batches(_contents(database, following, lost))):
                 yield self._columns(rows, wanted)
         self._report_lost(damage, intact, lost)
 
@@ -160,12 +162,18 @@ class SqliteBag(MessageReader):
             rows = rows if behind or not before else f"rows from {begin} on"
             self._faults.add(Sentence(f"{damaged}; messages", *when, f" are lost: {rows}"))
 
+    def _sound(self, batches: Iterable[list[Row]]) -> Iterator[list[Row]]:
+        """Yield rows without those that a damaged file has filled with anything else."""
+        for rows in batches:
+            sound = [row for row in rows if tuple(map(type, row)) == _TYPES]
+            if len(sound) < len(rows):
+                lost = len(rows) - len(sound)
+                self._faults.add(f"{self.name}: {lost} messages have no number, time or content")
+            if sound:
+                yield sound
+
     def _columns(self, rows: Sequence[Row], wanted: Mapping[int, str]) -> MessageColumns:
         places, numbers, times, payloads = zip(*rows, strict=True)
-        if set(map(type, payloads)) != {bytes} or set(map(type, times)) != {int}:
-            good = [row for row in rows if type(row[3]) is bytes and type(row[2]) is int]
-            self._faults.add(f"{self.name}: {len(rows) - len(good)} messages have no time or no content")
-            return self._columns(good, wanted) if good else MessageColumns()
         topics = [wanted[number] for number in numbers]
         channel = np.searchsorted(self._numbers, np.array(numbers, np.int64))
         place = np.array(places, np.int64)

@@ -112,8 +112,9 @@ def info(
         with progress("samples") as advance:
             overview = overview_of(open_source(log, **reading), advance)
     faults = tuple(dict.fromkeys((*overview.faults, *(surveyed.faults if surveyed else ()))))
-    faults, remarks = (counted_from(texts, overview.start_ns or 0) for texts in (faults, overview.remarks))
-    warn(*dict.fromkeys((*faults, *(surveyed.remarks if surveyed else ()), *remarks)))
+    remarks = (*(surveyed.remarks if surveyed else ()), *overview.remarks)
+    faults, remarks = (counted_from(texts, overview.start_ns or 0) for texts in (faults, remarks))
+    warn(*dict.fromkeys((*faults, *remarks)))
     if as_json:
         show_json(_document(overview, surveyed, faults))
     else:
@@ -208,7 +209,7 @@ def _print_mapping(log: LogFile, reader: MessageReader | None, as_json: bool) ->
         raise UsageError(f"{source.name} needs no mapping: it names its objects")
     with progress("messages") as advance:
         surveyed = survey(reader, advance, whole=False)
-    warn(*surveyed.faults, *surveyed.remarks)
+    warn(*counted_from((*surveyed.faults, *surveyed.remarks), surveyed.start_ns or 0))
     show_file(surveyed.mapping)
     return ExitCode.DAMAGED if surveyed.faults else ExitCode.SATISFIED
 

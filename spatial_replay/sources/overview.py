@@ -24,6 +24,7 @@ from spatial_replay.logs.source import Source, TrackSource, axes_of, reading_onl
 from spatial_replay.logs.topics import OBJECTS
 from spatial_replay.mapping.suggest import EXAMPLES, suggest_mapping, suggest_topics
 from spatial_replay.sources.open_log import is_bag_folder, readable_file
+from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.axes import OUR_AXES, Axes
 from spatial_replay.trace.trace import Trace
 
@@ -141,7 +142,7 @@ class _Counter:
         self.counts = {topic.name: 0 for topic in topics}
         self.examples: dict[str, list[object]] = {}
         self._remarks: list[str] = []
-        self._undecodable: dict[str, tuple[int, str]] = {}
+        self._undecodable: dict[str, tuple[int, Sentence]] = {}
         self._looked_at: dict[str, int] = {}
         self._decoders: dict[str, Decoder] = {}
         self.missing = {topic.name for topic in topics if topic.count != 0}
@@ -150,7 +151,7 @@ class _Counter:
                 self._decoders[topic.name] = reader.decoder(topic.name)
                 self.examples[topic.name] = []
             except LogError as error:
-                self._remarks.append(_of_topic(topic.name, str(error)))
+                self._remarks.append(_of_topic(topic.name, Sentence(str(error))))
         self._declared = {topic.name: topic.count for topic in topics}
         self._bytes = dict.fromkeys(self._declared, 0)
 
@@ -174,20 +175,21 @@ class _Counter:
         try:
             self.examples[topic].append(self._decoders[topic](message.payload))
         except LogError as error:
-            count, first = self._undecodable.get(topic, (0, f"{error}, at {message.log_time_ns} ns"))
+            here = Sentence(f"{error}, at ", Instant(message.log_time_ns, 0))
+            count, first = self._undecodable.get(topic, (0, here))
             self._undecodable[topic] = count + 1, first
 
     def take_remarks(self) -> list[str]:
         """Return remarks on topics, and on messages looked at, that cannot be decoded."""
         return self._remarks + [
-            f"{_of_topic(topic, first)} ({count} of {self._looked_at[topic]} messages looked at)"
+            Sentence(_of_topic(topic, first), f" ({count} of {self._looked_at[topic]} messages looked at)")
             for topic, (count, first) in self._undecodable.items()
         ]
 
 
-def _of_topic(name: str, what: str) -> str:
+def _of_topic(name: str, what: Sentence) -> Sentence:
     start = f"topic {name!r}: "
-    return what if what.startswith(start) else start + what
+    return what if what.startswith(start) else Sentence(start, what)
 
 
 @dataclass(frozen=True, slots=True)

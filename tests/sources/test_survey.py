@@ -99,6 +99,7 @@ def test_a_later_message_that_cannot_be_decoded_is_remarked_once(tmp_path: Path)
     found = [remark for remark in survey(reader).remarks if "/a" in remark]
     assert len(found) == 1
     assert "(2 of 4 messages looked at)" in found[0]
+    assert ", at 0.000 s (" in found[0]
     assert all(remark.count("topic '/b': ") <= 1 for remark in survey(reader).remarks)
 
 
