@@ -270,8 +270,7 @@ class LiveSession:
             self._early, early = Inbox(), self._early
             for item in early.take():
                 # it has waited for the beginning, not for evaluation that falls behind
-                is_message = isinstance(item, Received)
-                inbox.put(item._replace(arrived_s=time.monotonic()) if is_message else item)
+                inbox.put(item._replace(arrived_s=now_s) if isinstance(item, Received) else item)
         if silent := self._silent_topics(now_s):
             self._silent |= {*silent}
             listed = ", ".join(silent)

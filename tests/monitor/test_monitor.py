@@ -35,6 +35,29 @@ def test_a_verdict_settles_as_samples_come():
     assert third.node("up").value == 1
 
 
+@pytest.mark.parametrize(
+    ("text", "at", "reason"),
+    [
+        ("F (robot dist vase <= 1)", 3, "`robot dist vase <= 1` holds by 0 at 3.000 s"),
+        ("G[0s,2s] (robot dist vase >= 1.5)", 2, "`robot dist vase >= 1.5` holds by 0.5 at 2.000 s"),
+        (
+            "F (robot dist vase <= 2.5 and robot dist vase >= 0)",
+            2,
+            "`robot dist vase <= 2.5` holds by 0.5 at 2.000 s",
+        ),
+    ],
+)
+def test_a_satisfied_verdict_says_which_atom_decided_it(text: str, at: int, reason: str) -> None:
+    monitor = Monitor(parse_specification(f"spec wanted = {text}"))
+    for second in range(at + 1):
+        robot = Footprint.box(5 - second, 0, 6 - second, 1)
+        vase = Footprint.box(0, 0, 1, 1)
+        update = monitor.update(Sample(second * SECOND, {"robot": robot, "vase": vase}))
+        assert len(update.satisfied) == (second >= at)
+    assert [each.reason for each in update.satisfied] == [reason]
+    assert update.violations == ()
+
+
 def test_terms_look_back_before_the_start_of_a_monitor():
     monitor = Monitor(parse_specification("H a dist a[-1] <= 2"), start_ns=SECOND)
     before = monitor.update(Sample(0, {"a": Footprint.disc(0, 0, 0)}))
