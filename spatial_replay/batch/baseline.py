@@ -144,8 +144,9 @@ def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Dif
         (BASELINE_ROBUSTNESS, pa.float64(), [number for _, number in was]),
     ):
         table = table.append_column(name, pa.array(values, kind))
-    rows = dict(zip(_keys(baseline), baseline.to_pylist(), strict=True)) if gone else {}
-    missing = [_gone_row(rows[each.key], each) for each in gone]
+    places = {key: place for place, key in enumerate(_keys(baseline))} if gone else {}
+    rows = baseline.take(pa.array([places[each.key] for each in gone], pa.int64())).to_pylist()
+    missing = [_gone_row(row, each) for row, each in zip(rows, gone, strict=True)]
     return pa.concat_tables([table, pa.Table.from_pylist(missing, table.schema)])
 
 

@@ -170,7 +170,7 @@ def when_stored(folder: Path, rows: int, pid: int) -> threading.Thread:
             time.sleep(0.005)
         os.kill(pid, signal.SIGKILL)
 
-    killer = threading.Thread(target=kill)
+    killer = threading.Thread(target=kill, daemon=True)
     killer.start()
     return killer
 
@@ -191,7 +191,7 @@ def test_a_cluster_evaluates_a_batch_outlives_a_worker_and_ends_with_its_schedul
         arguments = ["batch", "logs", "--spec", "gate.spatial", "--dask", address]
         killer = when_stored(fleet, 1, int(victim))
         done = command(*arguments, "--html", "pages")
-        killer.join()
+        killer.join(60)
         assert done.code == 1, done.err
         assert f"{2 * LOGS} results: 30 satisfied, 10 violated" in done.out
         assert set(keys_of(fleet / "results").values()) == {1}
@@ -200,7 +200,7 @@ def test_a_cluster_evaluates_a_batch_outlives_a_worker_and_ends_with_its_schedul
         shutil.rmtree(fleet / "results")
         killer = when_stored(fleet, 1, process.pid)
         done = command(*arguments)
-        killer.join()
+        killer.join(60)
     assert (done.code, "the scheduler answers no more" in done.err) == (70, True), done.err
     assert "Traceback" not in done.err
     assert sr.evaluate_logs("logs", "gate.spatial", output="results").evaluated < LOGS
