@@ -286,9 +286,10 @@ class LiveSession:
         trace = self._assembler.add(messages, time.monotonic())
         self._notes += self._assembler.take_faults()
         if self._assembler.is_finished and self.failure is None:
+            jump = self._assembler.jump or "time jumps back by more than a second"
             self.failure = LogError(
-                f"{self._address}: time jumps back by more than a second, as when a simulation or a player"
-                " starts again; the run ends there, and what comes after is another: start the monitor again"
+                f"{self._address}: {jump}, as when a simulation or a player starts again; the run ends there:"
+                " start the monitor again"
             )
         return trace
 

@@ -18,6 +18,7 @@ class ObjectsAssembler:
     """Decodes samples as they come; what it offers is that of `LiveAssembler`."""
 
     overdue = 0
+    jump = None
     topics = (OBJECTS,)
 
     def __init__(self, name: str) -> None:

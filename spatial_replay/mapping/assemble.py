@@ -122,12 +122,13 @@ class Assembler:
         self._latest_ns = self._settled_ns = self._forgot_ns = -1
         self._count = self._bytes = 0
         self._step = _FIRST_STEP
-        self._has_split = False
+        self.jump: Sentence | None = None
+        """Where time jumped back so far that the log is taken to end there."""
 
     @property
     def is_finished(self) -> bool:
         """Whether no further message counts: after a jump that splits the log, or past the window."""
-        return self._has_split or self._settled_ns >= self._window_ns[1] - 1
+        return self.jump is not None or self._settled_ns >= self._window_ns[1] - 1
 
     def add(self, messages: Sequence[Message] | MessageColumns) -> Trace:
         """Add messages in the order of the log; return the samples that are final now.
@@ -210,6 +211,10 @@ class Assembler:
             UsageError: the mapping fits no message of a topic.
         """
         trace = self._settle(max(self._newest_ns, self._latest_ns))
+        # of a system that runs, there is no log to cut
+        if self.jump is not None and self._arrived is None:
+            what_follows = ": the log is taken to end there; cut it to evaluate what comes after"
+            self._remarks.add(Sentence(self.jump, what_follows))
         for reader in self._readers.values():
             reader.finish()
             if reader.unstamped:
@@ -309,10 +314,7 @@ class Assembler:
         )
         if self._on_time_jump == "error":
             raise LogError(f"{self._name}: {where}; {JUMP_REMEDY}, and another clock may not jump")
-        self._has_split = True
-        self._remarks.add(
-            Sentence(where, ": the log is taken to end there; cut it to evaluate what comes after")
-        )
+        self.jump = where
         return place
 
     def _put(self, stamped: _Stamped, arrived: MessageColumns) -> None:

@@ -27,6 +27,7 @@ from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.mapping.topic_reader import MISFITS, TopicReader
+from spatial_replay.text import Sentence
 from spatial_replay.trace.trace import Trace
 
 _MOMENT_S: Final = 0.001
@@ -146,6 +147,11 @@ class LiveAssembler:
     def is_finished(self) -> bool:
         """Whether time has jumped back, so that no further message counts."""
         return self._assembler.is_finished
+
+    @property
+    def jump(self) -> Sentence | None:
+        """Where time has jumped back."""
+        return self._assembler.jump
 
     def add(self, messages: Sequence[Message], now_s: float) -> Trace:
         """Add messages as they came; return the samples that are final now.
