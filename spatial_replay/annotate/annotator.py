@@ -109,7 +109,7 @@ class Annotator:
         ]
         written = [tree.written(files[tree.file].source) for tree in trees]
         self._standing = StandingEncoder(trees, self._runs, written, units)
-        self._encoder = SceneEncoder(shown_regions(files))
+        self._encoder = SceneEncoder(shown_regions(files), units.get("", ""))
         self._latest: tuple[Trace, list[SeriesBlock]] | None = None
         self._scene = scene or SceneState()
         self._show = show

@@ -104,9 +104,10 @@ def causes_of(results: Sequence[EvaluatedResult], found: Violations) -> tuple[tu
 _LONGEST_CAUSE: Final = 60
 
 
-def robustness_text(number: float) -> str:
-    """Return a number with three digits, or as many as fit."""
+def robustness_text(number: float, unit: str = "") -> str:
+    """Return a number with three digits, or as many as fit, and its unit if that fits, too."""
     text = f"{number:.3g}"
     if len(text) > LABEL_LENGTH:
         text = next(text for digits in (2, 1) if len(text := f"{number:.{digits}g}") <= LABEL_LENGTH)
-    return text
+    whole = f"{text} {unit}"
+    return whole if unit.isascii() and unit and len(whole) <= LABEL_LENGTH else text

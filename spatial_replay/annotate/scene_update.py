@@ -198,6 +198,7 @@ class SceneFrames:
     _presence: Presence
     _content: _SceneContent
     _regions: tuple[Region, ...]
+    _unit: str = ""
 
     def frame(self, index: int) -> SceneFrame:
         """Return what one of the messages shows."""
@@ -217,7 +218,8 @@ class SceneFrames:
         if found.is_shown[index]:
             robustness = float(found.robustness[index])
             which, node, leaf = (int(each[index]) for each in (found.result, found.node, found.leaf))
-            label = f"{content.causes[content.arrow[index] - _FIRST_FORM]}: {robustness_text(robustness)}"
+            number = robustness_text(robustness, self._unit)
+            label = f"{content.causes[content.arrow[index] - _FIRST_FORM]}: {number}"
             violation = DrawnViolation(found.points[index], label, which, node, robustness, leaf)
         is_violated = bool((self.objects[index] < 0.0).any() or (self.regions[index] < 0.0).any())
         return SceneFrame(entities, violation, is_violated)
@@ -243,9 +245,11 @@ class SceneEncoder:
 
     Attributes:
         regions: by name.
+        unit: that of lengths, "" where nothing declares it.
     """
 
     regions: Mapping[str, Outline]
+    unit: str = ""
     _drawn: tuple[Region, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -298,7 +302,9 @@ class SceneEncoder:
             place=state.place,
             templates=MappingProxyType(dict(list(templates.items())[-_MOST_TEMPLATES:])),
         )
-        frames = SceneFrames(times_ns, objects, regions, *shades, scale, presence, content, self._drawn)
+        frames = SceneFrames(
+            times_ns, objects, regions, *shades, scale, presence, content, self._drawn, self.unit
+        )
         return SceneMessages(times_ns, payloads, after, frames)
 
     def scaled(self, state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState, Floats, int]:
@@ -347,7 +353,7 @@ class SceneEncoder:
             colour = objects[samples, column]
             columns += words_of_object(drawn, points, bottom, top, colour, _LIFT * scale)
         if layout.witness:
-            columns += _words_of_arrow(content.violations, samples, scale)
+            columns += _words_of_arrow(content.violations, samples, scale, self.unit)
         return np.concatenate([np.empty((len(samples), 0)), *columns], axis=1)
 
 
@@ -380,9 +386,9 @@ class _SceneContent(NamedTuple):
     banners: tuple[Banner | None, ...]
 
 
-def _words_of_arrow(found: Violations, samples: Integers, scale: float) -> list[Floats]:
+def _words_of_arrow(found: Violations, samples: Integers, scale: float, unit: str) -> list[Floats]:
     z = np.fmax(found.top[samples], 0.0) + 3.0 * _LIFT * scale
-    labels = [robustness_text(number) for number in found.robustness[samples].tolist()]
+    labels = [robustness_text(number, unit) for number in found.robustness[samples].tolist()]
     return words_of_witness(found.points[samples], z, scale, labels)
 
 

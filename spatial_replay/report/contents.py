@@ -60,6 +60,7 @@ class ReportedResult:
         pointer: the two points between which the atom that decided it stands; None if it has none.
         named: the specs of its file, by name.
         units: those of the numbers that its robustness is the least of.
+        unit: that of its robustness, if it is declared, or "".
         automaton: None if it has none.
         no_automaton: why not.
         path: the states of the run.
@@ -75,6 +76,7 @@ class ReportedResult:
     pointer: Pointer | None
     named: Mapping[str, NamedSpec]
     units: tuple[Unit, ...]
+    unit: str
     automaton: Automaton | None
     no_automaton: str
     path: StatePath

@@ -139,6 +139,7 @@ def page_data(report: RunReport) -> PageData:
     decisions = decisions_value(report.decisions, report.first_ns, packing)
     facts = {
         "settles": report.semantics == "ltlf",
+        "lengths": report.declared_units.get("", ""),
         "is_thinned": len(kept) < len(times_ns),
         "times": packing.add((kept - report.first_ns) / 1e9, "f8"),
         "palette": {
@@ -202,7 +203,7 @@ def _result_value(
         "name": each.result.name,
         "object": each.result.object,
         "verdict": str(each.result.verdict),
-        "pointer": _pointer_value(each, first_ns),
+        "pointer": _pointer_value(each, first_ns, report.declared_units.get("", "")),
         "fault": None if each.fault_ns is None else (each.fault_ns - first_ns) / 1e9,
         "first": int(np.searchsorted(kept, here[0])) if len(here) else 0,
         "samples": len(here),
@@ -236,7 +237,7 @@ def _place_of(each: ReportedResult) -> int | None:
     return shown.index(each.decided_node) if each.decided_node in shown else None
 
 
-def _pointer_value(each: ReportedResult, first_ns: int) -> Mapping[str, Any] | None:
+def _pointer_value(each: ReportedResult, first_ns: int, lengths: str) -> Mapping[str, Any] | None:
     """Return the arrow at what decided a result that is not satisfied, and when it is shown."""
     if each.pointer is None or each.fault_ns is None:
         return None
@@ -244,7 +245,7 @@ def _pointer_value(each: ReportedResult, first_ns: int) -> Mapping[str, Any] | N
         "time": (each.fault_ns - first_ns) / 1e9,
         "ends": each.pointer.ends.reshape(-1).tolist(),
         "text": each.pointer.text,
-        "label": f"{each.pointer.number:.3g}",
+        "label": f"{each.pointer.number:.3g} {lengths}".rstrip(),
         "number": json_number(each.pointer.number),
         "is_condition": each.pointer.is_condition,
     }

@@ -166,7 +166,8 @@ def _counts(report: RunReport) -> str:
 def _summary(each: ReportedResult, first_ns: int) -> Html:
     """Return the line of a result: its verdict, requirement and number, and since when it is certain."""
     result = each.result
-    numbers = [f"robustness {each.robustness_text or 'not determined'}"]
+    unit = f" {each.unit}" if each.unit and each.robustness_text else ""
+    numbers = [f"robustness {each.robustness_text or 'not determined'}{unit}"]
     if result.violated_at_ns is not None:
         numbers.append(f"violated since {Instant(result.violated_at_ns, first_ns)}")
     elif result.satisfied_at_ns is not None:

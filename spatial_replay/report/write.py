@@ -7,11 +7,12 @@ A replay gives the results and a `Collector` takes the rest from its messages. T
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from spatial_replay.annotate.specification import unit_of
 from spatial_replay.errors import UsageError
 from spatial_replay.logs import topics as log_topics
 from spatial_replay.logs.messages import Messages
@@ -134,7 +135,7 @@ def _report(source: Source, replay: Replay, replayed: Replayed, collector: Colle
         semantics=replayed.semantics,
         certificate=replayed.certificate,
         files=tuple(replay.files),
-        results=tuple(_results(replay, replayed, collector)),
+        results=tuple(_results(replay, replayed, collector, declared_units(source))),
         vacuous=replayed.vacuous,
         observed_ns=_observed_ns(replayed),
         scene=collector.scene.scene,
@@ -143,11 +144,13 @@ def _report(source: Source, replay: Replay, replayed: Replayed, collector: Colle
     )
 
 
-def _results(replay: Replay, replayed: Replayed, collector: Collector) -> Iterator[ReportedResult]:
+def _results(
+    replay: Replay, replayed: Replayed, collector: Collector, declared: Mapping[str, str]
+) -> Iterator[ReportedResult]:
     explained = _explained(replayed)
     for index, result in enumerate(replayed.results):
         tree, compiled = replay.trees[index], replay.automata[index]
-        file = replay.files[tree.file]
+        file, unit = replay.files[tree.file], unit_of(result.formula, declared)
         is_explained = index in explained
         witness = result.worst if is_explained else None
         yield ReportedResult(
@@ -161,6 +164,7 @@ def _results(replay: Replay, replayed: Replayed, collector: Collector) -> Iterat
             pointer=None if witness is None else _pointer(witness),
             named={spec.name: spec for spec in file.specs},
             units=units_of(result.formula),
+            unit=unit if unit in declared.values() else "",
             automaton=compiled.automaton,
             no_automaton=compiled.reason,
             path=collector.path(tree.name, tree.object),

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
@@ -16,7 +17,7 @@ from spatial_replay import read_trace
 from spatial_replay.cli import run
 from spatial_replay.logs.schemas.Robustness_pb2 import StandingUpdate
 from spatial_replay.logs.schemas.Specification_pb2 import Specification
-from spatial_replay.logs.topics import STANDING
+from spatial_replay.logs.topics import SCENE, STANDING
 
 TURTLES = """\
 sample: {topic: /turtle2/pose}    # the later of the two: no sample without the other
@@ -212,14 +213,18 @@ def test_a_declared_unit_of_lengths_is_at_axes_in_tables_and_in_what_is_made_of_
         assert panels["3D!scene"]["lichtblickPanelTitle"] == "Scene, y up; lengths in m"
         with (folder / log).open("rb") as stream:
             messages = [
-                (channel.topic, message.data)
-                for _, channel, message in make_reader(stream).iter_messages([STANDING, described])
+                (channel.topic, message.data) for _, channel, message in make_reader(stream).iter_messages()
             ]
         standing = [StandingUpdate.FromString(data) for topic, data in messages if topic == STANDING]
         assert {each.unit for message in standing for each in (*message.results, *message.nodes)} == {"m"}
+        drawn = [SceneUpdate.FromString(data) for topic, data in messages if topic == SCENE]
+        [arrow] = [each for each in drawn[-1].entities if each.id == "witness"]
+        assert arrow.texts[0].text.strip() == "turtle1 ovlp turtle2: -1.53 m"
         [found] = [Specification.FromString(data) for topic, data in messages if topic == described]
         assert {node.unit for result in found.results for node in result.nodes} == {"m"}
     run(["report", "annotated.mcap", "-o", "run.html"])
-    facts = re.search(r'id="facts">(.*?)</script>', (folder / "run.html").read_text(encoding="utf-8"))
+    page = (folder / "run.html").read_text(encoding="utf-8")
+    assert "robustness -1.514 m" in page
+    facts = re.search(r'id="facts">(.*?)</script>', page)
     assert facts is not None
     assert {node["unit"] for each in json.loads(facts[1])["results"] for node in each["nodes"]} == {"m"}

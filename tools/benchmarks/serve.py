@@ -9,6 +9,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 import spatial_replay as sr
+from spatial_replay.annotate.standing import StandingEncoder
 from spatial_replay.logs.source import MemorySource
 from spatial_replay.logs.topics import CURVES_TOPIC, SCENE
 from spatial_replay.replay import LoadedLog
@@ -53,6 +55,14 @@ class Viewer:
         value = float(next(self._values))
         self._send(op="setParameters", parameters=[{"name": "near", "value": value, "type": "float64"}])
         self.wait_for(topic)
+
+    def ask(self) -> None:
+        """Ask for the parameters, and wait for them."""
+        self._send(op="getParameters", parameterNames=[], id="asked")
+        while True:
+            received = self._connection.recv(PATIENCE_S)
+            if isinstance(received, str) and json.loads(received).get("id") == "asked":
+                return
 
     def wait_for(self, topic: str) -> None:
         head = struct.pack("<BI", 1, self._channels[topic])
@@ -102,13 +112,47 @@ def bench_serve_windows(measure: Any) -> None:
             )
 
 
+def bench_serve_relay(measure: Any) -> None:
+    """A question and its answer through the server's door, which looks at every frame of an older viewer."""
+    trace = sr.Trace.from_samples(
+        sr.Sample(index * 10**8, {"a": sr.Footprint.box(index, 0, index + 1, 1)}) for index in range(10)
+    )
+    for protocol in ("foxglove.sdk.v1", "foxglove.websocket.v1"):
+        with viewing(trace, "spec there = F a closeto[near] a", protocol) as viewer:
+            measure(f"question, {protocol}", lambda _: viewer.ask(), unit="question", limit_s=0.05)
+
+
+def bench_standing(measure: Any) -> None:
+    """Messages on how results stand: one and eight results over the camera recording, at most 50 a second."""
+    data = _data()
+    if not data.is_dir():
+        return
+    trace = sr.read_trace(data / "blocks_moving_passage.jsonl.gz")
+    for count in (1, 8):
+        text = "\n".join(f"spec s{index} = G red1 farfrom[{-index}] blue1" for index in range(count))
+        evaluated = LoadedLog(MemorySource(trace), [sr.parse_specification(text)]).evaluate()
+        trees, (samples, blocks) = evaluated.evaluation.trees, evaluated.part(0, len(trace))
+        written, of_none = [tree.written(text) for tree in trees], [""] * count
+        measure(
+            f"standing of {count}",
+            partial(_encode, samples.times_ns, blocks, of_none),
+            prepare=partial(StandingEncoder, trees, [None] * count, written, {}),
+            unit="sample",
+            per=len(trace),
+        )
+
+
+def _encode(times_ns: Any, blocks: Any, over: list[str], encoder: StandingEncoder) -> object:
+    return encoder.encode(times_ns, blocks, over)
+
+
 @contextmanager
-def viewing(trace: Trace, text: str) -> Iterator[Viewer]:
+def viewing(trace: Trace, text: str, protocol: str = "foxglove.sdk.v1") -> Iterator[Viewer]:
     """A viewer of a log and a specification with the constant `near`."""
     loaded = LoadedLog(MemorySource(trace), [sr.parse_specification(f"const near = 70\n{text}")])
     with (
         open_server(loaded.evaluate(), port=0) as server,
-        connect(server.address, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None) as connection,
+        connect(server.address, subprotocols=[Subprotocol(protocol)], max_size=None) as connection,
     ):
         yield Viewer(connection)
 

@@ -334,7 +334,7 @@ function wordsOf(clock, scene, frame) {
     }
     const how = pointer.number < 0 ? "fails" : "must not hold, and does";
     return ["the arrow, what decided the verdict: ", element("code", {}, pointer.text),
-      ` of ${run.results[clock.result].title} ${how} by ${numberText(Math.abs(pointer.number))}`];
+      ` of ${run.results[clock.result].title} ${how} by ${numberText(Math.abs(pointer.number))}${spaced(run.lengths)}`];
   }
   const violation = violationAt(clock, scene, frame);
   if (violation) return ["the arrow: ", ...violationWords(run, scene.times[frame], violation)];
@@ -376,14 +376,23 @@ function violationWords(run, time, {result: which, node: index, label, robustnes
     return failureWords({result, node, place});
   }
   // a page of a long run leaves samples out: the atom that decides is not known
-  return [...partWords({result, node}), ` is violated by ${numberText(-robustness)} now`];
+  return [...partWords({result, node}), ` is violated by ${numberText(-robustness)}${spaced(run.lengths)} now`];
 }
 
 function failureWords(part) {
   // in the unit of the log, as the number beside the arrow
   const node = atomOf(part), number = node.series[NOW][part.place] * node.divisor;
   const how = number < 0 ? "fails" : "must not hold, and does";
-  return [...partWords({...part, node}), ` ${how} by ${numberText(Math.abs(number))} now`];
+  return [...partWords({...part, node}), ` ${how} by ${numberText(Math.abs(number))}${spaced(declaredUnit(node))} now`];
+}
+
+// The unit that the log declares for the number of an atom, or "".
+function declaredUnit({unit, divisor}) {
+  return divisor !== 1 || unit === "1" || unit === "mixed" || unit.startsWith("units of") ? "" : unit;
+}
+
+function spaced(unit) {
+  return unit && ` ${unit}`;
 }
 
 function partWords({result, node}) {
