@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 from typing import Any
+
+from mcap.writer import Writer
 
 
 def _run(*arguments: str, cache: str | None = None) -> None:
@@ -41,8 +44,6 @@ def bench_short_replay(measure: Any) -> None:
 
 def bench_replay_command(measure: Any) -> None:
     """`spatial-replay replay` of the blocks recording, 1579 samples."""
-    import json
-
     data = Path(os.environ.get("SPATIAL_REPLAY_DATA", "")) / "paper"
     if not data.is_dir():
         return
@@ -53,3 +54,39 @@ def bench_replay_command(measure: Any) -> None:
         measure("verdict only", lambda _: _run("replay", log, "--spec", str(spec)), limit_s=1.5)
         annotated = f"{folder}/annotated.mcap"
         measure("with -o", lambda _: _run("replay", log, "--spec", str(spec), "-o", annotated), limit_s=1.5)
+
+
+def bench_template(measure: Any) -> None:
+    """A template for each of 125 tracks that come and go in an external log of 600 samples."""
+    with tempfile.TemporaryDirectory() as folder:
+        log, mapping, spec = (f"{folder}/{name}" for name in ("tracks.mcap", "tracks.yaml", "calm.spatial"))
+        _write_tracks(Path(log))
+        Path(mapping).write_text(
+            "topics:\n  /tracks: {objects: 'tracks[*]', name: 'person_{id}', class: person,"
+            " position: [x, y], shape: {disc: 0.3}, complete: true}\n"
+        )
+        Path(spec).write_text('spec calm(ego) = G (ego dist (class "person" except ego) >= 0.5)\n')
+        options = (log, "--mapping", mapping, "--spec", spec, "--each", "ego=class:person")
+        measure(
+            "replay --json --series",
+            lambda _: _run("replay", *options, "--json", "-", "--series"),
+            limit_s=6.0,
+        )
+        measure("explain", lambda _: _run("explain", *options), limit_s=3.5)
+
+
+def _write_tracks(path: Path) -> None:
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("Tracks", "jsonschema", b"{}")
+        channel = writer.register_channel("/tracks", "json", schema)
+        for tick in range(600):
+            there = [each for each in range(125) if 0 <= tick - 4 * each < 80 + each]
+            tracks = [
+                {"id": each, "x": each % 12 * 5.0 + 0.02 * tick, "y": each // 12 * 5.0 - 0.01 * tick}
+                for each in there
+            ]
+            time_ns = 1_700_000_000_000_000_000 + tick * 10**8
+            writer.add_message(channel, time_ns, json.dumps({"tracks": tracks}).encode(), time_ns)
+        writer.finish()
