@@ -52,6 +52,7 @@ COMMANDS: dict[str, str] = {
     "report": "Write an HTML report of a run.",
     "results": "Show what a batch found.",
     "serve": "Replay live to a viewer, with constants to change.",
+    "tags": "Print AprilTags, and calibrate a camera.",
     "tune": "Find the constants that fit recorded runs.",
     "verify": "Recompute a log's certificate and compare.",
     "warmup": "Compile everything once, for images.",

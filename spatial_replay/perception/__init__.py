@@ -11,6 +11,8 @@
     object_poses    corners to poses and their covariance
     observer        frames to samples
     camera_messages what the log shows of it
+    calibration     a camera from views of known tags
+    tag_sheet       tags to print
     rendering       images whose truth is known
 
 Names are loaded when they are first used.

@@ -56,7 +56,7 @@ class ImageTopic:
 
         Raises:
             MissingFileError: there is no such file.
-            LogError: it is no log of messages.
+            LogError: it is not a log of messages.
             UsageError: no such topic, or none or several with images.
         """
         self._reader = open_messages(path)
@@ -159,5 +159,5 @@ def open_frames(
             raise UsageError(f"{path.name} is a log, whose messages have stamps; leave out --rate")
         return ImageTopic(path, topic)
     if topic is not None:
-        raise UsageError(f"{path.name} is no log of messages; leave out --topic")
+        raise UsageError(f"{path.name} is not a log of messages; leave out --topic")
     return VideoFile(local_copy(path), rate=rate)

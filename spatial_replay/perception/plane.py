@@ -293,7 +293,7 @@ def _refuse_edge_on(tags: TagsFile, seen: Floats, known: Floats) -> None:
 
 def _edge_on() -> str:
     return (
-        "the plane is seen edge-on, so that places in it cannot be told apart; look at it from further"
+        "the plane is seen edge-on, so that places in it cannot be distinguished; look at it from further"
         " above, and spread the reference tags, not on one line"
     )
 

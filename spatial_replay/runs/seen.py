@@ -107,7 +107,7 @@ def record_seen(
 
     Args:
         hold_ns: how long a hidden object stays where it was, with growing uncertainty.
-        keep: what becomes of the video; None copies it where that is possible, and encodes it otherwise.
+        keep: how the log keeps the video; None copies it where that is possible, and encodes it otherwise.
         inputs: files that the output must not be.
         begin: takes the time of the first frame.
         show: takes each change of a verdict.
