@@ -77,7 +77,7 @@ def calibrate_camera(
     if len(views) < _LEAST_VIEWS:
         raise UsageError(
             f"{name}: {counted(len(views), 'frame')} of different views with {_LEAST_TAGS} or more of the"
-            f" tags ({counted(seen, 'frame')} with so many in all); {_LEAST_VIEWS} are needed: tilt the sheet,"
+            f" tags ({counted(seen, 'frame')} with so many in all); {_LEAST_VIEWS} are needed: tilt it,"
             " or move the camera around the table, near and far"
         )
     found_calibration = calibrate(points, pixels, size)
