@@ -264,10 +264,10 @@ class Recorder(SampleWriter):
     """Record samples into an MCAP log, with the robustness of specifications beside them.
 
     The log is written in place: if the process is killed, less than a second of samples is lost, counted from
-    when `write` took them, however busy the machine is. Leaving the `with` block closes the log properly, also after an error or Ctrl-C; the log
-    then says that it was interrupted. So does SIGTERM: in a `with` block of the main thread it raises
-    SystemExit(143), unless the program has a handler of its own. A signal that arrives while the log is
-    closed waits until that is done.
+    when `write` took them, however busy the machine is. Leaving the `with` block closes the log properly,
+    also after an error or Ctrl-C; the log then says that it was interrupted. So does SIGTERM: in a `with`
+    block of the main thread it raises SystemExit(143), unless the program has a handler of its own. A signal
+    that arrives while the log is closed waits until that is done.
 
     With a trigger, nothing is written until it fires. What came before it waits in memory, and each firing
     leaves one log around it.
