@@ -94,7 +94,9 @@ def _summary(found: Clip) -> str:
         return "  nothing smaller has these verdicts and witnesses: the clip holds every sample of the log"
     window = " to ".join(time_text(at, first_ns) for at in (found.start_ns, found.end_ns))
     size = f"{found.clip_bytes:,} bytes"
-    if found.source_bytes:
+    if found.source_bytes and found.clip_bytes >= found.source_bytes:
+        size += f"; the log itself, {found.source_bytes:,} bytes, is smaller than its schemas and annotations"
+    elif found.source_bytes:
         size += f", {found.clip_bytes / found.source_bytes:.2%} of the log's {found.source_bytes:,}"
     samples = f"{found.replayed.samples:,} of {counted(found.whole.samples, 'sample')}"
     return f"  {', '.join(found.kept)}: {samples}, {window} of the log; {size}"

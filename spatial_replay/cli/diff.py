@@ -35,11 +35,11 @@ if TYPE_CHECKING:
 @click.argument("other", required=False, type=LogPath())
 @click.option(
     "--align",
-    metavar="time|progress|NAME",
+    metavar="time|progress[:NAME]|NAME",
     default="time",
     show_default=True,
-    help="Two logs: align them by time since the first sample, by the progress of an automaton, or by the "
-    "first change of sign of the spec NAME.",
+    help="Two logs: align them by time since the first sample, by the progress of the automaton of "
+    "NAME, or of that with the most states in common, or by the first change of sign of the spec NAME.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 @output_option("Page to write (HTML), with both under one time cursor.")

@@ -199,10 +199,10 @@ def _lines(tuning: Tuning) -> Iterator[str]:
     )
     if tuning.conflict is not None:
         names = ", ".join(constant.name for constant in tuning.constants)
-        together = "these contradict each other:" if len(tuning.conflict.runs) > 1 else "this one never fits:"
         start = f"no values of {names} exist" if tuning.conflict.is_proven else f"found no values of {names}"
-        yield f"{start} that fit {runs}; {together}"
-        yield from (f"  {part}" for part in tuning.conflict.message.split("; "))
+        for number, (what, needs) in enumerate(tuning.conflict.sections):
+            yield f"and {what}:" if number else f"{start} that fit {runs}; {what}:"
+            yield from (f"  {part}" for part in needs)
         return
     kind = ("widest margin" if tuning.is_widest else "margin") if count[False] else "tightest values"
     yield f"{kind} for {runs}: {tuning.margin:.6g}" if count[False] else f"{kind} for {runs}"

@@ -79,7 +79,8 @@ def align_runs(
     Args:
         times_ns: of the samples of A and of B, at least one each.
         results: of both runs, in pairs.
-        align: "time", "progress", or the name of a spec, whose first change of sign is the event.
+        align: "time", "progress", "progress:NAME", or the name of a spec, whose first change of sign is the
+            event.
 
     Raises:
         UsageError: no such spec, a spec that never changes its sign, no result with an automaton.
@@ -88,8 +89,11 @@ def align_runs(
     start = Knot(int(a[0]), int(b[0]))
     if align == "time":
         return _alignment("time", None, [start], a, b)
-    if align != "progress":
+    kind, colon, wanted = align.partition(":")
+    if kind != "progress" or (colon and not wanted):
         return _alignment("event", align, [_event(results, align)], a, b)
+    if wanted:
+        results = _titled(results, wanted)
     found: list[tuple[str, list[Knot]]] = []
     for one, other in results:
         require_ltlf(one.semantics, "the progress of an automaton")
@@ -105,12 +109,24 @@ def align_runs(
         found.append((one.title, knots))
     if not found:
         raise UsageError(
-            "no spec has an automaton to align by (past operators and bounds in seconds have none); "
-            "align by time, or by a spec's name"
+            f"{wanted + ' has no' if wanted else 'no spec has an'} automaton to align by (past operators and "
+            "bounds in seconds have none); align by time, or by a spec's name"
         )
     # without temporal operators, an automaton ends where it begins
     name, knots = max(found, key=lambda each: len(each[1]))
     return _alignment("progress", name, knots, a, b)
+
+
+def _titled(
+    results: Sequence[tuple[SpecResult, SpecResult]], wanted: str
+) -> list[tuple[SpecResult, SpecResult]]:
+    """Return the pair of results of a name or title."""
+    found = [pair for pair in results if wanted in (pair[0].title, pair[0].name)]
+    if not found:
+        titles = [one.title for one, _ in results]
+        hint = nearest_hint(wanted, titles) or f"there are {', '.join(titles) or 'none'}"
+        raise UsageError(f"no result is named {wanted!r} to align by the progress of; {hint}")
+    return found
 
 
 def parting_of(one: SpecResult, other: SpecResult, files: Sequence[Specification]) -> Parting | None:
@@ -202,7 +218,7 @@ def _path(result: SpecResult, files: Sequence[Specification]) -> list[_Visit] | 
     """Return the states of a run, each as often as it is entered; None without an automaton."""
     if result.leaves is None or not len(result.times_ns) or result.semantics != "ltlf":
         return None
-    file = next((file for file in files if any(each.formula is result.formula for each in file.specs)), None)
+    file = file_of(files, result)
     if file is None:
         return None
     try:
@@ -222,6 +238,15 @@ def _path(result: SpecResult, files: Sequence[Specification]) -> list[_Visit] | 
         )
         for at in entered
     ]
+
+
+def file_of(files: Sequence[Specification], result: SpecResult) -> Specification | None:
+    """Return the file that a result comes from; None if it is another one."""
+    pairs = [(file, each.formula) for file in files for each in file.specs]
+    same = (file for file, formula in pairs if formula is result.formula)
+    # one that was parsed by another profile is evaluated as it is logged: equal, and another object
+    equal = (file for file, formula in pairs if formula == result.formula)
+    return next(same, None) or next(equal, None)
 
 
 def _common(one: Sequence[_Visit], other: Sequence[_Visit]) -> int:

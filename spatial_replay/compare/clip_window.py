@@ -1,6 +1,6 @@
 """The smallest window of a log whose replay has the verdict, robustness and witness of the whole log.
 
-The part that settled a violation first keeps its own, too.
+What settled a verdict before the log ended stays, too: the sample, the part that failed first, its witness.
 
 No window is measured again: atoms are those of the first replay, except the first few that look back to
 before the window, where a clip has no samples.
@@ -8,26 +8,30 @@ before the window, where a clip has no samples.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
+from spatial_replay.compare.alignment import file_of
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
 from spatial_replay.logs.source import Source
 from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
-from spatial_replay.monitor.offline import evaluate_offline
+from spatial_replay.monitor.causes import find_causes
+from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.result import SpecResult
-from spatial_replay.monitor.verdict import final_verdict
-from spatial_replay.monitor.witness.path import End, deciding_path
+from spatial_replay.monitor.stream import NEVER
+from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
+from spatial_replay.monitor.witness.path import End, MissedResponse, deciding_path, missed_response
+from spatial_replay.monitor.witness.unfinished import UnfinishedNodes, evaluate_unfinished
 from spatial_replay.replay.selection import ReplayOptions, Selection
 from spatial_replay.spec.diagnostics import nearest_hint
-from spatial_replay.spec.formula import Outline, Specification
+from spatial_replay.spec.formula import Outline, Specification, iter_nodes
 from spatial_replay.trace.trace import ABSENT, Trace, window_of
 from spatial_replay.tuning.number_search import last_that_holds
 
@@ -58,26 +62,20 @@ def chosen_nodes(results: Sequence[SpecResult], of: Sequence[str]) -> list[KeptN
     return found
 
 
-def _first_causes(kept: Sequence[KeptNode]) -> Iterator[KeptNode]:
-    """Yield the part of each node that settled its violation: not always the one that its number is of."""
-    for each in kept:
-        first = each.result.first_cause(each.node)
-        if first is not None and first.settled_ns is not None and first.node != each.node:
-            yield KeptNode(each.result, first.node, each.title)
-
-
-class _Reason(NamedTuple):
-    """A result on some samples, as a clip has to repeat it.
+class _Path(NamedTuple):
+    """What decides a node, as a clip has to repeat it.
 
     Attributes:
-        ends: lower and upper end, the nominal ones, too.
         nodes: the ids on the path to the deciding atom.
         decided_ns: the sample that decides.
+        number: the interval of the last of these nodes there.
+        missed: the implication on the path that failed.
     """
 
-    ends: tuple[float, ...]
     nodes: tuple[int, ...]
     decided_ns: int
+    number: tuple[float, float]
+    missed: MissedResponse | None
 
 
 class _Part:
@@ -90,25 +88,44 @@ class _Part:
         self._result, self._node = result, kept.node
         self._leaves, self._times_ns = result.leaves, result.times_ns
         self._order = result.evidence.instance.program.leaves
+        self._nodes = [node for _, _, node in iter_nodes(result.formula)]
         self._trace, self._regions = trace, regions
         self._reach = look_back([result.formula])
         # an instance lasts from the first to the last appearance of its object
         self._seen_ns: Integers | None = None
         if result.object is not None and trace is not None:
             self._seen_ns = trace.times_ns[_appearances(trace, result.object)]
-        self.reason = self._reason(self._leaves, self._times_ns)
+        self._certain_ns = result.certain_ns(kept.node)
+        cause = result.first_cause(kept.node)
+        self._cause = None if cause is None else cause.node
+        self._settled_ns = self._certain_ns if cause is None else cause.settled_ns
+        done = self._evaluated(self._leaves, self._times_ns)
+        self._ends = self._ends_of(done)
+        self._verdict = final_verdict(*self._ends[0][:2])
+        self._paths = [self._path(done, self._times_ns, self._node), *self._settled(self._leaves, done)]
+        times_ns = [path.decided_ns for path in self._paths]
+        times_ns += [each for each in (self._certain_ns, self._settled_ns) if each is not None]
+        self.span_ns = min(times_ns), max(times_ns)
 
-    def over(self, start_ns: int, end_ns: int) -> _Reason | None:
-        """Return the reason over the samples from one time to another, both included; None without any."""
+    def holds_over(self, start_ns: int, end_ns: int) -> bool:
+        """Say whether all of it is the same over the samples from one time to another, both included."""
         if self._seen_ns is not None:
             begin, end = window_of(self._seen_ns, start_ns, end_ns + 1)
             if begin == end:
-                return None
+                return False
             start_ns, end_ns = self._seen_ns[[begin, end - 1]].tolist()
         begin, end = window_of(self._times_ns, start_ns, end_ns + 1)
         if begin == end:
-            return None
-        return self._reason(self._within(begin, end, start_ns), self._times_ns[begin:end])
+            return False
+        leaves, times_ns = self._within(begin, end, start_ns), self._times_ns[begin:end]
+        done = self._evaluated(leaves, times_ns)
+        return (
+            self._ends_of(done) == self._ends
+            and self._path(done, times_ns, self._node) == self._paths[0]
+            and self._is_certain_alike(leaves, times_ns)
+            and self._first_cause(leaves, times_ns, done) == self._cause
+            and self._settled(leaves, done, times_ns) == self._paths[1:]
+        )
 
     def _within(self, begin: int, end: int, first_ns: int) -> Floats:
         """Return the leaves of a window as a log of its own has them: nothing is known before its start."""
@@ -129,15 +146,80 @@ class _Part:
         leaves[:, :, : len(head)] = in_channels(known, channels)
         return leaves
 
-    def _reason(self, leaves: Floats, times_ns: Integers) -> _Reason:
-        done = evaluate_offline(self._result.formula, self._order, np.ascontiguousarray(leaves), times_ns)
-        ends = tuple(
-            float(end[0]) + 0.0 for wide in (True, False) for end in done.ends(self._node, wide=wide)
+    def _evaluated(self, leaves: Floats, times_ns: Integers) -> OfflineNodes:
+        return evaluate_offline(self._result.formula, self._order, np.ascontiguousarray(leaves), times_ns)
+
+    def _unfinished(self, leaves: Floats, times_ns: Integers, count: int) -> UnfinishedNodes:
+        """Return the nodes as the first samples alone settle them."""
+        return evaluate_unfinished(self._result.formula, self._order, leaves[:, :, :count], times_ns[:count])
+
+    def _ends_of(self, done: OfflineNodes) -> list[tuple[float, ...]]:
+        """Return the ends, the nominal ones, too, of the node and of the part that failed first."""
+        nodes = [self._node, *(() if self._cause is None else (self._cause,))]
+        return [
+            tuple(float(end[0]) + 0.0 for wide in (True, False) for end in done.ends(node, wide=wide))
+            for node in nodes
+        ]
+
+    def _path(self, done: OfflineNodes | UnfinishedNodes, times_ns: Integers, node: int) -> _Path:
+        goes_on = isinstance(done, UnfinishedNodes)
+        lower, upper = (float(end[0]) + 0.0 for end in done.ends(node))
+        end = End.of(final_verdict(lower, upper))
+        path = deciding_path(self._result.formula, done, times_ns, node, end, goes_on=goes_on)
+        last = path.steps[-1]
+        low, high = done.ends(last.node)
+        return _Path(
+            tuple(step.node for step in path.steps),
+            int(times_ns[last.sample]),
+            (float(low[last.sample]), float(high[last.sample])),
+            missed_response(path, self._nodes, done, times_ns) if end is End.HIGH else None,
         )
-        verdict = final_verdict(*ends[:2])
-        end = End.of(verdict)
-        steps = deciding_path(self._result.formula, done, times_ns, self._node, end).steps
-        return _Reason(ends, tuple(step.node for step in steps), int(times_ns[steps[-1].sample]))
+
+    def _settled(self, leaves: Floats, done: OfflineNodes, times_ns: Integers | None = None) -> list[_Path]:
+        """Return what decided the part that failed first, or the verdict that became certain, when it did."""
+        times_ns = self._times_ns if times_ns is None else times_ns
+        node = self._node if self._cause is None else self._cause
+        if self._settled_ns is None:
+            return [self._path(done, times_ns, node)]
+        count = int(np.searchsorted(times_ns, self._settled_ns, side="right"))
+        return [self._path(self._unfinished(leaves, times_ns, count), times_ns[:count], node)]
+
+    def _is_certain_alike(self, leaves: Floats, times_ns: Integers) -> bool:
+        """Say whether the verdict becomes certain at the same sample, or at none."""
+        count = len(times_ns)
+        if self._certain_ns is not None:
+            count = int(np.searchsorted(times_ns, self._certain_ns, side="right"))
+            if not count or times_ns[count - 1] != self._certain_ns:
+                return False
+            if self._online_verdict(leaves, times_ns, count) is not self._verdict:
+                return False
+            count -= 1
+        return count == 0 or self._online_verdict(leaves, times_ns, count) is not self._verdict
+
+    def _online_verdict(self, leaves: Floats, times_ns: Integers, count: int) -> Verdict:
+        lower, upper = self._unfinished(leaves, times_ns, count).ends(self._node)
+        return online_verdict(float(lower[0]) + 0.0, float(upper[0]) + 0.0)
+
+    def _first_cause(self, leaves: Floats, times_ns: Integers, done: OfflineNodes) -> int | None:
+        """Return the part that fails first, given that the verdict becomes certain when it did in the log."""
+        if self._cause is None:
+            return None
+        conjuncts = self._result.conjuncts_of(self._node)
+        final, values = np.zeros((len(self._nodes), 2)), np.zeros(len(self._nodes))
+        settled_ns = np.full((len(self._nodes), 2), NEVER, np.int64)
+        prefix, certain_ns = None, self._certain_ns or 0
+        if self._certain_ns is not None:
+            count = int(np.searchsorted(times_ns, self._certain_ns, side="right"))
+            prefix = self._unfinished(leaves, times_ns, count)
+        for node in (each.node for each in conjuncts):
+            final[node] = [float(end[0]) + 0.0 for end in done.ends(node)]
+            low, high = (float(end[0]) + 0.0 for end in done.ends(node, wide=False))
+            values[node] = low if low == high else np.nan
+            # no part was settled earlier than the whole, and one that is later does not come first
+            if prefix is not None and prefix.ends(node)[1][0] < 0.0:
+                settled_ns[node, 1] = certain_ns
+        causes = find_causes(conjuncts, values, final, settled_ns, lambda node, settled_ns: None)
+        return causes[0].node if causes else None
 
 
 class ClipSearch:
@@ -159,16 +241,15 @@ class ClipSearch:
         if needs_samples:
             trace = Selection(source, files, options).trace()
         self._parts = [
-            _Part(each, trace, _regions(files, each.result))
-            for each in (*kept, *_first_causes(kept))
-            if len(each.result.times_ns)
+            _Part(each, trace, _regions(files, each.result)) for each in kept if len(each.result.times_ns)
         ]
         self._times_ns = _joined_times([result.times_ns for result in results])
-        decided = [part.reason.decided_ns for part in self._parts]
+        first_ns = min(part.span_ns[0] for part in self._parts) - around_ns
+        last_ns = max(part.span_ns[1] for part in self._parts) + around_ns
         last = len(self._times_ns) - 1
         self._inner = (
-            int(np.searchsorted(self._times_ns, min(decided) - around_ns)),
-            min(last, int(np.searchsorted(self._times_ns, max(decided) + around_ns, side="right")) - 1),
+            int(np.searchsorted(self._times_ns, first_ns)),
+            min(last, int(np.searchsorted(self._times_ns, last_ns, side="right")) - 1),
         )
         self._known: dict[tuple[int, int], bool] = {}
 
@@ -203,12 +284,8 @@ class ClipSearch:
         """Say whether a window has every result, for the same reason."""
         if (first, last) not in self._known:
             times = int(self._times_ns[first]), int(self._times_ns[last])
-            self._known[first, last] = all(_same(part.over(*times), part.reason) for part in self._parts)
+            self._known[first, last] = all(part.holds_over(*times) for part in self._parts)
         return self._known[first, last]
-
-
-def _same(one: _Reason | None, other: _Reason) -> bool:
-    return one is not None and one == other
 
 
 def _joined_times(times_ns: Sequence[Integers]) -> Integers:
@@ -221,7 +298,8 @@ def _joined_times(times_ns: Sequence[Integers]) -> Integers:
 
 def _regions(files: Sequence[Specification], result: SpecResult) -> Mapping[str, Outline]:
     """Return the regions of the file that a result comes from."""
-    return next((file.regions for file in files for spec in file.specs if spec.formula is result.formula), {})
+    file = file_of(files, result)
+    return {} if file is None else file.regions
 
 
 def _appearances(trace: Trace, name: str) -> Booleans:

@@ -177,7 +177,8 @@ def diff_sources(
 
     Args:
         options: how each log is evaluated.
-        align: "time" since the first sample, "progress" of the automaton that both go farthest through, or
+        align: "time" since the first sample, "progress" of the automaton that both go farthest through,
+            "progress:NAME" of that of a spec, or
             the name of a spec, whose first change of sign in each run is the event.
         advance: called with the number of samples of each block that is read.
 

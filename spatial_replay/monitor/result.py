@@ -231,6 +231,12 @@ class SpecResult(Displayed):
         """Return why a node is violated or unknown, as `causes` does for the root."""
         return self._causes(node, self._settled_witness)
 
+    def conjuncts_of(self, node: int) -> list[Conjunct]:
+        """Return the parts of a node that have to hold for it to hold."""
+        formula = next(each for identifier, _, each in iter_nodes(self.formula) if identifier == node)
+        own = conjuncts_of(formula, self._name_of(node))
+        return [replace(each, node=node + each.node) for each in own]
+
     def first_cause(self, node: int) -> Cause | None:
         """Return the first of `causes_of` a node, without its witness: no sample is read for it."""
         return next(iter(self._causes(node, lambda node, settled_ns: None)), None)
@@ -239,7 +245,7 @@ class SpecResult(Displayed):
         if final_verdict(*self.final[node].tolist()) is Verdict.SATISFIED:
             return ()
         named = {**self.evidence.instance.named, self.name: self.spec}
-        return find_causes(self._conjuncts(node), self.values, self.final, self.settled_ns, witness, named)
+        return find_causes(self.conjuncts_of(node), self.values, self.final, self.settled_ns, witness, named)
 
     def to_pandas(self) -> Any:
         """Return the numbers of each sample as a pandas DataFrame, indexed by `time_ns`.
@@ -413,7 +419,7 @@ class SpecResult(Displayed):
         if not causes:
             return None
         name = self._name_of(node)
-        return find_least(self._conjuncts(node), self.values, self.final, causes[0], name)
+        return find_least(self.conjuncts_of(node), self.values, self.final, causes[0], name)
 
     def _least_at_ns(self, causes: Sequence[Cause]) -> int | None:
         first = causes[0] if causes else None
@@ -425,11 +431,6 @@ class SpecResult(Displayed):
 
     def _name_of(self, node: int) -> str:
         return self.name if node == 0 else self.nodes[node].name or shortened_formula(self.nodes[node].text)
-
-    def _conjuncts(self, node: int) -> list[Conjunct]:
-        formula = next(each for identifier, _, each in iter_nodes(self.formula) if identifier == node)
-        own = conjuncts_of(formula, self._name_of(node))
-        return [replace(each, node=node + each.node) for each in own]
 
     def _settled_witness(self, node: int, settled_ns: int | None) -> Witness | None:
         """Return what settled the verdict of a node at a time, or decides it on the whole log."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -33,6 +34,8 @@ _MOST_RUNS: Final = 50
 """The most runs in a table."""
 _MOST_LINES: Final = 40
 """The most runs whose change of verdict is drawn as a line of its own."""
+_MOST_MARGINS: Final = 10_000
+"""Margins that a picture may take, unless its least resolution takes more."""
 
 
 @html.register(Tuning)
@@ -41,7 +44,10 @@ def tuning_html(tuning: Tuning) -> Html:
     name = element("b", tuning.specification.filename)
     if tuning.conflict is not None:
         none = "no values fit" if tuning.conflict.is_proven else "found no values that fit"
-        return element("div", name, f": {none} all runs. {tuning.conflict.message}.")
+        about = " ".join(
+            f"{what.capitalize()}: {'; '.join(needs)}." for what, needs in tuning.conflict.sections
+        )
+        return element("div", name, f": {none} all runs. {about}")
     rows = [
         (each.name, str(each.value), str(each.written), f"{each.low} to {each.high}")
         for each in tuning.constants
@@ -66,12 +72,17 @@ def tuning_html(tuning: Tuning) -> Html:
 
 
 @plot.register(Tuning)
-def draw_tuning(tuning: Tuning, *names: str, points: int = 25, ax: Axes | None = None) -> Axes:
+def draw_tuning(tuning: Tuning, *names: str, points: int | None = None, ax: Axes | None = None) -> Axes:
     """Draw the margins over one or two constants; without names over the first two.
+
+    Args:
+        points: how many values of each constant; without it as few runs allow, 25 to 60.
 
     Raises:
         UsageError: a constant that was not varied; matplotlib is not installed.
     """
+    if points is None:
+        points = int(np.clip(math.sqrt(_MOST_MARGINS / len(tuning.runs)), 25, 60))
     return draw_surface(tuning.surface(*names, points=points), ax)
 
 
@@ -87,7 +98,7 @@ def draw_surface(surface: Surface, ax: Axes | None = None) -> Axes:
     """
     ax = ax or new_panel((6.4, 4.4))
     (_draw_curves if len(surface.names) == 1 else _draw_colours)(surface, ax)
-    ax.set_xlabel(plain(surface.names[0]))
+    ax.set_xlabel(_labelled(surface, 0))
     _name_runs(surface, ax)
     return ax
 
@@ -118,7 +129,7 @@ def _draw_curves(surface: Surface, ax: Axes) -> None:
     ax.axhline(0.0, color=INK, linewidth=0.8, linestyle=":")
     if surface.found is not None:
         ax.axvline(surface.found[0], color=INK, linewidth=0.8)
-    ax.set_ylabel("margin")
+    ax.set_ylabel("margin (robustness towards the right verdict)")
     ax.legend(loc="best", frameon=False)
 
 
@@ -139,7 +150,12 @@ def _draw_colours(surface: Surface, ax: Axes) -> None:
     )
     figure = ax.get_figure(root=True)
     if figure is not None:
-        figure.colorbar(mesh, ax=ax, label="least margin", extend="min" if least.min() < -most else "neither")
+        figure.colorbar(
+            mesh,
+            ax=ax,
+            label="least margin of all runs (robustness)",
+            extend="min" if least.min() < -most else "neither",
+        )
     for (_, is_good), margins in list(zip(surface.runs, surface.margins, strict=True))[:_MOST_LINES]:
         if min(margins.shape) > 1 and margins.min() < 0.0 <= margins.max():
             ax.contour(
@@ -153,7 +169,12 @@ def _draw_colours(surface: Surface, ax: Axes) -> None:
             )
     if surface.found is not None:
         ax.plot(*surface.found, marker="o", markersize=7, color="white", markeredgecolor=INK)
-    ax.set_ylabel(plain(surface.names[1]))
+    ax.set_ylabel(_labelled(surface, 1))
+
+
+def _labelled(surface: Surface, axis: int) -> str:
+    """Return the label of an axis: the constant, and in which unit it is; numbers are as in the file."""
+    return plain(f"{surface.names[axis]} (s)" if surface.durations[axis] else surface.names[axis])
 
 
 def _name_runs(surface: Surface, ax: Axes) -> None:

@@ -41,12 +41,14 @@ class Found:
         is_held: whether every run has the right verdict there.
         conflict: runs that have not all the right verdict at any point, as far as was searched; () if held.
         is_proven: whether they have it at no point at all; if held, whether no other point is better.
+        alone: those of the conflict that have the right verdict at no point, whatever the others need.
     """
 
     point: Point
     is_held: bool
     conflict: tuple[int, ...] = ()
     is_proven: bool = True
+    alone: tuple[int, ...] = ()
 
 
 class Search:
@@ -110,7 +112,7 @@ class Search:
         loosest = self._at([_PARTS] * len(self._steps), _PARTS)
         failing = tuple(run for run in self._good if not self._margins.holds(run, loosest))
         if failing:
-            return Found(loosest, is_held=False, conflict=failing)
+            return Found(loosest, is_held=False, conflict=failing, alone=failing)
         together = self._least(self._good, _PARTS, lambda part: self._at([part] * len(self._steps), _PARTS))
         point = self._at([together] * len(self._steps), _PARTS)
         for axis, steps in enumerate(self._steps):
@@ -127,22 +129,26 @@ class Search:
         def at(looseness: int) -> Point:
             return (self._numbered(0, looseness),)
 
-        loosest, tightest = at(steps), at(0)
-        alone = [run for run in self._good if not self._margins.holds(run, loosest)]
-        alone += [run for run in self._bad if not self._margins.holds(run, tightest)]
-        if alone:
-            return Found(self._margins.start, is_held=False, conflict=tuple(alone))
-        first = self._least(self._good, steps, at)
-        last = steps - self._least(self._bad, steps, lambda tightness: at(steps - tightness))
+        alone = self._alone(at(steps), at(0))
+        good, bad = ([run for run in runs if run not in alone] for runs in (self._good, self._bad))
+        first = self._least(good, steps, at)
+        last = steps - self._least(bad, steps, lambda tightness: at(steps - tightness))
+        failing: list[int] = []
         if first > last:
-            failing = [run for run in self._good if not self._margins.holds(run, at(last))]
-            failing += [run for run in self._bad if not self._margins.holds(run, at(first))]
-            return Found(at(first), is_held=False, conflict=tuple(failing))
+            failing = [run for run in good if not self._margins.holds(run, at(last))]
+            failing += [run for run in bad if not self._margins.holds(run, at(first))]
+        if alone or failing:
+            return Found(at(first), is_held=False, conflict=(*alone, *failing), alone=alone)
         number = self._crossing(first, last, at)
         widest = max(number, max(number - 1, first), key=lambda each: self._least_margin(at(each)))
         least = self._least_margin(at(widest))
         interval = self.interval(at(widest), 0, least)
         return Found((self._margins.varied[0].roundest(*interval),), is_held=True)
+
+    def _alone(self, loosest: Point, tightest: Point) -> tuple[int, ...]:
+        """Return the runs that have the right verdict at no point, given the two at which that is easiest."""
+        good = [run for run in self._good if not self._margins.holds(run, loosest)]
+        return (*good, *(run for run in self._bad if not self._margins.holds(run, tightest)))
 
     def _crossing(self, first: int, last: int, at: Callable[[int], Point]) -> int:
         """Return the least looseness at which the good have the wider margin; the last if there is none.
@@ -179,6 +185,11 @@ class Search:
 
     def _widest_by_boxes(self) -> Found:
         """Decide exactly over the runs that decide, and add those that turn out to, until none is missing."""
+        alone = self._alone(
+            self._at([_PARTS] * len(self._steps), _PARTS), self._loosened([0] * len(self._steps))
+        )
+        if alone:
+            return Found(self._margins.start, is_held=False, conflict=alone, alone=alone)
         exact = ExactSearch(self._margins, self._loosened)
         deciding = self._worst(self._margins.start, [])
         while True:

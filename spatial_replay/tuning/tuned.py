@@ -78,11 +78,23 @@ class Conflict:
         runs: names of the runs that cannot all have the right verdict.
         message: what each of them needs, as far as that is known.
         is_proven: whether no values exist, rather than that none were found.
+        alone: those of them that fit no values by themselves, whatever the others need.
     """
 
     runs: tuple[str, ...]
     message: str
     is_proven: bool
+    alone: tuple[str, ...] = ()
+
+    @property
+    def sections(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
+        """What the runs have in common, and what each of them needs: those that fit no values first."""
+        needs = self.message.split("; ")
+        count = min(len(self.alone), _MOST_NAMED) + (len(self.alone) > _MOST_NAMED)
+        alone = "this one fits none by itself" if len(self.alone) == 1 else "these fit none by themselves"
+        together = "these contradict each other" if len(self.runs) > 1 else "this one never fits"
+        parts = ((alone, tuple(needs[:count])), (together, tuple(needs[count:])))
+        return tuple(part for part in parts if part[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +107,7 @@ class Surface(Displayed):
         margins: (R, Y, X); -inf where the specification is invalid.
         runs: (R,) names of the runs, and whether each is good.
         found: the values found, or None.
+        durations: for each constant, whether it is a duration.
     """
 
     names: tuple[str, ...]
@@ -103,6 +116,7 @@ class Surface(Displayed):
     margins: Floats
     runs: tuple[tuple[str, bool], ...]
     found: tuple[float, ...] | None
+    durations: tuple[bool, ...]
 
     @property
     def least(self) -> Floats:
@@ -194,6 +208,7 @@ class Tuning(Displayed):
             margins,
             tuple((run.name, run.is_good) for run in self.runs),
             found if self.is_found else None,
+            tuple(each.written.duration_ns is not None for each in varied),
         )
 
     @property
@@ -232,6 +247,7 @@ class Tuning(Displayed):
                 "runs": list(self.conflict.runs),
                 "message": self.conflict.message,
                 "proven": self.conflict.is_proven,
+                "alone": list(self.conflict.alone),
             },
         }
 
@@ -340,20 +356,28 @@ def _tuning(specification: Specification, margins: Margins, search: Search, foun
 
 def _conflict(margins: Margins, search: Search, found: Found) -> Conflict:
     conflict = sorted(found.conflict, key=lambda run: (margins.margin(run, found.point), run))
-    names = tuple(margins.runs[run].name for run in conflict)
+    alone = [run for run in conflict if run in found.alone]
+    others = [run for run in conflict if run not in found.alone]
     is_exact = len(margins.varied) == 1 and margins.directions[0] is not None
-    parts = [_needs(margins, search, run, is_exact) for run in conflict[:_MOST_NAMED]]
-    more = len(names) - len(parts)
-    if more:
-        parts.append(f"and {counted(more, 'other run')} likewise")
-    return Conflict(names, "; ".join(parts), found.is_proven)
+    parts: list[str] = []
+    for runs in (alone, others):
+        parts += [
+            _needs(margins, search, run, is_exact=is_exact, is_alone=runs is alone)
+            for run in runs[:_MOST_NAMED]
+        ]
+        if len(runs) > _MOST_NAMED:
+            parts.append(f"and {counted(len(runs) - _MOST_NAMED, 'other run')} likewise")
+    names = tuple(margins.runs[run].name for run in (*alone, *others))
+    return Conflict(names, "; ".join(parts), found.is_proven, names[: len(alone)])
 
 
-def _needs(margins: Margins, search: Search, run: int, is_exact: bool) -> str:
+def _needs(margins: Margins, search: Search, run: int, *, is_exact: bool, is_alone: bool) -> str:
     """Say which values a run needs, in a part of a sentence."""
     one = margins.runs[run]
     what = "satisfied" if one.is_good else "violated"
     if not is_exact:
+        if is_alone:
+            return f"{one.name} is not {what} with any values tried"
         return f"{one.name} has to be {what}"
     constant, limit = margins.varied[0], search.limit(run)
     if limit is None:

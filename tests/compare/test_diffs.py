@@ -66,6 +66,11 @@ def test_runs_of_different_speeds_are_aligned_by_their_progress() -> None:
     by_progress = sr.diff_logs(fast, slow, specification, align="progress")
     assert by_progress.alignment is not None
     assert by_progress.alignment.about == "away"
+    by_name = sr.diff_logs(fast, slow, specification, align="progress:away").alignment
+    assert by_name is not None
+    assert (by_name.about, by_name.knots) == ("away", by_progress.alignment.knots)
+    with pytest.raises(sr.UsageError, match="did you mean 'away'"):
+        sr.diff_logs(fast, slow, specification, align="progress:awy")
     assert len(by_progress.alignment.knots) >= 3
     assert by_time.shift > 5.0
     # between two changes of state the cup moves evenly, so that each sample has its counterpart

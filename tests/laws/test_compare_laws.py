@@ -174,6 +174,13 @@ def test_a_clip_has_the_verdicts_the_robustness_and_the_witnesses_of_the_log(spe
     again = sr.evaluate(specification, cut, each=each)
     for one, other in zip(whole, again, strict=True):
         assert (one.title, numbers_of(one)) == (other.title, numbers_of(other))
+        # what `replay` prints
+        if one.verdict is not sr.Verdict.UNKNOWN:
+            assert one.reason(0) == other.reason(0)
+        assert one.certain_ns() == other.certain_ns()
+        assert [(each.node, each.settled_ns) for each in one.causes[:1]] == [
+            (each.node, each.settled_ns) for each in other.causes[:1]
+        ]
         mine, its = one.witness(), other.witness()
         assert (mine.time_ns, [step.node for step in mine.path]) == (
             its.time_ns,

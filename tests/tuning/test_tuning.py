@@ -91,7 +91,22 @@ def test_json_has_values_margins_and_conflicts(folder: Path, capsys: pytest.Capt
         "runs": ["0.jsonl"],
         "message": "0.jsonl is not satisfied with any near from 0 to 0.5",
         "proven": True,
+        "alone": ["0.jsonl"],
     }
+
+
+def test_runs_that_fit_no_value_are_named_apart_from_those_that_contradict_each_other(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_tracks(run_at([6, 3, 0.4]), folder / "bad" / "near.jsonl")
+    assert tune(*LOGS[:3], "--bad", "bad/near.jsonl", "--vary", "near=0:0.9") == 1
+    assert capsys.readouterr().out.splitlines() == [
+        "no values of near exist that fit 2 good runs and 1 bad run; this one fits none by itself:",
+        "  0.jsonl is not satisfied with any near from 0 to 0.9",
+        "and these contradict each other:",
+        "  near.jsonl is violated only with near <= 0.3999999",
+        "  1.jsonl is satisfied only with near >= 0.5",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -158,7 +173,7 @@ def test_several_constants_are_searched_together_and_drawn(folder: Path) -> None
             ]
             assert surface.margins[:, row, column] == pytest.approx(margins)
     axes = surface.plot()
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("hold", "near")
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("hold (s)", "near")
     assert "close" not in tuning._repr_html_() and "near" in tuning._repr_html_()
 
 
